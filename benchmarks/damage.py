@@ -1,13 +1,15 @@
 """What becomes of damaged files: the long campaign, by one command.
 
-    python benchmarks/damage.py [--text 100000] [--binary 10000] [--only NAME ...] [--processes 2] [--show] [--write]
+    python benchmarks/damage.py [--text 100000] [--binary 10000] [--only NAME ...] [--processes 2]
+    [--show] [--write]
 
-Every kind of file that the package reads (`tests/helpers/mutants.py`) is damaged, a seed each, and loaded: binary kinds
-that many times, and the kinds of text that one function reads that many times together. What was done is kept in
-`.bench/damage`, a file for every few thousand seeds: a campaign that is stopped goes on, and a larger one takes in a
-smaller one. A process may take 1 GB beyond what it has before, and a file 20 s; one that dies is counted with its seed.
-``--show`` prints what was wrong, ``--write`` puts the table into the documentation
-(`docs/explanation/reliability.md`). Without ``--text`` and ``--binary`` nothing new is tried.
+Every kind of file that the package reads (`tests/helpers/mutants.py`) is damaged, a seed each, and
+loaded: binary kinds that many times, and the kinds of text that one function reads that many times
+together. What was done is kept in `.bench/damage`, a file for every few thousand seeds: a campaign
+that is stopped goes on, and a larger one takes in a smaller one. A process may take 1 GB beyond
+what it has before, and a file 20 s; one that dies is counted with its seed. ``--show`` prints what
+was wrong, ``--write`` puts the table into the documentation (`docs/explanation/reliability.md`).
+Without ``--text`` and ``--binary`` nothing new is tried.
 """
 
 from __future__ import annotations
@@ -54,10 +56,16 @@ def _too_long(*_: Any) -> None:
 
 
 def work(folder: Path, name: str, first: int, last: int) -> None:
-    """Try the seeds [first, last) of a sample, and print what became of them; in a process of its own."""
+    """Try the seeds [first, last) of a sample, and print what became of them; in a process of its
+    own.
+    """
     bench, sample = Bench(folder), next(s for s in SAMPLES if s.file == name)
     bench.valid(sample)
-    pages = int(Path("/proc/self/statm").read_text().split()[0]) if os.path.exists("/proc/self/statm") else 0
+    pages = (
+        int(Path("/proc/self/statm").read_text().split()[0])
+        if os.path.exists("/proc/self/statm")
+        else 0
+    )
     if pages:
         limit = pages * resource.getpagesize() + MOST_BYTES
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
@@ -85,13 +93,17 @@ def work(folder: Path, name: str, first: int, last: int) -> None:
 
 
 def tried(name: str, first: int, last: int, out: Path) -> dict[str, Any]:
-    """What became of the seeds [first, last); from the file that keeps it, if they were tried before."""
+    """What became of the seeds [first, last); from the file that keeps it, if they were tried
+    before.
+    """
     kept = out / f"{name}-{first}-{last}.json"
     if kept.exists():
         result: dict[str, Any] = json.loads(kept.read_text("utf-8"))
         return result
     # Files of a moment are written into memory where the system offers that.
-    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as folder:
+    with tempfile.TemporaryDirectory(
+        dir="/dev/shm" if os.path.isdir("/dev/shm") else None
+    ) as folder:
         result = _tried(name, first, last, out, Path(folder))
     kept.write_text(json.dumps(result) + "\n", "utf-8")
     return result
@@ -133,8 +145,12 @@ def _sum(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def campaign(samples: Sequence[Sample], text: int, binary: int, processes: int, out: Path) -> dict[str, dict[str, Any]]:
-    """Try all that was not tried; what is known of every sample, that of earlier campaigns included."""
+def campaign(
+    samples: Sequence[Sample], text: int, binary: int, processes: int, out: Path
+) -> dict[str, dict[str, Any]]:
+    """Try all that was not tried; what is known of every sample, that of earlier campaigns
+    included.
+    """
     out.mkdir(parents=True, exist_ok=True)
     if not (out / "valid" / LAST).exists():
         (out / "valid").mkdir(exist_ok=True)
@@ -151,13 +167,20 @@ def campaign(samples: Sequence[Sample], text: int, binary: int, processes: int, 
     ]
     start = time.monotonic()
     with ThreadPoolExecutor(processes) as pool:
-        for done, (job, result) in enumerate(zip(jobs, pool.map(lambda job: tried(*job, out), jobs), strict=True), 1):
+        for done, (job, result) in enumerate(
+            zip(jobs, pool.map(lambda job: tried(*job, out), jobs), strict=True), 1
+        ):
             bad = sum(result["counts"].get(kind, 0) for kind in BAD)
             print(
-                f"{done}/{len(jobs)} {time.monotonic() - start:.0f} s  {job[0]} {job[1]}-{job[2]}: {bad} bad",
+                (
+                    f"{done}/{len(jobs)} {time.monotonic() - start:.0f} s  {job[0]} "
+                    f"{job[1]}-{job[2]}: {bad} bad"
+                ),
                 flush=True,
             )
-    return {sample.file: _sum(parts) for sample in samples if (parts := list(_kept(sample.file, out)))}
+    return {
+        sample.file: _sum(parts) for sample in samples if (parts := list(_kept(sample.file, out)))
+    }
 
 
 def _kept(name: str, out: Path) -> Iterator[dict[str, Any]]:
@@ -176,13 +199,20 @@ def _kept(name: str, out: Path) -> Iterator[dict[str, Any]]:
 
 def _judged(counts: dict[str, int]) -> Counter[str]:
     """Counts by `KINDS`."""
-    return Counter({kind: counts.get(kind, 0) for kind in KINDS[:-1]} | {"wrong": sum(counts.get(k, 0) for k in BAD)})
+    return Counter(
+        {kind: counts.get(kind, 0) for kind in KINDS[:-1]}
+        | {"wrong": sum(counts.get(k, 0) for k in BAD)}
+    )
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
     """The results in Markdown."""
     lines = [
-        "| File | Read by | Damaged | Refused | Same content | Other content | Wrong | Slowest, s |",
+        (
+            "| File | Read by | Damaged | Refused | Same content | Other content | Wrong | "
+            "Slowest, "
+            "s |"
+        ),
         "|---|---|" + "---:|" * 6,
     ]
     total: Counter[str] = Counter()
@@ -193,14 +223,19 @@ def table(results: dict[str, dict[str, Any]]) -> str:
             total += counts
             numbers = " | ".join(f"{counts[kind]:,}" for kind in KINDS)
             reads = ", ".join(f"`{name}`" for name in sample.reads)
-            lines.append(f"| {sample.file} | {reads} | {sum(counts.values()):,} | {numbers} | {one['slowest_s']:.2f} |")
+            lines.append(
+                f"| {sample.file} | {reads} | {sum(counts.values()):,} | {numbers} | "
+                f"{one['slowest_s']:.2f} |"
+            )
     numbers = " | ".join(f"{total[kind]:,}" for kind in KINDS)
     lines.append(f"| **all** | | {sum(total.values()):,} | {numbers} | |")
     return "\n".join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--text", type=int, default=0, help="damaged files of each reader of text")
     parser.add_argument("--binary", type=int, default=0, help="damaged files of each binary kind")
     parser.add_argument("--only", nargs="+", default=[], help="files, or parts of their names")
@@ -214,7 +249,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder, name, first, last = options.work
         work(Path(folder), name, int(first), int(last))
         return
-    samples = [s for s in SAMPLES if not options.only or any(part in s.file for part in options.only)]
+    samples = [
+        s for s in SAMPLES if not options.only or any(part in s.file for part in options.only)
+    ]
     results = campaign(samples, options.text, options.binary, options.processes, options.out)
     made = table(results)
     print(made)

@@ -1,8 +1,9 @@
 """Contestants in turns, ratios with spread.
 
-Every contestant has a process of its own, in the interpreter that it needs. After a first call, which does not count
-(imports, compilation, caches), they take turns: A B C A B C, so that a busy machine is busy for all. A ratio is taken
-in each turn; given are the median and the quartiles of these.
+Every contestant has a process of its own, in the interpreter that it needs. After a first call,
+which does not count (imports, compilation, caches), they take turns: A B C A B C, so that a busy
+machine is busy for all. A ratio is taken in each turn; given are the median and the quartiles of
+these.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ import numpy as np
 
 CONTESTANTS = Path(__file__).resolve().parent / "contestants"
 ONE_THREAD = {
-    **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"),
+    **dict.fromkeys(
+        ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
+    ),
     **dict.fromkeys(("NUMBA_NUM_THREADS", "RAYON_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"),
     "ONE_CORE": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
@@ -74,9 +77,17 @@ class Worker:
         command: Sequence[str],
         environment: Mapping[str, str],
     ) -> None:
-        """Start ``file:function`` with its options on the data of a folder; `environment` is added to ours."""
+        """Start ``file:function`` with its options on the data of a folder; `environment` is added
+        to ours.
+        """
         file, function = call.split(":")
-        arguments = [str(CONTESTANTS / "worker.py"), file, function, str(folder), json.dumps(dict(options))]
+        arguments = [
+            str(CONTESTANTS / "worker.py"),
+            file,
+            function,
+            str(folder),
+            json.dumps(dict(options)),
+        ]
         self.errors = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 (closed with the worker)
         self.process = subprocess.Popen(
             [*command, *arguments],
@@ -85,7 +96,8 @@ class Worker:
             stderr=self.errors,
             text=True,
             # Compiled files are kept, as they are for users.
-            env={k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | dict(environment),
+            env={k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+            | dict(environment),
         )
         self.missing: str | None = self._read().get("missing")
 
@@ -135,7 +147,10 @@ def take_turns(
                     continue
                 if (turn < 0 and not contestant.first) or (turn > 0 and turn % contestant.every):
                     continue
-                tell(f"{contestant.label}, {'first call' if turn < 0 else f'turn {turn + 1} of {repeats}'}")
+                tell(
+                    f"{contestant.label}, "
+                    f"{'first call' if turn < 0 else f'turn {turn + 1} of {repeats}'}"
+                )
                 answer = worker.go()
                 if worker.missing is not None:
                     run.missing = worker.missing
@@ -168,12 +183,18 @@ def spread(values: Sequence[float]) -> Ratio:
     return Ratio(float(median), float(low), float(high))
 
 
-def ratio(rival: Runs, ours: Runs, clock: str, amount: Callable[[Any], float] = lambda result: 1.0) -> Ratio | None:
-    """How many times as long the rival takes for the same amount, turn by turn in which both took part."""
+def ratio(
+    rival: Runs, ours: Runs, clock: str, amount: Callable[[Any], float] = lambda result: 1.0
+) -> Ratio | None:
+    """How many times as long the rival takes for the same amount, turn by turn in which both took
+    part.
+    """
     common = [t for t in rival.turns if t in ours.turns]
     if not common:
         return None
-    return spread([cost(rival.turns[t], clock, amount) / cost(ours.turns[t], clock, amount) for t in common])
+    return spread(
+        [cost(rival.turns[t], clock, amount) / cost(ours.turns[t], clock, amount) for t in common]
+    )
 
 
 def cost(turn: Turn, clock: str, amount: Callable[[Any], float] = lambda result: 1.0) -> float:

@@ -2,10 +2,11 @@
 
     python benchmarks/identify.py [--frames 1000] [--seed 2004] [--engine tetra3rs]
 
-A frame is correct when at least four stars are identified and all of them rightly; wrong when a single one is not.
-Brightness is known to 0.2 mag; a false star has the magnitude of any star of the catalogue and lies anywhere. tetra3rs
-gives positions of its own catalogue, which are compared with the truth within two pixels; it is left out where it is
-not installed. Every frame is identified by itself. "Failed" frames have four centroids or more and no attitude.
+A frame is correct when at least four stars are identified and all of them rightly; wrong when a
+single one is not. Brightness is known to 0.2 mag; a false star has the magnitude of any star of the
+catalogue and lies anywhere. tetra3rs gives positions of its own catalogue, which are compared with
+the truth within two pixels; it is left out where it is not installed. Every frame is identified by
+itself. "Failed" frames have four centroids or more and no attitude.
 """
 
 from __future__ import annotations
@@ -47,12 +48,16 @@ def camera(fov_deg: float, focal: float = 1.0, shift_px: float = 0.0) -> sc.Came
     return sc.Camera(SIZE_PX, SIZE_PX, 10.0, focal_px / 100.0, centre, centre)
 
 
-def random_frames(stars: Any, cam: sc.Camera, n: int, seed: int, false: int, missing: float) -> list[Frame]:
+def random_frames(
+    stars: Any, cam: sc.Camera, n: int, seed: int, false: int, missing: float
+) -> list[Frame]:
     """Frames at random attitudes, whatever number of stars they show."""
     rng = np.random.default_rng(seed)
     rotations = random_rotations(n, rng)
     frames = []
-    for rotation, (star, xy) in zip(rotations, Sky(stars, cam, 6.0 * SIGMA_PX).views(rotations), strict=True):
+    for rotation, (star, xy) in zip(
+        rotations, Sky(stars, cam, 6.0 * SIGMA_PX).views(rotations), strict=True
+    ):
         seen = rng.random(len(star)) >= missing
         star, xy = star[seen], xy[seen] + SIGMA_PX * rng.standard_normal((int(seen.sum()), 2))
         mag = stars.mag[star] + 0.2 * rng.standard_normal(len(star))
@@ -81,7 +86,9 @@ def score(correct: float, wrong: float, times: Any, failed: Any) -> Score:
     return Score(correct, wrong, float(np.median(times)), float(np.percentile(times, 95)), slow)
 
 
-def score_ours(frames: list[Frame], stars: Any, nominal: sc.Camera, engine: Any = "pyramid") -> Score:
+def score_ours(
+    frames: list[Frame], stars: Any, nominal: sc.Camera, engine: Any = "pyramid"
+) -> Score:
     """`identify`, each frame by itself."""
     n = [len(f.xy) for f in frames]
     xy = np.concatenate([f.xy for f in frames])
@@ -96,10 +103,15 @@ def score_ours(frames: list[Frame], stars: Any, nominal: sc.Camera, engine: Any 
         time_utc=[None] * len(frames),
     )
     found = identify(table, nominal, stars, engine=engine, share_camera=False, cache=False)
-    row = {(f, x): i for i, (f, x) in enumerate(zip(table.frame.tolist(), table.x_px.tolist(), strict=True))}
+    row = {
+        (f, x): i
+        for i, (f, x) in enumerate(zip(table.frame.tolist(), table.x_px.tolist(), strict=True))
+    }
     truth = np.concatenate([f.star for f in frames])
     o = found.observations
-    at = np.array([row[key] for key in zip(o.frame.tolist(), o.x_px.tolist(), strict=True)], dtype=int)
+    at = np.array(
+        [row[key] for key in zip(o.frame.tolist(), o.x_px.tolist(), strict=True)], dtype=int
+    )
     true_id = np.where(truth[at] >= 0, stars.star_id[truth[at]], "")
     bad = np.unique(o.frame[o.star_id != true_id])
     done = sum(f.status == "identified" for f in found.frames)
@@ -109,7 +121,9 @@ def score_ours(frames: list[Frame], stars: Any, nominal: sc.Camera, engine: Any 
     return score(done / len(frames) - wrong, wrong, times, failed)
 
 
-def score_tetra3rs(frames: list[Frame], stars: Any, nominal: sc.Camera, database: Any, off: bool) -> Score:
+def score_tetra3rs(
+    frames: list[Frame], stars: Any, nominal: sc.Camera, database: Any, off: bool
+) -> Score:
     """tetra3rs; its field may be off by what ours may."""
     import tetra3rs
 
@@ -135,7 +149,9 @@ def score_tetra3rs(frames: list[Frame], stars: Any, nominal: sc.Camera, database
             continue
         index = np.asarray(result.matched_centroids, dtype=int)
         known = [database.get_star_by_id(int(i)) for i in result.matched_catalog_ids]
-        theirs = unit_vectors(np.array([s.ra_deg for s in known]), np.array([s.dec_deg for s in known]))
+        theirs = unit_vectors(
+            np.array([s.ra_deg for s in known]), np.array([s.dec_deg for s in known])
+        )
         true = f.star[index]
         apart = np.linalg.norm(theirs - stars.directions_icrs[true], axis=1)
         right = (true >= 0) & (apart < 2.0 / nominal.focal_px)
@@ -156,12 +172,16 @@ CASES = {
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=2004)
     parser.add_argument("--fields", type=float, nargs="+", default=[8.0, 12.0, 20.0])
     parser.add_argument("--max-mag", type=float, default=6.0)
-    parser.add_argument("--engine", choices=ENGINES, default="pyramid", help="what proposes attitudes to starcal_uq")
+    parser.add_argument(
+        "--engine", choices=ENGINES, default="pyramid", help="what proposes attitudes to starcal_uq"
+    )
     parser.add_argument("--no-rival", action="store_true")
     arguments = parser.parse_args()
     try:
@@ -172,8 +192,19 @@ def main() -> None:
     if arguments.no_rival:
         tetra3rs = None
     stars = sc.load_catalogue(arguments.max_mag, epoch=EPOCH)
-    table = Table(title=f"{arguments.frames} random frames each, stars to G = {arguments.max_mag:g}")
-    for name in ("field", "case", "engine", "correct", "wrong", "median ms", "95 % ms", "failed ms"):
+    table = Table(
+        title=f"{arguments.frames} random frames each, stars to G = {arguments.max_mag:g}"
+    )
+    for name in (
+        "field",
+        "case",
+        "engine",
+        "correct",
+        "wrong",
+        "median ms",
+        "95 % ms",
+        "failed ms",
+    ):
         table.add_column(name)
     for fov in arguments.fields:
         database = None
@@ -185,11 +216,15 @@ def main() -> None:
                 epoch_proper_motion_year=EPOCH,
             )
         for case, (focal, shift, false, missing) in CASES.items():
-            frames = random_frames(stars, camera(fov, focal, shift), arguments.frames, arguments.seed, false, missing)
+            frames = random_frames(
+                stars, camera(fov, focal, shift), arguments.frames, arguments.seed, false, missing
+            )
             few = np.mean([np.sum(f.star >= 0) < 4 for f in frames])
             scores = {"starcal_uq": score_ours(frames, stars, camera(fov), arguments.engine)}
             if database is not None:
-                scores["tetra3rs"] = score_tetra3rs(frames, stars, camera(fov), database, focal != 1.0)
+                scores["tetra3rs"] = score_tetra3rs(
+                    frames, stars, camera(fov), database, focal != 1.0
+                )
             for engine, s in scores.items():
                 table.add_row(
                     f"{fov:g} deg",

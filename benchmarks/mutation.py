@@ -2,19 +2,22 @@
 
     python benchmarks/mutation.py [--seed N] [--subject NAME ...] [--again] [--show] [--write]
 
-A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. A seed draws one of each
-function of a subject; a later seed leaves out what those before it draw, so its first result is of changes that no test
-was written against. Each is given to the fast tests that reach its line, in a process of its own; it is killed when one
-of them fails. What was drawn and tried is kept in `.bench/mutation`, so a run that is stopped goes on; without
-``--seed`` nothing new is tried. ``--again`` tries those that survived, after tests were strengthened. ``--show`` prints
-survivors as differences, ``--write`` puts the table of all draws into `docs/explanation/reliability.md`.
+A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. A seed
+draws one of each function of a subject; a later seed leaves out what those before it draw, so its
+first result is of changes that no test was written against. Each is given to the fast tests that
+reach its line, in a process of its own; it is killed when one of them fails. What was drawn and
+tried is kept in `.bench/mutation`, so a run that is stopped goes on; without ``--seed`` nothing new
+is tried. ``--again`` tries those that survived, after tests were strengthened. ``--show`` prints
+survivors as differences, ``--write`` puts the table of all draws into
+`docs/explanation/reliability.md`.
 
-A subject's tests are collected once. Each mutant is a fork of that process in which the one function gets its changed
-code; what stands outside functions is imported anew.
+A subject's tests are collected once. Each mutant is a fork of that process in which the one
+function gets its changed code; what stands outside functions is imported anew.
 
-Not mutated, because no test should care: sentences, annotations, decorators, what follows ``raise``, sizes of blocks,
-seeds, and -1 where it stands for the last axis of two or for a size to be found. `estimation/loops` is left out: its
-compiled code is cached by the file on the disk. Tests hold it equal to `estimation/sums`.
+Not mutated, because no test should care: sentences, annotations, decorators, what follows
+``raise``, sizes of blocks, seeds, and -1 where it stands for the last axis of two or for a size to
+be found. `estimation/loops` is left out: its compiled code is cached by the file on the disk. Tests
+hold it equal to `estimation/sums`.
 """
 
 from __future__ import annotations
@@ -53,8 +56,15 @@ PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 # Files of the package, and the tests that answer for them.
 SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "likelihood": (
-        ("estimation/marginal.py", "estimation/sums.py", "estimation/compressed.py", "estimation/student.py"),
-        tuple(f"estimation/test_{name}.py" for name in ("likelihood", "sums", "student", "merging")),
+        (
+            "estimation/marginal.py",
+            "estimation/sums.py",
+            "estimation/compressed.py",
+            "estimation/student.py",
+        ),
+        tuple(
+            f"estimation/test_{name}.py" for name in ("likelihood", "sums", "student", "merging")
+        ),
     ),
     "pairs": (
         ("estimation/pairs.py", "estimation/composite.py"),
@@ -65,17 +75,33 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "budget": (("budgeting/*.py",), ("budgeting",)),
     "inference": (("inference/*.py",), ("inference",)),
 }
-# A mutant may take this many times what its tests take, and this long beside, of the processor's time.
+# A mutant may take this many times what its tests take, and this long beside, of the processor's
+# time.
 SLOWER, BESIDE_S = 5.0, 20.0
 # Tests of a mutant take at most this long (s) without it: the quickest files that reach the line.
 LONGEST_S = 60.0
 # Exit status of a fork that came to no result.
 BROKEN = 97
 
-COMPARISONS = {ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "=="}
+COMPARISONS = {
+    ast.Lt: ">=",
+    ast.LtE: ">",
+    ast.Gt: "<=",
+    ast.GtE: "<",
+    ast.Eq: "!=",
+    ast.NotEq: "==",
+}
 COMPARISONS |= {ast.Is: "is not", ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in"}
 BORDERS = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">"}
-ARITHMETIC = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.Pow: "*", ast.FloorDiv: "/", ast.Mod: "//"}
+ARITHMETIC = {
+    ast.Add: "-",
+    ast.Sub: "+",
+    ast.Mult: "/",
+    ast.Div: "*",
+    ast.Pow: "*",
+    ast.FloorDiv: "/",
+    ast.Mod: "//",
+}
 ARITHMETIC |= {ast.BitAnd: "|", ast.BitOr: "&"}
 TWINS = {
     "min": "max",
@@ -111,7 +137,11 @@ def _text(node: ast.expr) -> bool:
 
 
 def _last(node: ast.expr) -> bool:
-    return isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub) and isinstance(node.operand, ast.Constant)
+    return (
+        isinstance(node, ast.UnaryOp)
+        and isinstance(node.op, ast.USub)
+        and isinstance(node.operand, ast.Constant)
+    )
 
 
 class Places(ast.NodeVisitor):
@@ -162,7 +192,10 @@ class Places(ast.NodeVisitor):
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
         named = [*node.args.posonlyargs, *node.args.args][::-1]
         defaults = [*zip(named, node.args.defaults[::-1], strict=False)]
-        for argument, default in (*defaults, *zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)):
+        for argument, default in (
+            *defaults,
+            *zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True),
+        ):
             if default is not None and argument.arg != "seed":
                 self.visit(default)
         self.within(node)
@@ -194,7 +227,9 @@ class Places(ast.NodeVisitor):
     @staticmethod
     def a_size(target: ast.expr) -> bool:
         """A tuning of speed and memory, which no result depends on."""
-        return isinstance(target, ast.Name) and bool(re.search(r"_AT_ONCE|BLOCK|CHUNK|CACHE", target.id))
+        return isinstance(target, ast.Name) and bool(
+            re.search(r"_AT_ONCE|BLOCK|CHUNK|CACHE", target.id)
+        )
 
     # --- what is changed
     def visit_Assign(self, node: ast.Assign) -> None:
@@ -237,19 +272,25 @@ class Places(ast.NodeVisitor):
             self.swap(left, right, COMPARISONS[type(operator)], "comparison")
             # Between numbers that are not counted, equality does not happen.
             counted = re.compile(r"[1-9]\d*|len\(.*|n_\w+|.*\.(size|n_\w+)")
-            if type(operator) in BORDERS and any(counted.fullmatch(self.code(side)) for side in (left, right)):
+            if type(operator) in BORDERS and any(
+                counted.fullmatch(self.code(side)) for side in (left, right)
+            ):
                 self.swap(left, right, BORDERS[type(operator)], "border")
         self.generic_visit(node)
 
     def visit_BinOp(self, node: ast.BinOp) -> None:
         sides = (node.left, node.right)
-        sentence = any(isinstance(side, ast.JoinedStr | ast.List | ast.Tuple) or _text(side) for side in sides)
+        sentence = any(
+            isinstance(side, ast.JoinedStr | ast.List | ast.Tuple) or _text(side) for side in sides
+        )
         if type(node.op) in ARITHMETIC and not sentence:
             self.swap(node.left, node.right, ARITHMETIC[type(node.op)], "arithmetic")
         self.generic_visit(node)
 
     def visit_BoolOp(self, node: ast.BoolOp) -> None:
-        self.swap(node.values[0], node.values[1], "or" if isinstance(node.op, ast.And) else "and", "logic")
+        self.swap(
+            node.values[0], node.values[1], "or" if isinstance(node.op, ast.And) else "and", "logic"
+        )
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
@@ -268,13 +309,18 @@ class Places(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Call(self, node: ast.Call) -> None:
-        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        name = (
+            node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        )
         if name in TWINS and not (name == "sum" and isinstance(node.func, ast.Name)):
             code = self.code(node.func)
             self.add(node.func, code[: len(code) - len(name)] + TWINS[name], "function")
         self.visit(node.func)
         for part in (*node.args, *(key.value for key in node.keywords if key.arg != "strict")):
-            if not (_last(part) and (name == "reshape" or any(key.arg == "axis" for key in node.keywords))):
+            if not (
+                _last(part)
+                and (name == "reshape" or any(key.arg == "axis" for key in node.keywords))
+            ):
                 self.visit(part)
 
     def visit_Slice(self, node: ast.Slice) -> None:
@@ -302,23 +348,31 @@ def mutants(file: str) -> list[Mutant]:
 
 def files_of(subject: str) -> list[str]:
     """Files of a subject, as paths from the root."""
-    found = [path for name in SUBJECTS[subject][0] for path in sorted((ROOT / "starcal_uq").glob(name))]
+    found = [
+        path for name in SUBJECTS[subject][0] for path in sorted((ROOT / "starcal_uq").glob(name))
+    ]
     return [path.relative_to(ROOT).as_posix() for path in found if path.name != "__init__.py"]
 
 
 def functions(found: Iterable[Mutant]) -> int:
-    """In how many functions (a class and a file count as one for what is outside its own) some mutants are."""
+    """In how many functions (a class and a file count as one for what is outside its own) some
+    mutants are.
+    """
     return len({(mutant.file, mutant.function) for mutant in found})
 
 
 def drawn(found: dict[str, Mutant], seed: int, before: Iterable[str] = ()) -> list[str]:
-    """Keys of the mutants that a seed draws, in the order of the source; without those `before` and of lower seeds."""
+    """Keys of the mutants that a seed draws, in the order of the source; without those `before` and
+    of lower seeds.
+    """
     chosen: dict[tuple[str, str], str] = {}
     gone = {*before}
     for turn in range(1, seed + 1):
         gone |= {*chosen.values()}
         chosen = {}
-        for name in sorted({*found} - gone, key=lambda name: hashlib.sha256(f"{turn} {name}".encode()).digest()):
+        for name in sorted(
+            {*found} - gone, key=lambda name: hashlib.sha256(f"{turn} {name}".encode()).digest()
+        ):
             chosen.setdefault((found[name].file, found[name].function), name)
     return sorted(chosen.values(), key=lambda name: (found[name].file, found[name].start))
 
@@ -357,9 +411,16 @@ class Reached:
             return (yield)
         finally:
             sys.settrace(None)
-            asked = (found for several in item._fixtureinfo.name2fixturedefs.values() for found in several)
+            asked = (
+                found
+                for several in item._fixtureinfo.name2fixturedefs.values()
+                for found in several
+            )
             lines = self.lines.union(*(self.fixtures.get(fixture, ()) for fixture in asked))
-            self.tests[item.nodeid] = {"seconds": time.process_time() - began, "lines": sorted(lines)}
+            self.tests[item.nodeid] = {
+                "seconds": time.process_time() - began,
+                "lines": sorted(lines),
+            }
 
 
 def quiet_pytest(arguments: list[str], log: Path, plugins: list[Any]) -> int:
@@ -367,12 +428,26 @@ def quiet_pytest(arguments: list[str], log: Path, plugins: list[Any]) -> int:
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(output, 1)
     os.dup2(output, 2)
-    options = ["-q", "-x", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=line", "-W", "ignore"]
+    options = [
+        "-q",
+        "-x",
+        "-m",
+        "not slow",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+        "--tb=line",
+        "-W",
+        "ignore",
+    ]
     return int(pytest.main([*options, *arguments], plugins))
 
 
 def forked(work: Callable[[], int], seconds: float = 0.0) -> str:
-    """What became of `work()` in a process of its own, of so much processor time: its status, or ``timeout``."""
+    """What became of `work()` in a process of its own, of so much processor time: its status, or
+    ``timeout``.
+    """
     process = os.fork()
     if process == 0:
         status = BROKEN
@@ -391,7 +466,11 @@ def forked(work: Callable[[], int], seconds: float = 0.0) -> str:
     while time.monotonic() < end:
         found, status = os.waitpid(process, os.WNOHANG)
         if found:
-            return "timeout" if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU else str(status)
+            return (
+                "timeout"
+                if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU
+                else str(status)
+            )
         time.sleep(0.01)
     os.killpg(process, signal.SIGKILL)
     os.waitpid(process, 0)
@@ -406,23 +485,31 @@ def digest(*paths: Path) -> str:
 def files_of_tests(subject: str) -> list[Path]:
     """Files of the tests that answer for a subject."""
     named = [ROOT / "tests" / name for name in SUBJECTS[subject][1]]
-    return [path for test in named for path in (sorted(test.glob("test_*.py")) if test.is_dir() else [test])]
+    return [
+        path
+        for test in named
+        for path in (sorted(test.glob("test_*.py")) if test.is_dir() else [test])
+    ]
 
 
 def tests_for(mutant: Mutant, tests: dict[str, dict[str, Any]]) -> tuple[list[str], float]:
     """Tests to run, quickest first, file by file, and what they cost (s).
 
-    What a file makes once is counted for its first test, so tests of a file that do not reach the line come after
-    those that do. A line outside all functions is reached by all tests.
+    What a file makes once is counted for its first test, so tests of a file that do not reach the
+    line come after those that do. A line outside all functions is reached by all tests.
     """
-    hits = {name for name, test in tests.items() if [mutant.file, mutant.line] in test["lines"]} or set(tests)
+    hits = {
+        name for name, test in tests.items() if [mutant.file, mutant.line] in test["lines"]
+    } or set(tests)
     order: list[str] = []
     cost = 0.0
     by_file: dict[str, list[str]] = {}
     for name in tests:
         by_file.setdefault(name.split("::")[0], []).append(name)
     reached = [names for names in by_file.values() if any(name in hits for name in names)]
-    for names in sorted(reached, key=lambda names: min(tests[name]["seconds"] for name in names if name in hits)):
+    for names in sorted(
+        reached, key=lambda names: min(tests[name]["seconds"] for name in names if name in hits)
+    ):
         for name in sorted(names, key=lambda name: (name not in hits, tests[name]["seconds"])):
             if cost + tests[name]["seconds"] <= LONGEST_S or not order:
                 order.append(name)
@@ -432,13 +519,17 @@ def tests_for(mutant: Mutant, tests: dict[str, dict[str, Any]]) -> tuple[list[st
 
 def key(mutant: Mutant, text: str) -> str:
     """A mutant is known by the change and its surroundings, wherever these stand in the file."""
-    around = text[max(0, mutant.start - 60) : mutant.start] + "|" + text[mutant.start : mutant.end + 40]
+    around = (
+        text[max(0, mutant.start - 60) : mutant.start] + "|" + text[mutant.start : mutant.end + 40]
+    )
     return hashlib.sha256("\0".join((mutant.file, around, mutant.new)).encode()).hexdigest()[:16]
 
 
 def difference(mutant: Mutant, text: str) -> str:
     """The change as a few lines of a unified difference."""
-    lines = difflib.unified_diff(text.splitlines(), mutant.source(text).splitlines(), n=0, lineterm="")
+    lines = difflib.unified_diff(
+        text.splitlines(), mutant.source(text).splitlines(), n=0, lineterm=""
+    )
     return "\n".join([f"{mutant.file}:{mutant.line} ({mutant.what})", *list(lines)[3:]])
 
 
@@ -463,25 +554,39 @@ def functions_of(files: Iterable[str]) -> Functions:
     for thing in gc.get_objects():
         if type(thing) is FunctionType and thing.__code__.co_filename in wanted:
             code = thing.__code__
-            found.setdefault((code.co_filename, code.co_qualname, code.co_firstlineno), []).append(thing)
+            found.setdefault((code.co_filename, code.co_qualname, code.co_firstlineno), []).append(
+                thing
+            )
     gc.freeze()
     return found
 
 
 def changes(mutant: Mutant, text: str, live: Functions) -> list[Callable[[], None]]:
-    """What makes the functions of this process those of the mutant; nothing if its change is in no function."""
+    """What makes the functions of this process those of the mutant; nothing if its change is in no
+    function.
+    """
     path, new_text = str(ROOT / mutant.file), mutant.source(text)
-    old, new = (codes(compile(source, path, "exec", dont_inherit=True)) for source in (text, new_text))
+    old, new = (
+        codes(compile(source, path, "exec", dont_inherit=True)) for source in (text, new_text)
+    )
     found: list[Callable[[], None]] = []
     for place, code in new.items():
         if code != old.get(place):
-            found += [partial(setattr, function, "__code__", code) for function in live.get((path, *place), [])]
+            found += [
+                partial(setattr, function, "__code__", code)
+                for function in live.get((path, *place), [])
+            ]
     for before, node in zip(ast.walk(ast.parse(text)), ast.walk(ast.parse(new_text)), strict=False):
         if isinstance(node, ast.FunctionDef) and isinstance(before, ast.FunctionDef):
             if ast.dump(before.args) == ast.dump(node.args):
                 continue
             line = min([node.lineno, *(part.lineno for part in node.decorator_list)])
-            for function in (f for (p, _, at), several in live.items() if (p, at) == (path, line) for f in several):
+            for function in (
+                f
+                for (p, _, at), several in live.items()
+                if (p, at) == (path, line)
+                for f in several
+            ):
                 found += [partial(_set_defaults, function, node.args)]
     return found
 
@@ -492,13 +597,19 @@ def _set_defaults(function: FunctionType, arguments: ast.arguments) -> None:
 
     function.__defaults__ = tuple(map(value, arguments.defaults)) or None
     named = zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
-    function.__kwdefaults__ = {key.arg: value(node) for key, node in named if node is not None} or None
+    function.__kwdefaults__ = {
+        key.arg: value(node) for key, node in named if node is not None
+    } or None
 
 
 class Trials:
-    """Mutants of a subject, tried in forks of a process that has collected its tests; a plug-in for pytest."""
+    """Mutants of a subject, tried in forks of a process that has collected its tests; a plug-in for
+    pytest.
+    """
 
-    def __init__(self, subject: str, todo: list[tuple[Mutant, str]], tell: Callable[[Mutant, str], None]) -> None:
+    def __init__(
+        self, subject: str, todo: list[tuple[Mutant, str]], tell: Callable[[Mutant, str], None]
+    ) -> None:
         self.subject, self.todo, self.tell = subject, todo, tell
 
     def pytest_runtestloop(self, session: Any) -> bool:
@@ -515,7 +626,11 @@ class Trials:
                 return self.tests(session, [items[name] for name in names])
 
             def anew(mutant: Mutant = mutant, text: str = text, names: list[str] = names) -> int:
-                for name in [name for name in sys.modules if name.split(".")[0] in ("starcal_uq", "tests", "conftest")]:
+                for name in [
+                    name
+                    for name in sys.modules
+                    if name.split(".")[0] in ("starcal_uq", "tests", "conftest")
+                ]:
                     del sys.modules[name]
                 changed, plain = str(ROOT / mutant.file), SourceFileLoader.get_code
 
@@ -542,10 +657,15 @@ class Trials:
         return 0
 
     def reach(self, session: Any) -> dict[str, dict[str, Any]]:
-        """Tests with the lines they reach; measured once for each state of the sources and of a file of tests."""
+        """Tests with the lines they reach; measured once for each state of the sources and of a
+        file of tests.
+        """
         files = files_of(self.subject)
         sources = [ROOT / file for file in files]
-        kept = {path: OUT / f"reach-{path.stem}-{digest(*sources, path)}.json" for path in files_of_tests(self.subject)}
+        kept = {
+            path: OUT / f"reach-{path.stem}-{digest(*sources, path)}.json"
+            for path in files_of_tests(self.subject)
+        }
         missing = [item for item in session.items if not kept[item.path].exists()]
 
         def work() -> int:
@@ -554,7 +674,9 @@ class Trials:
             status = self.tests(session, missing)
             for path in {item.path for item in missing if not status}:
                 names = [item.nodeid for item in missing if item.path == path]
-                kept[path].write_text(json.dumps({name: plugin.tests[name] for name in names}), "utf-8")
+                kept[path].write_text(
+                    json.dumps({name: plugin.tests[name] for name in names}), "utf-8"
+                )
             return status
 
         if missing and forked(work) != "0":
@@ -568,7 +690,9 @@ class Trials:
 def entries() -> list[dict[str, Any]]:
     """What was tried, in the order of time."""
     log = OUT / "tried.jsonl"
-    return [json.loads(line) for line in log.read_text("utf-8").splitlines()] if log.exists() else []
+    return (
+        [json.loads(line) for line in log.read_text("utf-8").splitlines()] if log.exists() else []
+    )
 
 
 def draw(subject: str, seed: int) -> None:
@@ -576,17 +700,31 @@ def draw(subject: str, seed: int) -> None:
     kept = OUT / f"draw-{seed}-{subject}.json"
     if not kept.exists():
         found = known(subject)[0]
-        before = [name for path in OUT.glob(f"draw-*-{subject}.json") for name in json.loads(path.read_text())["keys"]]
-        commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout
-        made = {"commit": commit.strip(), "mutants": len(found), "functions": functions(found.values())}
+        before = [
+            name
+            for path in OUT.glob(f"draw-*-{subject}.json")
+            for name in json.loads(path.read_text())["keys"]
+        ]
+        commit = subprocess.run(
+            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False
+        ).stdout
+        made = {
+            "commit": commit.strip(),
+            "mutants": len(found),
+            "functions": functions(found.values()),
+        }
         keys = drawn(found, seed, before)
-        kept.write_text(json.dumps({"subject": subject, "seed": seed, **made, "keys": keys}), "utf-8")
+        kept.write_text(
+            json.dumps({"subject": subject, "seed": seed, **made, "keys": keys}), "utf-8"
+        )
 
 
 def known(subject: str) -> tuple[dict[str, Mutant], dict[str, str]]:
     """All mutants of a subject by their key, and the text of its files."""
     texts = {file: (ROOT / file).read_text("utf-8") for file in files_of(subject)}
-    return {key(mutant, texts[mutant.file]): mutant for file in texts for mutant in mutants(file)}, texts
+    return {
+        key(mutant, texts[mutant.file]): mutant for file in texts for mutant in mutants(file)
+    }, texts
 
 
 def draws(subjects: Iterable[str]) -> list[dict[str, Any]]:
@@ -596,10 +734,16 @@ def draws(subjects: Iterable[str]) -> list[dict[str, Any]]:
         now, texts = known(subject)
         for path in sorted(OUT.glob(f"draw-*-{subject}.json")):
             one = json.loads(path.read_text("utf-8"))
-            of_these = {name: [e["outcome"] for e in tried if e["key"] == name] for name in one["keys"]}
+            of_these = {
+                name: [e["outcome"] for e in tried if e["key"] == name] for name in one["keys"]
+            }
             first = {name: outcomes[0] for name, outcomes in of_these.items() if outcomes}
             last = {name: of_these[name][-1] for name in first}
-            last |= {name: "gone" for name, what in last.items() if what == "survived" and name not in now}
+            last |= {
+                name: "gone"
+                for name, what in last.items()
+                if what == "survived" and name not in now
+            }
             found.append({**one, "first": first, "last": last, "now": now, "texts": texts})
     return found
 
@@ -607,7 +751,11 @@ def draws(subjects: Iterable[str]) -> list[dict[str, Any]]:
 def run(one: dict[str, Any], again: bool) -> None:
     """Try the mutants of a draw that were not tried yet, or those that survived."""
     title, names = f"{one['subject']} {one['seed']}", one["last"]
-    chosen = [name for name in one["keys"] if (names.get(name) == "survived" if again else name not in names)]
+    chosen = [
+        name
+        for name in one["keys"]
+        if (names.get(name) == "survived" if again else name not in names)
+    ]
     todo = {one["now"][name]: name for name in chosen if name in one["now"]}
     if not todo:
         return
@@ -616,13 +764,22 @@ def run(one: dict[str, Any], again: bool) -> None:
 
     def tell(mutant: Mutant, outcome: str) -> None:
         with (OUT / "tried.jsonl").open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps({"key": todo[mutant], "outcome": outcome, **asdict(mutant)}) + "\n")
+            stream.write(
+                json.dumps({"key": todo[mutant], "outcome": outcome, **asdict(mutant)}) + "\n"
+            )
         place = f"{mutant.file}:{mutant.line} {mutant.what}"
         print(f"{title} {next(count)}/{len(todo)} {place}: {outcome}", file=screen, flush=True)
 
     log = OUT / f"{title.replace(' ', '-')}.log"
     trials = Trials(one["subject"], [(mutant, one["texts"][mutant.file]) for mutant in todo], tell)
-    if forked(lambda: quiet_pytest([str(path) for path in files_of_tests(one["subject"])], log, [trials])) != "0":
+    if (
+        forked(
+            lambda: quiet_pytest(
+                [str(path) for path in files_of_tests(one["subject"])], log, [trials]
+            )
+        )
+        != "0"
+    ):
         raise SystemExit(f"the tests of {title} cannot be run: {log}")
 
 
@@ -631,7 +788,8 @@ def table(found: list[dict[str, Any]]) -> str:
     from starcal_uq.maths.intervals import binomial_interval
 
     lines = [
-        "| Subject | Mutants | In functions | Seed | Tried | Killed at first | By time | Share (95 %) | "
+        "| Subject | Mutants | In functions | Seed | Tried | Killed at first | By time | Share "
+        "(95 %) | "
         "Killed now | Gone | Left |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
@@ -645,7 +803,16 @@ def table(found: list[dict[str, Any]]) -> str:
         tried = f"{n}" if n == len(one["keys"]) else f"{n} of {len(one['keys'])}"
         share = f"{100 * (n - survived) / n:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
         killed, gone, left = last["killed"] + last["timeout"], last["gone"], last["survived"]
-        row = (one["subject"], one["mutants"], one["functions"], one["seed"], tried, n - survived, late, share)
+        row = (
+            one["subject"],
+            one["mutants"],
+            one["functions"],
+            one["seed"],
+            tried,
+            n - survived,
+            late,
+            share,
+        )
         lines.append(f"| {' | '.join(map(str, (*row, killed, gone, left)))} |")
     return "\n".join(lines)
 
@@ -653,18 +820,25 @@ def table(found: list[dict[str, Any]]) -> str:
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(description="Mutation testing of the mathematics.")
-    parser.add_argument("--seed", type=int, help="try what this seed draws, as far as it was not tried")
+    parser.add_argument(
+        "--seed", type=int, help="try what this seed draws, as far as it was not tried"
+    )
     parser.add_argument("--subject", nargs="+", choices=[*SUBJECTS], default=[*SUBJECTS])
-    parser.add_argument("--again", action="store_true", help="try again those that survived, of all draws")
+    parser.add_argument(
+        "--again", action="store_true", help="try again those that survived, of all draws"
+    )
     parser.add_argument("--show", action="store_true", help="print what survived")
-    parser.add_argument("--write", action="store_true", help="put the table of all draws into the documentation")
+    parser.add_argument(
+        "--write", action="store_true", help="put the table of all draws into the documentation"
+    )
     options = parser.parse_args(arguments)
     OUT.mkdir(parents=True, exist_ok=True)
     os.chdir(ROOT)
     sys.dont_write_bytecode = False
     sys.path[:0] = [str(ROOT)]
     os.environ.update(
-        dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"), MPLBACKEND="Agg"
+        dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+        MPLBACKEND="Agg",
     )
     if options.seed is not None:
         for subject in options.subject:
@@ -676,7 +850,10 @@ def main(arguments: list[str] | None = None) -> None:
         for one in draws(options.subject):
             for name, mutant in one["now"].items():
                 if one["last"].get(name) == "survived":
-                    print(f"seed {one['seed']} {difference(mutant, one['texts'][mutant.file])}", end="\n\n")
+                    print(
+                        f"seed {one['seed']} {difference(mutant, one['texts'][mutant.file])}",
+                        end="\n\n",
+                    )
     made = table([one for one in draws(SUBJECTS) if one["first"]])
     print(made)
     if options.write:

@@ -1,4 +1,6 @@
-"""Tables in the documentation, between the markers ``<!-- word -->`` and ``<!-- /word -->`` of a page."""
+"""Tables in the documentation, between the markers ``<!-- word -->`` and ``<!-- /word -->`` of a
+page.
+"""
 
 from __future__ import annotations
 

@@ -1,14 +1,16 @@
-"""Are the stated uncertainties right, regime by regime? The tables of the documentation are made by this command.
+"""Are the stated uncertainties right, regime by regime? The tables of the documentation are made by
+this command.
 
-    python benchmarks/regimes.py [--only NAME ...] [--runs N] [--seed 1] [--processes N] [--write] [--list]
+    python benchmarks/regimes.py [--only NAME ...] [--runs N] [--seed 1] [--processes N] [--write]
+    [--list]
 
-Every run simulates a campaign with `tests/helpers/outside.py` (NumPy alone, none of the package's code), takes it
-through the public chain (`calibrate`, intervals of the estimate, `diagnose`, the verdict), and compares with the truth.
-``--write`` puts the rows that were run into the tables of `docs/explanation`; the other rows stay as they are.
-``--only`` takes parts of names.
+Every run simulates a campaign with `tests/helpers/outside.py` (NumPy alone, none of the package's
+code), takes it through the public chain (`calibrate`, intervals of the estimate, `diagnose`, the
+verdict), and compares with the truth. ``--write`` puts the rows that were run into the tables of
+`docs/explanation`; the other rows stay as they are. ``--only`` takes parts of names.
 
-A regime is a function from a random generator to an `Outcome`, listed with `Regime` in REGIMES: most are a `campaign`
-with some switches, and `chain`.
+A regime is a function from a random generator to an `Outcome`, listed with `Regime` in REGIMES:
+most are a `campaign` with some switches, and `chain`.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ from starcal_uq.observations.frames import StarFrames  # noqa: E402
 from tests.diagnostics import test_air, test_pattern  # noqa: E402
 from tests.helpers.outside import Campaign, campaign, measured_again  # noqa: E402
 
-# A fact of the data and no test: few frames and empty corners are warned of in every run of such a regime.
+# A fact of the data and no test: few frames and empty corners are warned of in every run of such a
+# regime.
 FACTS = ("Coverage of the field",)
 VERDICTS = {Level.PASS: "passed", Level.WARN: "warning", Level.FAIL: "do not use"}
 STATISTICS_HEAD = (
@@ -58,11 +61,14 @@ STATISTICS_HEAD = (
 class Outcome:
     """What one run gave."""
 
-    # For each parameter whether its 95 % interval holds the truth; empty where there is no estimate.
+    # For each parameter whether its 95 % interval holds the truth; empty where there is no
+    # estimate.
     inside: tuple[bool, ...] = ()
-    # Squared error (normalised by the stated covariance, over its expectation): 1 on average if that is right.
+    # Squared error (normalised by the stated covariance, over its expectation): 1 on average if
+    # that is right.
     squared: float = float("nan")
-    verdict: str = ""  # One of VERDICTS; "refused" where the chain raised an error, empty where nothing was judged
+    # One of VERDICTS; "refused" where the chain raised an error, empty where nothing was judged
+    verdict: str = ""
     alarms: tuple[str, ...] = ()  # Checks that did not pass, those of FACTS left out
     # Further numbers by column name; the table shows their medians.
     figures: Mapping[str, float] = field(default_factory=dict)
@@ -72,7 +78,9 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Regime:
-    """A row: its name, what is done in one run, how many runs stand in the table, and the page with the table."""
+    """A row: its name, what is done in one run, how many runs stand in the table, and the page with
+    the table.
+    """
 
     name: str
     run: Callable[[np.random.Generator], Outcome]
@@ -81,9 +89,15 @@ class Regime:
 
 
 def chain(
-    c: Campaign, *, diagnose: bool = True, calibrate: Mapping[str, Any] | None = None, **diagnosis: Any
+    c: Campaign,
+    *,
+    diagnose: bool = True,
+    calibrate: Mapping[str, Any] | None = None,
+    **diagnosis: Any,
 ) -> Outcome:
-    """Calibrate a campaign, with `calibrate`'s options, diagnose it, and hold both against the truth."""
+    """Calibrate a campaign, with `calibrate`'s options, diagnose it, and hold both against the
+    truth.
+    """
     obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
     camera = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
     try:
@@ -94,7 +108,9 @@ def chain(
     return against_truth(c, cal, *(verdict_of(obs, cal, found) if diagnose else ("", ())))
 
 
-def against_truth(c: Campaign, cal: sc.Calibration, verdict: str = "", alarms: tuple[str, ...] = ()) -> Outcome:
+def against_truth(
+    c: Campaign, cal: sc.Calibration, verdict: str = "", alarms: tuple[str, ...] = ()
+) -> Outcome:
     """Intervals and squared error of an estimate."""
     low, high = cal.interval(0.95).T
     error = (cal.theta - c.theta) / cal.sigmas
@@ -110,8 +126,14 @@ def against_truth(c: Campaign, cal: sc.Calibration, verdict: str = "", alarms: t
 def verdict_of(
     obs: sc.Observations, cal: sc.Calibration, found: sc.diagnostics.Diagnosis | None
 ) -> tuple[str, tuple[str, ...]]:
-    """The verdict on a run that has not been sampled, and the checks that did not pass; facts left out."""
-    checks = [c for c in judge(obs, cal, diagnosis=found).checks if c.name not in FACTS and c.level is not Level.PASS]
+    """The verdict on a run that has not been sampled, and the checks that did not pass; facts left
+    out.
+    """
+    checks = [
+        c
+        for c in judge(obs, cal, diagnosis=found).checks
+        if c.name not in FACTS and c.level is not Level.PASS
+    ]
     level = max((c.level for c in checks), key=lambda v: v.rank, default=Level.PASS)
     return VERDICTS[level], tuple(c.name for c in checks)
 
@@ -131,9 +153,14 @@ def twice(rng: np.random.Generator, duplicates: str) -> Outcome:
 
 def merged(rng: np.random.Generator, ratio: float) -> Outcome:
     """Two runs, the smaller with so many times the noise, merged."""
-    parts = [campaign(rng, n_frames=n, sigma_px=sigma) for n, sigma in ((20, 0.05), (8, 0.05 * ratio))]
+    parts = [
+        campaign(rng, n_frames=n, sigma_px=sigma) for n, sigma in ((20, 0.05), (8, 0.05 * ratio))
+    ]
     sheets = [sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)) for c in parts]
-    runs = [sc.calibrate(sc.Observations(**c.columns), sheet) for c, sheet in zip(parts, sheets, strict=True)]
+    runs = [
+        sc.calibrate(sc.Observations(**c.columns), sheet)
+        for c, sheet in zip(parts, sheets, strict=True)
+    ]
     try:
         return against_truth(parts[0], sc.estimation.merge(runs), "passed")
     except sc.StarcalError:
@@ -146,20 +173,29 @@ def clean(name: str, runs: int, **options: Any) -> Regime:
 
 
 def few(rng: np.random.Generator, options: Mapping[str, Any], method: str, before: bool) -> Outcome:
-    """Intervals from few data, and those of before: Gaussian, and of the pair estimate from the scatter of frames."""
+    """Intervals from few data, and those of before: Gaussian, and of the pair estimate from the
+    scatter of frames.
+    """
     c = campaign(rng, **options)
     obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
     try:
-        cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), method=method)
+        cal = sc.calibrate(
+            obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), method=method
+        )
     except sc.StarcalError:
         return Outcome(verdict="refused")
     if before and method == "three_stage":
-        cal = replace(cal, covariance=PairObjective(StarFrames.from_observations(obs), "brown").godambe(cal.theta))
+        cal = replace(
+            cal,
+            covariance=PairObjective(StarFrames.from_observations(obs), "brown").godambe(cal.theta),
+        )
     return against_truth(c, replace(cal, dof=10**6) if before else cal)
 
 
 def frame_scatter(rng: np.random.Generator, n_frames: int) -> Outcome:
-    """The test of the scatter of frames on clean data, and the one of before: leave-one-out against chi-square."""
+    """The test of the scatter of frames on clean data, and the one of before: leave-one-out against
+    chi-square.
+    """
     c = campaign(rng, n_frames=n_frames)
     obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
     cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
@@ -170,13 +206,18 @@ def frame_scatter(rng: np.random.Generator, n_frames: int) -> Outcome:
         "Alarm (nominal 1 %)": bool(np.any((p * found.p_values < 0.01) & (found.ratio > 1.1))),
         "Alarm before": bool(np.any((p * before < 0.01) & (found.jackknife_ratio > 1.1))),
     }
-    small = {f"p < 5 %: {n}": bool(v < 0.05) for n, v in zip(found.parameter_names, found.p_values, strict=True)}
+    small = {
+        f"p < 5 %: {n}": bool(v < 0.05)
+        for n, v in zip(found.parameter_names, found.p_values, strict=True)
+    }
     least = float(found.detectable(0.01 / p).min())
     return Outcome(figures={"Ratio seen nine times in ten": least}, shares=alarms | small)
 
 
 def recurring(name: str, *, star_errors: bool = False, runs: int = 150, **options: Any) -> Regime:
-    """Frames that see the same stars again and again; without other models and starts, which take most of the time."""
+    """Frames that see the same stars again and again; without other models and starts, which take
+    most of the time.
+    """
     chosen: dict[str, Any] = {"calibrate": {"star_errors": True}} if star_errors else {}
     return Regime(name, partial(plain, options=options, models=(), n_starts=0, **chosen), runs)
 
@@ -186,7 +227,9 @@ FEW: dict[str, Any] = {"n_frames": 20, "patch_stars": 15, "star_sigma_px": 0.03}
 
 
 def worse_outside(radius: np.ndarray, mag: np.ndarray, frame: np.ndarray) -> np.ndarray:
-    """Three times the noise at the edge of the field, which is at 0.75 of the half diagonal on average."""
+    """Three times the noise at the edge of the field, which is at 0.75 of the half diagonal on
+    average.
+    """
     return 0.05 * (1.0 + 2.0 * (radius / 0.75) ** 4)
 
 
@@ -212,7 +255,9 @@ def uneven(name: str, *, noise: str = "common", runs: int = 100, **options: Any)
 
 
 def misfit_to_attitude(rng: np.random.Generator, planted: str) -> Outcome:
-    """A planted misfit: what it is said to do to the rest over what it does, and by its whole size in each axis."""
+    """A planted misfit: what it is said to do to the rest over what it does, and by its whole size
+    in each axis.
+    """
     seed = int(rng.integers(2**31))
     run, found = test_pattern.calibrated(planted, seed), {}
     for where in ("observed", "random", "slew"):
@@ -244,9 +289,15 @@ def refraction_at_night(rng: np.random.Generator, **options: Any) -> Outcome:
 
 
 def _named(found: sc.diagnostics.AirTest | None, short_px: float) -> Outcome:
-    named, open_ = (found is not None and flag for flag in (found and found.is_air, found and found.like_others))
-    figures = {"Of f too short, found": found.f_px / short_px} if found is not None and named else {}
-    return Outcome(figures=figures, shares={"Named": bool(named), "Not to be told from the lens": bool(open_)})
+    named, open_ = (
+        found is not None and flag for flag in (found and found.is_air, found and found.like_others)
+    )
+    figures = (
+        {"Of f too short, found": found.f_px / short_px} if found is not None and named else {}
+    )
+    return Outcome(
+        figures=figures, shares={"Named": bool(named), "Not to be told from the lens": bool(open_)}
+    )
 
 
 def air(name: str, runs: int, **options: Any) -> Regime:
@@ -267,7 +318,9 @@ REGIMES: list[Regime] = [
     clean("clean: field of 55°, 50 frames", 200, n_frames=50, field_deg=55.0),
     *(
         Regime(
-            f"{name}{', intervals as before' if before else ''}", partial(few, method=m, options=o, before=before), 400
+            f"{name}{', intervals as before' if before else ''}",
+            partial(few, method=m, options=o, before=before),
+            400,
         )
         for name, m, o in (
             ("3 frames of 4 stars", "efficient", {"n_frames": 3, "stars_per_frame": 4}),
@@ -276,11 +329,18 @@ REGIMES: list[Regime] = [
         )
         for before in (False, True)
     ),
-    *(Regime(f"scatter of {k} frames", partial(frame_scatter, n_frames=k), 400, "misfit") for k in (3, 5, 10, 20, 100)),
-    recurring("40 stars again and again in 60 frames, without errors of their own", runs=300, **PATCH),
+    *(
+        Regime(f"scatter of {k} frames", partial(frame_scatter, n_frames=k), 400, "misfit")
+        for k in (3, 5, 10, 20, 100)
+    ),
+    recurring(
+        "40 stars again and again in 60 frames, without errors of their own", runs=300, **PATCH
+    ),
     recurring("40 stars: errors of 0.01 px of their own", star_sigma_px=0.01, **PATCH),
     recurring("40 stars: errors of 0.03 px of their own", star_sigma_px=0.03, **PATCH),
-    recurring("40 stars: 0.03 px, with `--star-errors`", star_errors=True, star_sigma_px=0.03, **PATCH),
+    recurring(
+        "40 stars: 0.03 px, with `--star-errors`", star_errors=True, star_sigma_px=0.03, **PATCH
+    ),
     recurring("40 stars: no errors, with `--star-errors`", star_errors=True, **PATCH),
     recurring("15 stars in 20 frames: errors of 0.03 px of their own", **FEW),
     recurring("15 stars: the same, with `--star-errors`", star_errors=True, **FEW),
@@ -292,31 +352,68 @@ REGIMES: list[Regime] = [
     uneven("noise of its own in every frame", noise="model", sigma_px=by_frame),
     uneven("clean: 40 frames", noise="model"),
     Regime("every frame twice, 20 frames", partial(twice, duplicates="refuse"), 100),
-    Regime("every frame twice, kept (`--duplicates keep`: as before)", partial(twice, duplicates="keep"), 100),
-    Regime("every frame twice, left out (`--duplicates drop`)", partial(twice, duplicates="drop"), 100),
+    Regime(
+        "every frame twice, kept (`--duplicates keep`: as before)",
+        partial(twice, duplicates="keep"),
+        100,
+    ),
+    Regime(
+        "every frame twice, left out (`--duplicates drop`)", partial(twice, duplicates="drop"), 100
+    ),
     Regime("20 and 8 frames merged, equal noise", partial(merged, ratio=1.0), 200),
-    Regime("20 and 8 frames merged, 5 times the noise in the second", partial(merged, ratio=5.0), 200),
+    Regime(
+        "20 and 8 frames merged, 5 times the noise in the second", partial(merged, ratio=5.0), 200
+    ),
     *(
         Regime(f"misfit planted: {name}", partial(misfit_to_attitude, planted=name), 4, "attitude")
         for name in test_pattern.PLANTED
     ),
     air("no air: 60 frames of 40 stars", 60, **PATCH),
     air("no air: 40 stars with errors of 0.03 px", 60, star_sigma_px=0.03, **PATCH),
-    air("no air: the same, with `--star-errors`", 60, star_sigma_px=0.03, star_errors=True, **PATCH),
+    air(
+        "no air: the same, with `--star-errors`", 60, star_sigma_px=0.03, star_errors=True, **PATCH
+    ),
     air("no air: 15 stars in 20 frames, with errors of 0.03 px", 60, **FEW),
-    air("no air: one field, drifting by 3.3 px a frame, star errors of 0.03 px", 60, star_sigma_px=0.03, **STARING),
-    air("no air: the same 40 stars, noise three times larger at the edge", 40, sigma_px=worse_outside, **PATCH),
+    air(
+        "no air: one field, drifting by 3.3 px a frame, star errors of 0.03 px",
+        60,
+        star_sigma_px=0.03,
+        **STARING,
+    ),
+    air(
+        "no air: the same 40 stars, noise three times larger at the edge",
+        40,
+        sigma_px=worse_outside,
+        **PATCH,
+    ),
     Regime("no air: frames with times", partial(refraction_at_night, air=0.0), 60, "air"),
-    *(air(f"no air, 30 frames: {name}", 24, **options) for name, options in test_air.LOOKALIKES.items()),
-    air("no air, 30 frames: axes that differ by 0.3 px at the corner", 24, displaced=test_air.SKEWED),
+    *(
+        air(f"no air, 30 frames: {name}", 24, **options)
+        for name, options in test_air.LOOKALIKES.items()
+    ),
+    air(
+        "no air, 30 frames: axes that differ by 0.3 px at the corner", 24, displaced=test_air.SKEWED
+    ),
     air("air: a zenith of its own in each of 30 frames", 24, air="each"),
     air("air: the same, 0.1 px of noise", 24, air="each", sigma_px=0.1),
     air("air: the same, 0.2 px of noise", 24, air="each", sigma_px=0.2),
     air("air: the same, 10 frames", 24, air="each", n_frames=10),
     air("air: the same, field of 5°", 24, air="each", field_deg=5.0),
     air("air: the same, field of 30°", 24, air="each", field_deg=30.0),
-    air("air: the same, 60 frames of 40 stars with errors of 0.03 px", 24, air="each", star_sigma_px=0.03, **PATCH),
-    air("air: one moment, 60 frames of 40 stars with errors of 0.03 px", 24, air="one", star_sigma_px=0.03, **PATCH),
+    air(
+        "air: the same, 60 frames of 40 stars with errors of 0.03 px",
+        24,
+        air="each",
+        star_sigma_px=0.03,
+        **PATCH,
+    ),
+    air(
+        "air: one moment, 60 frames of 40 stars with errors of 0.03 px",
+        24,
+        air="one",
+        star_sigma_px=0.03,
+        **PATCH,
+    ),
     air("air: 30 frames, horizon fixed in the camera", 24, air="fixed"),
     Regime("air: frames with times", partial(refraction_at_night), 24, "air"),
 ]
@@ -337,16 +434,23 @@ def cells(regime: Regime, found: Sequence[Outcome]) -> dict[str, str]:
         shares = 100.0 * np.mean(inside, axis=0)
         row["Coverage of 95 %"] = f"{shares.min():.1f} – {shares.max():.1f} %"
         squared = np.array([o.squared for o in found if o.inside])
-        # A squared error over p parameters scatters widely where degrees of freedom are few: the mean, with its error.
+        # A squared error over p parameters scatters widely where degrees of freedom are few: the
+        # mean, with its error.
         error = f"{squared.mean():.2f} ± {squared.std(ddof=1) / np.sqrt(len(squared)):.2f}"
         row["Squared error / stated"] = error if np.isfinite(squared).all() else "not defined"
     if verdicts := [o.verdict for o in found if o.verdict]:
-        for words, column in (("passed", "Passed"), ("warning", "Warning"), ("do not use", "Do not use")):
+        for words, column in (
+            ("passed", "Passed"),
+            ("warning", "Warning"),
+            ("do not use", "Do not use"),
+        ):
             row[column] = _share(sum(v == words for v in verdicts), len(verdicts))
         counted = Counter(name for o in found for name in o.alarms).most_common(3)
         refused = sum(v == "refused" for v in verdicts)
         named = [("refused", refused)] if refused else []
-        row["Most frequent alarms"] = ", ".join(f"{name} {_share(k, n)}" for name, k in named + counted) or "–"
+        row["Most frequent alarms"] = (
+            ", ".join(f"{name} {_share(k, n)}" for name, k in named + counted) or "–"
+        )
     for name in dict.fromkeys(name for o in found for name in o.figures):
         row[name] = f"{np.median([o.figures[name] for o in found if name in o.figures]):.3g}"
     for name in dict.fromkeys(name for o in found for name in o.shares):
@@ -368,7 +472,10 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
 def page(name: str) -> tuple[Path, str]:
     """The page of a table, and the word between its markers."""
     page_name = "misfit" if name == "air" else name
-    return ROOT / "docs" / "explanation" / f"{page_name}.md", "regimes" if name == "statistics" else f"{name} regimes"
+    return (
+        ROOT / "docs" / "explanation" / f"{page_name}.md",
+        "regimes" if name == "statistics" else f"{name} regimes",
+    )
 
 
 def stored(name: str) -> list[dict[str, str]]:
@@ -384,33 +491,57 @@ def write(name: str, rows: Sequence[Mapping[str, str]], seed: int) -> None:
     path, word = page(name)
     merged = {row["Regime"]: row for row in [*stored(name), *rows]}
     ordered = [merged[r.name] for r in REGIMES if r.name in merged]
-    made = f"Made by `python benchmarks/regimes.py --seed {seed} --write`; do not edit.{_together(ordered)}"
+    made = (
+        f"Made by `python benchmarks/regimes.py --seed {seed} --write`; do not "
+        f"edit.{_together(ordered)}"
+    )
     put(path, word, f"{made}\n\n{markdown(ordered)}")
 
 
 def _together(rows: Sequence[Mapping[str, str]]) -> str:
     """What the verdict said of all clean regimes together."""
-    counted = [row for row in rows if row["Regime"].startswith("clean") and row.get("Passed", "–") != "–"]
+    counted = [
+        row for row in rows if row["Regime"].startswith("clean") and row.get("Passed", "–") != "–"
+    ]
     n = sum(int(row["Runs"]) for row in counted)
     if n == 0:
         return ""
 
     def total(column: str) -> str:
-        count = round(sum(0.01 * float(row[column].removesuffix(" %")) * int(row["Runs"]) for row in counted))
+        count = round(
+            sum(0.01 * float(row[column].removesuffix(" %")) * int(row["Runs"]) for row in counted)
+        )
         low, high = binomial_interval(count, n)
         return f"{_share(count, n)} (95 % interval {100.0 * low:.1f} to {100.0 * high:.1f} %)"
 
-    return f" All clean runs together ({n}): warning {total('Warning')}, do not use {total('Do not use')}."
+    return (
+        f" All clean runs together ({n}): warning {total('Warning')}, do not use "
+        f"{total('Do not use')}."
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python benchmarks/regimes.py", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--only", nargs="+", default=[""], metavar="NAME", help="regimes whose name has one of these")
-    parser.add_argument("--runs", type=int, help="runs of each regime (default: as many as the documentation's)")
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/regimes.py", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=[""],
+        metavar="NAME",
+        help="regimes whose name has one of these",
+    )
+    parser.add_argument(
+        "--runs", type=int, help="runs of each regime (default: as many as the documentation's)"
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed (default 1)")
-    parser.add_argument("--processes", type=int, default=processors(), help="processes; 0 stays in this one")
-    parser.add_argument("--write", action="store_true", help="write the rows into the documentation")
+    parser.add_argument(
+        "--processes", type=int, default=processors(), help="processes; 0 stays in this one"
+    )
+    parser.add_argument(
+        "--write", action="store_true", help="write the rows into the documentation"
+    )
     parser.add_argument("--list", action="store_true", help="list the regimes and stop")
     options = parser.parse_args(arguments)
     chosen = [r for r in REGIMES if any(part in r.name for part in options.only)]
@@ -422,7 +553,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         task = partial(one_run, name=regime.name, seed=options.seed)
         report = partial(_report, regime.name)
         runs = options.runs or regime.runs
-        found, stopped = run_tasks(task, runs, caller="regimes.py", chunk=4, workers=options.processes, progress=report)
+        found, stopped = run_tasks(
+            task, runs, caller="regimes.py", chunk=4, workers=options.processes, progress=report
+        )
         sys.stderr.write("\n")
         if stopped:
             return 1

@@ -2,10 +2,11 @@
 
     python benchmarks/remedies.py [--only WORD] [--seed 7] [--write]
 
-Each misfit is planted in a table of 24 frames of 20 stars (16 frames at one place on the ground for refraction), made
-by NumPy alone, and run by the command line. The first command that is printed to try is executed as it stands, and so
-on, until none is printed. A chain that does not run, changes nothing, gives an option twice or comes back to where it
-was stops the script. ``--write`` puts the table into the documentation (`docs/explanation/misfit.md`).
+Each misfit is planted in a table of 24 frames of 20 stars (16 frames at one place on the ground for
+refraction), made by NumPy alone, and run by the command line. The first command that is printed to
+try is executed as it stands, and so on, until none is printed. A chain that does not run, changes
+nothing, gives an option twice or comes back to where it was stops the script. ``--write`` puts the
+table into the documentation (`docs/explanation/misfit.md`).
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ def chain(name: str, seed: int) -> list[Step]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default="", help="misfits whose names hold this word")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--write", action="store_true", help="put the table into the documentation")
@@ -66,7 +69,9 @@ def main() -> None:
                 lines.append(f"| {' | '.join(row(name, chain(name, arguments.seed)))} |")
                 print(lines[-1], flush=True)
     if arguments.write:
-        note = f"Made by `python benchmarks/remedies.py --seed {arguments.seed} --write`; do not edit."
+        note = (
+            f"Made by `python benchmarks/remedies.py --seed {arguments.seed} --write`; do not edit."
+        )
         put(PAGE, "remedies", f"{note}\n\n" + "\n".join(lines))
 
 

@@ -59,7 +59,10 @@ def main() -> None:
     print(f"{'writing it as FITS':32s}{writing:8.1f} ms")
     for mag in (0, 2, 4, 5, 6, 7, 8):
         snr, sigma_px = sensor.star_accuracy(mag)
-        print(f"G = {mag}: {float(sensor.electrons(mag)):8.0f} e, SNR {snr:6.1f}, centroid {sigma_px:.4f} px")
+        print(
+            f"G = {mag}: {float(sensor.electrons(mag)):8.0f} e, SNR {snr:6.1f}, centroid "
+            f"{sigma_px:.4f} px"
+        )
 
 
 if __name__ == "__main__":

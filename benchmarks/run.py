@@ -1,15 +1,18 @@
-"""The package beside its rivals, each at full strength, in turns on one machine, as a page of the documentation.
+"""The package beside its rivals, each at full strength, in turns on one machine, as a page of the
+documentation.
 
     python benchmarks/run.py [--only NAME ...] [--quick] [--large] [--repeats N] [--write] [--list]
 
-``--only`` takes names or parts of them; ``--quick`` takes less data and fewer turns (under two minutes), ``--large``
-adds the rows that take minutes each. ``--write`` puts what was run into `benchmarks/results.json` and makes the tables
-of `docs/explanation/benchmarks.md` from that file; rows that were not run stay.
+``--only`` takes names or parts of them; ``--quick`` takes less data and fewer turns (under two
+minutes), ``--large`` adds the rows that take minutes each. ``--write`` puts what was run into
+`benchmarks/results.json` and makes the tables of `docs/explanation/benchmarks.md` from that file;
+rows that were not run stay.
 
-A row is a question: contestants, ours first, that take turns on the same data, in processes of their own
-(`harness.take_turns`). First it is shown that the answers are the same; a ratio without that means nothing. A rival
-that cannot run here is named with the reason. `make bench-rivals` makes an environment for those that are not in ours;
-mrcal comes with the system (Debian: ``apt-get install python3-mrcal``).
+A row is a question: contestants, ours first, that take turns on the same data, in processes of
+their own (`harness.take_turns`). First it is shown that the answers are the same; a ratio without
+that means nothing. A rival that cannot run here is named with the reason. `make bench-rivals` makes
+an environment for those that are not in ours; mrcal comes with the system (Debian: ``apt-get
+install python3-mrcal``).
 """
 
 from __future__ import annotations
@@ -55,7 +58,8 @@ PAGE = ROOT / "docs" / "explanation" / "benchmarks.md"
 BEFORE = "0e7b0a1afa4eb04b62df08dc31eeebd4d9d66f9b"
 SEED = 2017
 IMAGES = Path(os.environ.get("STARCAL_IMAGES", ROOT.parent / "shared" / "data" / "esa-tetra3"))
-# By its defaults tetra3rs takes the noise of short exposures for stars; of what was tried, this solves most of them.
+# By its defaults tetra3rs takes the noise of short exposures for stars; of what was tried, this
+# solves most of them.
 SHORT_EXTRACTION = {"matched_filter_sigma": None, "sigma_threshold": 8.0, "min_pixels": 5}
 SHORT = IMAGES.parent / "openstartracker"
 # Of ESA's frames.
@@ -89,7 +93,9 @@ sigma_px = [0.02, 0.05, 0.1, 0.2, 0.5]
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far a rival's answer is from ours, in words, and whether they are the same for all that matters."""
+    """How far a rival's answer is from ours, in words, and whether they are the same for all that
+    matters.
+    """
 
     words: str
     same: bool
@@ -103,7 +109,8 @@ class Target:
     """What was asked."""
 
     words: str  # As it was asked
-    # `rival`, `factor`, `of`: so many times as long as ours the rival takes, or as the contestant `of`.
+    # `rival`, `factor`, `of`: so many times as long as ours the rival takes, or as the contestant
+    # `of`.
     rival: str | None = None
     factor: float | None = None
     of: str | None = None
@@ -127,16 +134,21 @@ class Row:
     amount: Callable[[Any], float] = lambda result: 1.0  # How many of it a result holds
     frames: int = 0  # Frames of the data; 0 for none
     repeats: int = 7  # Turns
-    one_core: bool = True  # All contestants on one core and one thread; otherwise as a user would start them
+    one_core: bool = (
+        True  # All contestants on one core and one thread; otherwise as a user would start them
+    )
     large: bool = False  # Runs only when it is asked for
     targets: tuple[Target, ...] = ()  # What was asked
 
 
-# --- the same answer --------------------------------------------------------------------------------------------------
+# --- the same answer
+# --------------------------------------------------------------------------------------------------
 
 
 def same_estimate(limit: float = 0.03) -> Same:
-    """Largest difference of the optics in our standard deviations, and of the deviations where both have them."""
+    """Largest difference of the optics in our standard deviations, and of the deviations where both
+    have them.
+    """
 
     def compare(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> Agreement:
         if "theta" not in rival:
@@ -183,7 +195,8 @@ def same_arrays(key: str, scale: float, unit: str, limit: float) -> Same:
     return compare
 
 
-# --- the rows ---------------------------------------------------------------------------------------------------------
+# --- the rows
+# --------------------------------------------------------------------------------------------------
 
 
 def rows(quick: bool = False) -> list[Row]:
@@ -199,7 +212,11 @@ def rows(quick: bool = False) -> list[Row]:
             contestants=(
                 Contestant(ours, "ours:calibrate"),
                 *(
-                    Contestant(f"{ours}, {path} path", "ours:calibrate", environment={"STARCAL_UQ_KERNELS": word})
+                    Contestant(
+                        f"{ours}, {path} path",
+                        "ours:calibrate",
+                        environment={"STARCAL_UQ_KERNELS": word},
+                    )
                     for word, path in (("numba", "compiled"), ("numpy", "NumPy"))
                 ),
                 Contestant(before, "ours:calibrate", "before"),
@@ -207,7 +224,9 @@ def rows(quick: bool = False) -> list[Row]:
                 Contestant("SciPy least_squares, sparse", "bundles:least_squares"),
                 Contestant("NumPy bundle, angles eliminated", "bundles:schur"),
                 Contestant("mrcal", "bundle_mrcal:bundle", "system"),
-                Contestant("mrcal, no covariance", "bundle_mrcal:bundle", "system", {"covariance": False}),
+                Contestant(
+                    "mrcal, no covariance", "bundle_mrcal:bundle", "system", {"covariance": False}
+                ),
             ),
             same=same_estimate(),
             frames=frames,
@@ -222,7 +241,9 @@ def rows(quick: bool = False) -> list[Row]:
                     )
                     for suffix, of in (("", None), (" (compiled path)", f"{ours}, compiled path"))
                 ),
-                Target("3 times as fast as before (NumPy path)", before, 3.0, f"{ours}, NumPy path"),
+                Target(
+                    "3 times as fast as before (NumPy path)", before, 3.0, f"{ours}, NumPy path"
+                ),
             ),
         )
         for frames in ((1000,) if quick else (1000, 10_000))
@@ -239,7 +260,10 @@ def rows(quick: bool = False) -> list[Row]:
             frames=100_000,
             repeats=3,
             large=True,
-            targets=(Target("8 times as fast as before", before, 8.0), Target("less than 1.5 GB", peak_mb=1500.0)),
+            targets=(
+                Target("8 times as fast as before", before, 8.0),
+                Target("less than 1.5 GB", peak_mb=1500.0),
+            ),
         ),
         Row(
             name="three-stages",
@@ -262,7 +286,15 @@ def rows(quick: bool = False) -> list[Row]:
                 *(
                     ()
                     if quick
-                    else (Contestant("OpenCV calibrateCamera", "points:calibrate", "rivals", first=False, every=3),)
+                    else (
+                        Contestant(
+                            "OpenCV calibrateCamera",
+                            "points:calibrate",
+                            "rivals",
+                            first=False,
+                            every=3,
+                        ),
+                    )
                 ),
             ),
             same=same_estimate(),
@@ -277,7 +309,9 @@ def rows(quick: bool = False) -> list[Row]:
                 Contestant(before, "ours:sample", "before"),
                 Contestant("NUTS (NumPyro), exact likelihood", "nuts:numpyro", "rivals", draws),
                 *(
-                    Contestant(label, "samplers:ensemble", options={"move": move, **chain}, first=False)
+                    Contestant(
+                        label, "samplers:ensemble", options={"move": move, **chain}, first=False
+                    )
                     for label, move in (
                         ("emcee, stretch, exact likelihood", "StretchMove"),
                         ("emcee, DE, exact likelihood", "DEMove"),
@@ -301,7 +335,9 @@ def rows(quick: bool = False) -> list[Row]:
             frames=10_000,
             repeats=3,
             large=True,
-            targets=(Target("the same whatever the number of stars", "starcal_uq, 1,000 frames", 0.8),),
+            targets=(
+                Target("the same whatever the number of stars", "starcal_uq, 1,000 frames", 0.8),
+            ),
         ),
         *(
             Row(
@@ -337,7 +373,9 @@ def rows(quick: bool = False) -> list[Row]:
             what="A million directions to pixels",
             contestants=(
                 Contestant(ours, "ours:project", options={"points": 1_000_000}),
-                Contestant("OpenCV projectPoints", "points:project", "rivals", {"points": 1_000_000}),
+                Contestant(
+                    "OpenCV projectPoints", "points:project", "rivals", {"points": 1_000_000}
+                ),
             ),
             same=same_arrays("xy", 1.0, "px", 1e-6),
             repeats=turns,
@@ -347,7 +385,9 @@ def rows(quick: bool = False) -> list[Row]:
             what="A million pixels to directions",
             contestants=(
                 Contestant(ours, "ours:unproject", options={"points": 1_000_000}),
-                Contestant("OpenCV undistortPoints", "points:unproject", "rivals", {"points": 1_000_000}),
+                Contestant(
+                    "OpenCV undistortPoints", "points:unproject", "rivals", {"points": 1_000_000}
+                ),
             ),
             same=same_arrays("b", 206264.8, "arcsec", 1e-4),
             repeats=turns,
@@ -377,7 +417,10 @@ def commands(ours: str, before: str) -> list[Row]:
         )
 
     stars, camera = "{data}/stars.parquet", "{data}/camera.toml"
-    table, nominal = IMAGES.parent / "esa_tetra3_observations.csv", IMAGES.parent / "esa_tetra3_camera.toml"
+    table, nominal = (
+        IMAGES.parent / "esa_tetra3_observations.csv",
+        IMAGES.parent / "esa_tetra3_camera.toml",
+    )
     images = {"images": str(IMAGES)}
     identified = {**images, "camera": str(nominal)}
     return [
@@ -424,7 +467,11 @@ def commands(ours: str, before: str) -> list[Row]:
             ),
             repeats=3,
             large=True,
-            targets=(Target("processor time grows with the power 1.05 of the frames at most", exponent=1.05),),
+            targets=(
+                Target(
+                    "processor time grows with the power 1.05 of the frames at most", exponent=1.05
+                ),
+            ),
         ),
         Row(
             name="simulate",
@@ -458,20 +505,31 @@ def commands(ours: str, before: str) -> list[Row]:
             repeats=2,
             one_core=False,
             large=True,
-            targets=(Target("under 90 s on two cores", seconds=90.0), Target("under 2 GB", peak_mb=2000.0)),
+            targets=(
+                Target("under 90 s on two cores", seconds=90.0),
+                Target("under 2 GB", peak_mb=2000.0),
+            ),
         ),
         *(
             Row(
                 name=f"study-{mode}",
                 what=f"`study`, {cells:,} cells {words}",
-                contestants=(Contestant(ours, "ours:study", options={"definition": text}, first=False),),
+                contestants=(
+                    Contestant(ours, "ours:study", options={"definition": text}, first=False),
+                ),
                 repeats=2,
                 one_core=False,
                 large=True,
                 targets=(Target(f"under {limit:.0f} s on two cores", seconds=limit),),
             )
             for mode, cells, words, text, limit in (
-                ("fisher", 10_000, "by Fisher information, of 300 frames", STUDY.format("fisher", 300, 20), 60.0),
+                (
+                    "fisher",
+                    10_000,
+                    "by Fisher information, of 300 frames",
+                    STUDY.format("fisher", 300, 20),
+                    60.0,
+                ),
                 (
                     "simulate",
                     1000,
@@ -488,7 +546,9 @@ def commands(ours: str, before: str) -> list[Row]:
                 Contestant(ours, "ours:centroids", options=images),
                 Contestant(before, "ours:centroids", "before", images),
                 Contestant("cedar-solve get_centroids", "images_cedar:centroids", "cedar", images),
-                Contestant("tetra3rs extract_centroids", "images_tetra3rs:centroids", "rivals", images),
+                Contestant(
+                    "tetra3rs extract_centroids", "images_tetra3rs:centroids", "rivals", images
+                ),
             ),
             same=counted("stars found"),
             unit="for a frame",
@@ -502,8 +562,15 @@ def commands(ours: str, before: str) -> list[Row]:
             contestants=(
                 Contestant(ours, "ours:identify", options=identified),
                 Contestant(before, "ours:identify", "before", identified),
-                Contestant("cedar-solve solve_from_centroids", "images_cedar:identify", "cedar", identified),
-                Contestant("tetra3rs solve_from_centroids", "images_tetra3rs:identify", "rivals", identified),
+                Contestant(
+                    "cedar-solve solve_from_centroids", "images_cedar:identify", "cedar", identified
+                ),
+                Contestant(
+                    "tetra3rs solve_from_centroids",
+                    "images_tetra3rs:identify",
+                    "rivals",
+                    identified,
+                ),
             ),
             same=counted("frames identified"),
             unit="for a frame",
@@ -513,7 +580,10 @@ def commands(ours: str, before: str) -> list[Row]:
         ),
         Row(
             name="frames",
-            what="ESA's night-sky frames one by one, centroids and identification with a sheet, per frame",
+            what=(
+                "ESA's night-sky frames one by one, centroids and identification with a sheet, "
+                "per frame"
+            ),
             contestants=(
                 Contestant(ours, "ours:frames", options=identified),
                 Contestant("cedar-solve", "images_cedar:frames", "cedar", identified),
@@ -530,8 +600,18 @@ def commands(ours: str, before: str) -> list[Row]:
                 what=f"Identification of {whose} frames without a camera sheet, per frame",
                 contestants=(
                     Contestant(ours, "ours:identify_unknown", options=options),
-                    Contestant("cedar-solve, 10 to 30 degrees", "images_cedar:identify_unknown", "cedar", options),
-                    Contestant("tetra3rs, 5 to 30 degrees", "images_tetra3rs:identify_unknown", "rivals", options),
+                    Contestant(
+                        "cedar-solve, 10 to 30 degrees",
+                        "images_cedar:identify_unknown",
+                        "cedar",
+                        options,
+                    ),
+                    Contestant(
+                        "tetra3rs, 5 to 30 degrees",
+                        "images_tetra3rs:identify_unknown",
+                        "rivals",
+                        options,
+                    ),
                     *(
                         Contestant(
                             "tetra3rs, thresholds chosen for these images",
@@ -543,7 +623,12 @@ def commands(ours: str, before: str) -> list[Row]:
                     ),
                 ),
                 same=lambda mine, rival: Agreement(
-                    f"{rival['found']} frames, {rival['wrong']} wrong; ours {mine['found']} and {mine['wrong']}", True
+                    (
+                        f"{rival['found']} frames, {rival['wrong']} wrong; ours {mine['found']} "
+                        "and "
+                        f"{mine['wrong']}"
+                    ),
+                    True,
                 ),
                 unit="for a frame",
                 amount=lambda result: float(result["frames"]),
@@ -562,23 +647,27 @@ def commands(ours: str, before: str) -> list[Row]:
 
 
 def same_frames(table: Path) -> Same:
-    """Frames found and wrong, stars named rightly, scatter of the centroids, median and worst times of both steps.
+    """Frames found and wrong, stars named rightly, scatter of the centroids, median and worst times
+    of both steps.
 
-    A frame is wrong whose middle is more than 0.05 degrees from where the stars of a table have it, or of whose stars
-    more than one in twenty is (`judged_frames`). Times are of the processor. Scatter is of the stars that both
-    measured, of those of the table, about a cubic polynomial of the places in each frame, which takes up attitude, lens
-    and which pixel counts first.
+    A frame is wrong whose middle is more than 0.05 degrees from where the stars of a table have it,
+    or of whose stars more than one in twenty is (`judged_frames`). Times are of the processor.
+    Scatter is of the stars that both measured, of those of the table, about a cubic polynomial of
+    the places in each frame, which takes up attitude, lens and which pixel counts first.
     """
 
     def words(result: Mapping[str, Any], rms: float) -> str:
         frames = result["frames"]
         found = judged_frames(table, frames)
         wrong = sum(apart_deg > 0.05 or right < 0.95 * n for apart_deg, right, n in found)
-        n_right, n_stars = (sum(column) for column in list(zip(*found, strict=True))[1:] or ([], []))
+        n_right, n_stars = (
+            sum(column) for column in list(zip(*found, strict=True))[1:] or ([], [])
+        )
         steps = 1e3 * np.diff([f["clock"] for f in frames], axis=1)
         (c, i), (slow_c, slow_i) = np.median(steps, axis=0), np.max(steps, axis=0)
         return (
-            f"{len(found) - wrong} of {len(frames)} frames, {wrong} wrong (farthest {max(f[0] for f in found):.3f}°), "
+            f"{len(found) - wrong} of {len(frames)} frames, {wrong} wrong (farthest "
+            f"{max(f[0] for f in found):.3f}°), "
             f"{n_right} of {n_stars} stars right, {rms:.3f} px, centroids {c:.1f} ms (worst "
             f"{slow_c:.1f}), identification {i:.1f} ms (worst {slow_i:.1f})"
         )
@@ -590,16 +679,21 @@ def same_frames(table: Path) -> Same:
     return compare
 
 
-# Farther from its place than this a star is another one, px; catalogues of other epochs differ by a tenth of it.
+# Farther from its place than this a star is another one, px; catalogues of other epochs differ by a
+# tenth of it.
 _OTHER_STAR_PX = 3.0
 
 
 def judged_frames(table: Path, frames: Sequence[Mapping[str, Any]]) -> list[tuple[float, int, int]]:
-    """Of each frame found: how far its middle is off, degrees, and how many of its stars are right, of how many.
+    """Of each frame found: how far its middle is off, degrees, and how many of its stars are right,
+    of how many.
 
-    What is right follows from the places and catalogue directions of the table's own stars, by a cubic polynomial.
+    What is right follows from the places and catalogue directions of the table's own stars, by a
+    cubic polynomial.
     """
-    stars = np.genfromtxt(table, delimiter=",", names=True, usecols=range(10), dtype=None, encoding="utf-8")
+    stars = np.genfromtxt(
+        table, delimiter=",", names=True, usecols=range(10), dtype=None, encoding="utf-8"
+    )
 
     def terms(xy: Any) -> Any:
         u, v = (np.asarray(xy, dtype=float) - MIDDLE_PX).T / 500.0
@@ -610,7 +704,10 @@ def judged_frames(table: Path, frames: Sequence[Mapping[str, Any]]) -> list[tupl
         if frame["middle"] is None:
             continue
         own = stars[stars["frame"] == k]
-        r, xy = directions(own["ra_deg"], own["dec_deg"]), np.column_stack([own["x_px"], own["y_px"]])
+        r, xy = (
+            directions(own["ra_deg"], own["dec_deg"]),
+            np.column_stack([own["x_px"], own["y_px"]]),
+        )
         axes = np.linalg.svd(r)[2]
         axes[0] *= np.sign(np.mean(r @ axes[0]))
         plane = np.linalg.lstsq(terms(xy), (r @ axes[1:].T) / (r @ axes[0])[:, None], rcond=None)[0]
@@ -635,14 +732,21 @@ def directions(ra_deg: Any, dec_deg: Any) -> Any:
 
 
 def scatter(table: Path, measured: Sequence[Sequence[Any]]) -> list[float]:
-    """Scatter per axis, px, of each list of places by frame (n, 2), of the stars that all lists have."""
+    """Scatter per axis, px, of each list of places by frame (n, 2), of the stars that all lists
+    have.
+    """
     from scipy.spatial import cKDTree
 
-    stars = np.genfromtxt(table, delimiter=",", names=True, usecols=range(10), dtype=None, encoding="utf-8")
+    stars = np.genfromtxt(
+        table, delimiter=",", names=True, usecols=range(10), dtype=None, encoding="utf-8"
+    )
     left: list[list[Any]] = [[] for _ in measured]
     for k in np.unique(stars["frame"]):
         own = stars[stars["frame"] == k]
-        near = [cKDTree(places[k]).query(np.column_stack([own["x_px"], own["y_px"]])) for places in measured]
+        near = [
+            cKDTree(places[k]).query(np.column_stack([own["x_px"], own["y_px"]]))
+            for places in measured
+        ]
         all_have = np.all([distance < 2.0 for distance, _ in near], axis=0)
         r = directions(own["ra_apparent_deg"], own["dec_apparent_deg"])
         axes = np.linalg.svd(r)[2]
@@ -663,14 +767,21 @@ def counted(words: str) -> Same:
     return lambda ours, rival: Agreement(f"{rival['found']} {words}, ours {ours['found']}", True)
 
 
-# --- running ----------------------------------------------------------------------------------------------------------
+# --- running
+# --------------------------------------------------------------------------------------------------
 
 
 def data_of(frames: int) -> Path:
     """Folder with the data of so many frames, made when it is not there."""
     folder = CACHE / "data" / f"{frames}-{SEED}"
     if frames and not (folder / "camera.toml").exists():
-        command = [sys.executable, str(CONTESTANTS / "data.py"), str(folder), str(frames), str(SEED)]
+        command = [
+            sys.executable,
+            str(CONTESTANTS / "data.py"),
+            str(folder),
+            str(frames),
+            str(SEED),
+        ]
         subprocess.run(command, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
     return folder
 
@@ -679,17 +790,22 @@ def fetch_before() -> None:
     """Put the version before into the cache, where git knows it."""
     if (CACHE / "before").exists():
         return
-    found = subprocess.run(["git", "-C", str(ROOT), "archive", BEFORE, "starcal_uq"], capture_output=True)
+    found = subprocess.run(
+        ["git", "-C", str(ROOT), "archive", BEFORE, "starcal_uq"], capture_output=True
+    )
     if found.returncode == 0:
         with tarfile.open(fileobj=io.BytesIO(found.stdout)) as archive:
             archive.extractall(CACHE / "before", filter="data")
-        # It knew no Numba: ArviZ, which uses it where it is, then gave arrays where it expected numbers.
+        # It knew no Numba: ArviZ, which uses it where it is, then gave arrays where it expected
+        # numbers.
         hide = 'import sys\n\nsys.modules["numba"] = None\n'
         (CACHE / "before" / "sitecustomize.py").write_text(hide, encoding="utf-8")
         compileall.compile_dir(CACHE / "before", quiet=1)
 
 
-def run_row(row: Row, repeats: int | None = None, tell: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+def run_row(
+    row: Row, repeats: int | None = None, tell: Callable[[str], None] = lambda text: None
+) -> dict[str, Any]:
     """Time all contestants of a row, and put what came out into a record."""
     folder = data_of(row.frames)
 
@@ -699,11 +815,19 @@ def run_row(row: Row, repeats: int | None = None, tell: Callable[[str], None] = 
         found = interpreter(contestant.python, ROOT, CACHE)
         if isinstance(found, str):
             return found
-        data = data_of(contestant.options["n_frames"]) if "n_frames" in contestant.options else folder
+        data = (
+            data_of(contestant.options["n_frames"]) if "n_frames" in contestant.options else folder
+        )
         options = {k: v for k, v in contestant.options.items() if k != "n_frames"}
         command, environment = found
         fixed = ONE_THREAD if row.one_core else {}
-        return Worker(contestant.call, options, data, command, {**fixed, **environment, **contestant.environment})
+        return Worker(
+            contestant.call,
+            options,
+            data,
+            command,
+            {**fixed, **environment, **contestant.environment},
+        )
 
     runs = take_turns(row.contestants, repeats or row.repeats, start, tell)
     for run in runs:
@@ -716,7 +840,9 @@ def run_row(row: Row, repeats: int | None = None, tell: Callable[[str], None] = 
 
 
 def moments(path: str) -> list[list[float]]:
-    """Means, standard deviations and effective numbers of draws (chains, draws, parameters), by ArviZ for everybody."""
+    """Means, standard deviations and effective numbers of draws (chains, draws, parameters), by
+    ArviZ for everybody.
+    """
     from starcal_uq.inference.arviz import ess_bulk
 
     draws = np.load(path)
@@ -733,12 +859,18 @@ def record(row: Row, runs: Sequence[Runs]) -> dict[str, Any]:
     """All figures of a row, as they are kept."""
     mine, listed = runs[0], []
     for run in runs:
-        entry: dict[str, Any] = {"label": run.label, "missing": run.missing, "turns": len(run.turns)}
+        entry: dict[str, Any] = {
+            "label": run.label,
+            "missing": run.missing,
+            "turns": len(run.turns),
+        }
         if run.turns:
             entry["peak_mb"] = run.peak_mb
             entry["first_s"] = run.first and run.first.wall
             for clock in CLOCKS:
-                entry[clock] = vars(spread([cost(t, clock, row.amount) for t in run.turns.values()]))
+                entry[clock] = vars(
+                    spread([cost(t, clock, row.amount) for t in run.turns.values()])
+                )
             if run is not mine and mine.turns:
                 agreement = row.same(mine.turns[0].result, run.turns[0].result)
                 entry["answer"], entry["same"] = agreement.words, agreement.same
@@ -762,12 +894,20 @@ def record(row: Row, runs: Sequence[Runs]) -> dict[str, Any]:
 def judged(row: Row, target: Target, listed: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A target and what came out; one in time is met where both clocks say so."""
     mine = listed[0]
-    said: dict[str, Any] = {"asked": target.words, "rival": target.rival, "measured": None, "met": None}
+    said: dict[str, Any] = {
+        "asked": target.words,
+        "rival": target.rival,
+        "measured": None,
+        "met": None,
+    }
     if target.factor is not None:
         rival = next(entry for entry in listed if entry["label"] == target.rival)
         subject = next((entry for entry in listed if entry["label"] == target.of), None)
         found = [rival.get(f"{clock}_ratio") for clock in CLOCKS]
-        by = [{"median": 1.0} if target.of is None else subject and subject.get(f"{clock}_ratio") for clock in CLOCKS]
+        by = [
+            {"median": 1.0} if target.of is None else subject and subject.get(f"{clock}_ratio")
+            for clock in CLOCKS
+        ]
         if all(found) and all(by):
             factors = [f["median"] / b["median"] for f, b in zip(found, by, strict=True)]
             said["measured"] = f"{factors[0]:.2g} times (wall clock {factors[1]:.2g})"
@@ -777,10 +917,15 @@ def judged(row: Row, target: Target, listed: Sequence[Mapping[str, Any]]) -> dic
         said["measured"], said["met"] = seconds(took), took <= target.seconds
     elif target.exponent is not None and all(entry["turns"] for entry in listed):
         sizes = np.log([contestant.options["n_frames"] for contestant in row.contestants])
-        slope = float(np.polyfit(sizes, np.log([entry["processor"]["median"] for entry in listed]), 1)[0])
+        slope = float(
+            np.polyfit(sizes, np.log([entry["processor"]["median"] for entry in listed]), 1)[0]
+        )
         said["measured"], said["met"] = f"{slope:.2f}", slope <= target.exponent
     elif target.peak_mb is not None and "peak_mb" in mine:
-        said["measured"], said["met"] = f"{mine['peak_mb']:,.0f} MB", mine["peak_mb"] <= target.peak_mb
+        said["measured"], said["met"] = (
+            f"{mine['peak_mb']:,.0f} MB",
+            mine["peak_mb"] <= target.peak_mb,
+        )
     return said
 
 
@@ -789,13 +934,19 @@ def machine() -> str:
     name = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+        name = next(
+            line.partition(":")[2].strip() for line in lines if line.startswith("model name")
+        )
     except (OSError, StopIteration):
         pass
-    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}, NumPy {np.__version__}"
+    return (
+        f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}, NumPy "
+        f"{np.__version__}"
+    )
 
 
-# --- tables -----------------------------------------------------------------------------------------------------------
+# --- tables
+# --------------------------------------------------------------------------------------------------
 
 
 def seconds(value: float) -> str:
@@ -808,28 +959,55 @@ def seconds(value: float) -> str:
 
 def times(found: Mapping[str, float] | None) -> str:
     """Median and quartiles of a ratio."""
-    return "–" if not found else f"**{found['median']:.3g}** ({found['low']:.3g} to {found['high']:.3g})"
+    return (
+        "–"
+        if not found
+        else f"**{found['median']:.3g}** ({found['low']:.3g} to {found['high']:.3g})"
+    )
 
 
 def table(records: Sequence[Mapping[str, Any]]) -> str:
     """All contestants of all rows."""
-    head = ("", "Processor", "Wall", "Times ours (processor)", "Times ours (wall)", "Peak MB", "Beside our answer")
+    head = (
+        "",
+        "Processor",
+        "Wall",
+        "Times ours (processor)",
+        "Times ours (wall)",
+        "Peak MB",
+        "Beside our answer",
+    )
     lines = []
     for record in records:
         where = "one core" if record["one_core"] else "all cores"
         unit = f" ({record['unit']})" if record["unit"] else ""
         lines += [
             f"\n### {record['what']}{unit}\n",
-            f"`{record['name']}`, {where}, {record['made']}, load of the machine {record.get('load', 0.0):.1f}.\n",
+            (
+                f"`{record['name']}`, {where}, {record['made']}, load of the machine "
+                f"{record.get('load', 0.0):.1f}.\n"
+            ),
         ]
         lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
         for entry in record["contestants"]:
             if not entry["turns"]:
-                reason = " ".join((entry["missing"] or "it was not its turn").replace("|", "/").split())
-                lines.append(f"| {entry['label']} | not measured: {reason} |" + " |" * (len(head) - 2))
+                reason = " ".join(
+                    (entry["missing"] or "it was not its turn").replace("|", "/").split()
+                )
+                lines.append(
+                    f"| {entry['label']} | not measured: {reason} |" + " |" * (len(head) - 2)
+                )
                 continue
-            cells = [entry["label"], seconds(entry["processor"]["median"]), seconds(entry["wall"]["median"])]
-            cells += [times(entry.get("processor_ratio")), times(entry.get("wall_ratio")), f"{entry['peak_mb']:,.0f}"]
+            cells = [
+                entry["label"],
+                seconds(entry["processor"]["median"]),
+                seconds(entry["wall"]["median"]),
+            ]
+            cells += [
+                times(entry.get("processor_ratio")),
+                times(entry.get("wall_ratio")),
+                f"{entry['peak_mb']:,.0f}",
+            ]
             answer = entry.get("answer", "")
             cells.append(answer if entry.get("same", True) else f"**another answer**: {answer}")
             lines.append("| " + " | ".join(cells) + " |")
@@ -842,7 +1020,13 @@ def targets(records: Sequence[Mapping[str, Any]]) -> str:
     for record in records:
         for target in record["targets"]:
             met = {True: "yes", False: "**no**", None: "not measured"}[target["met"]]
-            cells = (record["what"], target["asked"], target["measured"] or "–", target["rival"] or "itself", met)
+            cells = (
+                record["what"],
+                target["asked"],
+                target["measured"] or "–",
+                target["rival"] or "itself",
+                met,
+            )
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -860,25 +1044,39 @@ def write(made: Sequence[dict[str, Any]]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="names of rows, or parts of names")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="NAME", help="names of rows, or parts of names"
+    )
     parser.add_argument("--quick", action="store_true", help="less data, fewer turns")
     parser.add_argument("--large", action="store_true", help="also the rows that take minutes each")
     parser.add_argument("--repeats", type=int, help="turns of each row")
-    parser.add_argument("--write", action="store_true", help="put the results into the documentation")
+    parser.add_argument(
+        "--write", action="store_true", help="put the results into the documentation"
+    )
     parser.add_argument("--list", action="store_true", help="names of the rows")
     options = parser.parse_args(arguments)
     if options.quick and options.write:
-        parser.error("--quick is for a look: what is written has all its data; leave one of them out.")
+        parser.error(
+            "--quick is for a look: what is written has all its data; leave one of them out."
+        )
     listed = rows(options.quick)
     names = {row.name for row in listed}
 
     def asked(row: Row) -> bool:
-        return not options.only or any(row.name == o or (o not in names and o in row.name) for o in options.only)
+        return not options.only or any(
+            row.name == o or (o not in names and o in row.name) for o in options.only
+        )
 
     chosen = [row for row in listed if asked(row)]
     if options.list:
-        print("\n".join(f"{row.name:20} {row.what}{' (--large)' if row.large else ''}" for row in chosen))
+        print(
+            "\n".join(
+                f"{row.name:20} {row.what}{' (--large)' if row.large else ''}" for row in chosen
+            )
+        )
         return 0
     if not options.large:
         chosen = [row for row in chosen if not row.large or row.name in options.only]

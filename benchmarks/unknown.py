@@ -1,23 +1,26 @@
-"""Cameras of all kinds that nothing is known of, or something wrong: how many frames are identified, how many wrongly.
+"""Cameras of all kinds that nothing is known of, or something wrong: how many frames are
+identified, how many wrongly.
 
     python benchmarks/unknown.py [--frames 10000] [--seed 1] [--part 0 2] [--show] [--write]
 
-Every camera has its own field of view (4 to 80 degrees, evenly in its logarithm, and of every twentieth 1 to 4, where
-preparing a catalogue takes tens of seconds), detector (256 to 4096 px), lens (up
-to 0.3 % of distortion at the corner, principal point up to 1 % of the width off), depth, noise, missing stars and false
-ones (hot pixels, and clusters as from the Moon, clouds and a horizon); its frames look anywhere on the sky. The sheet
-is missing, right, or 20 or 50 % wrong, in turns. Nine cameras of ten give lists of sixty frames, made here with NumPy
-alone of the catalogue's places; every tenth gives five images, rendered with defocus, hot pixels, streaks, the Moon
-and a horizon painted in, whose stars are measured.
+Every camera has its own field of view (4 to 80 degrees, evenly in its logarithm, and of every
+twentieth 1 to 4, where preparing a catalogue takes tens of seconds), detector (256 to 4096 px),
+lens (up to 0.3 % of distortion at the corner, principal point up to 1 % of the width off), depth,
+noise, missing stars and false ones (hot pixels, and clusters as from the Moon, clouds and a
+horizon); its frames look anywhere on the sky. The sheet is missing, right, or 20 or 50 % wrong, in
+turns. Nine cameras of ten give lists of sixty frames, made here with NumPy alone of the catalogue's
+places; every tenth gives five images, rendered with defocus, hot pixels, streaks, the Moon and a
+horizon painted in, whose stars are measured.
 
-A frame counts where it shows at least six true stars among its thirty brightest. A star is wrong when its name is, a
-frame when at least half of its stars are; attitudes also hold the offset of the principal point. A star, false or one
-of a close pair, within five standard deviations of the place of a star that the list leaves out is that star for all
-that anybody can tell: it is counted apart, as a coincidence. Intervals are Clopper and Pearson's, 95 %.
+A frame counts where it shows at least six true stars among its thirty brightest. A star is wrong
+when its name is, a frame when at least half of its stars are; attitudes also hold the offset of the
+principal point. A star, false or one of a close pair, within five standard deviations of the place
+of a star that the list leaves out is that star for all that anybody can tell: it is counted apart,
+as a coincidence. Intervals are Clopper and Pearson's, 95 %.
 
-What was done is kept in `.bench/unknown`, a line for each camera: a campaign that is stopped goes on, and several
-processes share one (``--part 0 2`` and ``--part 1 2``). ``--show`` prints the table of what there is and ``--write``
-puts it into the documentation (`docs/explanation/reliability.md`).
+What was done is kept in `.bench/unknown`, a line for each camera: a campaign that is stopped goes
+on, and several processes share one (``--part 0 2`` and ``--part 1 2``). ``--show`` prints the table
+of what there is and ``--write`` puts it into the documentation (`docs/explanation/reliability.md`).
 """
 
 from __future__ import annotations
@@ -57,7 +60,9 @@ LEAST, BRIGHTEST = 6, 30
 
 @dataclass(frozen=True)
 class Made:
-    """A camera without errors in its sheet, and its frames: rotations, stars by place, and whether they count."""
+    """A camera without errors in its sheet, and its frames: rotations, stars by place, and whether
+    they count.
+    """
 
     camera: sc.Camera
     table: Any
@@ -74,10 +79,16 @@ def random_rotation(rng: np.random.Generator) -> Any:
     return q if np.linalg.det(q) > 0 else q[[1, 0, 2]]
 
 
-def seen_by(stars: Any, rotation: Any, camera: sc.Camera, bend: float, offset: Any) -> tuple[Any, Any]:
-    """Rows and places of the stars on the detector: a pinhole with a cubic displacement of its own formula."""
+def seen_by(
+    stars: Any, rotation: Any, camera: sc.Camera, bend: float, offset: Any
+) -> tuple[Any, Any]:
+    """Rows and places of the stars on the detector: a pinhole with a cubic displacement of its own
+    formula.
+    """
     corner = 0.5 * np.hypot(camera.width_px, camera.height_px)
-    ahead = np.flatnonzero(stars.directions_icrs @ rotation[2] > np.cos(np.arctan(1.1 * corner / camera.focal_px)))
+    ahead = np.flatnonzero(
+        stars.directions_icrs @ rotation[2] > np.cos(np.arctan(1.1 * corner / camera.focal_px))
+    )
     b = stars.directions_icrs[ahead] @ rotation.T
     u = camera.focal_px * b[:, :2] / b[:, 2:]
     u = u * (1.0 + bend * np.sum(u * u, axis=1) / corner**2)[:, None]
@@ -86,8 +97,12 @@ def seen_by(stars: Any, rotation: Any, camera: sc.Camera, bend: float, offset: A
     return ahead[on], xy[on]
 
 
-def make_camera(rng: np.random.Generator, fields: tuple[float, float]) -> tuple[sc.Camera, float, Any]:
-    """A sheet, and how the lens differs from it: distortion at the corner and the offset of the principal point."""
+def make_camera(
+    rng: np.random.Generator, fields: tuple[float, float]
+) -> tuple[sc.Camera, float, Any]:
+    """A sheet, and how the lens differs from it: distortion at the corner and the offset of the
+    principal point.
+    """
     width = int(rng.choice([256, 512, 1024, 2048, 4096]))
     height = int(width * rng.choice([1.0, 0.75, 0.625]))
     fov = np.exp(rng.uniform(*np.log(fields)))
@@ -104,7 +119,11 @@ def make_frames(rng: np.random.Generator, stars: Any, n: int, fields: tuple[floa
     wanted = np.exp(rng.uniform(*np.log([8.0, 60.0]))) * 4.0 * np.pi / sr
     limit = stars.mag[min(int(wanted), len(stars) - 1)]
     depth = stars.select(stars.mag <= limit)
-    sigma, false, missing = rng.choice([0.05, 0.1, 0.3]), rng.choice([0, 3, 10]), rng.choice([0.0, 0.1, 0.3])
+    sigma, false, missing = (
+        rng.choice([0.05, 0.1, 0.3]),
+        rng.choice([0, 3, 10]),
+        rng.choice([0.0, 0.1, 0.3]),
+    )
     rotations, frame, xs, names, mags, counts, unseen = [], [], [], [], [], [], {}
     deeper = stars.select(stars.mag <= limit + 1.0)
     for k in range(n):
@@ -150,13 +169,17 @@ def make_frames(rng: np.random.Generator, stars: Any, n: int, fields: tuple[floa
     return Made(camera, table, rotations, truth, counts, unseen)
 
 
-def render_camera(rng: np.random.Generator, stars: Any, n: int, fields: tuple[float, float]) -> Made:
+def render_camera(
+    rng: np.random.Generator, stars: Any, n: int, fields: tuple[float, float]
+) -> Made:
     """The same with pixels: defocus, hot pixels, streaks, the Moon and a horizon."""
     camera, bend, offset = make_camera(rng, fields)
     size, height = camera.width_px, camera.height_px
     corner = 0.5 * np.hypot(size, height)
     true = camera.replace(
-        x0_px=camera.x0_px + offset[0], y0_px=camera.y0_px + offset[1], coefficients=(bend / corner**2, 0.0)
+        x0_px=camera.x0_px + offset[0],
+        y0_px=camera.y0_px + offset[1],
+        coefficients=(bend / corner**2, 0.0),
     )
     sr = np.prod(np.radians(camera.fov_deg))
     wanted = np.exp(rng.uniform(*np.log([15.0, 60.0]))) * 4.0 * np.pi / sr
@@ -165,14 +188,19 @@ def render_camera(rng: np.random.Generator, stars: Any, n: int, fields: tuple[fl
     psf = rng.choice([0.7, 1.0, 1.6, 2.5])
     zero = 12.0 * 11.0 * 2.0 * psf * np.sqrt(np.pi) * 10.0 ** (0.4 * limit) / 0.1
     sensor = sc.simulation.Sensor(
-        psf_sigma_px=psf, zero_point_e_s=zero, hot_pixel_fraction=rng.choice([0.0, 1e-5, 1e-4]), hot_pixel_seed=7
+        psf_sigma_px=psf,
+        zero_point_e_s=zero,
+        hot_pixel_fraction=rng.choice([0.0, 1e-5, 1e-4]),
+        hot_pixel_seed=7,
     )
     depth = stars.select(stars.mag <= limit + 0.5)
     images, rotations, truths = [], [], []
     y, x = np.ogrid[:height, :size]
     for k in range(n):
         rotation = random_rotation(rng)
-        rendered = sc.simulation.render(depth, true, rotation, sensor, seed=int(rng.integers(2**31)))
+        rendered = sc.simulation.render(
+            depth, true, rotation, sensor, seed=int(rng.integers(2**31))
+        )
         data = rendered.data.astype(np.float32)
         if rng.random() < 0.3:
             # The Moon and its light.
@@ -182,17 +210,30 @@ def render_camera(rng: np.random.Generator, stars: Any, n: int, fields: tuple[fl
         if rng.random() < 0.3:
             # A satellite.
             a, b = rng.random((2, 2)) * [size, height]
-            away = np.abs((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / np.hypot(*(b - a))
+            away = np.abs((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / np.hypot(
+                *(b - a)
+            )
             data += 400.0 * np.exp(-0.5 * (away / psf) ** 2)
         if rng.random() < 0.3:
             # Trees before the sky.
             trees = y > height * (0.85 + 0.05 * np.sin(x / 11.0) + 0.03 * np.sin(x / 2.3))
             data[trees] = 70.0 + 40.0 * rng.random(int(trees.sum()))
-        images.append(sc.images.Image(np.clip(data, 0, 4095).astype(np.uint16), f"frame {k}", saturation=4095.0))
+        images.append(
+            sc.images.Image(
+                np.clip(data, 0, 4095).astype(np.uint16), f"frame {k}", saturation=4095.0
+            )
+        )
         rotations.append(rotation)
         # Stars just outside, which are not in the truth of the image, give their light to its edge.
-        ahead = np.flatnonzero(depth.directions_icrs @ rotation[2] > np.cos(np.arctan(1.1 * corner / true.focal_px)))
-        truths.append((depth.star_id[ahead], sc.camera.project(true, depth.directions_icrs[ahead] @ rotation.T)))
+        ahead = np.flatnonzero(
+            depth.directions_icrs @ rotation[2] > np.cos(np.arctan(1.1 * corner / true.focal_px))
+        )
+        truths.append(
+            (
+                depth.star_id[ahead],
+                sc.camera.project(true, depth.directions_icrs[ahead] @ rotation.T),
+            )
+        )
     table = sc.images.extract_centroids(images)
     names, counts = {}, []
     for k, truth in enumerate(truths):
@@ -209,15 +250,23 @@ def render_camera(rng: np.random.Generator, stars: Any, n: int, fields: tuple[fl
     return Made(camera, table, rotations, names, counts, {})
 
 
-def judged(made: Made, sheet: str, rng: np.random.Generator) -> tuple[int, int, int, int, int, int, float]:
-    """Frames that count, identified, wrong; stars, wrong stars, coincidences; seconds of the processor."""
+def judged(
+    made: Made, sheet: str, rng: np.random.Generator
+) -> tuple[int, int, int, int, int, int, float]:
+    """Frames that count, identified, wrong; stars, wrong stars, coincidences; seconds of the
+    processor.
+    """
     factor = {
         "none": None,
         "right": 1.0,
         "20 % off": 1.2 ** rng.choice([-1, 1]),
         "50 % off": 1.5 ** rng.choice([-1, 1]),
     }
-    camera = None if factor[sheet] is None else made.camera.replace(focal_mm=made.camera.focal_mm * factor[sheet])
+    camera = (
+        None
+        if factor[sheet] is None
+        else made.camera.replace(focal_mm=made.camera.focal_mm * factor[sheet])
+    )
     clock = process_time()
     _, found = identify_to_depth(made.table, camera, EPOCH, cache=False)
     seconds = process_time() - clock
@@ -241,7 +290,11 @@ def tried(number: int, seed: int, stars: Any) -> dict[str, Any]:
     rng = np.random.default_rng([seed, number])
     rendered, sheet = number % EVERY == EVERY - 1, SHEETS[(number + number // EVERY) % len(SHEETS)]
     fields = NARROW if number // 2 % SELDOM == SELDOM - 1 else WIDE
-    made = render_camera(rng, stars, RENDERED, fields) if rendered else make_frames(rng, stars, LISTED, fields)
+    made = (
+        render_camera(rng, stars, RENDERED, fields)
+        if rendered
+        else make_frames(rng, stars, LISTED, fields)
+    )
     names = ("counting", "identified", "wrong", "stars", "wrong_stars", "coincidences", "seconds")
     result = dict(zip(names, map(float, judged(made, sheet, rng)), strict=True))
     camera = {"number": number, "field": made.camera.fov_deg[0], "width": made.camera.width_px}
@@ -250,7 +303,11 @@ def tried(number: int, seed: int, stars: Any) -> dict[str, Any]:
 
 def results(seed: int) -> list[dict[str, Any]]:
     """What was done so far."""
-    lines = [line for path in sorted(OUT.glob(f"{seed}-*.jsonl")) for line in path.read_text().splitlines()]
+    lines = [
+        line
+        for path in sorted(OUT.glob(f"{seed}-*.jsonl"))
+        for line in path.read_text().splitlines()
+    ]
     return list({row["number"]: row for row in map(json.loads, lines)}.values())
 
 
@@ -262,22 +319,33 @@ def table(rows: list[dict[str, Any]]) -> str:
         groups["images" if row["rendered"] else "lists"].append(row)
         groups[f"sheet: {row['sheet']}"].append(row)
     for row in sorted(rows, key=lambda row: row["field"]):
-        low, high = next((a, b) for a, b in pairwise((1, 2, 4, 10, 20, 40, 81)) if row["field"] <= b)
+        low, high = next(
+            (a, b) for a, b in pairwise((1, 2, 4, 10, 20, 40, 81)) if row["field"] <= b
+        )
         groups[f"field {low} to {min(high, 80)}°"].append(row)
     for row in sorted(rows, key=lambda row: row["width"]):
         groups[f"width {row['width']} px"].append(row)
     lines = [
-        "|  | Cameras | Frames that count | Identified | Wrong frames | Wrong stars | By chance | Processor a frame |",
+        (
+            "|  | Cameras | Frames that count | Identified | Wrong frames | Wrong stars | By "
+            "chance "
+            "| Processor a frame |"
+        ),
         "|---|---:|---:|---|---|---|---:|---|",
     ]
     for name, group in groups.items():
         keys = ("counting", "identified", "wrong", "stars", "wrong_stars", "coincidences")
-        n, found, wrong, n_stars, bad, chance = (int(sum(row[key] for row in group)) for key in keys)
+        n, found, wrong, n_stars, bad, chance = (
+            int(sum(row[key] for row in group)) for key in keys
+        )
         if not n:
             continue
         times = np.quantile([row["seconds"] / row["frames"] for row in group], [0.5, 0.95])
         lines.append(
-            f"| {name} | {len(group)} | {n} | {share(found, n)} | {share(wrong, n)} | {bad} of {n_stars} | {chance} | "
+            (
+                f"| {name} | {len(group)} | {n} | {share(found, n)} | {share(wrong, n)} | {bad} of "
+                f"{n_stars} | {chance} | "
+            )
             + ", ".join(f"{t:.2g} s" for t in times)
             + " |"
         )
@@ -296,7 +364,9 @@ def share(k: int, n: int) -> str:
 
 def main() -> None:
     """Go on until so many frames are tried, then show what there is."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--frames", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("NUMBER", "OF"))

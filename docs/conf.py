@@ -38,7 +38,8 @@ extensions = [
 copybutton_prompt_text = "$ "
 exclude_patterns = ["_build", "reference/_commands.md", "reference/_schemas.md"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
-# Notebooks are executed on every build, each in a folder of its own; one that fails fails the build.
+# Notebooks are executed on every build, each in a folder of its own; one that fails fails the
+# build.
 nb_execution_mode = "force"
 nb_execution_in_temp = True
 nb_execution_timeout = 300
@@ -50,7 +51,8 @@ myst_heading_anchors = 2
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints = "none"  # the docstrings state shapes and units, which annotations cannot
 napoleon_google_docstring = False
-# Names that share a line share an entry; fields of dataclasses are described once, in the docstring of the class.
+# Names that share a line share an entry; fields of dataclasses are described once, in the docstring
+# of the class.
 napoleon_use_param = False
 napoleon_custom_sections = [("Fields", "params_style")]
 napoleon_use_rtype = False
@@ -60,7 +62,8 @@ NumpyDocstring._consume_inline_attribute = lambda self: ("", self._consume_to_en
 default_role = "py:obj"  # `name` is a link where it is public
 add_module_names = False
 python_maximum_signature_line_length = 60
-# Words of a docstring's types ("n_frames values") are taken for references; two classes may have such a field.
+# Words of a docstring's types ("n_frames values") are taken for references; two classes may have
+# such a field.
 suppress_warnings = ["ref.python"]
 
 html_theme = "furo"
@@ -73,7 +76,9 @@ def write_gallery(_app: object) -> None:
     """Draw the figures of the gallery, in a process of its own: they change Matplotlib's state."""
     code = "import gallery_figures, pathlib, sys; gallery_figures.main(pathlib.Path(sys.argv[1]))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
-    subprocess.run([sys.executable, "-c", code, str(HERE / "gallery.md")], env=environment, check=True)
+    subprocess.run(
+        [sys.executable, "-c", code, str(HERE / "gallery.md")], env=environment, check=True
+    )
 
 
 def write_schemas(_app: object) -> None:
@@ -108,31 +113,43 @@ def command_names() -> list[str]:
     """The commands of the command line, in the order of its help."""
     from starcal_uq.cli.commands import app
 
-    return [str(command.name or command.callback.__name__) for command in app.registered_commands if command.callback]
+    return [
+        str(command.name or command.callback.__name__)
+        for command in app.registered_commands
+        if command.callback
+    ]
 
 
 def write_command_help(_app: object) -> None:
-    """Write the help texts as the installed command prints them, so that the page cannot go stale."""
+    """Write the help texts as the installed command prints them, so that the page cannot go
+    stale.
+    """
     command = str(Path(sys.executable).with_name("starcal-uq"))
     environment = {**os.environ, "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     texts = []
     for name in ("", *command_names()):
         arguments = [name, "--help"] if name else ["--help"]
-        run = subprocess.run([command, *arguments], env=environment, capture_output=True, text=True, check=True)
+        run = subprocess.run(
+            [command, *arguments], env=environment, capture_output=True, text=True, check=True
+        )
         lines = [line.rstrip() for line in run.stdout.strip().splitlines()]
         texts += [f"## {name}\n" if name else "", "```text", *lines, "```\n"]
     (HERE / "reference" / "_commands.md").write_text("\n".join(texts), encoding="utf-8")
 
 
 def public_objects() -> dict[str, dict[str, Any]]:
-    """What a user can name, by namespace: "" for the top, then the wings; modules among them left out."""
+    """What a user can name, by namespace: "" for the top, then the wings; modules among them left
+    out.
+    """
     wings = sorted(path.parent.name for path in (HERE.parent / "starcal_uq").glob("*/__init__.pyi"))
     found = {}
     for wing in ("", *wings):
         module = importlib.import_module(f"starcal_uq.{wing}".rstrip("."))
         names = sorted(module.__all__, key=lambda name: (not name[0].isupper(), name.lower()))
         public = {name: getattr(module, name) for name in names}
-        found[wing] = {name: value for name, value in public.items() if not isinstance(value, ModuleType)}
+        found[wing] = {
+            name: value for name, value in public.items() if not isinstance(value, ModuleType)
+        }
     return found
 
 
@@ -150,7 +167,9 @@ def drawn_by(public: Any) -> str:
 
 
 def write_reference(_app: object) -> None:
-    """One page an object, and one a namespace, from what the stubs offer: a public name cannot be forgotten here."""
+    """One page an object, and one a namespace, from what the stubs offer: a public name cannot be
+    forgotten here.
+    """
     from starcal_uq.core.records import Saved
 
     folder = HERE / "reference" / "api"
@@ -165,7 +184,9 @@ def write_reference(_app: object) -> None:
             # Classes and functions may differ by a capital letter only, and file systems may not.
             page = f"{name}-class" if isinstance(public, type) else name
             pages.append(f"{place.name}/{page}")
-            kind = "class" if isinstance(public, type) else "function" if callable(public) else "data"
+            kind = (
+                "class" if isinstance(public, type) else "function" if callable(public) else "data"
+            )
             of_file = isinstance(public, type) and issubclass(public, Saved)
             files = "\n\n   .. automethod:: save\n   .. automethod:: load" if of_file else ""
             directive = f".. auto{kind}:: {module}.{name}{files}"
@@ -176,18 +197,28 @@ def write_reference(_app: object) -> None:
             rows.append(f"| [`{prefix}{name}`]({pages[-1]}.md) | {told} |")
         if wing == "core":
             pages.append(f"{place.name}/errors")
-            directive = ".. automodule:: starcal_uq.core.errors\n   :exclude-members: printable, register_reason"
+            directive = (
+                ".. automodule:: starcal_uq.core.errors\n   :exclude-members: printable, "
+                "register_reason"
+            )
             errors = f"# sc.errors\n\n```{{eval-rst}}\n{directive}\n```\n"
             (place / "errors.md").write_text(errors, encoding="utf-8")
             rows.append(f"| [`sc.errors`]({pages[-1]}.md) | Errors that a user can act on. |")
-        told = (importlib.import_module(module).__doc__ or "").strip() if wing else "What a day's work needs."
+        told = (
+            (importlib.import_module(module).__doc__ or "").strip()
+            if wing
+            else "What a day's work needs."
+        )
         lines = [f"# {prefix.rstrip('.')}", "", told, "", "| | |", "|---|---|", *rows]
         lines += ["", "```{toctree}", ":hidden:", "", *pages, "```", ""]
         (folder / f"{wing or '_top'}.md").write_text("\n".join(lines), encoding="utf-8")
 
 
-def readable(_app: object, what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
-    """Fields of a class under that name, links from types, and formulas that are not read as markup.
+def readable(
+    _app: object, what: str, _name: str, _object: object, _options: object, lines: list[str]
+) -> None:
+    """Fields of a class under that name, links from types, and formulas that are not read as
+    markup.
 
     The bars of |A| and the last underscore of `str_` are kept; literals stay as they are.
     """
@@ -200,7 +231,9 @@ def readable(_app: object, what: str, _name: str, _object: object, _options: obj
             literal_above = None
         if literal_above is None:
             parts = re.split(r"(``.*?``|`.*?`)", line)
-            parts[::2] = [re.sub(r"(?<!\\)\||(?<=\w)_(?!\w)", r"\\\g<0>", part) for part in parts[::2]]
+            parts[::2] = [
+                re.sub(r"(?<!\\)\||(?<=\w)_(?!\w)", r"\\\g<0>", part) for part in parts[::2]
+            ]
             line = "".join(parts)
             field, colon, kind = line.partition(" : ")
             if colon and not indent:
@@ -219,7 +252,9 @@ def linked(name: str) -> str:
 
 
 def find_public(_app: object) -> None:
-    """Where each public name is described: classes of the top level in their wings' docstrings, too."""
+    """Where each public name is described: classes of the top level in their wings' docstrings,
+    too.
+    """
     for wing, objects in public_objects().items():
         for name in objects:
             PUBLIC.setdefault(name, ".".join(filter(None, ["starcal_uq", wing, name])))
@@ -228,15 +263,21 @@ def find_public(_app: object) -> None:
 
 def resolve_short(app: Any, env: Any, node: Any, content: Any) -> Any:
     """`Camera` and `Camera.load` stand for the public ones, from wherever they are named."""
-    first, dot, rest = node.get("reftarget", "").removeprefix("sc.").rpartition("starcal_uq.")[2].partition(".")
+    first, dot, rest = (
+        node.get("reftarget", "").removeprefix("sc.").rpartition("starcal_uq.")[2].partition(".")
+    )
     if node.get("refdomain") != "py" or first not in PUBLIC:
         return None
     target = PUBLIC[first] + dot + rest
-    return env.domains["py"].resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, content)
+    return env.domains["py"].resolve_xref(
+        env, node["refdoc"], app.builder, "obj", target, node, content
+    )
 
 
 def name_twice(_app: object, doctree: Any) -> None:
-    """Objects bear their names at the top and under their wing, whichever links of the source pages have."""
+    """Objects bear their names at the top and under their wing, whichever links of the source pages
+    have.
+    """
     import starcal_uq as sc
 
     for node in doctree.findall(desc_signature):

@@ -1,6 +1,7 @@
 """The figures of the gallery: every figure that a result draws, with the code that makes it.
 
-`conf.py` runs the code when it builds the documentation and writes the page; a test holds the list against the views.
+`conf.py` runs the code when it builds the documentation and writes the page; a test holds the list
+against the views.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ THUMBNAIL_PX = 260
 
 @dataclass(frozen=True)
 class Scene:
-    """Code that makes some results, and the code of their figures, by class and name of the figure."""
+    """Code that makes some results, and the code of their figures, by class and name of the
+    figure.
+    """
 
     title: str
     words: str
@@ -40,9 +43,18 @@ camera = sc.paper.paper_start()
 cal = sc.calibrate(obs, camera)
 post = sc.sample(obs, cal, seed=1)""",
         {
-            "Posterior.corner": ("Which values are believed, pair by pair?", "post.plot.corner(cal, truth)"),
-            "Posterior.prior_posterior": ("What did the data add to the prior?", "post.plot.prior_posterior(truth)"),
-            "Calibration.convergence": ("How did the three stages get there?", "cal.plot.convergence(truth)"),
+            "Posterior.corner": (
+                "Which values are believed, pair by pair?",
+                "post.plot.corner(cal, truth)",
+            ),
+            "Posterior.prior_posterior": (
+                "What did the data add to the prior?",
+                "post.plot.prior_posterior(truth)",
+            ),
+            "Calibration.convergence": (
+                "How did the three stages get there?",
+                "cal.plot.convergence(truth)",
+            ),
             "Calibration.residuals": ("What is left, and is it noise?", "cal.plot.residuals(obs)"),
             "Coupling.correlation": (
                 "Which parameters trade against each other?",
@@ -52,7 +64,10 @@ post = sc.sample(obs, cal, seed=1)""",
                 "And with the attitude among them?",
                 "sc.coupling(post).plot.correlations()",
             ),
-            "Coupling.couplings": ("What does not knowing the others cost?", "sc.coupling(post).plot.couplings()"),
+            "Coupling.couplings": (
+                "What does not knowing the others cost?",
+                "sc.coupling(post).plot.couplings()",
+            ),
         },
     ),
     Scene(
@@ -65,9 +80,15 @@ error = sc.propagate(post, obs)
 need = Requirement("R-1", "cross-boresight", 60.0, 0.997)
 budget = sc.budget(post, obs, error, file=sc.budgeting.BudgetFile(requirements=(need,)))""",
         {
-            "AttitudeError.contributors": ("What does each part do to the attitude?", "error.plot.contributors()"),
+            "AttitudeError.contributors": (
+                "What does each part do to the attitude?",
+                "error.plot.contributors()",
+            ),
             "Budget.contributors": ("Who spends the budget?", "budget.plot.contributors()"),
-            "FieldMap.maps": ("Where on the detector?", "sc.propagation.field_map(post, obs).plot.maps()"),
+            "FieldMap.maps": (
+                "Where on the detector?",
+                "sc.propagation.field_map(post, obs).plot.maps()",
+            ),
             "DistortionCurve.curve": (
                 "How well is the distortion known, star by star?",
                 "sc.propagation.distortion_curve(post, obs).plot.curve()",
@@ -76,7 +97,10 @@ budget = sc.budget(post, obs, error, file=sc.budgeting.BudgetFile(requirements=(
     ),
     Scene(
         "A slew",
-        "Calibration errors change as stars move over the detector: along a slew they become a spectrum.",
+        (
+            "Calibration errors change as stars move over the detector: along a slew they become a "
+            "spectrum."
+        ),
         """\
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -99,15 +123,24 @@ diagnosis = sc.diagnose(obs, cal, models=("none", "k1", "brown", "brown3"), n_st
 validation = sc.validate(camera, n_replicates=24, n_frames=20, workers=0)
 halves = sc.comparison.compare_halves(obs, camera)""",
         {
-            "Diagnosis.diagnosis": ("Does anything speak against the model?", "diagnosis.plot.diagnosis()"),
+            "Diagnosis.diagnosis": (
+                "Does anything speak against the model?",
+                "diagnosis.plot.diagnosis()",
+            ),
             "Misfit.p_values": ("Which test does?", "diagnosis.misfit.plot.p_values()"),
             "Jackknife.ratios": ("Are frames independent?", "diagnosis.jackknife.plot.ratios()"),
             "ModelComparison.models": (
                 "Would another model predict better?",
                 "diagnosis.comparison.plot.models()",
             ),
-            "Validation.ranks": ("Are the intervals right for this sensor?", "validation.plot.ranks()"),
-            "CameraComparison.difference": ("Do two halves of the data agree?", "halves.plot.difference()"),
+            "Validation.ranks": (
+                "Are the intervals right for this sensor?",
+                "validation.plot.ranks()",
+            ),
+            "CameraComparison.difference": (
+                "Do two halves of the data agree?",
+                "halves.plot.difference()",
+            ),
         },
     ),
     Scene(
@@ -128,7 +161,10 @@ check = sc.planning.check_forecast(
     ),
     Scene(
         "Coupling studies",
-        "What couples with what, over fields, frames, stars and models ([studies](explanation/studies.md)).",
+        (
+            "What couples with what, over fields, frames, stars and models "
+            "([studies](explanation/studies.md))."
+        ),
         """\
 sc.studies.write_study_template("frames-stars", "study.toml")
 study = sc.study("study.toml", workers=0)
@@ -158,12 +194,18 @@ simulated = sc.study("simulated.toml", workers=0)""",
             "Study.inflation": ("Each sigma, others unknown and known", "study.plot.inflation()"),
             "Study.needed": ("How many frames for a target?", "study.plot.needed()"),
             "Study.simpler": ("Would a simpler model do?", "study.plot.simpler()"),
-            "Study.coverage": ("Do simulated intervals hold the truth?", "simulated.plot.coverage()"),
+            "Study.coverage": (
+                "Do simulated intervals hold the truth?",
+                "simulated.plot.coverage()",
+            ),
         },
     ),
     Scene(
         "Ye & Yang (2017) again",
-        "The paper's experiments, here with fewer repetitions than [the page on it](explanation/paper.md).",
+        (
+            "The paper's experiments, here with fewer repetitions than [the page on "
+            "it](explanation/paper.md)."
+        ),
         """\
 paper = sc.paper.reproduce("paper", n_replicates=8, n_frames=50, study=False, workers=0)
 sizes = {"fields_deg": (7.0, 15.0), "frames": (12, 48), "max_mags": (5.5, 6.5)}
@@ -172,14 +214,20 @@ bias = sc.paper.interaction_study(distortion_scales=(0.0, 0.1, 1.0, 10.0), worke
         {
             "Reproduction.trajectories": ("The paper's figure 3", "paper.plot.trajectories()"),
             "Reproduction.error_fields": ("Its map of errors", "paper.plot.error_fields()"),
-            "Reproduction.printed_numbers": ("Its numbers beside ours", "paper.plot.printed_numbers()"),
+            "Reproduction.printed_numbers": (
+                "Its numbers beside ours",
+                "paper.plot.printed_numbers()",
+            ),
             "Replicates.spread": ("Which method is worth what?", "paper.replicates.plot.spread()"),
             "InteractionStudy.bias": ("When does distortion bias the optics?", "bias.plot.bias()"),
         },
     ),
     Scene(
         "Its field experiment",
-        "Not drawn here, because it renders and identifies hundreds of images: `starcal-uq reproduce-field -o field`.",
+        (
+            "Not drawn here, because it renders and identifies hundreds of images: `starcal-uq "
+            "reproduce-field -o field`."
+        ),
         """\
 from starcal_uq.paper.field.experiment import field_experiment
 
@@ -230,7 +278,9 @@ def write(page: Path, folder: Path) -> float:
                 alt = f"{result}: {name}. {question}"
                 where = f"{folder.name}/{_anchor(key)}"
                 options = f":alt: {alt}\n:target: '#{_anchor(key)}'\n"
-                thumbnails.append(f"```{{figure}} {where}-small.png\n{options}\n{result}<br>{name}\n```\n")
+                thumbnails.append(
+                    f"```{{figure}} {where}-small.png\n{options}\n{result}<br>{name}\n```\n"
+                )
                 sections.append(f"```{{image}} {where}.png\n:alt: {alt}\n:loading: lazy\n```\n")
             sections.append(_code(code))
     opening = """# Gallery

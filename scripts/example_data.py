@@ -2,7 +2,8 @@
 
     python scripts/example_data.py esa-tetra3/ [stars.ecsv]
 
-`esa-tetra3/` holds the eight TIFF files of github.com/esa/tetra3 (examples/data). Written is what the package holds.
+`esa-tetra3/` holds the eight TIFF files of github.com/esa/tetra3 (examples/data). Written is what
+the package holds.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ DECIMALS = {"x_px": 4, "y_px": 4, "ra_deg": 7, "dec_deg": 7, "sigma_px": 6, "mag
 
 
 def measure(images: Path) -> sc.Observations:
-    """Every star that is found and identified, none left out, its noise that of the pixels alone."""
+    """Every star that is found and identified, none left out, its noise that of the pixels
+    alone.
+    """
     camera, site = sc.Camera.load(FOLDER / "camera.toml"), sc.sky.Site.load(FOLDER / "site.toml")
     _, _, found = observations_from_images([images], camera, site=site)
     obs = found.identification.observations
@@ -38,4 +41,6 @@ def measure(images: Path) -> sc.Observations:
 
 
 if __name__ == "__main__":
-    measure(Path(sys.argv[1])).save(sys.argv[2] if sys.argv[2:] else FOLDER / "stars.ecsv", force=True)
+    measure(Path(sys.argv[1])).save(
+        sys.argv[2] if sys.argv[2:] else FOLDER / "stars.ecsv", force=True
+    )

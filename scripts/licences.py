@@ -1,8 +1,10 @@
 """Licences of what the package brings along, from the packages' own metadata.
 
-    licences.py PYTHON ...     the table of docs/reference/licences.md, from these environments together
+    licences.py PYTHON ...     the table of docs/reference/licences.md, from these environments
+    together
 
-Listed is what `pip install starcal-uq` installs, directly or not, and what its extras for users add.
+Listed is what `pip install starcal-uq` installs, directly or not, and what its extras for users
+add.
 """
 
 from __future__ import annotations
@@ -34,19 +36,37 @@ table). None of it is part of our files: each is installed as its authors publis
 
 
 def licence(package: Distribution) -> str:
-    """What a package says of itself: expression, classifiers, the first line of its text or the text."""
-    said = [line.rpartition(" :: ")[2] for line in package.metadata.get_all("Classifier", []) if "License ::" in line]
+    """What a package says of itself: expression, classifiers, the first line of its text or the
+    text.
+    """
+    said = [
+        line.rpartition(" :: ")[2]
+        for line in package.metadata.get_all("Classifier", [])
+        if "License ::" in line
+    ]
     names = ", ".join(name for name in said if name != "OSI Approved")
     text = (package.metadata.get("License") or "").strip().partition("\n")[0]
-    return package.metadata.get("License-Expression") or names or text or by_text(package) or "not stated"
+    return (
+        package.metadata.get("License-Expression")
+        or names
+        or text
+        or by_text(package)
+        or "not stated"
+    )
 
 
 def by_text(package: Distribution) -> str:
-    """Of a package whose metadata have the text alone: the BSD licence of three clauses, known by its last one."""
+    """Of a package whose metadata have the text alone: the BSD licence of three clauses, known by
+    its last one.
+    """
     files = [
-        file.read_text() for file in package.files or () if file.name in package.metadata.get_all("License-File", [])
+        file.read_text()
+        for file in package.files or ()
+        if file.name in package.metadata.get_all("License-File", [])
     ]
-    known = any("Redistributions in binary form" in text and "Neither the name" in text for text in files)
+    known = any(
+        "Redistributions in binary form" in text and "Neither the name" in text for text in files
+    )
     return "BSD-3-Clause" if known else ""
 
 
@@ -66,7 +86,9 @@ def licences() -> dict[str, str]:
         for line in package.requires or ():
             needed = Requirement(line)
             if needed.marker is None or needed.marker.evaluate({"extra": at[1]}):
-                wanted |= {(canonicalize_name(needed.name), extra) for extra in ("", *needed.extras)} - seen
+                wanted |= {
+                    (canonicalize_name(needed.name), extra) for extra in ("", *needed.extras)
+                } - seen
     return found
 
 
@@ -76,13 +98,17 @@ def main() -> None:
         return
     table: dict[str, str] = {}
     pins = PAGE.parents[2].joinpath("constraints.txt").read_text("utf-8")
-    pinned = {canonicalize_name(line.partition("==")[0]) for line in pins.splitlines() if "==" in line}
+    pinned = {
+        canonicalize_name(line.partition("==")[0]) for line in pins.splitlines() if "==" in line
+    }
     for python in sys.argv[1:]:
         made = subprocess.run([python, __file__], capture_output=True, text=True, check=True).stdout
         table |= json.loads(made)
     if unpinned := sorted(set(table) - pinned):
         raise SystemExit(f"constraints.txt does not pin {', '.join(unpinned)}")
-    PAGE.write_text(HEAD + "".join(f"| {name} | {table[name]} |\n" for name in sorted(table)), "utf-8")
+    PAGE.write_text(
+        HEAD + "".join(f"| {name} | {table[name]} |\n" for name in sorted(table)), "utf-8"
+    )
 
 
 if __name__ == "__main__":

@@ -2,16 +2,18 @@
 
     supply.py [--all] [--only PART ...] [--python VERSION ...] [--keep FOLDER]
 
-1. The source distribution is built, and the wheel from it; both are compared with what is under version control.
-2. For each Python: the wheel without any extra into an empty environment, at the versions of `constraints.txt`; the
-   tests run against it in a folder without the package's source, those of an extra are skipped. Then with all extras.
-3. Extras one after the other beside the wheel, once: their tests run. The source distribution, once, and there the
-   tests of the project itself as well.
+1. The source distribution is built, and the wheel from it; both are compared with what is under
+version control.
+2. For each Python: the wheel without any extra into an empty environment, at the versions of
+   `constraints.txt`; the tests run against it in a folder without the package's source, those of an
+   extra are skipped. Then with all extras.
+3. Extras one after the other beside the wheel, once: their tests run. The source distribution,
+   once, and there the tests of the project itself as well.
 4. The wheel with the lowest versions that `pyproject.toml` allows, on the lowest Python.
 5. The licences of everything that comes along, into `docs/reference/licences.md`.
 
-Runs in an environment with `build`, `packaging` and `uv`. Tests are those of a few wings that reach every dependency;
-``--all`` runs all fast ones.
+Runs in an environment with `build`, `packaging` and `uv`. Tests are those of a few wings that reach
+every dependency; ``--all`` runs all fast ones.
 """
 
 from __future__ import annotations
@@ -31,9 +33,22 @@ ROOT = Path(__file__).resolve().parents[1]
 PYTHONS = ("3.11", "3.12", "3.13")
 # Files, numbers, sampling, pages, the command line: each dependency is used by one of these.
 TESTS = (
-    *("tests/camera", "tests/observations", "tests/core/test_cluster.py", "tests/images/test_centroids.py"),
-    *("tests/sky/test_catalogue.py", "tests/estimation/test_sums.py", "tests/inference/test_arviz_compat.py"),
-    *("tests/inference/test_sampler.py", "tests/budgeting/test_budget.py", "tests/runs/test_previous_files.py"),
+    *(
+        "tests/camera",
+        "tests/observations",
+        "tests/core/test_cluster.py",
+        "tests/images/test_centroids.py",
+    ),
+    *(
+        "tests/sky/test_catalogue.py",
+        "tests/estimation/test_sums.py",
+        "tests/inference/test_arviz_compat.py",
+    ),
+    *(
+        "tests/inference/test_sampler.py",
+        "tests/budgeting/test_budget.py",
+        "tests/runs/test_previous_files.py",
+    ),
     *(
         "tests/presentation/test_plots.py",
         "tests/cli/test_cli.py",
@@ -54,8 +69,14 @@ def say(message: str) -> None:
 
 
 def run(*command: str | Path, cwd: Path = ROOT) -> str:
-    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    done = subprocess.run([str(part) for part in command], cwd=cwd, env=environment, text=True, stdout=subprocess.PIPE)
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONPATH", "VIRTUAL_ENV")
+    }
+    done = subprocess.run(
+        [str(part) for part in command], cwd=cwd, env=environment, text=True, stdout=subprocess.PIPE
+    )
     if done.returncode:
         print(done.stdout)
         raise SystemExit(f"failed: {' '.join(str(part) for part in command)}")
@@ -63,11 +84,19 @@ def run(*command: str | Path, cwd: Path = ROOT) -> str:
 
 
 def interpreter(version: str) -> Path | None:
-    """An interpreter of a version that runs; a name on PATH may be a shim for one that is not installed."""
+    """An interpreter of a version that runs; a name on PATH may be a shim for one that is not
+    installed.
+    """
     home = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
-    known = [shutil.which(f"python{version}"), *sorted(home.glob(f"versions/{version}.*/bin/python"))]
+    known = [
+        shutil.which(f"python{version}"),
+        *sorted(home.glob(f"versions/{version}.*/bin/python")),
+    ]
     for candidate in (str(path) for path in known if path):
-        if subprocess.run([candidate, "-c", "import ensurepip"], capture_output=True).returncode == 0:
+        if (
+            subprocess.run([candidate, "-c", "import ensurepip"], capture_output=True).returncode
+            == 0
+        ):
             return Path(candidate)
     return None
 
@@ -113,16 +142,28 @@ def contents(archives: dict[str, Path]) -> None:
         assert any(name.endswith("dist-info/licenses/LICENSE") for name in wheel.namelist())
     for kind, names in wanted.items():
         if names != held[kind]:
-            raise SystemExit(f"{kind}: missing {sorted(names - held[kind])}, too much {sorted(held[kind] - names)}")
-        say(f"{kind}: {len(names)} files, {archives[kind].stat().st_size / 1e6:.1f} MB, none missing, none too much")
+            raise SystemExit(
+                f"{kind}: missing {sorted(names - held[kind])}, too much "
+                f"{sorted(held[kind] - names)}"
+            )
+        say(
+            f"{kind}: {len(names)} files, {archives[kind].stat().st_size / 1e6:.1f} MB, none "
+            "missing, none too much"
+        )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Tests what users install.")
     parser.add_argument("--all", action="store_true", help="all fast tests on each Python")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to do, instead of all")
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, default=PARTS, help="parts to do, instead of all"
+    )
     parser.add_argument("--python", nargs="+", default=PYTHONS, help="versions of Python")
-    parser.add_argument("--keep", type=Path, help="folder for environments and trees, kept (default: a temporary one)")
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        help="folder for environments and trees, kept (default: a temporary one)",
+    )
     options = parser.parse_args()
     os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     with tempfile.TemporaryDirectory(prefix="starcal-supply-") as temporary:
@@ -132,7 +173,11 @@ def main() -> None:
         run(sys.executable, "-m", "build", "--outdir", dist, ROOT)
         archives = {"sdist": next(dist.glob("*.tar.gz")), "wheel": next(dist.glob("*.whl"))}
         contents(archives)
-        pythons = {version: found for version in options.python if (found := interpreter(version)) is not None}
+        pythons = {
+            version: found
+            for version in options.python
+            if (found := interpreter(version)) is not None
+        }
         for version in set(options.python) - set(pythons):
             say(f"Python {version} was not found and is not tested")
         shutil.rmtree(work / "tests", ignore_errors=True)
@@ -149,10 +194,18 @@ def main() -> None:
 
         if "wheel" in options.only:
             for version in pythons:
-                plain = emptied(f"plain-{version}", "wheel without extras", version, pins, wheel, *TOOLS)
+                plain = emptied(
+                    f"plain-{version}", "wheel without extras", version, pins, wheel, *TOOLS
+                )
                 tested(plain, tests, chosen)
                 tested(
-                    emptied(f"all-{version}", "wheel with all extras", version, pins, f"{wheel}[all,test]"),
+                    emptied(
+                        f"all-{version}",
+                        "wheel with all extras",
+                        version,
+                        pins,
+                        f"{wheel}[all,test]",
+                    ),
                     tests,
                     chosen,
                 )
@@ -164,18 +217,35 @@ def main() -> None:
                 install(plain, pins, f"{wheel}[{extra}]")
                 tested(plain, tests, chosen, "-m", "extra and not slow")
         if "sdist" in options.only:
-            built = emptied("sdist", "source distribution", lowest, pins, f"{archives['sdist']}[test]")
-            tested(built, source, ("tests/test_project.py", "tests/test_benchmarks.py", "tests/observations"))
+            built = emptied(
+                "sdist", "source distribution", lowest, pins, f"{archives['sdist']}[test]"
+            )
+            tested(
+                built,
+                source,
+                ("tests/test_project.py", "tests/test_benchmarks.py", "tests/observations"),
+            )
         if "lowest" in options.only:
             limits = work / "lowest.txt"
             extras = [f"--extra={name}" for name in (*EXTRAS, "asdf", "compiled", "tetra3rs")]
             lowered = ("--resolution", "lowest-direct", "--python", pythons[lowest], *extras)
-            run("uv", "pip", "compile", "--quiet", *lowered, "pyproject.toml", "--output-file", limits)
+            run(
+                "uv",
+                "pip",
+                "compile",
+                "--quiet",
+                *lowered,
+                "pyproject.toml",
+                "--output-file",
+                limits,
+            )
             low = emptied("lowest", "lowest versions", lowest, limits, f"{wheel}[test]")
             # Old versions are out of date by what came after them.
             tested(low, tests, chosen, "-W", "ignore::DeprecationWarning")
         if "licences" in options.only:
-            found = [emptied(f"users-{v}", "what users get", v, pins, f"{wheel}[all]") for v in pythons]
+            found = [
+                emptied(f"users-{v}", "what users get", v, pins, f"{wheel}[all]") for v in pythons
+            ]
             run(sys.executable, ROOT / "scripts" / "licences.py", *found)
             say("licences: docs/reference/licences.md")
 

@@ -1,8 +1,10 @@
-"""Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error.
+"""Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude
+error.
 
-The names of the daily work are here, all others in the wings, which are namespaces: ``sc.simulation.render``,
-``sc.planning.choose_frames``. Nothing is loaded before it is used. What this package offers stands, with its types, in
-``__init__.pyi`` beside this file, and so it does in every wing.
+The names of the daily work are here, all others in the wings, which are namespaces:
+``sc.simulation.render``, ``sc.planning.choose_frames``. Nothing is loaded before it is used. What
+this package offers stands, with its types, in ``__init__.pyi`` beside this file, and so it does in
+every wing.
 """
 
 from collections.abc import Mapping

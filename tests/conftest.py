@@ -1,4 +1,6 @@
-"""What all tests share. It is read before any test imports NumPy, so thread counts can still be set."""
+"""What all tests share. It is read before any test imports NumPy, so thread counts can still be
+set.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +8,8 @@ import gc
 import os
 import tempfile
 
-# One BLAS thread: the matrices here are too small to gain from more, sums come out in the same order on every machine,
-# and the test processes that share the cores do not slow each other down.
+# One BLAS thread: the matrices here are too small to gain from more, sums come out in the same
+# order on every machine, and the test processes that share the cores do not slow each other down.
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -59,7 +61,9 @@ def known_centroids() -> dict[str, object]:
 
 @pytest.fixture
 def centroids_once(monkeypatch: pytest.MonkeyPatch, known_centroids: dict[str, object]) -> None:
-    """The same images are searched for stars once for all tests that use this, such as the real frames."""
+    """The same images are searched for stars once for all tests that use this, such as the real
+    frames.
+    """
     from starcal_uq.images import extract
 
     search = extract.extract_centroids
@@ -75,14 +79,32 @@ def centroids_once(monkeypatch: pytest.MonkeyPatch, known_centroids: dict[str, o
 
 @pytest.fixture
 def few_importance_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exact likelihoods, a millisecond each, are weighed with 200 draws instead of 2000; the chains are the same."""
+    """Exact likelihoods, a millisecond each, are weighed with 200 draws instead of 2000; the chains
+    are the same.
+    """
     monkeypatch.setattr("starcal_uq.inference.sample._N_IMPORTANCE_SLOW", 200)
 
 
 # Files that take long, so that no process is left with one of them at the end.
 LONG = (
-    *("test_notebook.py", "paper/", "cli/", "diagnostics/", "planning/", "estimation/", "presentation/"),
-    *("identification/", "inference/", "sky/", "budgeting/", "runs/", "comparison/", "propagation/"),
+    *(
+        "test_notebook.py",
+        "paper/",
+        "cli/",
+        "diagnostics/",
+        "planning/",
+        "estimation/",
+        "presentation/",
+    ),
+    *(
+        "identification/",
+        "inference/",
+        "sky/",
+        "budgeting/",
+        "runs/",
+        "comparison/",
+        "propagation/",
+    ),
 )
 
 
@@ -90,7 +112,11 @@ LONG = (
 def installed(extra: str) -> bool:
     """Whether every library of an extra is there."""
     needed = map(Requirement, requires("starcal-uq") or ())
-    markers = [(one.name, one.marker) for one in needed if one.marker and one.marker.evaluate({"extra": extra})]
+    markers = [
+        (one.name, one.marker)
+        for one in needed
+        if one.marker and one.marker.evaluate({"extra": extra})
+    ]
     assert markers, f"{extra} is no extra of this package"
     return all(any(distributions(name=name)) for name, _ in markers)
 
@@ -113,7 +139,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Two thousand tests and the modules that they import are not searched for garbage again and again."""
+    """Two thousand tests and the modules that they import are not searched for garbage again and
+    again.
+    """
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)

@@ -32,7 +32,9 @@ class Planted:
         slow = 100.0 if self.turn < 0 else LOAD[self.turn % len(LOAD)]
         self.turn += 1
         took = SECONDS[self.name] * slow
-        theta = np.array([1.0, 2.0]) + (5.0 if self.name == "wrong" else 0.001) * (self.name != "ours")
+        theta = np.array([1.0, 2.0]) + (5.0 if self.name == "wrong" else 0.001) * (
+            self.name != "ours"
+        )
         result = {"theta": theta.tolist(), "covariance": np.eye(2).tolist()}
         return {"wall": 2.0 * took, "processor": took, "peak_mb": 50.0, "result": result}
 
@@ -90,7 +92,9 @@ def test_writing_keeps_rows_that_were_not_run(planted, monkeypatch, tmp_path):
     page.write_text(Path(bench.PAGE).read_text(encoding="utf-8"), encoding="utf-8")
     monkeypatch.setattr(bench, "PAGE", page)
     monkeypatch.setattr(bench, "RESULTS", tmp_path / "results.json")
-    monkeypatch.setattr(bench, "rows", lambda quick=False: [planted, replace(planted, name="other")])
+    monkeypatch.setattr(
+        bench, "rows", lambda quick=False: [planted, replace(planted, name="other")]
+    )
     assert bench.main(["--only", "other", "--repeats", "1", "--write"]) == 0
     assert bench.main(["--only", "planted", "--repeats", "1", "--write"]) == 0
     text = page.read_text(encoding="utf-8")
@@ -103,16 +107,22 @@ def test_writing_keeps_rows_that_were_not_run(planted, monkeypatch, tmp_path):
 
 def test_ratios_count_what_was_done_and_take_common_turns_only():
     ours = Runs("ours", {i: Turn(1.0, 1.0, 10.0) for i in range(4)})
-    rival = Runs("rival", {i: Turn(3.0, 2.0, amount) for i, amount in ((0, 1.0), (3, 2.0), (9, 1e9))})
+    rival = Runs(
+        "rival", {i: Turn(3.0, 2.0, amount) for i, amount in ((0, 1.0), (3, 2.0), (9, 1e9))}
+    )
     found = ratio(rival, ours, "wall", float)
-    assert (found.low, found.median, found.high) == pytest.approx((18.75, 22.5, 26.25))  # quartiles of 15 and 30
+    assert (found.low, found.median, found.high) == pytest.approx(
+        (18.75, 22.5, 26.25)
+    )  # quartiles of 15 and 30
     assert ratio(Runs("rival"), ours, "wall") is None
     assert spread([5.0, 1.0, 3.0]).median == 3.0
 
 
 def test_growth_is_fitted_through_all_sizes():
     sizes = (10, 100, 1000)
-    row = bench.Row("growth", "Growth", tuple(Contestant(f"{n}", "x:y", options={"n_frames": n}) for n in sizes))
+    row = bench.Row(
+        "growth", "Growth", tuple(Contestant(f"{n}", "x:y", options={"n_frames": n}) for n in sizes)
+    )
     for power in (0.9, 1.2):
         listed = [{"turns": 1, "processor": {"median": 1e-3 * n**power}} for n in sizes]
         said = bench.judged(row, bench.Target("slowly", exponent=1.05), listed)
@@ -165,7 +175,9 @@ def test_mutants_change_mathematics_and_leave_sentences(tmp_path, monkeypatch):
         "if x >= n and not n:": "comparison",
         "if x < n and (n):": "sign",
     }
-    assert {new.partition("return ")[2]: what for (old, new), what in changed.items() if old == returned} == {
+    assert {
+        new.partition("return ")[2]: what for (old, new), what in changed.items() if old == returned
+    } == {
         "None": "nothing returned",
         "g(x[: x + 1], axis=-1, strict=True)": "transpose dropped",
         "g(x.T[: (x + 1) - 1], axis=-1, strict=True)": "slice",
@@ -181,15 +193,24 @@ def test_frames_are_judged_by_their_stars_and_their_middle(tmp_path):
     # Rays of a camera that looks at right ascension 0, declination 0.
     x, y = ((xy - (511.5, 383.5)) / 5000.0).T
     ra, dec = np.degrees(np.arctan(x)), np.degrees(np.arctan2(y, np.hypot(1.0, x)))
-    rows = [f"0,{u},{v},{a},{d},s,5.0,20.0,{a},{d}" for (u, v), a, d in zip(xy, ra, dec, strict=True)]
+    rows = [
+        f"0,{u},{v},{a},{d},s,5.0,20.0,{a},{d}" for (u, v), a, d in zip(xy, ra, dec, strict=True)
+    ]
     table = tmp_path / "stars.csv"
     table.write_text(
-        "\n".join(["frame,x_px,y_px,ra_deg,dec_deg,star_id,mag,snr,ra_apparent_deg,dec_apparent_deg", *rows])
+        "\n".join(
+            [
+                "frame,x_px,y_px,ra_deg,dec_deg,star_id,mag,snr,ra_apparent_deg,dec_apparent_deg",
+                *rows,
+            ]
+        )
     )
     stars = np.column_stack([xy, ra, dec])
     right = {"middle": [1.0, 0.0, 0.0], "stars": stars.tolist()}
     # A star of another name is 4 px off; the camera looks 0.1 degrees past, or away from its stars.
-    other = stars + np.where(np.arange(40)[:, None] < 3, [0.0, 0.0, np.degrees(4.0 / 5000.0), 0.0], 0.0)
+    other = stars + np.where(
+        np.arange(40)[:, None] < 3, [0.0, 0.0, np.degrees(4.0 / 5000.0), 0.0], 0.0
+    )
     past = [np.cos(np.radians(0.1)), np.sin(np.radians(0.1)), 0.0]
 
     def judged(**changes):
@@ -203,7 +224,9 @@ def test_frames_are_judged_by_their_stars_and_their_middle(tmp_path):
 
 
 def test_a_function_becomes_its_mutant_wherever_it_is_held(tmp_path, monkeypatch):
-    """Behind a cache, as a method and in a list; a change outside functions has to be imported anew."""
+    """Behind a cache, as a method and in a list; a change outside functions has to be imported
+    anew.
+    """
     monkeypatch.setattr(mutation, "ROOT", tmp_path)
     text = (
         "from functools import cache\nLIMIT = 3.0\n@cache\ndef f(x, n=2.0):\n    return x + n\n"

@@ -1,4 +1,6 @@
-"""The how-to pages: every command has an example, and what is not run at every build is of the lines that it shows."""
+"""The how-to pages: every command has an example, and what is not run at every build is of the
+lines that it shows.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ def example():
 
 
 def test_every_command_has_an_example(example):
-    found = [found for page in sorted(example.PAGES.glob("*.md")) for found in example.examples(page)]
+    found = [
+        found for page in sorted(example.PAGES.glob("*.md")) for found in example.examples(page)
+    ]
     lines = [line for _, lines in found for line in lines]
     named = {line.split()[1] for line in lines if line.startswith("starcal-uq ")}
     assert named == set(typer.main.get_command(app).commands)
@@ -38,7 +42,9 @@ def test_every_command_has_an_example(example):
 
 
 def test_examples_are_what_their_lines_print(example, tmp_path):
-    text = example.output_of("echo a; echo b >&2; echo $COLUMNS; printf 'x%.0s' {1..99}; exit 1", tmp_path)
+    text = example.output_of(
+        "echo a; echo b >&2; echo $COLUMNS; printf 'x%.0s' {1..99}; exit 1", tmp_path
+    )
     assert text.splitlines() == ["a", "b", "80", 80 * "x", f"  {19 * 'x'}"]
     assert example.output_of(f"echo {tmp_path}/run", tmp_path) == "run"
     with pytest.raises(RuntimeError, match="status 2"):

@@ -32,7 +32,13 @@ def at_home(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         "quickstart",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("coupling_study", "error_budget", "model_comparison", "own_images", "paper")
+            for name in (
+                "coupling_study",
+                "error_budget",
+                "model_comparison",
+                "own_images",
+                "paper",
+            )
         ),
     ],
 )
@@ -41,15 +47,22 @@ def test_it_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel draws inline
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     client = NotebookClient(
-        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+        notebook,
+        timeout=300,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(tmp_path)}},
     )
 
     client.execute()
 
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    errors = [output.text for cell in cells for output in cell.outputs if output.get("name") == "stderr"]
+    errors = [
+        output.text for cell in cells for output in cell.outputs if output.get("name") == "stderr"
+    ]
     assert errors == []
-    shown = [output.data for cell in cells for output in cell.outputs if output.output_type != "stream"]
+    shown = [
+        output.data for cell in cells for output in cell.outputs if output.output_type != "stream"
+    ]
     words = sum("text/html" in data or "text/markdown" in data for data in shown)
     assert words >= 4, "results show themselves as tables or in words"
     assert sum("image/png" in data for data in shown) >= 3, "figures are drawn"
@@ -60,14 +73,18 @@ def test_cells_of_a_run_are_those_of_what_it_holds() -> None:
     assert cells[1] == ("parameters", "folder = '/data/night'")
     source = "\n".join(text for _, text in cells)
     assert "run.calibration" in source
-    assert not {"posterior", "attitude", "budget", "images"} & set(re.findall(r"run\.(?:error_|shown_)?(\w+)", source))
+    assert not {"posterior", "attitude", "budget", "images"} & set(
+        re.findall(r"run\.(?:error_|shown_)?(\w+)", source)
+    )
     for kind, text in cells:
         if kind != "markdown":
             compile(text, "cell", "exec")
 
 
 @pytest.mark.slow
-def test_a_run_becomes_a_notebook_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_becomes_a_notebook_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("PYTHONPATH", str(NOTEBOOKS.parent))
     monkeypatch.setenv("MPLBACKEND", "Agg")  # the kernel draws inline all the same
     run = sc.Run(tmp_path / "run")
@@ -80,9 +97,15 @@ def test_a_run_becomes_a_notebook_of_its_own(tmp_path: Path, monkeypatch: pytest
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     first, *others = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert (first.source, first.metadata["tags"], first.outputs) == ("folder = '.'", ["parameters"], [])
+    assert (first.source, first.metadata["tags"], first.outputs) == (
+        "folder = '.'",
+        ["parameters"],
+        [],
+    )
     outputs = [output for cell in others for output in cell.outputs]
-    assert all(len(cell.outputs) == 1 for cell in others), "every cell shows one thing, and no stream"
+    assert all(len(cell.outputs) == 1 for cell in others), (
+        "every cell shows one thing, and no stream"
+    )
     assert sum("image/png" in output.data for output in outputs) == 5
     assert run.verdict.headline in outputs[0].data["text/plain"]
     with pytest.raises(RunFolderError, match=r"report\.ipynb: the file exists already"):
@@ -92,7 +115,9 @@ def test_a_run_becomes_a_notebook_of_its_own(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.slow
-def test_an_interrupted_cell_leaves_the_session_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_cell_leaves_the_session_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The stop button of a notebook, while `Run.sample` and `sc.sample` work."""
     at_home(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
@@ -123,7 +148,9 @@ def test_an_interrupted_cell_leaves_the_session_and_goes_on(tmp_path: Path, monk
             "import time"
         )
         assert cell("run.sample(**short, progress=told)", "far enough") == "KeyboardInterrupt"
-        assert cell("sc.sample(run.observations, run.calibration, **short, progress=told)", "far enough")
+        assert cell(
+            "sc.sample(run.observations, run.calibration, **short, progress=told)", "far enough"
+        )
         # What was done is kept, nothing else is, and the same cell goes on.
         assert [path.name for path in run.path.glob("*checkpoint*")] and not run.has("posterior")
         assert not cell(
@@ -144,13 +171,17 @@ def test_an_interrupted_cell_leaves_the_session_and_goes_on(tmp_path: Path, monk
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of ArviZ 0.23 beside newer libraries
 def test_the_page_on_own_tools_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On either generation of ArviZ: `make test-other` runs it on the second one, `make docs` on the first."""
+    """On either generation of ArviZ: `make test-other` runs it on the second one, `make docs` on
+    the first.
+    """
     for name in ("corner", "seaborn"):
         pytest.importorskip(name)
     import matplotlib.pyplot as plt
 
     page = (NOTEBOOKS.parent / "docs" / "how-to" / "own-tools.md").read_text(encoding="utf-8")
-    cells = re.findall(r"^```{code-cell} python\n((?:^:[^\n]*\n)*)(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    cells = re.findall(
+        r"^```{code-cell} python\n((?:^:[^\n]*\n)*)(.*?)^```$", page, re.MULTILINE | re.DOTALL
+    )
     assert len(cells) >= 8
     place: dict[str, object] = {}
     drawn = 0

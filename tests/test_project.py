@@ -1,4 +1,6 @@
-"""The project as a whole: what an import costs, what the files agree on, what the machinery promises."""
+"""The project as a whole: what an import costs, what the files agree on, what the machinery
+promises.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,25 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FIND_PYTHON = ROOT / "scripts" / "find_python.sh"
 WINGS = sorted(path.parent.name for path in (ROOT / "starcal_uq").glob("*/__init__.py"))
-HEAVY = ("arviz", "astropy", "casadi", "emcee", "jinja2", "matplotlib", "pandas", "pyarrow", "scipy", "xarray")
+HEAVY = (
+    "arviz",
+    "astropy",
+    "casadi",
+    "emcee",
+    "jinja2",
+    "matplotlib",
+    "pandas",
+    "pyarrow",
+    "scipy",
+    "xarray",
+)
 
 
 def run_python(code: str) -> str:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
     return run.stdout
 
 
@@ -34,7 +49,10 @@ def test_import_is_fast() -> None:
 
     def seconds(modules: str) -> float:
         return float(
-            run_python(f"import time; t = time.process_time(); import {modules}; print(time.process_time() - t)")
+            run_python(
+                f"import time; t = time.process_time(); import {modules}; "
+                "print(time.process_time() - t)"
+            )
         )
 
     ours, reference = "starcal_uq", "dataclasses, importlib.metadata, json, pathlib, typing"
@@ -49,14 +67,17 @@ def test_import_loads_nothing_heavy() -> None:
 
 def test_every_public_name_exists() -> None:
     code = (
-        "import starcal_uq as sc; print([n for n in sc.__all__ if not hasattr(sc, n)], set(sc.__all__) - set(dir(sc)))"
+        "import starcal_uq as sc; print([n for n in sc.__all__ if not hasattr(sc, n)], "
+        "set(sc.__all__) - set(dir(sc)))"
     )
     assert run_python(code).strip() == "[] set()"
 
 
 def test_versions_agree() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
-    citation = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE)
+    citation = re.search(
+        r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE
+    )
     changelog = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
     assert citation is not None
     assert changelog is not None
@@ -69,11 +90,15 @@ def test_import_contracts_hold() -> None:
     if not command.exists():
         pytest.skip("import-linter is not installed beside this interpreter")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    run = subprocess.run([command, "--no-cache"], cwd=ROOT, env=environment, capture_output=True, text=True)
+    run = subprocess.run(
+        [command, "--no-cache"], cwd=ROOT, env=environment, capture_output=True, text=True
+    )
     assert run.returncode == 0, run.stdout + run.stderr
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.name
+)
 def test_notebooks_store_no_outputs(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
@@ -85,19 +110,30 @@ def test_notebooks_store_no_outputs(path: Path) -> None:
 @pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
 def test_make_commands_in_the_texts_exist(name: str) -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
-    commands = set(re.findall(r"^ {4}make ([a-z-]+)|`make ([a-z-]+)", (ROOT / name).read_text("utf-8"), re.MULTILINE))
+    commands = set(
+        re.findall(
+            r"^ {4}make ([a-z-]+)|`make ([a-z-]+)", (ROOT / name).read_text("utf-8"), re.MULTILINE
+        )
+    )
     named = {first or second for first, second in commands}
     assert named
     assert named <= targets
 
 
 def test_links_in_the_texts_lead_somewhere() -> None:
-    pages = [*ROOT.glob("*.md"), *(page for page in ROOT.glob("docs/**/*.md") if "_build" not in page.parts)]
+    pages = [
+        *ROOT.glob("*.md"),
+        *(page for page in ROOT.glob("docs/**/*.md") if "_build" not in page.parts),
+    ]
 
     def leads_somewhere(page: Path, target: str) -> bool:
         # Building the documentation brings the notebooks there.
         place = Path(os.path.normpath(page.parent / target))
-        brought = ROOT / "notebooks" / place.name if place.parent == ROOT / "docs" / "notebooks" else place
+        brought = (
+            ROOT / "notebooks" / place.name
+            if place.parent == ROOT / "docs" / "notebooks"
+            else place
+        )
         return brought.exists() or place.with_name(f"{place.name}.md").exists()
 
     broken = [
@@ -111,7 +147,11 @@ def test_links_in_the_texts_lead_somewhere() -> None:
 
 def test_constraints_pin_every_dependency() -> None:
     """Every line pins one version, and both sides of Python 3.12 are covered."""
-    lines = [line for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines() if not line.startswith("#")]
+    lines = [
+        line
+        for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines()
+        if not line.startswith("#")
+    ]
     pattern = re.compile(r'([a-z0-9-]+)==[\w.]+(?: ; python_version (<|>=) "3\.12")?')
     pinned: dict[str, set[str]] = {}
     for line in lines:
@@ -119,25 +159,39 @@ def test_constraints_pin_every_dependency() -> None:
         assert match, line
         pinned.setdefault(match[1], set()).update({match[2]} if match[2] else {"<", ">="})
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    wanted = [*project["dependencies"], *(d for extra in project["optional-dependencies"].values() for d in extra)]
-    names = {re.split(r"[\[<>=]", requirement)[0].lower() for requirement in wanted} - {"starcal-uq"}
+    wanted = [
+        *project["dependencies"],
+        *(d for extra in project["optional-dependencies"].values() for d in extra),
+    ]
+    names = {re.split(r"[\[<>=]", requirement)[0].lower() for requirement in wanted} - {
+        "starcal-uq"
+    }
     assert {name for name in names if pinned.get(name) != {"<", ">="}} == set()
 
 
 # Names of imports that differ from their package's, and parts of ArviZ 1 and of pydantic.
-IMPORTED_AS = {"PIL": "pillow", "cv2": "opencv_python_headless", "erfa": "pyerfa", "h5py": "h5netcdf", "yaml": "pyyaml"}
+IMPORTED_AS = {
+    "PIL": "pillow",
+    "cv2": "opencv_python_headless",
+    "erfa": "pyerfa",
+    "h5py": "h5netcdf",
+    "yaml": "pyyaml",
+}
 IMPORTED_AS |= {"arviz_base": "arviz", "arviz_plots": "arviz", "pydantic_core": "pydantic"}
 
 
 def test_every_import_is_a_declared_dependency() -> None:
-    """Otherwise the command works only where the tools of the tests happen to bring a package along.
+    """Otherwise the command works only where the tools of the tests happen to bring a package
+    along.
 
     What an extra brings is imported in files that name this extra where it is missing.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
     def names(requirements: list[str]) -> set[str]:
-        return {re.split(r"[\[<>=]", requirement)[0].replace("-", "_") for requirement in requirements}
+        return {
+            re.split(r"[\[<>=]", requirement)[0].replace("-", "_") for requirement in requirements
+        }
 
     extras = {name: names(brings) for name, brings in project["optional-dependencies"].items()}
     assert extras["all"] == {"starcal_uq"}
@@ -149,7 +203,10 @@ def test_every_import_is_a_declared_dependency() -> None:
     for path in (ROOT / "starcal_uq").rglob("*.py"):
         text = path.read_text("utf-8")
         # Compiled loops are reached by one door, which looks first.
-        named = {*re.findall(r'with extra\("(\w+)"', text), *(["compiled"] if path.name == "loops.py" else [])}
+        named = {
+            *re.findall(r'with extra\(\s*"(\w+)"', text),
+            *(["compiled"] if path.name == "loops.py" else []),
+        }
         assert named <= set(extras), path.name
         allowed = required.union(*(extras[name] for name in named))
         for node in ast.walk(ast.parse(text)):
@@ -157,12 +214,16 @@ def test_every_import_is_a_declared_dependency() -> None:
             if isinstance(node, ast.ImportFrom) and node.level == 0:
                 imported = [node.module or ""]
             roots = {name.partition(".")[0] for name in imported}
-            undeclared |= {(path.name, root) for root in roots if IMPORTED_AS.get(root, root) not in allowed}
+            undeclared |= {
+                (path.name, root) for root in roots if IMPORTED_AS.get(root, root) not in allowed
+            }
     assert undeclared == set()
 
 
 def test_licences_of_all_that_is_installed_are_listed() -> None:
-    """By name: a licence that changes with a version is seen when `make supply` makes the table anew."""
+    """By name: a licence that changes with a version is seen when `make supply` makes the table
+    anew.
+    """
     from scripts.licences import PAGE, licences
 
     listed = set(re.findall(r"^\| ([\w-]+) \| \S", PAGE.read_text("utf-8"), re.MULTILINE))
@@ -201,7 +262,10 @@ def test_missing_interpreter_is_one_sentence(tmp_path: Path) -> None:
 
 
 def test_interpreter_without_venv_names_the_package(tmp_path: Path) -> None:
-    script(tmp_path / "python3", f'case "$2" in *ensurepip*) exit 1;; esac; exec "{sys.executable}" "$@"')
+    script(
+        tmp_path / "python3",
+        f'case "$2" in *ensurepip*) exit 1;; esac; exec "{sys.executable}" "$@"',
+    )
     run = find_python(tmp_path)
     assert run.returncode == 1
     assert f"apt install python{sys.version_info[0]}.{sys.version_info[1]}-venv" in run.stderr
@@ -222,7 +286,9 @@ def test_second_interpreter_is_of_the_other_generation(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("wing", ["", *WINGS])
 def test_no_public_name_is_that_of_a_module_beside_it(wing: str) -> None:
-    """Importing such a module would put it in the function's place (`sc.calibrate` would no longer be callable)."""
+    """Importing such a module would put it in the function's place (`sc.calibrate` would no longer
+    be callable).
+    """
     modules = {path.stem for path in (ROOT / "starcal_uq" / wing).iterdir()}
     namespaces = set(WINGS) if not wing else {"errors"} if wing == "core" else set()
     package = importlib.import_module(f"starcal_uq.{wing}".rstrip("."))
@@ -253,16 +319,28 @@ def test_a_wrong_call_fails_the_type_check(tmp_path: Path) -> None:
     files = {call: tmp_path / f"call_{number}.py" for number, call in enumerate(["", *wrong])}
     for call, file in files.items():
         file.write_text(CALLS.format(call=call), "utf-8")
-    command = [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", *map(str, files.values())]
+    command = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--strict",
+        "--no-error-summary",
+        *map(str, files.values()),
+    ]
     told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout
     assert files[""].name not in told, told
     for call, words in wrong.items():
-        assert any(files[call].name in line and words in line for line in told.splitlines()), (call, told)
+        assert any(files[call].name in line and words in line for line in told.splitlines()), (
+            call,
+            told,
+        )
 
 
 def test_files_do_not_import_each_other_in_circles() -> None:
     """Neither within wings nor between them; an annotation counts."""
     graph = grimp.build_graph("starcal_uq", exclude_type_checking_imports=False)
-    sorter = TopologicalSorter({module: graph.find_modules_directly_imported_by(module) for module in graph.modules})
+    sorter = TopologicalSorter(
+        {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    )
     sorter.prepare()  # raises CycleError with the circle in its message
     assert sorter.is_active()

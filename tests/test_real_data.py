@@ -1,4 +1,6 @@
-"""Real stars: a table measured in night-sky images of the European Space Agency, against an independent bundle fit."""
+"""Real stars: a table measured in night-sky images of the European Space Agency, against an
+independent bundle fit.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,15 @@ import pytest
 
 import starcal_uq as sc
 
-# Independent bundle fit of the table (apparent directions, SNR >= 10, 242 stars): value and standard error.
-INDEPENDENT = {"x0": (517.3, 1.0), "y0": (389.9, 1.4), "f": (5116.54, 0.28), "k1f2": (0.078, 0.017), "k2f4": (1.5, 1.1)}
+# Independent bundle fit of the table (apparent directions, SNR >= 10, 242 stars): value and
+# standard error.
+INDEPENDENT = {
+    "x0": (517.3, 1.0),
+    "y0": (389.9, 1.4),
+    "f": (5116.54, 0.28),
+    "k1f2": (0.078, 0.017),
+    "k2f4": (1.5, 1.1),
+}
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +57,9 @@ def test_agrees_with_the_independent_fit(camera, table):
     assert obs.n_stars == 242
     cal = sc.calibrate(obs, camera)
     f = cal.theta[2]
-    ours = dict(zip(INDEPENDENT, [*cal.theta[:3], cal.theta[3] * f**2, cal.theta[4] * f**4], strict=True))
+    ours = dict(
+        zip(INDEPENDENT, [*cal.theta[:3], cal.theta[3] * f**2, cal.theta[4] * f**4], strict=True)
+    )
     sigmas = [*cal.sigmas[:3], cal.sigmas[3] * f**2, cal.sigmas[4] * f**4]
     for (name, (value, error)), sigma in zip(INDEPENDENT.items(), sigmas, strict=True):
         assert abs(ours[name] - value) < 0.3 * error, name

@@ -13,7 +13,9 @@ Result = dict[str, Any]
 
 
 def directions(frames: int, stars: int) -> tuple[np.ndarray, np.ndarray]:
-    """Measured and catalogued directions (frames, stars, 3): 12 degrees across, noise of 10 arcsec."""
+    """Measured and catalogued directions (frames, stars, 3): 12 degrees across, noise of 10
+    arcsec.
+    """
     rng = np.random.default_rng(0)
     b = rng.normal(0.0, 0.07, (frames, stars, 3)) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
     b /= np.linalg.norm(b, axis=2, keepdims=True)

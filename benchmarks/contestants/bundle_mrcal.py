@@ -1,9 +1,10 @@
 """mrcal's sparse bundle, by the system's Python (Debian: ``apt-get install python3-mrcal``).
 
-The optics are LENSMODEL_OPENCV4: a second focal length and two tangential terms more than ours, which its covariance
-holds at fx = fy and p1 = p2 = 0 afterwards. The stars are fixed points a billion units away, and every frame is a
-camera of its own. mrcal leaves each camera a translation; two points a unit away, where the camera at the start sees
-them, hold it with a weight of 1e-3: it moves no star by 1e-6 px then. No outlier rejection, no regularisation.
+The optics are LENSMODEL_OPENCV4: a second focal length and two tangential terms more than ours,
+which its covariance holds at fx = fy and p1 = p2 = 0 afterwards. The stars are fixed points a
+billion units away, and every frame is a camera of its own. mrcal leaves each camera a translation;
+two points a unit away, where the camera at the start sees them, hold it with a weight of 1e-3: it
+moves no star by 1e-6 px then. No outlier rejection, no regularisation.
 """
 
 import mrcal
@@ -79,7 +80,9 @@ def bundle(folder, covariance=True):
 
 
 def held(optics, covariance):
-    """x0, y0, f, k1, k2 in pixels with fx = fy and no tangential terms: what this covariance makes of that."""
+    """x0, y0, f, k1, k2 in pixels with fx = fy and no tangential terms: what this covariance makes
+    of that.
+    """
     rows = np.zeros((3, 8))
     rows[0, 0], rows[0, 1], rows[1, 6], rows[2, 7] = 1.0, -1.0, 1.0, 1.0
     gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T)

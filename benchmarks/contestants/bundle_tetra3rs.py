@@ -1,7 +1,7 @@
 """`calibrate_camera` of tetra3rs, on frames that its own solver identified before (not timed).
 
-Its catalogue differs from ours by a hundredth of a pixel, and by more for blends: every star is moved by what that is
-on the detector, so that its residuals are the same noise as ours.
+Its catalogue differs from ours by a hundredth of a pixel, and by more for blends: every star is
+moved by what that is on the detector, so that its residuals are the same noise as ours.
 """
 
 from __future__ import annotations
@@ -27,12 +27,17 @@ def calibrate(folder: Path) -> Callable[[], Result]:
     centre = 0.5 * (size - 1.0)
     field = float(np.degrees(2.0 * np.arctan(0.5 * width / start[2])))
     database = tetra3rs.SolverDatabase.generate_from_gaia(
-        max_fov_deg=1.1 * field, min_fov_deg=0.9 * field, star_max_magnitude=6.0, epoch_proper_motion_year=2026.9
+        max_fov_deg=1.1 * field,
+        min_fov_deg=0.9 * field,
+        star_max_magnitude=6.0,
+        epoch_proper_motion_year=2026.9,
     )
     model = tetra3rs.CameraModel(float(start[2]), width, height)
 
     def solved(points: Any) -> Any:
-        return database.solve_from_centroids(points, camera_model=model, fov_max_error_deg=0.05 * field)
+        return database.solve_from_centroids(
+            points, camera_model=model, fov_max_error_deg=0.05 * field
+        )
 
     ours, _ = bundle.linear(fitted["theta"], fitted["rotations"])
     theirs = bundle.r.copy()
@@ -64,10 +69,15 @@ def calibrate(folder: Path) -> Callable[[], Result]:
         raise Missing(f"its solver identified {len(results)} of {len(bundle.counts)} frames")
 
     def run() -> Result:
-        done = database.calibrate_camera(results, centroids, width, height, model="radial", max_iterations=100)
+        done = database.calibrate_camera(
+            results, centroids, width, height, model="radial", max_iterations=100
+        )
         camera, d = done.camera_model, done.camera_model.distortion
         x0, y0 = np.asarray(camera.crpix) + d.center + centre
-        said = f"{done.n_inliers} stars, rms {done.rmse_after_px:.3f} px, principal point at the centre"
+        said = (
+            f"{done.n_inliers} stars, rms {done.rmse_after_px:.3f} px, principal point at the "
+            "centre"
+        )
         return {"theta": [x0, y0, camera.focal_length_px, d.k1, d.k2], "said": said}
 
     return run

@@ -1,8 +1,9 @@
 """Bundles of a second make: NumPy and SciPy, none of the package's code.
 
-Unknown are x0, y0, f, k1, k2 and three angles for each frame; the noise is the same for all stars, so that the
-estimate needs no weights. All derivatives are analytic. The attitudes at the start are a gift: they are not timed.
-Iterations end when a step is below a thousandth of a standard deviation.
+Unknown are x0, y0, f, k1, k2 and three angles for each frame; the noise is the same for all stars,
+so that the estimate needs no weights. All derivatives are analytic. The attitudes at the start are
+a gift: they are not timed. Iterations end when a step is below a thousandth of a standard
+deviation.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ class Bundle:
         self.dof = 2 * len(self.frame) - 3 * len(self.counts) - 5
 
     def linear(self, theta: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (2, n), observed minus predicted, and derivatives (2, 8, n) by optics and angles."""
+        """Residuals (2, n), observed minus predicted, and derivatives (2, 8, n) by optics and
+        angles.
+        """
         at = np.repeat(rotations.reshape(-1, 9), self.counts, axis=0).T
         z = at[6] * self.r[0] + at[7] * self.r[1] + at[8] * self.r[2]
         p = (at[0] * self.r[0] + at[1] * self.r[1] + at[2] * self.r[2]) / z
@@ -65,7 +68,9 @@ class Bundle:
         """Rotations after small ones (K, 3) in the camera frame, by Rodrigues' formula."""
         turns = np.linalg.norm(angles, axis=1)[:, None, None] / np.pi
         cross = self.cross(angles)
-        turn = np.eye(3) + np.sinc(turns) * cross + 0.5 * np.sinc(0.5 * turns) ** 2 * (cross @ cross)
+        turn = (
+            np.eye(3) + np.sinc(turns) * cross + 0.5 * np.sinc(0.5 * turns) ** 2 * (cross @ cross)
+        )
         return turn @ rotations
 
     def gauss_newton(self, solve: Solve) -> Result:
@@ -88,7 +93,9 @@ class Bundle:
 
 
 def schur(folder: Path) -> Callable[[], Result]:
-    """Gauss-Newton by NumPy: the frames' angles are eliminated one frame at a time, all frames together."""
+    """Gauss-Newton by NumPy: the frames' angles are eliminated one frame at a time, all frames
+    together.
+    """
     bundle = Bundle(folder)
     rows, columns = np.triu_indices(3)
 
@@ -103,7 +110,9 @@ def schur(folder: Path) -> Callable[[], Result]:
 
         block = np.empty((len(first), 3, 3))
         for a, b in zip(rows, columns, strict=True):
-            block[:, a, b] = block[:, b, a] = summed(angles[0, a] * angles[0, b] + angles[1, a] * angles[1, b])
+            block[:, a, b] = block[:, b, a] = summed(
+                angles[0, a] * angles[0, b] + angles[1, a] * angles[1, b]
+            )
         right = np.empty((len(first), 3, 6))
         for a in range(3):
             right[:, a, 5] = summed(angles[0, a] * e[0] + angles[1, a] * e[1])
@@ -119,7 +128,9 @@ def schur(folder: Path) -> Callable[[], Result]:
 
 
 def sparse(folder: Path) -> Callable[[], Result]:
-    """Gauss-Newton by SciPy: sparse normal equations, factored by SuperLU; rows and columns are laid out once."""
+    """Gauss-Newton by SciPy: sparse normal equations, factored by SuperLU; rows and columns are
+    laid out once.
+    """
     from scipy import sparse as sp
     from scipy.sparse.linalg import splu
 
@@ -132,7 +143,9 @@ def sparse(folder: Path) -> Callable[[], Result]:
         matrix = sp.csr_array((j.transpose(2, 0, 1).reshape(-1)[layout], *pattern))
         scale = np.sqrt(matrix.power(2).sum(axis=0))
         matrix.data /= scale[matrix.indices]
-        factor = splu((matrix.T @ matrix).tocsc(), permc_spec="NATURAL", options={"SymmetricMode": True})
+        factor = splu(
+            (matrix.T @ matrix).tocsc(), permc_spec="NATURAL", options={"SymmetricMode": True}
+        )
         units = np.zeros((n_angles + 5, 6))
         units[n_angles + np.arange(5), np.arange(5)] = 1.0
         units[:, 5] = matrix.T @ e.T.reshape(-1)
@@ -144,7 +157,9 @@ def sparse(folder: Path) -> Callable[[], Result]:
 
 
 def least_squares(folder: Path) -> Callable[[], Result]:
-    """`scipy.optimize.least_squares` with a sparse analytic Jacobian, LSMR inside a trust region."""
+    """`scipy.optimize.least_squares` with a sparse analytic Jacobian, LSMR inside a trust
+    region.
+    """
     from scipy import optimize
     from scipy import sparse as sp
     from scipy.sparse.linalg import splu
@@ -157,14 +172,17 @@ def least_squares(folder: Path) -> Callable[[], Result]:
         def jacobian(x: np.ndarray) -> Any:
             w = x[:n_angles].reshape(-1, 3)
             _, j = bundle.linear(x[n_angles:], bundle.turned(bundle.rotations, w))
-            # From angles of the turned camera to the unknowns: the left Jacobian of the rotations, to second order.
+            # From angles of the turned camera to the unknowns: the left Jacobian of the rotations,
+            # to second order.
             cross = bundle.cross(w)
             left = np.eye(3) + 0.5 * cross + cross @ cross / 6.0
             j[:, 5:] = np.einsum("can,nab->cbn", j[:, 5:], np.repeat(left, bundle.counts, axis=0))
             return sp.csr_array((-j.transpose(2, 0, 1).reshape(-1)[layout], *pattern))
 
         def residuals(x: np.ndarray) -> np.ndarray:
-            e, _ = bundle.linear(x[n_angles:], bundle.turned(bundle.rotations, x[:n_angles].reshape(-1, 3)))
+            e, _ = bundle.linear(
+                x[n_angles:], bundle.turned(bundle.rotations, x[:n_angles].reshape(-1, 3))
+            )
             return e.T.reshape(-1)
 
         start = np.concatenate([np.zeros(n_angles), bundle.start])
@@ -182,11 +200,15 @@ def least_squares(folder: Path) -> Callable[[], Result]:
         scale = np.sqrt(found.jac.power(2).sum(axis=0))
         matrix = found.jac.copy()
         matrix.data /= scale[matrix.indices]
-        factor = splu((matrix.T @ matrix).tocsc(), permc_spec="NATURAL", options={"SymmetricMode": True})
+        factor = splu(
+            (matrix.T @ matrix).tocsc(), permc_spec="NATURAL", options={"SymmetricMode": True}
+        )
         units = np.zeros((n_angles + 5, 5))
         units[n_angles + np.arange(5), np.arange(5)] = 1.0
         variance = 2.0 * found.cost / bundle.dof
-        covariance = factor.solve(units)[n_angles:] / np.outer(scale[n_angles:], scale[n_angles:]) * variance
+        covariance = (
+            factor.solve(units)[n_angles:] / np.outer(scale[n_angles:], scale[n_angles:]) * variance
+        )
         theta = found.x[n_angles:]
         return {"theta": theta, "covariance": covariance, "sigma": np.sqrt(variance)}
 
@@ -194,7 +216,9 @@ def least_squares(folder: Path) -> Callable[[], Result]:
 
 
 def _layout(bundle: Bundle) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Order of (n, 2, 8) derivatives in the rows of a sparse matrix, with its column numbers and row starts."""
+    """Order of (n, 2, 8) derivatives in the rows of a sparse matrix, with its column numbers and
+    row starts.
+    """
     n = len(bundle.frame)
     order = (8 * np.arange(2 * n)[:, None] + np.array([5, 6, 7, 0, 1, 2, 3, 4])).reshape(-1)
     angles = np.repeat(3 * bundle.frame, 2)[:, None] + np.arange(3)

@@ -16,7 +16,9 @@ Result = dict[str, Any]
 
 
 def _images(folder: Path) -> list[np.ndarray]:
-    paths = [path for ending in ("tif*", "png") for path in sorted(Path(folder).glob(f"*.{ending}"))]
+    paths = [
+        path for ending in ("tif*", "png") for path in sorted(Path(folder).glob(f"*.{ending}"))
+    ]
     if not paths:
         raise Missing(f"{folder} is not on this machine")
     # Grey in the depth of the file: what it reads has one channel.
@@ -36,7 +38,10 @@ def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
 
 def _database(field: float) -> Any:
     return tetra3rs.SolverDatabase.generate_from_gaia(
-        max_fov_deg=1.05 * field, min_fov_deg=0.95 * field, star_max_magnitude=7.0, epoch_proper_motion_year=2019.6
+        max_fov_deg=1.05 * field,
+        min_fov_deg=0.95 * field,
+        star_max_magnitude=7.0,
+        epoch_proper_motion_year=2019.6,
     )
 
 
@@ -53,7 +58,11 @@ def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
             points = tetra3rs.extract_centroids(image, threads=1).centroids
             clock.append(process_time())
             found = database.solve_from_centroids(
-                points, fov_estimate_deg=field, image_width=width, image_height=height, fov_max_error_deg=0.03 * field
+                points,
+                fov_estimate_deg=field,
+                image_width=width,
+                image_height=height,
+                fov_max_error_deg=0.03 * field,
             )
             clock.append(process_time())
             places = [(p.x + 0.5 * (width - 1), p.y + 0.5 * (height - 1)) for p in points]
@@ -80,7 +89,11 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
     def run() -> Result:
         found = [
             database.solve_from_centroids(
-                p, fov_estimate_deg=field, image_width=width, image_height=height, fov_max_error_deg=0.03 * field
+                p,
+                fov_estimate_deg=field,
+                image_width=width,
+                image_height=height,
+                fov_max_error_deg=0.03 * field,
             )
             for p in points
         ]
@@ -92,7 +105,8 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
 def identify_unknown(
     folder: Path, *, images: str, field: float, extraction: dict[str, Any] | None = None
 ) -> Callable[[], Result]:
-    """`solve_from_centroids` of its own centroids with one guess, and patterns for fields of 5 to 30 degrees.
+    """`solve_from_centroids` of its own centroids with one guess, and patterns for fields of 5 to
+    30 degrees.
 
     With `extraction`, its centroids are those of these settings instead of its defaults.
     """
@@ -100,15 +114,24 @@ def identify_unknown(
     database = tetra3rs.SolverDatabase.generate_from_gaia(
         max_fov_deg=30.0, min_fov_deg=5.0, epoch_proper_motion_year=2019.6
     )
-    points = [tetra3rs.extract_centroids(image, threads=1, **(extraction or {})).centroids for image in grey]
+    points = [
+        tetra3rs.extract_centroids(image, threads=1, **(extraction or {})).centroids
+        for image in grey
+    ]
     height, width = grey[0].shape
 
     def run() -> Result:
         done = [
-            database.solve_from_centroids(p, fov_estimate_deg=12.0, image_width=width, image_height=height)
+            database.solve_from_centroids(
+                p, fov_estimate_deg=12.0, image_width=width, image_height=height
+            )
             for p in points
         ]
         fields = [float(f.fov_deg) for f in done if f]
-        return {"frames": len(grey), "found": len(fields), "wrong": sum(abs(f / field - 1.0) > 0.02 for f in fields)}
+        return {
+            "frames": len(grey),
+            "found": len(fields),
+            "wrong": sum(abs(f / field - 1.0) > 0.02 for f in fields),
+        }
 
     return run

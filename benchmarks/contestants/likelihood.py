@@ -1,8 +1,9 @@
 """The exact likelihood of x0, y0, f, k1, k2 and log sigma by NumPy, the frames' attitudes profiled.
 
-For other optics an attitude moves by arc seconds, so that it is profiled in one linear step from its best value:
-projected out with derivatives at the estimate. Flat in the optics and in log sigma: what priors change is below the
-noise of sampling. Coordinates are standard deviations from the estimate.
+For other optics an attitude moves by arc seconds, so that it is profiled in one linear step from
+its best value: projected out with derivatives at the estimate. Flat in the optics and in log sigma:
+what priors change is below the noise of sampling. Coordinates are standard deviations from the
+estimate.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ class Likelihood:
         self.first = bundle.starts[:-1]
         self.counts = bundle.counts
         _, jacobian = bundle.linear(self.theta_hat, rotations)
-        # An orthonormal basis of each frame's angles: triangular factors of the frames' 3 x 3 matrices.
+        # An orthonormal basis of each frame's angles: triangular factors of the frames' 3 x 3
+        # matrices.
         angles = jacobian[:, 5:]
         gram = np.add.reduceat(np.einsum("can,cbn->nab", angles, angles), self.first, axis=0)
         inverse = np.repeat(np.linalg.inv(np.linalg.cholesky(gram)), self.counts, axis=0)
@@ -39,7 +41,9 @@ class Likelihood:
     def parameters(self, z: np.ndarray) -> np.ndarray:
         """Draws (..., 6) of theta and sigma."""
         theta = self.theta_hat + z[..., :5] @ self.root.T
-        return np.concatenate([theta, np.exp(self.log_sigma + self.log_sigma_sd * z[..., 5:])], axis=-1)
+        return np.concatenate(
+            [theta, np.exp(self.log_sigma + self.log_sigma_sd * z[..., 5:])], axis=-1
+        )
 
     def squares(self, theta: np.ndarray) -> float:
         """Sum of squared residuals after the attitudes."""

@@ -1,4 +1,6 @@
-"""No-U-Turn sampling (NumPyro) of the exact likelihood in JAX; the first call, which compiles, does not count."""
+"""No-U-Turn sampling (NumPyro) of the exact likelihood in JAX; the first call, which compiles, does
+not count.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,13 @@ from numpyro.infer import MCMC, NUTS  # noqa: E402
 Result = dict[str, Any]
 
 
-def numpyro(folder: Path, *, chains: int = 4, warmup: int = 200, draws: int = 500) -> Callable[[], Result]:
+def numpyro(
+    folder: Path, *, chains: int = 4, warmup: int = 200, draws: int = 500
+) -> Callable[[], Result]:
     """Chains one after the other, from draws of the normal approximation, in its coordinates."""
     exact = Likelihood(folder)
-    # A frame in each row, filled up with zeros: sums over frames are then products of small matrices.
+    # A frame in each row, filled up with zeros: sums over frames are then products of small
+    # matrices.
     wide = int(exact.counts.max())
     inside = np.arange(wide) < exact.counts[:, None]
 
@@ -37,7 +42,9 @@ def numpyro(folder: Path, *, chains: int = 4, warmup: int = 200, draws: int = 50
     theta_hat, root = jnp.asarray(exact.theta_hat), jnp.asarray(exact.root)
 
     def parts(z: Any) -> tuple[Any, Any]:
-        """Value, and its gradient written out: four times as fast as what is derived from the value."""
+        """Value, and its gradient written out: four times as fast as what is derived from the
+        value.
+        """
         theta = theta_hat + root @ z[:5]
         u, v = theta[2] * p, theta[2] * q
         r2 = u * u + v * v
@@ -52,9 +59,15 @@ def numpyro(folder: Path, *, chains: int = 4, warmup: int = 200, draws: int = 50
         radial = u * ex + v * ey
         by_f = jnp.vdot(scale + slope * r2, p * ex + q * ey)
         weighed = radial * r2
-        slopes = jnp.stack([jnp.sum(ex), jnp.sum(ey), by_f, jnp.sum(weighed), jnp.vdot(weighed, r2)])
-        by_z = jnp.append(-precision * (root.T @ slopes), exact.log_sigma_sd * (exact.count - s * precision))
-        return 0.5 * s * precision + exact.count * (exact.log_sigma + exact.log_sigma_sd * z[5]), by_z
+        slopes = jnp.stack(
+            [jnp.sum(ex), jnp.sum(ey), by_f, jnp.sum(weighed), jnp.vdot(weighed, r2)]
+        )
+        by_z = jnp.append(
+            -precision * (root.T @ slopes), exact.log_sigma_sd * (exact.count - s * precision)
+        )
+        return 0.5 * s * precision + exact.count * (
+            exact.log_sigma + exact.log_sigma_sd * z[5]
+        ), by_z
 
     @jax.custom_vjp
     def potential(z: Any) -> Any:
@@ -79,6 +92,9 @@ def numpyro(folder: Path, *, chains: int = 4, warmup: int = 200, draws: int = 50
         start = jnp.asarray(np.random.default_rng(seed).standard_normal((chains, 6)))
         sampler.run(jax.random.PRNGKey(seed), init_params=start, extra_fields=("num_steps",))
         np.save(path, exact.parameters(np.asarray(sampler.get_samples(group_by_chain=True))))
-        return {"draws": str(path), "evaluations": int(np.sum(sampler.get_extra_fields()["num_steps"]))}
+        return {
+            "draws": str(path),
+            "evaluations": int(np.sum(sampler.get_extra_fields()["num_steps"])),
+        }
 
     return run

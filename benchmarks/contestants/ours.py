@@ -101,11 +101,16 @@ def study(folder: Path, *, definition: str) -> Callable[[], Result]:
     return lambda: {"cells": int(sc.study(path).data.sizes["cell"])}
 
 
-def command(folder: Path, *, arguments: list[str], needs: str | None = None) -> Callable[[], Result]:
-    """A command of the package in a fresh process; ``{data}`` is the folder of the data, ``{out}`` a new one."""
+def command(
+    folder: Path, *, arguments: list[str], needs: str | None = None
+) -> Callable[[], Result]:
+    """A command of the package in a fresh process; ``{data}`` is the folder of the data, ``{out}``
+    a new one.
+    """
     if needs is not None and not Path(needs).exists():
         raise Missing(f"{needs} is not on this machine")
-    # -P: else the package in the folder where the benchmark was started goes before the one that is asked for.
+    # -P: else the package in the folder where the benchmark was started goes before the one that is
+    # asked for.
     program = [sys.executable, "-P", "-c", "from starcal_uq.cli.app import main; main()"]
 
     def run() -> Result:
@@ -127,15 +132,21 @@ def command(folder: Path, *, arguments: list[str], needs: str | None = None) -> 
 
 
 def _tree_mb(root: int) -> float:
-    """Memory of a process and all that descend from it, pages that they share counted once; 0 where Linux is not."""
+    """Memory of a process and all that descend from it, pages that they share counted once; 0 where
+    Linux is not.
+    """
     total, waiting = 0.0, [root]
     while waiting:
         pid = waiting.pop()
         try:
             lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
-            total += sum(float(line.split()[1]) for line in lines if line.startswith("Pss:")) * 1.024e-3
+            total += (
+                sum(float(line.split()[1]) for line in lines if line.startswith("Pss:")) * 1.024e-3
+            )
             for task in Path(f"/proc/{pid}/task").iterdir():
-                waiting += [int(child) for child in (task / "children").read_text(encoding="ascii").split()]
+                waiting += [
+                    int(child) for child in (task / "children").read_text(encoding="ascii").split()
+                ]
         except OSError:
             # It has ended, or there is no such folder.
             continue
@@ -221,7 +232,10 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
 
     def run() -> Result:
         done = sc.identification.identify(found, nominal, stars, cache=False)
-        return {"frames": len(done.frames), "found": sum(f.status == "identified" for f in done.frames)}
+        return {
+            "frames": len(done.frames),
+            "found": sum(f.status == "identified" for f in done.frames),
+        }
 
     return run
 
@@ -248,7 +262,14 @@ def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
                 middle = Rotation.from_quat(quaternion).apply(seen, inverse=True).tolist()
             places = np.column_stack([found.x_px, found.y_px])
             named = np.column_stack([o.x_px, o.y_px, o.ra_deg, o.dec_deg])
-            done.append({"clock": clock, "middle": middle, "points": places.tolist(), "stars": named.tolist()})
+            done.append(
+                {
+                    "clock": clock,
+                    "middle": middle,
+                    "points": places.tolist(),
+                    "stars": named.tolist(),
+                }
+            )
         return {"frames": done}
 
     return run

@@ -1,4 +1,6 @@
-"""The paper's three stages on explicit pairs: SciPy's Levenberg-Marquardt (MINPACK), analytic derivatives, NumPy."""
+"""The paper's three stages on explicit pairs: SciPy's Levenberg-Marquardt (MINPACK), analytic
+derivatives, NumPy.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ Result = dict[str, Any]
 
 
 def three_stages(folder: Path) -> Callable[[], Result]:
-    """Optics without distortion, distortion linearly, both; covariance by the scatter of frames (Godambe)."""
+    """Optics without distortion, distortion linearly, both; covariance by the scatter of frames
+    (Godambe).
+    """
     with np.load(folder / "stars.npz") as data:
         starts, xy, r, start = data["starts"], data["xy"].T.copy(), data["r"], data["start"]
     inside = [np.triu_indices(m, 1) for m in np.diff(starts)]
@@ -64,30 +68,46 @@ def three_stages(folder: Path) -> Callable[[], Result]:
         unit, slopes = directions(theta)
         at_i, at_j = unit[:, i], unit[:, j]
         return np.stack(
-            [np.einsum("cn,cn->n", s[:, i], at_j) + np.einsum("cn,cn->n", s[:, j], at_i) for s in slopes], 1
+            [
+                np.einsum("cn,cn->n", s[:, i], at_j) + np.einsum("cn,cn->n", s[:, j], at_i)
+                for s in slopes
+            ],
+            1,
         )
 
     def minimum(theta: np.ndarray) -> np.ndarray:
-        return least_squares(residuals, theta, jacobian, method="lm", x_scale="jac", xtol=1e-10, ftol=1e-10).x
+        return least_squares(
+            residuals, theta, jacobian, method="lm", x_scale="jac", xtol=1e-10, ftol=1e-10
+        ).x
 
     def run() -> Result:
         optics = minimum(start[:3])
         unit, _ = directions(optics)
-        left, _, right = np.linalg.svd(np.add.reduceat(unit.T[:, :, None] * r[:, None, :], starts[:-1], axis=0))
+        left, _, right = np.linalg.svd(
+            np.add.reduceat(unit.T[:, :, None] * r[:, None, :], starts[:-1], axis=0)
+        )
         left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
         b = np.einsum("nij,nj->ni", np.repeat(left @ right, np.diff(starts), axis=0), r)
         u, v = optics[2] * b[:, 0] / b[:, 2], optics[2] * b[:, 1] / b[:, 2]
         r2 = u * u + v * v
-        rows = np.concatenate([np.column_stack([u * r2, u * r2 * r2]), np.column_stack([v * r2, v * r2 * r2])])
+        rows = np.concatenate(
+            [np.column_stack([u * r2, u * r2 * r2]), np.column_stack([v * r2, v * r2 * r2])]
+        )
         size = np.linalg.norm(rows, axis=0)
         distortion = (
-            np.linalg.lstsq(rows / size, np.concatenate([xy[0] - optics[0] - u, xy[1] - optics[1] - v]))[0] / size
+            np.linalg.lstsq(
+                rows / size, np.concatenate([xy[0] - optics[0] - u, xy[1] - optics[1] - v])
+            )[0]
+            / size
         )
         theta = minimum(np.concatenate([optics, distortion]))
         e, j_all = residuals(theta), jacobian(theta)
         scale = np.linalg.norm(j_all, axis=0)
         scores = np.add.reduceat(j_all / scale * e[:, None], first, axis=0)
         bread = np.linalg.inv((j_all / scale).T @ (j_all / scale))
-        return {"theta": theta, "covariance": bread @ (scores.T @ scores) @ bread / np.outer(scale, scale)}
+        return {
+            "theta": theta,
+            "covariance": bread @ (scores.T @ scores) @ bread / np.outer(scale, scale),
+        }
 
     return run

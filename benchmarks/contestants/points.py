@@ -29,7 +29,11 @@ def _opencv() -> tuple[Any, np.ndarray, np.ndarray]:
     import cv2
 
     cv2.setNumThreads(1)
-    return cv2, np.array([[F, 0.0, X0], [0.0, F, Y0], [0.0, 0.0, 1.0]]), np.array([K1 * F**2, K2 * F**4, 0.0, 0.0])
+    return (
+        cv2,
+        np.array([[F, 0.0, X0], [0.0, F, Y0], [0.0, 0.0, 1.0]]),
+        np.array([K1 * F**2, K2 * F**4, 0.0, 0.0]),
+    )
 
 
 def project(folder: Path, *, points: int) -> Callable[[], Result]:
@@ -40,7 +44,9 @@ def project(folder: Path, *, points: int) -> Callable[[], Result]:
 
 
 def unproject(folder: Path, *, points: int) -> Callable[[], Result]:
-    """`cv2.undistortPoints`, and unit vectors of what it gives; iterated to the precision that ours has."""
+    """`cv2.undistortPoints`, and unit vectors of what it gives; iterated to the precision that ours
+    has.
+    """
     cv2, matrix, distortion = _opencv()
     xy = pixels(points)
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-12)
@@ -54,7 +60,9 @@ def unproject(folder: Path, *, points: int) -> Callable[[], Result]:
 
 
 def calibrate(folder: Path) -> Callable[[], Result]:
-    """`cv2.calibrateCamera`, the stars as points far away, the views' translations as free as it leaves them."""
+    """`cv2.calibrateCamera`, the stars as points far away, the views' translations as free as it
+    leaves them.
+    """
     cv2, _, _ = _opencv()
     with np.load(folder / "stars.npz") as data:
         starts, xy, r, start = data["starts"], data["xy"], data["r"], data["start"]
@@ -65,10 +73,17 @@ def calibrate(folder: Path) -> Callable[[], Result]:
     seen = [xy[v].astype(np.float32) for v in views]
     x0, y0, f = start[:3]
     matrix = np.array([[f, 0.0, x0], [0.0, f, y0], [0.0, 0.0, 1.0]])
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+    flags = (
+        cv2.CALIB_USE_INTRINSIC_GUESS
+        | cv2.CALIB_FIX_ASPECT_RATIO
+        | cv2.CALIB_ZERO_TANGENT_DIST
+        | cv2.CALIB_FIX_K3
+    )
 
     def run() -> Result:
-        _, k, d, _, _ = cv2.calibrateCamera(stars, seen, size.tolist(), matrix.copy(), np.zeros(5), flags=flags)
+        _, k, d, _, _ = cv2.calibrateCamera(
+            stars, seen, size.tolist(), matrix.copy(), np.zeros(5), flags=flags
+        )
         f = k[0, 0]
         return {"theta": [k[0, 2], k[1, 2], f, d.ravel()[0] / f**2, d.ravel()[1] / f**4]}
 

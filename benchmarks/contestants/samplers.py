@@ -1,4 +1,6 @@
-"""Samplers on the exact likelihood: emcee as it comes, started from draws of the normal approximation."""
+"""Samplers on the exact likelihood: emcee as it comes, started from draws of the normal
+approximation.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from likelihood import Likelihood
 Result = dict[str, Any]
 
 
-def ensemble(folder: Path, *, move: str, walkers: int = 32, steps: int = 1500, burn: int = 200) -> Callable[[], Result]:
+def ensemble(
+    folder: Path, *, move: str, walkers: int = 32, steps: int = 1500, burn: int = 200
+) -> Callable[[], Result]:
     """One ensemble; `move` is ``StretchMove`` (emcee's default) or ``DEMove``."""
     import emcee
 

@@ -2,9 +2,10 @@
 
     python worker.py FILE FUNCTION FOLDER OPTIONS
 
-`FILE` is a module of this folder, and ``FUNCTION(FOLDER, **OPTIONS)`` prepares and returns what is to be timed. The
-answers are lines of JSON: ready, then for every ``go`` the times, the peak of memory and the result, until ``end``.
-Python's standard library alone, because the interpreter may be any.
+`FILE` is a module of this folder, and ``FUNCTION(FOLDER, **OPTIONS)`` prepares and returns what is
+to be timed. The answers are lines of JSON: ready, then for every ``go`` the times, the peak of
+memory and the result, until ``end``. Python's standard library alone, because the interpreter may
+be any.
 """
 
 import importlib
@@ -39,9 +40,12 @@ def peak_mb():
     unit = 1.0 if sys.platform == "darwin" else 1024.0
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
     try:
-        # Linux counts what the parent held before the program was replaced; the kernel's own mark does not.
+        # Linux counts what the parent held before the program was replaced; the kernel's own mark
+        # does not.
         with open("/proc/self/status", encoding="ascii") as status:
-            own = next(1024.0 * float(line.split()[1]) for line in status if line.startswith("VmHWM"))
+            own = next(
+                1024.0 * float(line.split()[1]) for line in status if line.startswith("VmHWM")
+            )
     except (OSError, StopIteration):
         pass
     return max(own, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * unit) / 1e6
@@ -65,7 +69,11 @@ def main():
         prepare = getattr(importlib.import_module(sys.argv[1]), sys.argv[2])
         run = prepare(pathlib.Path(sys.argv[3]), **json.loads(sys.argv[4]))
     except (ImportError, Missing, AttributeError) as error:
-        say(missing=f"{type(error).__name__}: {error}" if not isinstance(error, Missing) else str(error))
+        say(
+            missing=f"{type(error).__name__}: {error}"
+            if not isinstance(error, Missing)
+            else str(error)
+        )
         return
     say(ready=True)
     for line in sys.stdin:
@@ -76,7 +84,12 @@ def main():
             result = run()
             wall, processor = time.perf_counter() - wall, processor_seconds() - processor
             # A contestant that starts processes may know their sum.
-            say(wall=wall, processor=processor, peak_mb=result.pop("peak_mb", peak_mb()), result=result)
+            say(
+                wall=wall,
+                processor=processor,
+                peak_mb=result.pop("peak_mb", peak_mb()),
+                result=result,
+            )
         except Exception as error:
             traceback.print_exc()
             say(failed=f"{type(error).__name__}: {error}")

@@ -1,8 +1,9 @@
-"""Examples of the command line in the how-to pages: their output is made when the pages are, never typed.
+"""Examples of the command line in the how-to pages: their output is made when the pages are, never
+typed.
 
-The lines of an ``example`` are run in a folder of their page, which starts as a copy of one night that all pages share.
-What takes too long for every build has a name, and its output is kept under ``how-to/_recorded``;
-``python docs/_ext/example.py`` runs all pages and writes these files anew.
+The lines of an ``example`` are run in a folder of their page, which starts as a copy of one night
+that all pages share. What takes too long for every build has a name, and its output is kept under
+``how-to/_recorded``; ``python docs/_ext/example.py`` runs all pages and writes these files anew.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from typing import Any
 PAGES = Path(__file__).parents[1] / "how-to"
 RECORDED = PAGES / "_recorded"
 WIDTH = 80
-# The night: a camera of which the data sheet is wrong, stars in 60 of its frames, and four of them as images.
+# The night: a camera of which the data sheet is wrong, stars in 60 of its frames, and four of them
+# as images.
 NIGHT = (
     "starcal-uq new camera -o camera.toml",
     "starcal-uq simulate truth.toml -o stars.ecsv --frames 60 --seed 5",
@@ -63,7 +65,13 @@ def folder_of(page: str) -> Path:
 def output_of(line: str, folder: Path) -> str:
     """What a line prints, on both streams, in 80 columns; an error, unless ``|| true`` follows."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment = {**os.environ, "PATH": path, "COLUMNS": str(WIDTH), "NO_COLOR": "1", "PYTHONUNBUFFERED": "1"}
+    environment = {
+        **os.environ,
+        "PATH": path,
+        "COLUMNS": str(WIDTH),
+        "NO_COLOR": "1",
+        "PYTHONUNBUFFERED": "1",
+    }
     run = subprocess.run(
         ["bash", "-o", "pipefail", "-c", line],
         cwd=folder,
@@ -79,7 +87,9 @@ def output_of(line: str, folder: Path) -> str:
     shown = run.stdout.replace(f"{folder}/", "").replace(f"{_temporary()}/night/", "")
     lines = shown.rstrip().splitlines()
     return "\n".join(
-        part for each in lines for part in textwrap.wrap(each.rstrip(), WIDTH, subsequent_indent="  ") or [""]
+        part
+        for each in lines
+        for part in textwrap.wrap(each.rstrip(), WIDTH, subsequent_indent="  ") or [""]
     )
 
 
@@ -94,7 +104,9 @@ def text_of(page: str, lines: list[str]) -> str:
 
 def examples(page: Path) -> list[tuple[str, list[str]]]:
     """Name (empty for what every build runs) and lines of every example of a page."""
-    return [(name, body.strip().splitlines()) for name, body in BLOCK.findall(page.read_text("utf-8"))]
+    return [
+        (name, body.strip().splitlines()) for name, body in BLOCK.findall(page.read_text("utf-8"))
+    ]
 
 
 def recorded(name: str, lines: list[str]) -> str:
@@ -119,7 +131,11 @@ def setup(app: Any) -> dict[str, bool]:
 
         def run(self) -> list[nodes.Node]:
             lines = list(self.content)
-            text = recorded(self.arguments[0], lines) if self.arguments else text_of(Path(self.env.docname).name, lines)
+            text = (
+                recorded(self.arguments[0], lines)
+                if self.arguments
+                else text_of(Path(self.env.docname).name, lines)
+            )
             return [nodes.literal_block(text, text, language="text")]
 
     app.add_directive("example", Example)
@@ -131,5 +147,7 @@ if __name__ == "__main__":
     for page in sorted(PAGES.glob("*.md")):
         for name, lines in examples(page):
             if name and (not sys.argv[1:] or name in sys.argv[1:]):
-                (RECORDED / f"{name}.txt").write_text(text_of(page.stem, lines) + "\n", encoding="utf-8")
+                (RECORDED / f"{name}.txt").write_text(
+                    text_of(page.stem, lines) + "\n", encoding="utf-8"
+                )
                 print(f"{page.name}: {name}")

@@ -1,9 +1,9 @@
 """Attitudes over time from a file: a slew, an orbit, a scan law.
 
-The file is CSV, ECSV or Parquet with a time (``time_s``, or ``time_utc``) and a quaternion in each row. Quaternions are
-those of R_cam_icrs, scalar last: they turn ICRS vectors into the camera frame, b = R r, with the sense of
-``scipy.spatial.transform.Rotation``. Columns ``qx, qy, qz, qw`` say which component is which; numbered ones do not, and
-are refused unless the order is stated.
+The file is CSV, ECSV or Parquet with a time (``time_s``, or ``time_utc``) and a quaternion in each
+row. Quaternions are those of R_cam_icrs, scalar last: they turn ICRS vectors into the camera frame,
+b = R r, with the sense of ``scipy.spatial.transform.Rotation``. Columns ``qx, qy, qz, qw`` say
+which component is which; numbered ones do not, and are refused unless the order is stated.
 """
 
 from __future__ import annotations
@@ -61,10 +61,13 @@ class AttitudeProfile(Shown):
         where = f"{self.name or 'attitude profile'}: "
         if time.ndim != 1 or q.shape != (len(time), 4):
             raise AttitudeProfileError(
-                f"{where}times have shape {time.shape} and quaternions {q.shape}; give (K,) and (K, 4)."
+                f"{where}times have shape {time.shape} and quaternions {q.shape}; give (K,) and "
+                "(K, 4)."
             )
         if len(time) < 2:
-            raise AttitudeProfileError(f"{where}holds {plural(len(time), 'attitude')}; give at least two.")
+            raise AttitudeProfileError(
+                f"{where}holds {plural(len(time), 'attitude')}; give at least two."
+            )
         rows = np.arange(1, len(time) + 1)
         messages = (*self.messages, *check_samples(where, "row", rows, time, q))
         q /= np.linalg.norm(q, axis=1, keepdims=True)
@@ -77,15 +80,19 @@ class AttitudeProfile(Shown):
         far = np.degrees(np.linalg.norm(left_error(q[1:], q[:-1]), axis=1)) > _FAR_DEG
         if far.any():
             messages += (
-                f"{plural(int(far.sum()), 'step')} of the profile turn the camera by more than {_FAR_DEG:g} degrees: "
-                "attitudes in between are taken on the shortest arc; give more samples if the camera went otherwise.",
+                f"{plural(int(far.sum()), 'step')} of the profile turn the camera by more than "
+                f"{_FAR_DEG:g} degrees: "
+                "attitudes in between are taken on the shortest arc; give more samples if the "
+                "camera went otherwise.",
             )
         steps = np.diff(time)
         longest = int(np.argmax(steps))
         if steps[longest] > _GAP * float(np.median(steps)):
             messages += (
-                f"the profile has no attitude between {time[longest]:g} and {time[longest + 1]:g} s, "
-                f"{significant(steps[longest] / float(np.median(steps)), 2)} times its usual step: what lies in "
+                f"the profile has no attitude between {time[longest]:g} and "
+                f"{time[longest + 1]:g} s, "
+                f"{significant(steps[longest] / float(np.median(steps)), 2)} times its usual "
+                "step: what lies in "
                 "between is on the shortest arc.",
             )
         object.__setattr__(self, "messages", tuple(dict.fromkeys(messages)))
@@ -103,7 +110,8 @@ class AttitudeProfile(Shown):
         return rate
 
     def at(self, time_s: FloatArray) -> FloatArray:
-        """Attitudes (n, 4) at some times (n,), s, on the shortest arc between neighbouring samples (slerp).
+        """Attitudes (n, 4) at some times (n,), s, on the shortest arc between neighbouring samples
+        (slerp).
 
         Raises
         ------
@@ -116,7 +124,8 @@ class AttitudeProfile(Shown):
         slack = 1e-9 * self.duration_s
         if np.any((wanted < self.time_s[0] - slack) | (wanted > self.time_s[-1] + slack)):
             raise AttitudeProfileError(
-                f"{self.name or 'attitude profile'}: covers {self.time_s[0]:g} s to {self.time_s[-1]:g} s; it is not "
+                f"{self.name or 'attitude profile'}: covers {self.time_s[0]:g} s to "
+                f"{self.time_s[-1]:g} s; it is not "
                 "continued beyond."
             )
         wanted = np.clip(wanted, self.time_s[0], self.time_s[-1])
@@ -135,7 +144,8 @@ class AttitudeProfile(Shown):
         n = int(np.floor(self.duration_s * rate_hz * (1.0 + 1e-12))) + 1 if rate_hz > 0.0 else 0
         if not 2 <= n <= _MAX_FRAMES:
             raise AttitudeProfileError(
-                f"a rate of {rate_hz:g} Hz over {significant(self.duration_s, 3)} s gives {n} frames; choose one that "
+                f"a rate of {rate_hz:g} Hz over {significant(self.duration_s, 3)} s gives {n} "
+                "frames; choose one that "
                 f"gives 2 to {_MAX_FRAMES}."
             )
         time = self.time_s[0] + np.arange(n) / rate_hz
@@ -157,16 +167,19 @@ def load_attitude_profile(
     Parameters
     ----------
     path
-        A table with ``time_s`` (seconds) or ``time_utc`` (ISO 8601) and ``qx, qy, qz, qw``. Comments start with ``#``.
+        A table with ``time_s`` (seconds) or ``time_utc`` (ISO 8601) and ``qx, qy, qz, qw``.
+        Comments start with ``#``.
     scalar : {"first", "last"}, optional
-        Which of numbered columns (``q0`` to ``q3``, or ``q1`` to ``q4``) is the scalar part; refused if not stated.
+        Which of numbered columns (``q0`` to ``q3``, or ``q1`` to ``q4``) is the scalar part;
+        refused if not stated.
     sense : {"icrs_to_camera", "camera_to_icrs"}
         Direction of the quaternions. The default is b = R r, ICRS vectors into the camera frame.
 
     Raises
     ------
     AttitudeProfileError
-        When the file cannot be read, times do not increase, or a quaternion is far from unit length.
+        When the file cannot be read, times do not increase, or a quaternion is far from unit
+        length.
     """
     table = read_profile(path, scalar)
     q = table.quaternions
@@ -177,16 +190,23 @@ def load_attitude_profile(
     return AttitudeProfile(table.time_s, q, os.path.basename(os.fspath(path)), messages)
 
 
-def check_samples(where: str, word: str, numbers: IntArray, time_s: FloatArray, q: FloatArray) -> tuple[str, ...]:
-    """Refuse times that do not increase and quaternions far from unit length; say which were normalised."""
+def check_samples(
+    where: str, word: str, numbers: IntArray, time_s: FloatArray, q: FloatArray
+) -> tuple[str, ...]:
+    """Refuse times that do not increase and quaternions far from unit length; say which were
+    normalised.
+    """
     bad = ~(np.isfinite(q).all(axis=1) & np.isfinite(time_s))
     if bad.any():
-        raise AttitudeProfileError(f"{where}{word} {numbers[bad][0]} holds a value that is not finite; repair it.")
+        raise AttitudeProfileError(
+            f"{where}{word} {numbers[bad][0]} holds a value that is not finite; repair it."
+        )
     back = np.flatnonzero(np.diff(time_s) <= 0.0)
     if back.size:
         i = back[0] + 1
         raise AttitudeProfileError(
-            f"{where}{word} {numbers[i]}: the time {time_s[i]:.9g} s does not come after {time_s[i - 1]:.9g} s; "
+            f"{where}{word} {numbers[i]}: the time {time_s[i]:.9g} s does not come after "
+            f"{time_s[i - 1]:.9g} s; "
             "sort the rows by time and remove repeated ones."
         )
     with np.errstate(over="ignore"):
@@ -195,13 +215,15 @@ def check_samples(where: str, word: str, numbers: IntArray, time_s: FloatArray, 
     if np.any(off > _NEARLY_UNIT):
         i = int(np.argmax(off > _NEARLY_UNIT))
         raise AttitudeProfileError(
-            f"{where}{word} {numbers[i]}: the quaternion has the length {length[i]:.6g}, not 1; check its columns."
+            f"{where}{word} {numbers[i]}: the quaternion has the length {length[i]:.6g}, not 1; "
+            "check its columns."
         )
     uneven = int(np.sum(off > _UNIT))
     if not uneven:
         return ()
     return (
-        f"{plural(uneven, 'quaternion')} differed from unit length by up to {significant(float(off.max()))} and "
+        f"{plural(uneven, 'quaternion')} differed from unit length by up to "
+        f"{significant(float(off.max()))} and "
         f"{'was' if uneven == 1 else 'were'} normalised.",
     )
 
@@ -213,9 +235,11 @@ _DAY_S = 86_400.0
 
 @dataclass(frozen=True)
 class ProfileTable:
-    """What a file says: times (K,), s, of UTC times the seconds since the first, and quaternions (K, 4) as they stand.
+    """What a file says: times (K,), s, of UTC times the seconds since the first, and quaternions
+    (K, 4) as they stand.
 
-    `numbers` (K,) are lines (CSV, ECSV) or rows from 1 (Parquet), which `word` tells: ``"line"`` or ``"row"``.
+    `numbers` (K,) are lines (CSV, ECSV) or rows from 1 (Parquet), which `word` tells: ``"line"`` or
+    ``"row"``.
     """
 
     time_s: FloatArray
@@ -227,7 +251,9 @@ class ProfileTable:
 def read_profile(path: str | os.PathLike[str], scalar: str | None) -> ProfileTable:
     """Read times and quaternions; see `starcal_uq.attitude.profile.load_attitude_profile`."""
     path = Path(path)
-    with reading(path, "a readable table", "check the path, or write it again", AttitudeProfileError):
+    with reading(
+        path, "a readable table", "check the path, or write it again", AttitudeProfileError
+    ):
         ending = table_ending(path)
         if ending == ".parquet":
             columns, numbers, word = _parquet(path)
@@ -250,13 +276,16 @@ def _components(path: Path, columns: dict[str, Any], scalar: str | None) -> tupl
         if all(name in columns for name in names):
             if scalar is None:
                 raise AttitudeProfileError(
-                    f"{path}: the columns {', '.join(names)} do not say which is the scalar part; name them "
-                    f"{', '.join(NAMED)} (qw is the scalar), or state scalar='first' or scalar='last'."
+                    f"{path}: the columns {', '.join(names)} do not say which is the scalar "
+                    "part; name them "
+                    f"{', '.join(NAMED)} (qw is the scalar), or state scalar='first' or "
+                    "scalar='last'."
                 )
             return names if scalar == "last" else (*names[1:], names[0])
     missing = [name for name in NAMED if name not in columns]
     raise AttitudeProfileError(
-        f"{path}: column {missing[0]} is missing; give {', '.join(NAMED)} beside time_s or time_utc (the file has "
+        f"{path}: column {missing[0]} is missing; give {', '.join(NAMED)} beside time_s or "
+        "time_utc (the file has "
         f"{listed(list(columns)) or 'no columns'})."
     )
 
@@ -265,7 +294,9 @@ def _times(path: Path, word: str, numbers: IntArray, columns: dict[str, Any]) ->
     if "time_s" in columns:
         return _numbers(path, word, numbers, "time_s", columns["time_s"])
     if "time_utc" not in columns:
-        raise AttitudeProfileError(f"{path}: column time_s or time_utc is missing; add one of them.")
+        raise AttitudeProfileError(
+            f"{path}: column time_s or time_utc is missing; add one of them."
+        )
     try:
         tt, _, inverse = julian_days([str(text) for text in columns["time_utc"]])
     except CatalogueError as error:
@@ -276,7 +307,9 @@ def _times(path: Path, word: str, numbers: IntArray, columns: dict[str, Any]) ->
     return np.round(seconds, 9)
 
 
-def _numbers(path: Path, word: str, numbers: IntArray, name: str, cells: Iterable[Any]) -> FloatArray:
+def _numbers(
+    path: Path, word: str, numbers: IntArray, name: str, cells: Iterable[Any]
+) -> FloatArray:
     if isinstance(cells, np.ndarray) and cells.dtype.kind in "fiu":
         return np.asarray(cells, dtype=float)
     values = []
@@ -295,7 +328,9 @@ def _text(path: Path, *, ecsv: bool) -> tuple[dict[str, Any], IntArray, str]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
-        raise AttitudeProfileError(f"{path}: the text is not UTF-8; save the file in the encoding UTF-8.") from None
+        raise AttitudeProfileError(
+            f"{path}: the text is not UTF-8; save the file in the encoding UTF-8."
+        ) from None
     delimiter = "," if not ecsv or "# delimiter: ','" in text else " "
     lines = ("\n" if line.startswith("#") else line for line in text.splitlines(keepends=True))
     reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
@@ -306,7 +341,8 @@ def _text(path: Path, *, ecsv: bool) -> tuple[dict[str, Any], IntArray, str]:
     for number, row in rows[1:]:
         if len(row) != len(names):
             raise AttitudeProfileError(
-                f"{path}, line {number}: holds {len(row)} values under a header of {len(names)} columns; repair it."
+                f"{path}, line {number}: holds {len(row)} values under a header of {len(names)} "
+                "columns; repair it."
             )
     cells = {name: [row[i].strip() for _, row in rows[1:]] for i, name in enumerate(names)}
     return cells, np.array([number for number, _ in rows[1:]], dtype=np.int64), "line"

@@ -1,9 +1,9 @@
 """Rotations as arrays: matrices, scalar-last quaternions and small left rotation vectors.
 
-Conventions: ``R_cam_icrs`` maps ICRS vectors to the camera frame, b = R r. Quaternions are (x, y, z, w) with the
-sense of ``scipy.spatial.transform.Rotation``. An attitude error is the *left* (camera-frame) rotation vector phi
-in R' = exp([phi]x) R: phi_x is pitch, phi_y yaw and phi_z roll about the boresight. Every function takes any
-number of leading axes.
+Conventions: ``R_cam_icrs`` maps ICRS vectors to the camera frame, b = R r. Quaternions are (x, y,
+z, w) with the sense of ``scipy.spatial.transform.Rotation``. An attitude error is the *left*
+(camera-frame) rotation vector phi in R' = exp([phi]x) R: phi_x is pitch, phi_y yaw and phi_z roll
+about the boresight. Every function takes any number of leading axes.
 """
 
 from __future__ import annotations
@@ -14,21 +14,35 @@ from starcal_uq.core.types import FloatArray
 
 
 def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
-    """Scalar-last unit quaternions (..., 4), scalar part not negative, of proper rotation matrices (..., 3, 3).
+    """Scalar-last unit quaternions (..., 4), scalar part not negative, of proper rotation matrices
+    (..., 3, 3).
 
-    Of the four algebraically equal formulas the one with the largest divisor is used, matrix by matrix (Shepperd
-    1978), so that half turns lose no digits.
+    Of the four algebraically equal formulas the one with the largest divisor is used, matrix by
+    matrix (Shepperd 1978), so that half turns lose no digits.
     """
     m = np.asarray(rotation, dtype=float)
     if m.shape[-2:] != (3, 3):
         raise ValueError(f"rotation matrices have shape (..., 3, 3), not {m.shape}.")
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    wx, wy, wz = (
+        m[..., 2, 1] - m[..., 1, 2],
+        m[..., 0, 2] - m[..., 2, 0],
+        m[..., 1, 0] - m[..., 0, 1],
+    )
+    xy, xz, yz = (
+        m[..., 0, 1] + m[..., 1, 0],
+        m[..., 0, 2] + m[..., 2, 0],
+        m[..., 1, 2] + m[..., 2, 1],
+    )
     # Four times q q^T: each row is parallel to the quaternion.
     square = (1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz, 1.0 + xx + yy + zz)
     best = np.argmax(square, axis=0)
-    rows = ((square[0], xy, xz, wx), (xy, square[1], yz, wy), (xz, yz, square[2], wz), (wx, wy, wz, square[3]))
+    rows = (
+        (square[0], xy, xz, wx),
+        (xy, square[1], yz, wy),
+        (xz, yz, square[2], wz),
+        (wx, wy, wz, square[3]),
+    )
     x, y, z, w = (np.choose(best, column) for column in zip(*rows, strict=True))
     norm = np.sqrt(x * x + y * y + z * z + w * w)
     norm = np.where(w < 0.0, -norm, norm)
@@ -36,7 +50,9 @@ def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
 
 
 def quaternion_to_rotation(quaternion: FloatArray) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of scalar-last quaternions (..., 4) of any norm; ValueError for a norm of zero."""
+    """Rotation matrices (..., 3, 3) of scalar-last quaternions (..., 4) of any norm; ValueError for
+    a norm of zero.
+    """
     q = np.asarray(quaternion, dtype=float)
     if q.shape[-1:] != (4,):
         raise ValueError(f"quaternions have shape (..., 4), not {q.shape}.")
@@ -59,7 +75,9 @@ def _of_quaternion(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -
 
 
 def quaternion_multiply(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Hamilton product: the rotation `right` followed by the rotation `left`; both (..., 4), scalar last."""
+    """Hamilton product: the rotation `right` followed by the rotation `left`; both (..., 4), scalar
+    last.
+    """
     x1, y1, z1, w1 = np.moveaxis(np.asarray(left, dtype=float), -1, 0)
     x2, y2, z2, w2 = np.moveaxis(np.asarray(right, dtype=float), -1, 0)
     return np.stack(

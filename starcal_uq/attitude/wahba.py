@@ -2,22 +2,24 @@
 
 Wahba's loss is L(R) = 1/2 sum_i w_i |b_i - R r_i|^2 with weights of sum one. Sources:
 
-- Shuster & Oh 1981, J. Guidance and Control 4(1), 70-77: the quaternion as the eigenvector of the 4x4 matrix K that
-  belongs to its largest eigenvalue, found by Newton's method from the sum of weights; the covariance
-  [sum_i sigma_i^-2 (I - b_i b_i^T)]^-1.
-- Markley 1993, J. Astronautical Sciences 41(2), 261-280 (FOAM): the characteristic quartic of K factored as
-  p(l) = (l^2 - |B|^2)^2 - 8 l det B - 4 |adj B|^2. Unlike the expanded polynomial it gives the eigenvalue to rounding
-  error in narrow fields, where the two largest eigenvalues nearly coincide.
+- Shuster & Oh 1981, J. Guidance and Control 4(1), 70-77: the quaternion as the eigenvector of the
+  4x4 matrix K that belongs to its largest eigenvalue, found by Newton's method from the sum of
+  weights; the covariance [sum_i sigma_i^-2 (I - b_i b_i^T)]^-1.
+- Markley 1993, J. Astronautical Sciences 41(2), 261-280 (FOAM): the characteristic quartic of K
+  factored as p(l) = (l^2 - |B|^2)^2 - 8 l det B - 4 |adj B|^2. Unlike the expanded polynomial it
+  gives the eigenvalue to rounding error in narrow fields, where the two largest eigenvalues nearly
+  coincide.
 - Shuster's TASTE = sum_i |b_i - R r_i|^2 / sigma_i^2, chi-square with 2m-3 degrees of freedom.
 
-Shuster avoids the singularity at half turns by *sequential rotations*: the references are first turned by half a turn
-about one axis, which permutes the quaternion so that another component serves as divisor. The same four solutions are
-the four rows of the adjugate of (K - l I), each parallel to the quaternion. The row with the largest diagonal entry is
-the one whose divisor is the largest component: that is how the rotation is chosen here, problem by problem. One Newton
-step on the rotation itself then removes what rounding the adjugate has cost.
+Shuster avoids the singularity at half turns by *sequential rotations*: the references are first
+turned by half a turn about one axis, which permutes the quaternion so that another component serves
+as divisor. The same four solutions are the four rows of the adjugate of (K - l I), each parallel to
+the quaternion. The row with the largest diagonal entry is the one whose divisor is the largest
+component: that is how the rotation is chosen here, problem by problem. One Newton step on the
+rotation itself then removes what rounding the adjugate has cost.
 
-Arrays inside hold one component each, shaped (d, n) for d draws of n stars or (d, k) for k frames: NumPy is several
-times faster on them than on arrays of 3-vectors and 3x3 matrices.
+Arrays inside hold one component each, shaped (d, n) for d draws of n stars or (d, k) for k frames:
+NumPy is several times faster on them than on arrays of 3-vectors and 3x3 matrices.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 
 # Temporaries of this many stars stay in the processor's cache.
 _BLOCK = 32_768
-# Below this a rotation about one axis is lost in rounding: the stars span less than about 0.3 arcsec.
+# Below this a rotation about one axis is lost in rounding: the stars span less than about 0.3
+# arcsec.
 DEGENERATE = 1e-12
 _NEWTON_STEPS = 60
 
@@ -45,15 +48,18 @@ class DegenerateFrameError(StarcalError):
     def __init__(self, frames: IntArray) -> None:
         more = f" (and {frames.size - 1} more)" if frames.size > 1 else ""
         super().__init__(
-            f"frame number {int(frames[0])}{more} does not determine an attitude, because it has fewer than two "
-            "distinct stars or values that are not finite: remove such frames, or pass on_degenerate='flag'."
+            f"frame number {int(frames[0])}{more} does not determine an attitude, because it has "
+            "fewer than two "
+            "distinct stars or values that are not finite: remove such frames, or pass "
+            "on_degenerate='flag'."
         )
         self.frames = frames
 
 
 @dataclass(frozen=True)
 class QuestResult:
-    """Attitudes of K frames, with a leading axis of draws (D, K, ...) where the measurements had one.
+    """Attitudes of K frames, with a leading axis of draws (D, K, ...) where the measurements had
+    one.
 
     Attributes
     ----------
@@ -62,20 +68,23 @@ class QuestResult:
     lambda_max : (..., K) array
         Largest eigenvalue of K, weights of sum one: 1 - loss.
     loss : (..., K) array
-        Wahba's loss at the solution, weights of sum one. From the residuals where sigma_rad was given, otherwise
-        1 - lambda_max, whose rounding error is about 1e-15.
+        Wahba's loss at the solution, weights of sum one. From the residuals where sigma_rad was
+        given, otherwise 1 - lambda_max, whose rounding error is about 1e-15.
     observability : (..., K) array
-        Least curvature of the loss, weights of sum one: the smallest eigenvalue of sum_i w_i (I - b_i b_i^T) to first
-        order, at worst a factor 3 below it. In a narrow field the mean squared angle from the centroid, rad^2.
+        Least curvature of the loss, weights of sum one: the smallest eigenvalue of sum_i w_i (I -
+        b_i b_i^T) to first order, at worst a factor 3 below it. In a narrow field the mean squared
+        angle from the centroid, rad^2.
     ok : (..., K) bool array
         False where the frame does not determine an attitude.
     dof : (K,) array
         2 m - 3.
     covariance : (..., K, 3, 3) array or None
-        Covariance of the left rotation error (pitch, yaw, roll) in rad^2. Without sigma_rad it is for
-        sigma_i^2 = 1 / w_i rad^2 (1 rad^2 for every star without weights): multiply by the noise variance.
+        Covariance of the left rotation error (pitch, yaw, roll) in rad^2. Without sigma_rad it is
+        for sigma_i^2 = 1 / w_i rad^2 (1 rad^2 for every star without weights): multiply by the
+        noise variance.
     taste : (..., K) array or None
-        Chi-square with `dof` degrees of freedom if sigma_rad and the identifications are right; None without sigma_rad.
+        Chi-square with `dof` degrees of freedom if sigma_rad and the identifications are right;
+        None without sigma_rad.
     """
 
     quaternions: FloatArray
@@ -108,7 +117,8 @@ def quest(
     Parameters
     ----------
     b : (N, 3) or (D, N, 3) array
-        Measured unit vectors in the camera frame, sorted by frame; D draws of them share everything else.
+        Measured unit vectors in the camera frame, sorted by frame; D draws of them share everything
+        else.
     r : (N, 3) or (D, N, 3) array
         Catalogue unit vectors.
     starts : (K+1,) array
@@ -116,20 +126,27 @@ def quest(
     weights : (N,) array, optional
         Positive weights on any scale; equal by default.
     sigma_rad : float or (N,) array, optional
-        Direction noise per axis in rad. Sets the weights to sigma_rad^-2, scales the covariance, and asks for TASTE.
+        Direction noise per axis in rad. Sets the weights to sigma_rad^-2, scales the covariance,
+        and asks for TASTE.
     covariance : bool
         False saves the time for the covariances.
     on_degenerate : {"raise", "flag"}
-        Treatment of frames that do not determine an attitude; flagged frames have NaN and ``ok`` false.
+        Treatment of frames that do not determine an attitude; flagged frames have NaN and ``ok``
+        false.
 
     Raises
     ------
     ValueError
-        Shapes that do not match, vectors that are not of unit length, weights or sigmas not positive.
+        Shapes that do not match, vectors that are not of unit length, weights or sigmas not
+        positive.
     DegenerateFrameError
         One star, coinciding stars or values that are not finite, if `on_degenerate` is "raise".
     """
-    b, r, starts = np.asarray(b, dtype=float), np.asarray(r, dtype=float), np.asarray(starts, dtype=np.int64)
+    b, r, starts = (
+        np.asarray(b, dtype=float),
+        np.asarray(r, dtype=float),
+        np.asarray(starts, dtype=np.int64),
+    )
     _check_shapes(b, r, starts)
     w = _weights(weights, sigma_rad, b.shape[-2])
     batch = b if b.ndim == 3 else b[None]
@@ -183,15 +200,21 @@ def _check_shapes(b: FloatArray, r: FloatArray, starts: IntArray) -> None:
     if r.shape not in (b.shape, b.shape[-2:]):
         raise ValueError(f"r has shape {r.shape}, which does not match b of shape {b.shape}.")
     if starts.ndim != 1 or starts.size < 2 or starts[0] != 0 or starts[-1] != b.shape[-2]:
-        raise ValueError(f"starts must be a list of offsets from 0 to the number of stars, {b.shape[-2]}.")
+        raise ValueError(
+            f"starts must be a list of offsets from 0 to the number of stars, {b.shape[-2]}."
+        )
     if np.any(np.diff(starts) <= 0):
         empty = int(np.flatnonzero(np.diff(starts) <= 0)[0])
         raise ValueError(f"frame number {empty} has no stars: starts must increase strictly.")
 
 
-def _weights(weights: FloatArray | None, sigma_rad: FloatArray | float | None, n_stars: int) -> FloatArray | None:
+def _weights(
+    weights: FloatArray | None, sigma_rad: FloatArray | float | None, n_stars: int
+) -> FloatArray | None:
     if weights is not None and sigma_rad is not None:
-        raise ValueError("give weights or sigma_rad, not both: sigma_rad sets the weights to sigma_rad**-2.")
+        raise ValueError(
+            "give weights or sigma_rad, not both: sigma_rad sets the weights to sigma_rad**-2."
+        )
     values = weights if sigma_rad is None else sigma_rad
     if values is None:
         return None
@@ -215,7 +238,10 @@ def _blocks(starts: IntArray, n_draws: int) -> list[tuple[slice, slice, slice]]:
         last = min(max(last, first + 1), n_frames)
         rows = slice(int(starts[first]), int(starts[last]))
         step = max(1, _BLOCK // (rows.stop - rows.start))
-        blocks += [(rows, slice(first, last), slice(d, min(d + step, n_draws))) for d in range(0, n_draws, step)]
+        blocks += [
+            (rows, slice(first, last), slice(d, min(d + step, n_draws)))
+            for d in range(0, n_draws, step)
+        ]
         first = last
     return blocks
 
@@ -230,12 +256,19 @@ def _components(vectors: FloatArray) -> FloatArray:
 
 
 def _profile(
-    b: FloatArray, r: FloatArray, w: FloatArray | None, local: IntArray, total: FloatArray | IntArray
+    b: FloatArray,
+    r: FloatArray,
+    w: FloatArray | None,
+    local: IntArray,
+    total: FloatArray | IntArray,
 ) -> list[list[FloatArray]]:
     """Attitude profile matrix B_ij = sum w b_i r_j / sum w, each entry (d, k)."""
     weighted = r if w is None else r * w
     scale = 1.0 / total
-    return [[np.add.reduceat(b[i] * weighted[j], local, axis=-1) * scale for j in range(3)] for i in range(3)]
+    return [
+        [np.add.reduceat(b[i] * weighted[j], local, axis=-1) * scale for j in range(3)]
+        for i in range(3)
+    ]
 
 
 def _solve(B: list[list[FloatArray]]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -252,8 +285,8 @@ def _solve(B: list[list[FloatArray]]) -> tuple[FloatArray, FloatArray, FloatArra
     lam = _largest_root(norm2, adjoint2, det)
     q = _adjugate_quaternion(B, lam)
     q, curvature = _polish(q, B)
-    # |adj B| is about the second singular value of B: it sees coinciding stars, at which the quaternion is arbitrary
-    # and the curvature found at it may look sound.
+    # |adj B| is about the second singular value of B: it sees coinciding stars, at which the
+    # quaternion is arbitrary and the curvature found at it may look sound.
     return q, lam, np.minimum(curvature, np.sqrt(adjoint2 / np.where(norm2 > 0.0, norm2, 1.0)))
 
 
@@ -265,14 +298,16 @@ def _sum_of_squares(parts: tuple[FloatArray, ...]) -> FloatArray:
 
 
 def _largest_root(norm2: FloatArray, adjoint2: FloatArray, det: FloatArray) -> FloatArray:
-    """Newton's method from the sum of weights, 1, an upper bound from which it descends monotonically."""
+    """Newton's method from the sum of weights, 1, an upper bound from which it descends
+    monotonically.
+    """
     lam, step = np.ones_like(norm2), np.ones_like(norm2)
     for _ in range(_NEWTON_STEPS):
         a = lam * lam - norm2
         slope = 4.0 * lam * a - 8.0 * det
         value = np.maximum(a * a - 8.0 * lam * det - 4.0 * adjoint2, 0.0)
-        # All roots are real, so that steps from above only shrink: a longer one is rounding at a double root, where
-        # value and slope vanish together.
+        # All roots are real, so that steps from above only shrink: a longer one is rounding at a
+        # double root, where value and slope vanish together.
         step = np.minimum(value / np.where(slope > 0.0, slope, 1.0), step)
         lam = lam - step
         # Written so that a problem with NaN does not stop the others.
@@ -298,13 +333,16 @@ def _adjugate_quaternion(B: list[list[FloatArray]], lam: FloatArray) -> FloatArr
     d01, d02 = a02 * c4 - a01 * c5 - a03 * c3, a13 * s5 - a23 * s4 + a33 * s3
     d03, d12 = a22 * s4 - a12 * s5 - a23 * s3, a23 * s2 - a03 * s5 - a33 * s1
     d13, d23 = a02 * s5 - a22 * s2 + a23 * s1, a12 * s2 - a02 * s4 - a23 * s0
-    # All diagonal entries are <= 0 (three negative factors): the largest in magnitude is the smallest.
+    # All diagonal entries are <= 0 (three negative factors): the largest in magnitude is the
+    # smallest.
     xy, zw = d00 < d11, d22 < d33
     first = np.minimum(d00, d11) < np.minimum(d22, d33)
     rows = ((d00, d01, d02, d03), (d01, d11, d12, d13), (d02, d12, d22, d23), (d03, d13, d23, d33))
     q = np.empty((4, *lam.shape))
     for i in range(4):
-        q[i] = np.where(first, np.where(xy, rows[0][i], rows[1][i]), np.where(zw, rows[2][i], rows[3][i]))
+        q[i] = np.where(
+            first, np.where(xy, rows[0][i], rows[1][i]), np.where(zw, rows[2][i], rows[3][i])
+        )
     return _normalise(q)
 
 
@@ -316,7 +354,17 @@ def _normalise(q: FloatArray) -> FloatArray:
 
 def _matrix(q: FloatArray) -> list[list[FloatArray]]:
     x, y, z, w = q
-    xx, yy, zz, xy, xz, yz, xw, yw, zw = x * x, y * y, z * z, x * y, x * z, y * z, x * w, y * w, z * w
+    xx, yy, zz, xy, xz, yz, xw, yw, zw = (
+        x * x,
+        y * y,
+        z * z,
+        x * y,
+        x * z,
+        y * z,
+        x * w,
+        y * w,
+        z * w,
+    )
     return [
         [1.0 - 2.0 * (yy + zz), 2.0 * (xy - zw), 2.0 * (xz + yw)],
         [2.0 * (xy + zw), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - xw)],
@@ -325,16 +373,24 @@ def _matrix(q: FloatArray) -> list[list[FloatArray]]:
 
 
 def _polish(q: FloatArray, B: list[list[FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """One Newton step of Wahba's loss on the left rotation vector, and the least curvature of the loss.
+    """One Newton step of Wahba's loss on the left rotation vector, and the least curvature of the
+    loss.
 
-    With M = B R^T the gradient is minus the axial vector of M, and the Hessian tr(M) I - (M + M^T)/2 has the
-    eigenvalues s_i + s_j (sums of two signed singular values of B).
+    With M = B R^T the gradient is minus the axial vector of M, and the Hessian tr(M) I - (M +
+    M^T)/2 has the eigenvalues s_i + s_j (sums of two signed singular values of B).
     """
     R = _matrix(q)
-    M = [[B[i][0] * R[j][0] + B[i][1] * R[j][1] + B[i][2] * R[j][2] for j in range(3)] for i in range(3)]
+    M = [
+        [B[i][0] * R[j][0] + B[i][1] * R[j][1] + B[i][2] * R[j][2] for j in range(3)]
+        for i in range(3)
+    ]
     gx, gy, gz = M[2][1] - M[1][2], M[0][2] - M[2][0], M[1][0] - M[0][1]
     hxx, hyy, hzz = M[1][1] + M[2][2], M[0][0] + M[2][2], M[0][0] + M[1][1]
-    hxy, hxz, hyz = -0.5 * (M[0][1] + M[1][0]), -0.5 * (M[0][2] + M[2][0]), -0.5 * (M[1][2] + M[2][1])
+    hxy, hxz, hyz = (
+        -0.5 * (M[0][1] + M[1][0]),
+        -0.5 * (M[0][2] + M[2][0]),
+        -0.5 * (M[1][2] + M[2][1]),
+    )
     ixx, iyy, izz = hyy * hzz - hyz * hyz, hxx * hzz - hxz * hxz, hxx * hyy - hxy * hxy
     ixy, ixz, iyz = hxz * hyz - hxy * hzz, hxy * hyz - hxz * hyy, hxy * hxz - hxx * hyz
     det = hxx * ixx + hxy * ixy + hxz * ixz
@@ -349,7 +405,8 @@ def _polish(q: FloatArray, B: list[list[FloatArray]]) -> tuple[FloatArray, Float
     better[1] = y - px * z + py * w + pz * x
     better[2] = z + px * y - py * x + pz * w
     better[3] = w - px * x - py * y - pz * z
-    # For one small eigenvalue, det / (sum of principal minors) is that eigenvalue, and never 3 times less.
+    # For one small eigenvalue, det / (sum of principal minors) is that eigenvalue, and never 3
+    # times less.
     minors = ixx + iyy + izz
     curvature = np.where(sound, det, 0.0) / np.where(minors > 0.0, minors, np.inf)
     return _normalise(better), curvature
@@ -359,7 +416,8 @@ def _information(b: FloatArray, w: FloatArray | None, local: IntArray) -> FloatA
     """Sum of w (I - b b^T), as (xx, yy, zz, xy, xz, yz): (6, d, k)."""
     weighted = b if w is None else b * w
     xx, yy, zz, xy, xz, yz = (
-        np.add.reduceat(weighted[i] * b[j], local, axis=-1) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+        np.add.reduceat(weighted[i] * b[j], local, axis=-1)
+        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     )
     return np.stack((yy + zz, xx + zz, xx + yy, -xy, -xz, -yz))
 
@@ -385,9 +443,16 @@ def _full(h: FloatArray) -> FloatArray:
 
 
 def _squared_residuals(
-    b: FloatArray, r: FloatArray, w: FloatArray | None, local: IntArray, counts: IntArray, q: FloatArray
+    b: FloatArray,
+    r: FloatArray,
+    w: FloatArray | None,
+    local: IntArray,
+    counts: IntArray,
+    q: FloatArray,
 ) -> FloatArray:
-    """Sum of w |b - R r|^2 per frame, (d, k): from the residuals, as 1 - lambda would lose the digits."""
+    """Sum of w |b - R r|^2 per frame, (d, k): from the residuals, as 1 - lambda would lose the
+    digits.
+    """
     total = np.zeros(b.shape[1:])
     for i, row in enumerate(_matrix(q)):
         x, y, z = (np.repeat(entry, counts, axis=-1) for entry in row)

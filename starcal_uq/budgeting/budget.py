@@ -1,7 +1,9 @@
-"""The mission error budget: what the calibration contributes, what the user knows, and what nobody has assessed.
+"""The mission error budget: what the calibration contributes, what the user knows, and what nobody
+has assessed.
 
-Rows that the posterior knows are filled from it, and inflated where the tests of the model demand it. The others come
-from the user's file, or read "not assessed": they are never taken for zero, and the totals then say "at least".
+Rows that the posterior knows are filled from it, and inflated where the tests of the model demand
+it. The others come from the user's file, or read "not assessed": they are never taken for zero, and
+the totals then say "at least".
 """
 
 from __future__ import annotations
@@ -53,7 +55,8 @@ def budget(
     n_samples: int = N_SAMPLES,
     seed: int = 0,
 ) -> Budget:
-    """Attitude error budget in the terms of ECSS-E-ST-60-20C, combined after ECSS-E-ST-60-10C and by sampling.
+    """Attitude error budget in the terms of ECSS-E-ST-60-20C, combined after ECSS-E-ST-60-10C and
+    by sampling.
 
     Parameters
     ----------
@@ -62,13 +65,15 @@ def budget(
     obs : Observations
         The frames it was made from.
     attitude : AttitudeError, optional
-        The propagated posterior, over the mission's frames if they differ; over `obs` if it is left out.
+        The propagated posterior, over the mission's frames if they differ; over `obs` if it is left
+        out.
     file : BudgetFile or path, optional
         The user's contributors and requirements.
     confidence : float, optional
         Probability of the totals; that of the file, or 0.997. Requirements have their own.
     misfit : Diagnosis, optional
-        The tests of the model (`starcal_uq.diagnose`), for an attitude error that does not hold what they found.
+        The tests of the model (`starcal_uq.diagnose`), for an attitude error that does not hold
+        what they found.
     n_samples, seed : int
         Number and seed of the sampled totals.
 
@@ -81,18 +86,31 @@ def budget(
         from starcal_uq.propagation.propagate import propagate
 
         attitude = propagate(post, obs)
-    stated = file if isinstance(file, BudgetFile) else BudgetFile() if file is None else load_budget_file(file)
+    stated = (
+        file
+        if isinstance(file, BudgetFile)
+        else BudgetFile()
+        if file is None
+        else load_budget_file(file)
+    )
     chosen = confidence if confidence is not None else stated.confidence
-    chosen = checked_confidence(_CONFIDENCE if chosen is None else chosen, "the confidence of the budget")
+    chosen = checked_confidence(
+        _CONFIDENCE if chosen is None else chosen, "the confidence of the budget"
+    )
     if n_samples < 10_000:
-        raise BudgetError(f"n_samples is {n_samples}, too few for the tails of an error; use at least 10000.")
+        raise BudgetError(
+            f"n_samples is {n_samples}, too few for the tails of an error; use at least 10000."
+        )
     check_memory(f"n_samples={n_samples}", 8.0 * 12 * n_samples)
     if misfit is not None and attitude.misfit is None:
         from starcal_uq.diagnostics.inflation import with_misfit
 
         attitude = with_misfit(attitude, misfit, post, obs)
     untested = () if attitude.misfit is not None else (UNTESTED,)
-    rows = (*posterior_rows(attitude, post), *_from_file(stated, (*untested, *FROM_FILE), alignment_rows(attitude)))
+    rows = (
+        *posterior_rows(attitude, post),
+        *_from_file(stated, (*untested, *FROM_FILE), alignment_rows(attitude)),
+    )
     found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
     settings: AnyDict = {
         "confidence": chosen,
@@ -120,12 +138,17 @@ def budget(
 def _from_file(
     stated: BudgetFile, expected: tuple[Expected, ...], known: tuple[Contributor, ...]
 ) -> tuple[Contributor, ...]:
-    """Expected contributors as the file states them, as known without it, or not assessed; then the user's own.
+    """Expected contributors as the file states them, as known without it, or not assessed; then the
+    user's own.
 
     Each is there on three axes.
     """
     given = {(row.name, row.axis): row for row in (*known, *stated.contributors)}
-    rows = [given.pop((entry.name, axis), not_assessed(entry, axis)) for entry in expected for axis in AXES]
+    rows = [
+        given.pop((entry.name, axis), not_assessed(entry, axis))
+        for entry in expected
+        for axis in AXES
+    ]
     for name in dict.fromkeys(name for name, _ in given):
         first = next(row for row in given.values() if row.name == name)
         rows += [given.get((name, axis), _silent(first, axis)) for axis in AXES]
@@ -133,7 +156,9 @@ def _from_file(
 
 
 def _silent(stated: Contributor, axis: str) -> Contributor:
-    """A contributor of the user's own on an axis that the file leaves out: not known, and so not zero."""
+    """A contributor of the user's own on an axis that the file leaves out: not known, and so not
+    zero.
+    """
     return replace(
         stated,
         axis=axis,
@@ -153,12 +178,18 @@ def _notes(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
     missing = _missing(rows)
     if missing:
         notes.append(
-            f"Not assessed, and in no total: {join_words(missing)}. The totals say at least how large the error is."
+            f"Not assessed, and in no total: {join_words(missing)}. The totals say at least how "
+            "large the error is."
         )
-    part = tuple(dict.fromkeys(row.name for row in rows if row.absorbed_by_alignment == "in part" and row.assessed))
+    part = tuple(
+        dict.fromkeys(
+            row.name for row in rows if row.absorbed_by_alignment == "in part" and row.assessed
+        )
+    )
     if part:
         notes.append(
-            f"Absorbed by alignment in part: {join_words(part)}. It counts in full in bounds after alignment, and not "
+            f"Absorbed by alignment in part: {join_words(part)}. It counts in full in bounds "
+            "after alignment, and not "
             "at all where these would violate a requirement."
         )
     return tuple(notes)
@@ -170,6 +201,10 @@ def _missing(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
     for name, axes in by_contributor(rows).items():
         absent = [axis for axis, row in axes.items() if not row.assessed]
         if absent:
-            some = "" if len(absent) == len(axes) else f" (about {join_words([AXIS_LABELS[axis] for axis in absent])})"
+            some = (
+                ""
+                if len(absent) == len(axes)
+                else f" (about {join_words([AXIS_LABELS[axis] for axis in absent])})"
+            )
             names.append(name + some)
     return tuple(names)

@@ -1,4 +1,6 @@
-"""The user's part of a budget: contributors that no calibration knows, and requirements, from a TOML file."""
+"""The user's part of a budget: contributors that no calibration knows, and requirements, from a
+TOML file.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ CONTRIBUTOR_KEYS = {
     "name": _NAME,
     "ecss_class": Key.choice(ECSS_CLASSES),
     "axis": Key.choice(tuple(_AXIS_NAMES), required=True),
-    "mean_arcsec": Key(float, f"a number of arcsec, at most {_TURN:.0f}, a full turn", ge=-_TURN, le=_TURN),
+    "mean_arcsec": Key(
+        float, f"a number of arcsec, at most {_TURN:.0f}, a full turn", ge=-_TURN, le=_TURN
+    ),
     "sigma_arcsec": _SIZE,
     "half_width_arcsec": _SIZE,
     "distribution": Key.choice(DISTRIBUTIONS),
@@ -67,14 +71,20 @@ CONTRIBUTOR_KEYS = {
     "absorbed_by_alignment": Key.choice(ABSORBED),
     "correlation_group": _TEXT,
     "conditions": _TEXT,
-    "provenance": Key(str, "where the number is from, because a budget is signed", required=True, pattern=r"\S"),
+    "provenance": Key(
+        str, "where the number is from, because a budget is signed", required=True, pattern=r"\S"
+    ),
     "applies": Key(bool, "true or false, without quotes"),
 }
 REQUIREMENT_KEYS = {
     "name": _NAME,
     "axis": Key.choice(tuple(_REQUIREMENT_AXES), required=True),
     "limit_arcsec": Key(
-        float, f"a positive number of arcsec, at most {_TURN:.0f}, a full turn", required=True, gt=0.0, le=_TURN
+        float,
+        f"a positive number of arcsec, at most {_TURN:.0f}, a full turn",
+        required=True,
+        gt=0.0,
+        le=_TURN,
     ),
     "confidence": _CONFIDENCE,
     "scope": Key.choice(SCOPES),
@@ -83,7 +93,9 @@ REQUIREMENT_KEYS = {
     "frame": _TEXT,
 }
 SENSOR = "sensor"
-_FRAME = Section({"rotation": Key(Any, "a matrix of three rows, or a quaternion", required=True)}, BudgetError)
+_FRAME = Section(
+    {"rotation": Key(Any, "a matrix of three rows, or a quaternion", required=True)}, BudgetError
+)
 _HEAD, _CONTRIBUTOR, _REQUIREMENT = (
     Section(keys, BudgetError) for keys in (BUDGET_KEYS, CONTRIBUTOR_KEYS, REQUIREMENT_KEYS)
 )
@@ -160,21 +172,29 @@ class BudgetFile:
 def _read(data: Any, where: str, section: Section) -> AnyDict:
     """Checked values of one table, texts without the space around them."""
     if not isinstance(data, Mapping):
-        raise BudgetError(f"{where}: is no table; write [[contributor]] or [[requirement]] above its keys.")
+        raise BudgetError(
+            f"{where}: is no table; write [[contributor]] or [[requirement]] above its keys."
+        )
     for key in data:
         if key in _GONE:
-            raise BudgetError(f"{where}: key {key} is no longer read, because {_GONE[key]}; delete the line.")
+            raise BudgetError(
+                f"{where}: key {key} is no longer read, because {_GONE[key]}; delete the line."
+            )
     values = section.check(data, where)
     if "confidence" in values:
         checked_confidence(values["confidence"], f"{where}: key confidence")
-    return {key: value.strip() if isinstance(value, str) else value for key, value in values.items()}
+    return {
+        key: value.strip() if isinstance(value, str) else value for key, value in values.items()
+    }
 
 
 def checked_confidence(value: float, where: str) -> float:
     """A confidence between 0 and 1, or a `BudgetError`."""
     if not PROBABILITY.holds(value):
         hint = f"; write {value / 100:g} for {value:g} %" if 1.0 < value < 100.0 else ""
-        raise BudgetError(f"{where} is {value!r}, but a confidence lies between 0 and 1, such as 0.997{hint}.")
+        raise BudgetError(
+            f"{where} is {value!r}, but a confidence lies between 0 and 1, such as 0.997{hint}."
+        )
     return value
 
 
@@ -184,19 +204,25 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
     Raises
     ------
     BudgetError
-        If it cannot be read, or a key is unknown, missing or wrong; the sentence names file, table and key.
+        If it cannot be read, or a key is unknown, missing or wrong; the sentence names file, table
+        and key.
     """
     missing = "check the path, or write a starter with `starcal-uq budget RUN --template FILE`"
     content = read_toml(path, "budget", BudgetError, missing)
     for key in content:
         if key not in ("budget", "contributor", "requirement", "frame"):
             raise BudgetError(
-                f"{path}: {key} is not known; write [budget], [frame.NAME], [[contributor]] and [[requirement]] tables "
+                f"{path}: {key} is not known; write [budget], [frame.NAME], [[contributor]] and "
+                "[[requirement]] tables "
                 "only."
             )
     frames = _frames(content.get("frame", {}), path)
     head = _read(content.get("budget", {}), f"{path}, [budget]", _HEAD)
-    rows = [row for table, where in _tables(content, "contributor", path) for row in _contributor(table, where)]
+    rows = [
+        row
+        for table, where in _tables(content, "contributor", path)
+        for row in _contributor(table, where)
+    ]
     _no_doubles([(row.name, row.axis) for row in rows], f"{path}: contributor")
     asked: AnyDict = {"confidence": 0.997} | head
     requirements = tuple(
@@ -204,12 +230,16 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
         for table, where in _tables(content, "requirement", path)
     )
     _no_doubles([(requirement.name,) for requirement in requirements], f"{path}: requirement")
-    return BudgetFile(tuple(rows), requirements, head.get("title", ""), head.get("confidence"), str(path), frames)
+    return BudgetFile(
+        tuple(rows), requirements, head.get("title", ""), head.get("confidence"), str(path), frames
+    )
 
 
 def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
     """Rotations by frame: a matrix, or a quaternion with its scalar last."""
-    if not isinstance(tables, Mapping) or not all(isinstance(table, Mapping) for table in tables.values()):
+    if not isinstance(tables, Mapping) or not all(
+        isinstance(table, Mapping) for table in tables.values()
+    ):
         raise BudgetError(f"{path}: frame needs a name; write [frame.payload] above its rotation.")
     frames = {}
     for name, data in tables.items():
@@ -227,7 +257,8 @@ def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
             values = quaternion_to_rotation(values / np.linalg.norm(values))
         if values.shape != (3, 3) or not np.abs(values @ values.T - np.eye(3)).max() < _ORTHONORMAL:
             raise BudgetError(
-                f"{where}: key rotation is no rotation; write three rows of three numbers (v_{name} = R v_sensor), or "
+                f"{where}: key rotation is no rotation; write three rows of three numbers "
+                f"(v_{name} = R v_sensor), or "
                 "the four of a quaternion, scalar last."
             )
         if np.linalg.det(values) < 0.0:
@@ -236,12 +267,15 @@ def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
     return frames
 
 
-def _tables(content: Mapping[str, Any], key: str, path: str | os.PathLike[str]) -> Iterator[tuple[Any, str]]:
+def _tables(
+    content: Mapping[str, Any], key: str, path: str | os.PathLike[str]
+) -> Iterator[tuple[Any, str]]:
     """The tables of one kind, and how messages call each: by its number and name."""
     found = content.get(key, [])
     if not isinstance(found, list):
         raise BudgetError(
-            f"{path}: [{key}] must be written with two brackets, [[{key}]], because there may be several."
+            f"{path}: [{key}] must be written with two brackets, [[{key}]], because there may be "
+            "several."
         )
     for number, table in enumerate(found, start=1):
         name = table.get("name") if isinstance(table, Mapping) else None
@@ -253,7 +287,9 @@ def _no_doubles(names: Sequence[tuple[str, ...]], where: str) -> None:
     for index, name in enumerate(names):
         if name in names[:index]:
             shown = ", axis ".join(name)
-            raise BudgetError(f"{where} {shown} is stated twice; keep one, or give them different names.")
+            raise BudgetError(
+                f"{where} {shown} is stated twice; keep one, or give them different names."
+            )
 
 
 def _contributor(data: Any, where: str) -> list[Contributor]:
@@ -261,26 +297,35 @@ def _contributor(data: Any, where: str) -> list[Contributor]:
     name, close = _known_name(table["name"])
     if name in {entry.name for entry in (*FROM_POSTERIOR, INTERACTING)}:
         raise BudgetError(
-            f"{where}: key name: this row is filled by the posterior; give yours another name, or propagate over other "
+            f"{where}: key name: this row is filled by the posterior; give yours another name, "
+            "or propagate over other "
             "frames."
         )
     known = {entry.name: entry for entry in FROM_FILE}.get(name)
     if known is None:
         _check_own(table, where, name, close)
     stated: AnyDict = {
-        key: table[key] for key in ("correlation_group", "conditions", "provenance", "applies") if key in table
+        key: table[key]
+        for key in ("correlation_group", "conditions", "provenance", "applies")
+        if key in table
     }
     for key in ("distribution", *_OWN_KEYS):
         stated[key] = table.get(key, getattr(known or _OWN, key))
-    mean, sigma = _moments(table, where, stated["distribution"]) if table.get("applies", True) else (0.0, 0.0)
+    mean, sigma = (
+        _moments(table, where, stated["distribution"]) if table.get("applies", True) else (0.0, 0.0)
+    )
     return [
-        Contributor(name=name, axis=axis, mean_arcsec=mean, sigma_arcsec=sigma, source="file", **stated)
+        Contributor(
+            name=name, axis=axis, mean_arcsec=mean, sigma_arcsec=sigma, source="file", **stated
+        )
         for axis in _AXIS_NAMES[table["axis"]]
     ]
 
 
 def _known_name(written: str) -> tuple[str, str]:
-    """The name as the starter has it, whatever its case; else as written, with the most similar one of the starter."""
+    """The name as the starter has it, whatever its case; else as written, with the most similar one
+    of the starter.
+    """
     names = {entry.name.lower(): entry.name for entry in (*FROM_FILE, *FROM_POSTERIOR, INTERACTING)}
     plain = " ".join(written.lower().split())
     if plain in names:
@@ -290,17 +335,25 @@ def _known_name(written: str) -> tuple[str, str]:
 
 
 def _check_own(table: AnyDict, where: str, name: str, close: str) -> None:
-    """Refuse a mistyped name of the starter, and a contributor of the user's own that leaves out what it is."""
-    similar = difflib.SequenceMatcher(None, close.lower(), " ".join(name.lower().split())).ratio() if close else 0.0
+    """Refuse a mistyped name of the starter, and a contributor of the user's own that leaves out
+    what it is.
+    """
+    similar = (
+        difflib.SequenceMatcher(None, close.lower(), " ".join(name.lower().split())).ratio()
+        if close
+        else 0.0
+    )
     if similar >= _SAME_NAME:
         raise BudgetError(
-            f"{where}: key name: did you mean {close!r}? Write that, or a name of your own that differs more."
+            f"{where}: key name: did you mean {close!r}? Write that, or a name of your own that "
+            "differs more."
         )
     missing = [key for key in _OWN_KEYS if key not in table]
     if missing and table.get("applies", True):
         hint = f"did you mean {close!r}? " if close else ""
         raise BudgetError(
-            f"{where}: {hint}The starter has no such name, and a contributor of your own must state "
+            f"{where}: {hint}The starter has no such name, and a contributor of your own must "
+            "state "
             f"{', '.join(missing)} as well."
         )
 
@@ -310,22 +363,32 @@ def _moments(table: AnyDict, where: str, distribution: str) -> tuple[float, floa
     stated = [key for key in ("sigma_arcsec", "half_width_arcsec") if key in table]
     if distribution == "constant":
         if stated:
-            raise BudgetError(f"{where}: key {stated[0]}: a constant has no spread; give mean_arcsec alone.")
+            raise BudgetError(
+                f"{where}: key {stated[0]}: a constant has no spread; give mean_arcsec alone."
+            )
         if "mean_arcsec" not in table:
-            raise BudgetError(f"{where}: key mean_arcsec is missing; add the number of arcsec that is always there.")
+            raise BudgetError(
+                f"{where}: key mean_arcsec is missing; add the number of arcsec that is always "
+                "there."
+            )
         return table["mean_arcsec"], 0.0
     if len(stated) != 1:
         what = "is missing" if not stated else "and half_width_arcsec are both given"
-        raise BudgetError(f"{where}: key sigma_arcsec {what}; write either sigma_arcsec or half_width_arcsec.")
+        raise BudgetError(
+            f"{where}: key sigma_arcsec {what}; write either sigma_arcsec or half_width_arcsec."
+        )
     value = table[stated[0]]
     if stated[0] == "half_width_arcsec":
         if distribution not in HALF_WIDTHS:
             raise BudgetError(
-                f"{where}: key half_width_arcsec: a {distribution} error has no end; write sigma_arcsec, or "
+                f"{where}: key half_width_arcsec: a {distribution} error has no end; write "
+                "sigma_arcsec, or "
                 "distribution = 'uniform' or 'arcsine'."
             )
         value /= HALF_WIDTHS[distribution]
-    return table.get("mean_arcsec", RAYLEIGH_MEAN * value if distribution == "rayleigh" else 0.0), value
+    return table.get(
+        "mean_arcsec", RAYLEIGH_MEAN * value if distribution == "rayleigh" else 0.0
+    ), value
 
 
 def _requirement(data: Any, where: str, confidence: float, frames: tuple[str, ...]) -> Requirement:
@@ -333,11 +396,14 @@ def _requirement(data: Any, where: str, confidence: float, frames: tuple[str, ..
     frame = table.get("frame", SENSOR)
     if frame not in (SENSOR, *frames):
         raise BudgetError(
-            f"{where}: key frame is {frame!r}, which no table of the file describes; write [frame.{frame}] with its "
+            f"{where}: key frame is {frame!r}, which no table of the file describes; write "
+            f"[frame.{frame}] with its "
             "rotation."
         )
     axis = table.pop("axis")
-    return Requirement(axis=axis if axis == CROSS_BORESIGHT else _REQUIREMENT_AXES[axis][0], **table)
+    return Requirement(
+        axis=axis if axis == CROSS_BORESIGHT else _REQUIREMENT_AXES[axis][0], **table
+    )
 
 
 _LETTERS = dict(zip(AXES, "XYZ", strict=True))
@@ -388,7 +454,9 @@ confidence = 0.997
 
 
 def template_text(rows: Sequence[Contributor] = ()) -> str:
-    """Text of the starter file: everything, or what `rows` of a budget leave unassessed on an axis."""
+    """Text of the starter file: everything, or what `rows` of a budget leave unassessed on an
+    axis.
+    """
     parts = [_HEADER]
     for entry in FROM_FILE:
         mine = [row for row in rows if row.name == entry.name]

@@ -1,4 +1,6 @@
-"""The rows of a budget that a calibration fills: with the misfit found, as far as its model was tested."""
+"""The rows of a budget that a calibration fills: with the misfit found, as far as its model was
+tested.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,12 @@ from starcal_uq.budgeting.rows import (
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import join_words, plural
 from starcal_uq.core.types import FloatArray
-from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND, choice_words
+from starcal_uq.propagation.attitude_error import (
+    CONTRIBUTORS,
+    IF_MODEL_HOLDS,
+    WITH_MISFIT_FOUND,
+    choice_words,
+)
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -31,9 +38,13 @@ if TYPE_CHECKING:
 
 
 def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributor, ...]:
-    """Common rotation, rest, centroid noise, and their interaction where it was propagated; each on three axes."""
+    """Common rotation, rest, centroid noise, and their interaction where it was propagated; each on
+    three axes.
+    """
     hash_text = str(post.provenance.get("data_sha256") or "")[:12]
-    provenance = f"posterior of {plural(len(post.draws), 'draw')}" + (f", data {hash_text}" if hash_text else "")
+    provenance = f"posterior of {plural(len(post.draws), 'draw')}" + (
+        f", data {hash_text}" if hash_text else ""
+    )
     conditions = f"star geometry of {plural(attitude.n_frames, 'frame')} ({attitude.frames}), "
     conditions += f"{post.camera.distortion} distortion"
     expected = list(FROM_POSTERIOR)
@@ -46,14 +57,18 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
     rows = []
     for entry in expected:
         place = CONTRIBUTORS.index(entry.name)
-        held, with_misfit = attitude.if_model_holds_arcsec[place], attitude.with_misfit_found_arcsec[place]
+        held, with_misfit = (
+            attitude.if_model_holds_arcsec[place],
+            attitude.with_misfit_found_arcsec[place],
+        )
         counted = attitude.headline_arcsec[place]
         factor = factors.get(entry.name, 1.0)
         scale = np.divide(factor * held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
         correlation = axis_correlations(attitude.covariance_arcsec2[place], scale)
         alignment = f"; alignment on {attitude.alignment}" if entry.name == COMMON else ""
         for index, axis in enumerate(AXES):
-            # What the misfit adds has no frame-by-frame sigma: the excess of the tail shrinks with its share.
+            # What the misfit adds has no frame-by-frame sigma: the excess of the tail shrinks with
+            # its share.
             share = (factor * held[index] / counted[index]) ** 2 if counted[index] > 0.0 else 1.0
             excess = tails.get((entry.name, axis), GAUSSIAN_997) - GAUSSIAN_997
             why = "; ".join(reasons.get(entry.name, ())) if counted[index] > held[index] else ""
@@ -66,7 +81,9 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
                     sigma_arcsec=float(counted[index]),
                     distribution=entry.distribution,
                     # Frames that all see the same field: a bias that no moment changes.
-                    interpretation="ensemble" if entry.name == REST and attitude.stays[index] else entry.interpretation,
+                    interpretation="ensemble"
+                    if entry.name == REST and attitude.stays[index]
+                    else entry.interpretation,
                     absorbed_by_alignment=entry.absorbed_by_alignment,
                     axis_correlation=correlation[index],
                     tail_997=GAUSSIAN_997 + float(share) * excess,
@@ -85,19 +102,28 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
     found = attitude.misfit
     if found is None:
         return (
-            f"The model was not tested: the calibration rows hold {IF_MODEL_HOLDS}, and what they are "
+            f"The model was not tested: the calibration rows hold {IF_MODEL_HOLDS}, and what "
+            "they are "
             f"{WITH_MISFIT_FOUND} is not assessed (run `starcal-uq diagnose RUN`).",
         )
-    rows = [name for name, why in ((COMMON, found.common_reasons), (REST, found.rest_reasons)) if why]
-    note = f"Inflated by what the tests of the model found: {join_words([repr(name) for name in rows])}."
+    rows = [
+        name for name, why in ((COMMON, found.common_reasons), (REST, found.rest_reasons)) if why
+    ]
+    note = (
+        "Inflated by what the tests of the model found: "
+        f"{join_words([repr(name) for name in rows])}."
+    )
     none = (
-        "The tests of the model found nothing that inflates the calibration rows; what they cannot see is not in them."
+        "The tests of the model found nothing that inflates the calibration rows; what they "
+        "cannot see is not in them."
     )
     return tuple(filter(None, (note if rows else none, choice_words(attitude), *found.notes)))
 
 
 def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[float, ...], ...]:
-    """Lines of the correlation matrix, off-diagonal elements scaled down by what is added independently; or nothing."""
+    """Lines of the correlation matrix, off-diagonal elements scaled down by what is added
+    independently; or nothing.
+    """
     sigma = np.sqrt(np.diag(covariance))
     if not (np.isfinite(covariance).all() and (sigma > 0.0).all()):
         return ((),) * len(AXES)
@@ -107,7 +133,9 @@ def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[
 
 
 def alignment_rows(attitude: AttitudeError) -> tuple[Contributor, ...]:
-    """The error of the alignment from the noise of its frames, where it was propagated; a file may state another."""
+    """The error of the alignment from the noise of its frames, where it was propagated; a file may
+    state another.
+    """
     expected = next(entry for entry in FROM_FILE if entry.name == ALIGNMENT)
     correlations = axis_correlations(attitude.alignment_covariance_arcsec2, np.ones(3))
     rows = (
@@ -120,19 +148,26 @@ def alignment_rows(attitude: AttitudeError) -> tuple[Contributor, ...]:
             provenance="propagated with the posterior",
             source="posterior",
         )
-        for axis, sigma, correlation in zip(AXES, attitude.alignment_arcsec, correlations, strict=True)
+        for axis, sigma, correlation in zip(
+            AXES, attitude.alignment_arcsec, correlations, strict=True
+        )
     )
     return tuple(row for row in rows if math.isfinite(row.sigma_arcsec))
 
 
 def _tails(attitude: AttitudeError) -> dict[tuple[str, str], float]:
-    """99.7 % half-widths over sigmas as propagated: sigmas that differ from frame to frame make them larger.
+    """99.7 % half-widths over sigmas as propagated: sigmas that differ from frame to frame make
+    them larger.
 
-    Of centroid noise and rest only: common rotations are one Gaussian, and what differs from it in their sampled
-    quantile is chance.
+    Of centroid noise and rest only: common rotations are one Gaussian, and what differs from it in
+    their sampled quantile is chance.
     """
     table = attitude.to_dataframe()
     rows = table[table["contributor"].isin((NEA, REST))]
     ratios = (rows["p997_if_model_holds_arcsec"] / rows["if_model_holds_arcsec"]).tolist()
     keys = zip(rows["contributor"].tolist(), rows["axis"].tolist(), strict=True)
-    return {key: max(ratio, GAUSSIAN_997) for key, ratio in zip(keys, ratios, strict=True) if math.isfinite(ratio)}
+    return {
+        key: max(ratio, GAUSSIAN_997)
+        for key, ratio in zip(keys, ratios, strict=True)
+        if math.isfinite(ratio)
+    }

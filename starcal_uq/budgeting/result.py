@@ -37,7 +37,9 @@ _AXIS_NAMES = {
 
 @dataclass(frozen=True)
 class Outcome(Shown):
-    """A requirement against the total that it is about, which is at the requirement's confidence."""
+    """A requirement against the total that it is about, which is at the requirement's
+    confidence.
+    """
 
     requirement: Requirement
     total: Total
@@ -46,13 +48,15 @@ class Outcome(Shown):
     def bound_arcsec(self) -> float:
         """What is held against the limit: by the rule, by sampling, or the larger of both.
 
-        NaN if it is not known. The larger of both is at least the rule, which is enough where that violates the limit.
+        NaN if it is not known. The larger of both is at least the rule, which is enough where that
+        violates the limit.
         """
         return self._judged(self.total.rule_arcsec, self.total.sampled_arcsec)
 
     @property
     def least_arcsec(self) -> float:
-        """The same bound at the least: worst cases do not meet, and what is absorbed in part is gone.
+        """The same bound at the least: worst cases do not meet, and what is absorbed in part is
+        gone.
 
         Only where it is above the limit is the requirement violated.
         """
@@ -75,8 +79,8 @@ class Outcome(Shown):
     def verdict(self) -> str:
         """``violated``, ``met``, or ``open``.
 
-        Open while contributors are missing or samples do not resolve the confidence, and where the limit lies between
-        what is reached for certain and a bound that is only an upper one.
+        Open while contributors are missing or samples do not resolve the confidence, and where the
+        limit lies between what is reached for certain and a bound that is only an upper one.
         """
         if self.least_arcsec > self.requirement.limit_arcsec:
             return "violated"
@@ -141,13 +145,17 @@ class Budget(Shown):
 
     @property
     def comparable(self) -> tuple[Outcome, ...]:
-        """Requirements in the sensor's frame, mixed, at the budget's own confidence: its totals are about these."""
+        """Requirements in the sensor's frame, mixed, at the budget's own confidence: its totals are
+        about these.
+        """
         return tuple(
             outcome
             for outcome in self.outcomes
             if outcome.requirement.interpretation == "mixed"
             and outcome.requirement.frame == SENSOR
-            and math.isclose(1.0 - outcome.requirement.confidence, 1.0 - self.confidence, rel_tol=1e-9)
+            and math.isclose(
+                1.0 - outcome.requirement.confidence, 1.0 - self.confidence, rel_tol=1e-9
+            )
         )
 
     @property
@@ -155,14 +163,16 @@ class Budget(Shown):
         """Contributors that are not assessed on some axis."""
         return tuple(dict.fromkeys(row.name for row in self.rows if not row.assessed))
 
-    def total(self, axis: str, scope: str = "after alignment", interpretation: str = "mixed") -> Total:
+    def total(
+        self, axis: str, scope: str = "after alignment", interpretation: str = "mixed"
+    ) -> Total:
         """One of the totals.
 
         Parameters
         ----------
         axis : str
-            ``pitch``, ``yaw``, ``roll``, ``cross-boresight``, or as tables show it: ``X``, ``X (pitch)``, ``X and Y
-            together``.
+            ``pitch``, ``yaw``, ``roll``, ``cross-boresight``, or as tables show it: ``X``, ``X
+            (pitch)``, ``X and Y together``.
         scope : str
             ``before alignment`` or ``after alignment``.
         interpretation : str
@@ -178,18 +188,26 @@ class Budget(Shown):
             if (found.axis, found.scope, found.interpretation) == (name, scope, interpretation):
                 return found
         raise ValueError(
-            f"a budget has no total for {axis!r}, {scope!r}, {interpretation!r}; the axis is one of X, Y, Z (pitch, "
-            f"yaw, roll) or {CROSS_BORESIGHT}, the scope {' or '.join(SCOPES)}, the interpretation mixed, ensemble or "
+            f"a budget has no total for {axis!r}, {scope!r}, {interpretation!r}; the axis is one "
+            "of X, Y, Z (pitch, "
+            f"yaw, roll) or {CROSS_BORESIGHT}, the scope {' or '.join(SCOPES)}, the "
+            "interpretation mixed, ensemble or "
             "temporal"
         )
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per contributor and axis: the fields of `Contributor`, ``assessed`` and ``combination``."""
+        """One row per contributor and axis: the fields of `Contributor`, ``assessed`` and
+        ``combination``.
+        """
         import pandas as pd
 
         names = [f.name for f in fields(Contributor)]
         rows = [
-            {**{name: getattr(row, name) for name in names}, "assessed": row.assessed, "combination": row.combination}
+            {
+                **{name: getattr(row, name) for name in names},
+                "assessed": row.assessed,
+                "combination": row.combination,
+            }
             for row in self.rows
         ]
         return pd.DataFrame(rows)
@@ -202,10 +220,14 @@ class Budget(Shown):
             {**{f.name: getattr(entry, f.name) for f in fields(Total)}, "at_least": entry.at_least}
             for entry in self.totals
         ]
-        return pd.DataFrame(rows).assign(not_assessed=["; ".join(entry.not_assessed) for entry in self.totals])
+        return pd.DataFrame(rows).assign(
+            not_assessed=["; ".join(entry.not_assessed) for entry in self.totals]
+        )
 
     def classes_dataframe(self, scope: str = "after alignment") -> pd.DataFrame:
-        """Standard deviations by class of the standard: ``ecss_class``, ``axis``, ``sigma_arcsec``, ``at_least``."""
+        """Standard deviations by class of the standard: ``ecss_class``, ``axis``, ``sigma_arcsec``,
+        ``at_least``.
+        """
         import pandas as pd
 
         counted = [row for row in self.rows if row.counts(scope) and row.applies]
@@ -219,7 +241,9 @@ class Budget(Shown):
         return pd.DataFrame(records, columns=["ecss_class", "axis", "sigma_arcsec", "at_least"])
 
     def requirements_dataframe(self) -> pd.DataFrame:
-        """One row per requirement: its fields, the bounds, ``least_arcsec``, ``margin_arcsec`` and ``verdict``."""
+        """One row per requirement: its fields, the bounds, ``least_arcsec``, ``margin_arcsec`` and
+        ``verdict``.
+        """
         import pandas as pd
 
         names = [f.name for f in fields(Requirement)]
@@ -241,7 +265,10 @@ class Budget(Shown):
 
         def plain(table: pd.DataFrame) -> list[AnyDict]:
             records = table.to_dict("records")
-            return [{key: None if _unknown(value) else value for key, value in record.items()} for record in records]
+            return [
+                {key: None if _unknown(value) else value for key, value in record.items()}
+                for record in records
+            ]
 
         return {
             "title": self.title,
@@ -267,8 +294,14 @@ class Budget(Shown):
             If it cannot be written.
         """
         if Path(path).suffix.lower() != ".csv":
-            raise BudgetError(f"{path}: a budget is saved as .csv; sc.report(budget, path) writes .xlsx, .tex, .html.")
-        records = [{"record": "contributor", **_plain(row), "combination": row.combination} for row in self.rows]
+            raise BudgetError(
+                f"{path}: a budget is saved as .csv; sc.report(budget, path) writes .xlsx, .tex, "
+                ".html."
+            )
+        records = [
+            {"record": "contributor", **_plain(row), "combination": row.combination}
+            for row in self.rows
+        ]
         records += [{"record": "total", **_plain(entry)} for entry in self.totals]
         records += [
             {
@@ -286,11 +319,19 @@ class Budget(Shown):
             "notes": list(self.notes),
             "provenance": self.provenance,
         }
-        records += [{"record": "setting", "name": key, "value": json.dumps(value)} for key, value in settings.items()]
-        with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        records += [
+            {"record": "setting", "name": key, "value": json.dumps(value)}
+            for key, value in settings.items()
+        ]
+        with (
+            atomic_path(path) as temporary,
+            open(temporary, "w", newline="", encoding="utf-8") as file,
+        ):
             writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
             writer.writeheader()
-            writer.writerows({name: cell_text(value) for name, value in record.items()} for record in records)
+            writer.writerows(
+                {name: cell_text(value) for name, value in record.items()} for record in records
+            )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Budget:
@@ -301,19 +342,27 @@ class Budget(Shown):
         RunFolderError
             If the file is missing or is not a budget.
         """
-        with reading(path, "an error budget", "run `starcal-uq budget RUN --force` to write it again"):
+        with reading(
+            path, "an error budget", "run `starcal-uq budget RUN --force` to write it again"
+        ):
             with open(path, newline="", encoding="utf-8") as file:
                 records = [
-                    {name: cell_content(cell) for name, cell in record.items()} for record in csv.DictReader(file)
+                    {name: cell_content(cell) for name, cell in record.items()}
+                    for record in csv.DictReader(file)
                 ]
             by_kind: dict[str, list[dict[str, str]]] = {}
             for record in records:
                 before = record.pop("raw_sigma_arcsec", "nan")
                 if before not in ("", "nan"):
                     # What a version before called inflated.
-                    record |= {"if_model_holds_arcsec": before, "with_misfit_found_arcsec": record["sigma_arcsec"]}
+                    record |= {
+                        "if_model_holds_arcsec": before,
+                        "with_misfit_found_arcsec": record["sigma_arcsec"],
+                    }
                 by_kind.setdefault(record["record"], []).append(record)
-            settings = {record["name"]: json.loads(record["value"]) for record in by_kind["setting"]}
+            settings = {
+                record["name"]: json.loads(record["value"]) for record in by_kind["setting"]
+            }
             return Budget(
                 rows=tuple(_made(Contributor, record) for record in by_kind["contributor"]),
                 totals=tuple(_made(Total, record) for record in by_kind["total"]),
@@ -362,7 +411,10 @@ def by_contributor(rows: Sequence[Contributor]) -> dict[str, dict[str, Contribut
     for row in rows:
         found.setdefault(row.name, {})[row.axis] = row
     order = {axis: index for index, axis in enumerate(AXES)}
-    return {name: dict(sorted(axes.items(), key=lambda item: order[item[0]])) for name, axes in found.items()}
+    return {
+        name: dict(sorted(axes.items(), key=lambda item: order[item[0]]))
+        for name, axes in found.items()
+    }
 
 
 _SEPARATOR = " | "
@@ -373,14 +425,21 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "str": str,
     "tuple[str, ...]": lambda text: tuple(text.split(_SEPARATOR)) if text else (),
     # Earlier versions wrote them without brackets.
-    "tuple[float, ...]": lambda text: tuple(float(value) for value in re.findall(r"[^][,|\s]+", text)),
+    "tuple[float, ...]": lambda text: tuple(
+        float(value) for value in re.findall(r"[^][,|\s]+", text)
+    ),
 }
 
 _DERIVED = ("combination", "margin_arcsec", "verdict")
 
 _COLUMNS = tuple(
     dict.fromkeys(
-        ["record", *(f.name for kind in (Contributor, Requirement, Total) for f in fields(kind)), *_DERIVED, "value"]
+        [
+            "record",
+            *(f.name for kind in (Contributor, Requirement, Total) for f in fields(kind)),
+            *_DERIVED,
+            "value",
+        ]
     )
 )
 
@@ -400,5 +459,9 @@ def _text(value: Any) -> str:
 def _made(kind: Any, record: Mapping[str, str]) -> Any:
     # Files of earlier versions lack columns, for which the defaults stand.
     return kind(
-        **{f.name: _READERS[str(f.type)](record[f.name]) for f in fields(kind) if record.get(f.name) is not None}
+        **{
+            f.name: _READERS[str(f.type)](record[f.name])
+            for f in fields(kind)
+            if record.get(f.name) is not None
+        }
     )

@@ -1,8 +1,9 @@
-"""The rows of an error budget: one contributor on one axis, and the contributors that no budget may leave out.
+"""The rows of an error budget: one contributor on one axis, and the contributors that no budget may
+leave out.
 
-The classes are those of ECSS-E-ST-60-20C (star sensors): bias, thermo-elastic error, field-of-view spatial error, pixel
-spatial error, aberration, temporal noise, measurement date error. What a calibration cannot know is in this list too,
-so that it is read as "not assessed" and never as zero.
+The classes are those of ECSS-E-ST-60-20C (star sensors): bias, thermo-elastic error, field-of-view
+spatial error, pixel spatial error, aberration, temporal noise, measurement date error. What a
+calibration cannot know is in this list too, so that it is read as "not assessed" and never as zero.
 """
 
 from __future__ import annotations
@@ -66,27 +67,32 @@ class Contributor:
     distribution : str
         One of `DISTRIBUTIONS`: shape around the mean. ``constant`` has no spread.
     interpretation : str
-        Kind of randomness: ``ensemble`` (of calibrations and units: constant in time), ``temporal`` or ``mixed``.
+        Kind of randomness: ``ensemble`` (of calibrations and units: constant in time), ``temporal``
+        or ``mixed``.
     absorbed_by_alignment : str
-        Does an alignment calibration with the same camera parameters take it up? ``caused by it`` marks what exists
-        only after it. ``in part`` counts in full for upper bounds, and not at all for the least ones.
+        Does an alignment calibration with the same camera parameters take it up? ``caused by it``
+        marks what exists only after it. ``in part`` counts in full for upper bounds, and not at all
+        for the least ones.
     correlation_group : str
-        Rows with the same text err together, on all axes: their sigmas add. With ``-`` in front they err against
-        those without. Empty if it errs alone.
+        Rows with the same text err together, on all axes: their sigmas add. With ``-`` in front
+        they err against those without. Empty if it errs alone.
     axis_correlation : tuple of float
-        Correlations with pitch, yaw and roll of the same contributor; empty if its axes are independent.
+        Correlations with pitch, yaw and roll of the same contributor; empty if its axes are
+        independent.
     tail_997 : float
-        Half-width that holds 99.7 % of the absolute deviations, standard deviations. Above 2.968 for a Gaussian error
-        whose sigma changes from frame to frame.
+        Half-width that holds 99.7 % of the absolute deviations, standard deviations. Above 2.968
+        for a Gaussian error whose sigma changes from frame to frame.
     conditions, provenance : str
         Under what conditions it holds, and where the number is from.
     source : str
         ``posterior``, ``file`` or ``not assessed``.
     if_model_holds_arcsec, with_misfit_found_arcsec : float
-        Sigma by the posterior alone, and with what the tests of the model found, which is then `sigma_arcsec`; NaN
-        where there is no such figure, as in rows of a file or where the model was not tested.
+        Sigma by the posterior alone, and with what the tests of the model found, which is then
+        `sigma_arcsec`; NaN where there is no such figure, as in rows of a file or where the model
+        was not tested.
     applies : bool
-        False where the file states that there is no such error: it then counts as zero, with that as its reason.
+        False where the file states that there is no such error: it then counts as zero, with that
+        as its reason.
     """
 
     DOCUMENTED: ClassVar = ("assessed", "combination")
@@ -134,13 +140,19 @@ class Contributor:
             return "none"
         if self.distribution == "constant":
             return "mean: linear"
-        group = f"linear within group {self.group[0]!r}, then in squares" if self.correlation_group else ""
+        group = (
+            f"linear within group {self.group[0]!r}, then in squares"
+            if self.correlation_group
+            else ""
+        )
         against = " (against the others)" if self.group[1] < 0.0 else ""
         return group + against if group else "in squares"
 
     def counts(self, scope: str) -> bool:
         """True if it exists in this scope, one of `SCOPES` or `AFTER_AT_LEAST`."""
-        if self.absorbed_by_alignment == "yes" or (scope == AFTER_AT_LEAST and self.absorbed_by_alignment == "in part"):
+        if self.absorbed_by_alignment == "yes" or (
+            scope == AFTER_AT_LEAST and self.absorbed_by_alignment == "in part"
+        ):
             return scope == SCOPES[0]
         if self.absorbed_by_alignment == "caused by it":
             return scope != SCOPES[0]
@@ -149,7 +161,8 @@ class Contributor:
 
 @dataclass(frozen=True)
 class Expected:
-    """A contributor that a star-sensor budget must name, with entries of a `Contributor`; a file may state otherwise.
+    """A contributor that a star-sensor budget must name, with entries of a `Contributor`; a file
+    may state otherwise.
 
     `what` is the description and usual source of the number, for people.
     """
@@ -188,20 +201,31 @@ UNTESTED = Expected(
 FROM_FILE = (
     Expected(
         *("on-ground alignment measurement", "bias", "ensemble", "yes", "gaussian"),
-        "alignment of the sensor's frame with its mounting reference (cube, feet), as measured before launch",
+        (
+            "alignment of the sensor's frame with its mounting reference (cube, feet), as measured "
+            "before launch"
+        ),
     ),
     Expected(
         *("launch and settling shift", "bias", "ensemble", "yes", "uniform"),
-        "change of that alignment from its measurement to the start of the mission: launch loads, gravity, moisture",
+        (
+            "change of that alignment from its measurement to the start of the mission: launch "
+            "loads, gravity, moisture"
+        ),
     ),
     Expected(
         *(ALIGNMENT, "bias", "ensemble", "caused by it", "gaussian"),
-        "error of the in-flight estimate that replaces the rows it absorbs, if it is more than noise of the frames on "
+        "error of the in-flight estimate that replaces the rows it absorbs, if it is more than "
+        "noise of the frames on "
         "which `propagate` aligns",
     ),
     Expected(
         *("thermo-elastic distortion", "thermo-elastic", "temporal", "no", "arcsine"),
-        "motion of boresight against mounting reference with temperature and its gradients over orbit and season",
+        (
+            "motion of boresight against mounting reference with temperature and its gradients "
+            "over "
+            "orbit and season"
+        ),
     ),
     Expected(
         *("drift of focal length and distortion", "FOV spatial", "ensemble", "no", "gaussian"),
@@ -209,7 +233,11 @@ FROM_FILE = (
     ),
     Expected(
         *("chromatic and asymmetric star images", "FOV spatial", "mixed", "no", "gaussian"),
-        "shift of centroids with star colour, field position and focus that no distortion model holds",
+        (
+            "shift of centroids with star colour, field position and focus that no distortion "
+            "model "
+            "holds"
+        ),
     ),
     Expected(
         *("star catalogue", "FOV spatial", "mixed", "no", "gaussian"),
@@ -217,12 +245,17 @@ FROM_FILE = (
     ),
     Expected(
         *("pixel spatial error", "pixel spatial", "mixed", "no", "gaussian"),
-        "centroid interpolation, photo-response and dark-signal non-uniformity, as far as the calibration frames did "
+        "centroid interpolation, photo-response and dark-signal non-uniformity, as far as the "
+        "calibration frames did "
         "not hold it as noise",
     ),
     Expected(
         *("aberration residual", "aberration", "temporal", "no", "arcsine"),
-        "what the on-board correction of aberration leaves: velocity error, or the whole effect if it is not corrected",
+        (
+            "what the on-board correction of aberration leaves: velocity error, or the whole "
+            "effect "
+            "if it is not corrected"
+        ),
     ),
     Expected(
         *("measurement date error", "measurement date", "temporal", "no", "uniform"),
@@ -230,7 +263,10 @@ FROM_FILE = (
     ),
     Expected(
         *("motion during exposure", "temporal noise (NEA)", "temporal", "no", "gaussian"),
-        "smear, jitter and rolling shutter at the mission's rates, beyond those of the calibration frames",
+        (
+            "smear, jitter and rolling shutter at the mission's rates, beyond those of the "
+            "calibration frames"
+        ),
     ),
     Expected(
         *("end-of-life noise", "temporal noise (NEA)", "temporal", "no", "gaussian"),
@@ -244,7 +280,9 @@ FROM_FILE = (
 
 
 def confidence_text(confidence: float) -> str:
-    """A confidence in per cent, with the digits it has, all its nines included: 99.7 %, 99.99999 %."""
+    """A confidence in per cent, with the digits it has, all its nines included: 99.7 %,
+    99.99999 %.
+    """
     share = 100 * Decimal(repr(float(confidence)))
     # Four decimals, and three digits of what misses to 0 or 100.
     decimals = max([4, *(2 - part.adjusted() for part in (share, 100 - share) if part)])

@@ -1,4 +1,6 @@
-"""Distributions of the rows of a budget, scaled to mean 0 and standard deviation 1, and the quantiles of the rules."""
+"""Distributions of the rows of a budget, scaled to mean 0 and standard deviation 1, and the
+quantiles of the rules.
+"""
 
 from __future__ import annotations
 
@@ -36,16 +38,20 @@ def one_axis_factor(confidence: float) -> float:
 
 
 @lru_cache(maxsize=1024)
-def two_axis_radius(confidence: float, sigma_x: float, sigma_y: float, spread: float = 0.0) -> float:
+def two_axis_radius(
+    confidence: float, sigma_x: float, sigma_y: float, spread: float = 0.0
+) -> float:
     """Radius that holds this share of a Gaussian error on two axes with these standard deviations.
 
-    With equal sigmas it is the Rayleigh quantile: 2.448 sigma for 95 %, 3.409 for 99.7 %, 3.439 for 99.73 %; with one
-    sigma zero it is the two-sided quantile of the other. In between, in polar coordinates of the standardised plane,
+    With equal sigmas it is the Rayleigh quantile: 2.448 sigma for 95 %, 3.409 for 99.7 %, 3.439 for
+    99.73 %; with one sigma zero it is the two-sided quantile of the other. In between, in polar
+    coordinates of the standardised plane,
 
         P(r) = 1 - 1 / (2 pi) int exp(-r^2 / (2 (sigma_x^2 cos^2 t + sigma_y^2 sin^2 t))) dt,
 
-    which generalises Craig's formula and is integrated exactly by the trapezoidal rule. Where the sigmas change from
-    frame to frame by a common factor, `spread` is the standard deviation of its logarithm (see `mixture_spread`).
+    which generalises Craig's formula and is integrated exactly by the trapezoidal rule. Where the
+    sigmas change from frame to frame by a common factor, `spread` is the standard deviation of its
+    logarithm (see `mixture_spread`).
     """
     large, small = max(sigma_x, sigma_y), min(sigma_x, sigma_y)
     if large == 0.0:
@@ -68,7 +74,9 @@ def two_axis_radius(confidence: float, sigma_x: float, sigma_y: float, spread: f
 
 
 def _mixture_miss(limit: float, spread: float) -> float:
-    """Probability that a Gaussian error with log-normal sigma, of variance 1 in all, exceeds the limit."""
+    """Probability that a Gaussian error with log-normal sigma, of variance 1 in all, exceeds the
+    limit.
+    """
     from scipy.special import ndtr
 
     nodes, weights = _nodes(_NODES)
@@ -78,9 +86,11 @@ def _mixture_miss(limit: float, spread: float) -> float:
 
 @lru_cache(maxsize=256)
 def mixture_spread(tail_997: float) -> float:
-    """Standard deviation of log sigma that gives a Gaussian mixture this 99.7 % half-width, in standard deviations.
+    """Standard deviation of log sigma that gives a Gaussian mixture this 99.7 % half-width, in
+    standard deviations.
 
-    0 for a Gaussian tail or a lighter one; at most 1.2, beyond which the half-width grows no further.
+    0 for a Gaussian tail or a lighter one; at most 1.2, beyond which the half-width grows no
+    further.
     """
     if tail_997 <= GAUSSIAN_997 * (1.0 + 1e-6):
         return 0.0
@@ -96,7 +106,9 @@ def mixture_spread(tail_997: float) -> float:
 
 @lru_cache(maxsize=1024)
 def half_width(distribution: str, confidence: float, tail_997: float = GAUSSIAN_997) -> float:
-    """Deviation, in standard deviations, that this share of the errors stays below; the end of bounded ones."""
+    """Deviation, in standard deviations, that this share of the errors stays below; the end of
+    bounded ones.
+    """
     if distribution in HALF_WIDTHS:
         return HALF_WIDTHS[distribution]
     if distribution == "rayleigh":
@@ -114,11 +126,14 @@ def half_width(distribution: str, confidence: float, tail_997: float = GAUSSIAN_
     return float(brentq(lambda x: _mixture_miss(x, spread) - (1.0 - confidence), 0.0, reach))
 
 
-def deviates(distribution: str, uniform: FloatArray, log_scale: FloatArray, tail_997: float) -> FloatArray:
-    """Deviations of mean 0 and standard deviation 1 at probabilities `uniform` (n,); rows that share one err together.
+def deviates(
+    distribution: str, uniform: FloatArray, log_scale: FloatArray, tail_997: float
+) -> FloatArray:
+    """Deviations of mean 0 and standard deviation 1 at probabilities `uniform` (n,); rows that
+    share one err together.
 
-    `log_scale` (n,) are standard normal deviates that decide about sigma where it changes from frame to frame;
-    `distribution` and `tail_997` are those of a `Contributor`.
+    `log_scale` (n,) are standard normal deviates that decide about sigma where it changes from
+    frame to frame; `distribution` and `tail_997` are those of a `Contributor`.
     """
     from scipy.special import ndtri
 

@@ -1,21 +1,25 @@
 """Totals of a budget: by the rule of ECSS-E-ST-60-10C, and by sampling the same rows.
 
-By the rule, means add with their signs, sigmas of rows that err together add, everything else adds in squares, and the
-bound at a confidence is |mean| + n sigma, with n the Gaussian quantile of that confidence: two-sided for one axis, that
-of a two-axis Gaussian error for the angle across the boresight.
+By the rule, means add with their signs, sigmas of rows that err together add, everything else adds
+in squares, and the bound at a confidence is |mean| + n sigma, with n the Gaussian quantile of that
+confidence: two-sided for one axis, that of a two-axis Gaussian error for the angle across the
+boresight.
 
 What counts as random depends on what the confidence is about:
 
 - *mixed*: a sensor and a moment taken at random. All rows spread.
-- *ensemble*: a sensor taken at random, at its worst moment. Rows that are random in time alone enter with their worst.
-- *temporal*: the worst sensor, at a moment taken at random. Rows that are random over the ensemble alone enter so.
+- *ensemble*: a sensor taken at random, at its worst moment. Rows that are random in time alone
+  enter with their worst.
+- *temporal*: the worst sensor, at a moment taken at random. Rows that are random over the ensemble
+  alone enter so.
 
-A row that is random over both differs from sensor to sensor and from moment to moment: it spreads in all three, with
-its sigma as that of the worst sensor, or of the worst moment. Worst cases are half-widths at the confidence, and add
-linearly, as the standard has it; rows of a correlation group have one worst case, in which their signs count. That all
-of them meet in one sensor is an upper bound. Beside it stands what one sensor (or moment) in 1 / (1 - confidence)
-reaches, with the worst cases in squares, or sampled. The smaller of both is what the error reaches at the least: only
-that can violate a limit.
+A row that is random over both differs from sensor to sensor and from moment to moment: it spreads
+in all three, with its sigma as that of the worst sensor, or of the worst moment. Worst cases are
+half-widths at the confidence, and add linearly, as the standard has it; rows of a correlation group
+have one worst case, in which their signs count. That all of them meet in one sensor is an upper
+bound. Beside it stands what one sensor (or moment) in 1 / (1 - confidence) reaches, with the worst
+cases in squares, or sampled. The smaller of both is what the error reaches at the least: only that
+can violate a limit.
 """
 
 from __future__ import annotations
@@ -43,7 +47,8 @@ from starcal_uq.core.types import FloatArray
 N_SAMPLES = 200_000
 # Two standard errors of a quantile, as order statistics.
 _SPREAD = 2.0
-# Samples beyond a quantile with fewer say little about it: its standard error is unknown, or the samples end before it.
+# Samples beyond a quantile with fewer say little about it: its standard error is unknown, or the
+# samples end before it.
 _RESOLVED = 20.0
 # A bound that is surely below a quantile: of every so manyth sample, at a share so much smaller.
 _EVERY, _BELOW = 20, 0.01
@@ -53,7 +58,8 @@ _DOMINANT = 0.5
 # Bounds that differ by less agree.
 _AGREE = 0.02
 _BOUNDED = ("uniform", "arcsine")
-# Gaussian deviates on the way of a group from one end to the other; the ends are those of bounded rows to rounding.
+# Gaussian deviates on the way of a group from one end to the other; the ends are those of bounded
+# rows to rounding.
 _ON_THE_WAY = np.linspace(-8.0, 8.0, 801)
 # A mean of this many sigmas moves the bounds apart.
 _MEAN_COUNTS = 0.05
@@ -83,13 +89,14 @@ class Total:
     worst_arcsec : float
         Sum of what does not count as random, by its half-width, arcsec.
     rule_arcsec, sampled_arcsec : float
-        Bound by the rule, and quantile of the sampled error; NaN if no row is assessed. The sampled one is NaN too if
-        fewer than 20 samples lie beyond it.
+        Bound by the rule, and quantile of the sampled error; NaN if no row is assessed. The sampled
+        one is NaN too if fewer than 20 samples lie beyond it.
     sampled_se_arcsec : float
         Standard error of the sampled bound.
     rule_least_arcsec, sampled_least_arcsec : float
-        Bounds if worst cases of different rows do not meet, and alignment absorbs all of what it absorbs in part: only
-        a limit below is violated. That by the rule is never above the sampled one, where there is one.
+        Bounds if worst cases of different rows do not meet, and alignment absorbs all of what it
+        absorbs in part: only a limit below is violated. That by the rule is never above the sampled
+        one, where there is one.
     not_assessed : tuple of str
         Contributors that are missing: with any, the bounds are "at least".
     dominant : str
@@ -128,7 +135,11 @@ class Total:
     @property
     def larger_arcsec(self) -> float:
         """The larger of the two bounds; NaN if one is not known."""
-        return math.nan if math.isnan(self.sampled_arcsec) else max(self.rule_arcsec, self.sampled_arcsec)
+        return (
+            math.nan
+            if math.isnan(self.sampled_arcsec)
+            else max(self.rule_arcsec, self.sampled_arcsec)
+        )
 
     @property
     def unresolved(self) -> bool:
@@ -138,28 +149,40 @@ class Total:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Sums of sampled rows per scope and kind of randomness, arcsec: ``sums[scope, interpretation]`` is (3, n)."""
+    """Sums of sampled rows per scope and kind of randomness, arcsec: ``sums[scope,
+    interpretation]`` is (3, n).
+    """
 
     sums: dict[tuple[str, str], FloatArray]
 
     def along(self, axes: FloatArray, scope: str, kinds: Sequence[str]) -> FloatArray:
-        """What rows of these kinds add up to along axes (k, 3): (k, n), or (k, 1) zeros without kinds."""
+        """What rows of these kinds add up to along axes (k, 3): (k, n), or (k, 1) zeros without
+        kinds.
+        """
         return axes @ sum((self.sums[scope, kind] for kind in kinds), start=np.zeros((3, 1)))
 
 
 def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0) -> Samples:
     """Sample every assessed row around its mean and add up what has the same kind of randomness.
 
-    Rows of one correlation group share their probabilities, and axes of one contributor are correlated as it states. A
-    sigma that changes from frame to frame is the same for all axes of a contributor.
+    Rows of one correlation group share their probabilities, and axes of one contributor are
+    correlated as it states. A sigma that changes from frame to frame is the same for all axes of a
+    contributor.
     """
     from scipy.special import ndtr
 
-    scopes = (*SCOPES, AFTER_AT_LEAST) if any(row.absorbed_by_alignment == "in part" for row in rows) else SCOPES
+    scopes = (
+        (*SCOPES, AFTER_AT_LEAST)
+        if any(row.absorbed_by_alignment == "in part" for row in rows)
+        else SCOPES
+    )
     sums = {(scope, kind): np.zeros((3, n_samples)) for scope in scopes for kind in INTERPRETATIONS}
     shared: dict[str, FloatArray] = {}
     scales: dict[str, FloatArray] = {}
-    joint = {name: _joint(rows, name, n_samples, seed) for name in {row.name for row in rows if row.axis_correlation}}
+    joint = {
+        name: _joint(rows, name, n_samples, seed)
+        for name in {row.name for row in rows if row.axis_correlation}
+    }
     for index, row in enumerate(rows):
         if not (row.assessed and row.applies and row.sigma_arcsec > 0.0):
             continue
@@ -175,7 +198,9 @@ def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0)
         if row.tail_997 > GAUSSIAN_997 and row.name not in scales:
             scales[row.name] = np.random.default_rng((seed, 2, index)).standard_normal(n_samples)
         log_scale = scales.get(row.name, uniform)
-        errors = sign * row.sigma_arcsec * deviates(row.distribution, uniform, log_scale, row.tail_997)
+        errors = (
+            sign * row.sigma_arcsec * deviates(row.distribution, uniform, log_scale, row.tail_997)
+        )
         for scope in scopes:
             if row.counts(scope):
                 sums[scope, row.interpretation][AXES.index(row.axis)] += errors
@@ -196,7 +221,9 @@ def _joint(rows: Sequence[Contributor], name: str, n_samples: int, seed: int) ->
 
 
 def covariance(rows: Sequence[Contributor]) -> FloatArray:
-    """Covariance (3, 3) of the sum of rows, arcsec^2: groups err as one, axes as their contributor says."""
+    """Covariance (3, 3) of the sum of rows, arcsec^2: groups err as one, axes as their contributor
+    says.
+    """
     together: dict[str, FloatArray] = {}
     apart: dict[str, list[Contributor]] = {}
     for row in rows:
@@ -233,7 +260,11 @@ def total(
     """
     names = AXES[:2] if axis == CROSS_BORESIGHT else (axis,)
     along = (np.eye(3) if rotation is None else rotation)[[AXES.index(name) for name in names]]
-    seen = {name for name, column in zip(AXES, along.T, strict=True) if np.abs(column).max() > _PERPENDICULAR}
+    seen = {
+        name
+        for name, column in zip(AXES, along.T, strict=True)
+        if np.abs(column).max() > _PERPENDICULAR
+    }
     chosen = [row for row in rows if row.axis in seen and row.counts(scope)]
     missing = tuple(dict.fromkeys(row.name for row in chosen if not row.assessed))
     counted = [row for row in chosen if row.assessed and row.applies]
@@ -260,7 +291,8 @@ def total(
         rule_arcsec=here.rule,
         sampled_arcsec=here.sampled,
         sampled_se_arcsec=here.error,
-        # Samples that do not resolve the confidence are no bound: `min` keeps what stands before a NaN.
+        # Samples that do not resolve the confidence are no bound: `min` keeps what stands before a
+        # NaN.
         rule_least_arcsec=min(at_least.rule_least, here.rule, sampled_least),
         sampled_least_arcsec=sampled_least,
         not_assessed=missing,
@@ -269,9 +301,14 @@ def total(
     )
     if result.unresolved:
         n = next(iter(samples.sums.values())).shape[1]
-        text = f"{n} samples do not resolve a confidence of {confidence_text(confidence)}: there is no sampled bound."
+        text = (
+            f"{n} samples do not resolve a confidence of {confidence_text(confidence)}: there is "
+            "no sampled bound."
+        )
         return replace(result, explanation=text)
-    return replace(result, explanation=explain(result, counted, _spread(counted, interpretation), dominant))
+    return replace(
+        result, explanation=explain(result, counted, _spread(counted, interpretation), dominant)
+    )
 
 
 @dataclass(frozen=True)
@@ -328,7 +365,12 @@ def _spread(rows: Sequence[Contributor], interpretation: str) -> list[Contributo
     return [row for row in rows if row.interpretation in _random(interpretation)]
 
 
-def explain(total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor) -> str:
+def explain(
+    total: Total,
+    counted: Sequence[Contributor],
+    random: Sequence[Contributor],
+    dominant: Contributor,
+) -> str:
     """One sentence or two on rule against sampling; empty if no error is random."""
     if not total.rule_arcsec > 0.0:
         return "No error is left: all rows are zero."
@@ -339,33 +381,54 @@ def explain(total: Total, counted: Sequence[Contributor], random: Sequence[Contr
     size = percent(abs(difference), 2)
     head = f"The rule is {size} {'above' if difference > 0 else 'below'} the sampled bound"
     reasons = (_below if difference < 0.0 else _above)(total, counted, random, dominant)
-    return f"{head}: {'; '.join(reasons) or 'the rows together are not Gaussian, as the rule takes them to be'}."
+    return (
+        f"{head}: "
+        f"{'; '.join(reasons) or 'the rows together are not Gaussian, as the rule takes them to be'}."
+    )
 
 
 def _below(
-    total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor
+    total: Total,
+    counted: Sequence[Contributor],
+    random: Sequence[Contributor],
+    dominant: Contributor,
 ) -> list[str]:
     """Why the rule says less."""
     tailed = dominant if dominant.tail_997 > _TAILED else _heaviest(counted)
     if tailed is not None:
         return [
-            f"the sigma of {tailed.name!r} changes from frame to frame, so that 99.7 % of its errors reach "
+            f"the sigma of {tailed.name!r} changes from frame to frame, so that 99.7 % of its "
+            "errors reach "
             f"{significant(tailed.tail_997, 3)} sigma where a Gaussian error reaches 2.97"
         ]
     if dominant.distribution == "rayleigh":
-        return [f"{_share(total, dominant)} and is one-sided (Rayleigh), with a longer tail than a Gaussian error"]
+        return [
+            (
+                f"{_share(total, dominant)} and is one-sided (Rayleigh), with a longer tail than a "
+                "Gaussian error"
+            )
+        ]
     if _grouped(random):
-        return ["rows of a correlation group that are not Gaussian add to a longer tail than their sigmas say"]
+        return [
+            (
+                "rows of a correlation group that are not Gaussian add to a longer tail than their "
+                "sigmas say"
+            )
+        ]
     if dominant.distribution in _BOUNDED and dominant in random:
         return [
-            f"{_share(total, dominant)}; its distribution is {dominant.distribution}, and at this confidence reaches "
+            f"{_share(total, dominant)}; its distribution is {dominant.distribution}, and at "
+            "this confidence reaches "
             "further than a Gaussian error of the same sigma"
         ]
     return []
 
 
 def _above(
-    total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor
+    total: Total,
+    counted: Sequence[Contributor],
+    random: Sequence[Contributor],
+    dominant: Contributor,
 ) -> list[str]:
     """Why the rule says more; the first reason weighs most."""
     shape = dominant.distribution
@@ -380,27 +443,47 @@ def _above(
         reasons.append(
             "the rule adds the whole mean to the spread, as if both always pointed the same way"
             if total.axis == CROSS_BORESIGHT
-            else "a mean shifts the errors to one side, where fewer sigmas hold the same share than on both sides"
+            else (
+                "a mean shifts the errors to one side, where fewer sigmas hold the same share "
+                "than on both sides"
+            )
         )
         if abs(total.mean_arcsec) > total.sigma_arcsec:
             return reasons
     if total.worst_arcsec > _MEAN_COUNTS * total.sigma_arcsec > 0.0:
-        reasons.append("a worst case points one way, where fewer sigmas hold the same share than on both sides")
+        reasons.append(
+            "a worst case points one way, where fewer sigmas hold the same share than on both sides"
+        )
     # Small bounded rows explain nothing.
     bounded = [row for row in random if row.distribution in _BOUNDED]
-    bounded = [row for row in bounded if row.sigma_arcsec >= _WORTH_NAMING * max(r.sigma_arcsec for r in bounded)]
-    if math.hypot(*(row.sigma_arcsec for row in bounded)) >= _WORTH_NAMING * total.sigma_arcsec > 0.0:
+    bounded = [
+        row
+        for row in bounded
+        if row.sigma_arcsec >= _WORTH_NAMING * max(r.sigma_arcsec for r in bounded)
+    ]
+    if (
+        math.hypot(*(row.sigma_arcsec for row in bounded))
+        >= _WORTH_NAMING * total.sigma_arcsec
+        > 0.0
+    ):
         if total.axis == CROSS_BORESIGHT:
-            reasons.append("bounded distributions on two axes leave less in the corners than Gaussian errors do")
+            reasons.append(
+                "bounded distributions on two axes leave less in the corners than Gaussian "
+                "errors do"
+            )
         else:
             names = list(dict.fromkeys(repr(row.name) for row in bounded))
             each = "" if len(names) == 1 else " of each"
             factor = significant(total.factor, 3)
-            reasons.append(f"{join_words(names)} cannot exceed a fixed size, while the rule takes {factor} sigma{each}")
+            reasons.append(
+                f"{join_words(names)} cannot exceed a fixed size, while the rule takes {factor} "
+                f"sigma{each}"
+            )
     tailed = _heaviest(random)
     if not reasons and tailed is not None:
         reasons.append(
-            f"the sigma of {tailed.name!r} changes from frame to frame, so that at this confidence more of its errors "
+            f"the sigma of {tailed.name!r} changes from frame to frame, so that at this "
+            "confidence more of its errors "
             "are small than of a Gaussian error"
         )
     return reasons
@@ -412,7 +495,11 @@ def _share(total: Total, dominant: Contributor) -> str:
 
 def _heaviest(rows: Sequence[Contributor]) -> Contributor | None:
     tailed = [row for row in rows if row.tail_997 > _TAILED]
-    return max(tailed, key=lambda row: row.sigma_arcsec * (row.tail_997 - GAUSSIAN_997)) if tailed else None
+    return (
+        max(tailed, key=lambda row: row.sigma_arcsec * (row.tail_997 - GAUSSIAN_997))
+        if tailed
+        else None
+    )
 
 
 def _grouped(rows: Sequence[Contributor]) -> bool:
@@ -421,7 +508,9 @@ def _grouped(rows: Sequence[Contributor]) -> bool:
 
 
 def grouped_sigma(rows: Sequence[Contributor]) -> float:
-    """Standard deviation of the sum of rows on one axis: linear within groups, in squares otherwise."""
+    """Standard deviation of the sum of rows on one axis: linear within groups, in squares
+    otherwise.
+    """
     return math.sqrt(max(float(np.trace(covariance(rows))), 0.0))
 
 
@@ -444,10 +533,14 @@ def _worst_kinds(interpretation: str) -> tuple[str, ...]:
     return tuple(kind for kind in INTERPRETATIONS if kind not in _random(interpretation))
 
 
-def _worst(rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool) -> tuple[float, float]:
-    """Half-widths of what errs alone, added linearly, and in squares; a group reaches as far as the sum of its rows.
+def _worst(
+    rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool
+) -> tuple[float, float]:
+    """Half-widths of what errs alone, added linearly, and in squares; a group reaches as far as the
+    sum of its rows.
 
-    Half-widths are those of the distributions themselves, or take the rule's Gaussian factor where they are unbounded.
+    Half-widths are those of the distributions themselves, or take the rule's Gaussian factor where
+    they are unbounded.
     """
     alone: dict[str, list[Contributor]] = {}
     together: dict[str, list[Contributor]] = {}
@@ -455,25 +548,35 @@ def _worst(rows: Sequence[Contributor], along: FloatArray, confidence: float, *,
         group, _ = row.group
         (together if group else alone).setdefault(group or row.name, []).append(row)
     reached = [_reach(members, along, confidence, by_shape=by_shape) for members in alone.values()]
-    reached += [_reach_together(members, along, confidence, by_shape=by_shape) for members in together.values()]
+    reached += [
+        _reach_together(members, along, confidence, by_shape=by_shape)
+        for members in together.values()
+    ]
     return sum(reached, start=0.0), math.hypot(*reached)
 
 
-def _reach(rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool) -> float:
+def _reach(
+    rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool
+) -> float:
     """Half-width of one contributor on an axis, or on two together."""
     gaussian = [row for row in rows if row.distribution == "gaussian"]
     tail = max([GAUSSIAN_997, *(row.tail_997 for row in gaussian)]) if by_shape else GAUSSIAN_997
     bounded = np.zeros(3)
     for row in rows:
         if row.distribution != "gaussian":
-            bounded[AXES.index(row.axis)] += half_width(row.distribution, confidence) * row.sigma_arcsec
+            bounded[AXES.index(row.axis)] += (
+                half_width(row.distribution, confidence) * row.sigma_arcsec
+            )
     spread = along @ covariance(gaussian) @ along.T
     # Seen from other axes, ends of several axes meet in a corner.
     return _radius(confidence, spread, tail) + float(np.linalg.norm(np.abs(along) @ bounded))
 
 
-def _reach_together(rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool) -> float:
-    """Furthest that the rows of a group reach: one probability moves all, each to its own half-width at most.
+def _reach_together(
+    rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool
+) -> float:
+    """Furthest that the rows of a group reach: one probability moves all, each to its own
+    half-width at most.
 
     Where their signs and shapes differ, that may be on the way and not at an end.
     """
@@ -484,12 +587,16 @@ def _reach_together(rows: Sequence[Contributor], along: FloatArray, confidence: 
     for row in rows:
         end = half_width(row.distribution, confidence, row.tail_997 if by_shape else GAUSSIAN_997)
         deviate = deviates(row.distribution, uniform, uniform, GAUSSIAN_997)
-        errors[AXES.index(row.axis)] += row.group[1] * row.sigma_arcsec * np.clip(deviate, -end, end)
+        errors[AXES.index(row.axis)] += (
+            row.group[1] * row.sigma_arcsec * np.clip(deviate, -end, end)
+        )
     return float(_size(along @ errors).max())
 
 
 def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
-    """The mean with a worst case of this length beside it, in the direction that reaches furthest."""
+    """The mean with a worst case of this length beside it, in the direction that reaches
+    furthest.
+    """
     if worst == 0.0:
         return mean
     if len(mean) == 1:
@@ -506,17 +613,29 @@ def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
 
 
 def _one_of_many(rest: FloatArray, chance: FloatArray, confidence: float) -> float:
-    """What chance reaches at the confidence where the rest is as large as it is in one case of 1 / (1 - confidence)."""
+    """What chance reaches at the confidence where the rest is as large as it is in one case of 1 /
+    (1 - confidence).
+    """
     size = _size(rest)
     at = math.ceil(confidence * len(size)) - 1
-    near = range(max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS + 1, len(size))) if len(rest) > 1 else (at,)
+    near = (
+        range(max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS + 1, len(size)))
+        if len(rest) > 1
+        else (at,)
+    )
     order = np.argpartition(size, list(near))
-    return float(np.mean([_quantile(rest[:, order[place], None] + chance, confidence)[0] for place in near]))
+    return float(
+        np.mean([_quantile(rest[:, order[place], None] + chance, confidence)[0] for place in near])
+    )
 
 
 def _size(errors: FloatArray) -> FloatArray:
     """Size (n,) of errors (axes, n)."""
-    size: FloatArray = np.abs(errors[0]) if len(errors) == 1 else np.sqrt(np.square(errors[0]) + np.square(errors[1]))
+    size: FloatArray = (
+        np.abs(errors[0])
+        if len(errors) == 1
+        else np.sqrt(np.square(errors[0]) + np.square(errors[1]))
+    )
     return size
 
 
@@ -529,13 +648,17 @@ def _quantile(errors: FloatArray, confidence: float) -> tuple[float, float]:
     if n * min(confidence, 1.0 - confidence) < _RESOLVED * (1.0 - 1e-9):
         return math.nan, math.nan
     step = _SPREAD * math.sqrt(n * confidence * (1.0 - confidence))
-    places = [min(max(math.ceil(confidence * n + shift) - 1, 0), n - 1) for shift in (-step, 0.0, step)]
+    places = [
+        min(max(math.ceil(confidence * n + shift) - 1, 0), n - 1) for shift in (-step, 0.0, step)
+    ]
     low, here, high = _ranked(size, places)
     return here, (high - low) / (2.0 * _SPREAD)
 
 
 def _ranked(values: FloatArray, places: Sequence[int]) -> list[float]:
-    """The values at these places of their order; what is surely below the first place is not put into order."""
+    """The values at these places of their order; what is surely below the first place is not put
+    into order.
+    """
     some = values[::_EVERY]
     first = int((places[0] / len(values) - _BELOW) * len(some))
     if first > 0:
@@ -547,12 +670,17 @@ def _ranked(values: FloatArray, places: Sequence[int]) -> list[float]:
     return ranked
 
 
-def _dominant(rows: Sequence[Contributor], along: FloatArray, confidence: float) -> tuple[Contributor, float]:
+def _dominant(
+    rows: Sequence[Contributor], along: FloatArray, confidence: float
+) -> tuple[Contributor, float]:
     """The row that matters most, and its share of the squares of means and half-widths."""
     weight: dict[str, float] = {}
     part = dict(zip(AXES, np.linalg.norm(along, axis=0), strict=True))
     for row in rows:
-        size = abs(row.mean_arcsec) + half_width(row.distribution, confidence, row.tail_997) * row.sigma_arcsec
+        size = (
+            abs(row.mean_arcsec)
+            + half_width(row.distribution, confidence, row.tail_997) * row.sigma_arcsec
+        )
         weight[row.name] = weight.get(row.name, 0.0) + float(part[row.axis] * size) ** 2
     whole = sum(weight.values())
     name = max(weight, key=lambda key: weight[key])
@@ -563,7 +691,9 @@ def _dominant(rows: Sequence[Contributor], along: FloatArray, confidence: float)
 def totals(
     rows: Sequence[Contributor], confidence: float, *, n_samples: int = N_SAMPLES, seed: int = 0
 ) -> tuple[tuple[Total, ...], Samples]:
-    """All totals: both scopes, three axes and the two across the boresight together, three interpretations."""
+    """All totals: both scopes, three axes and the two across the boresight together, three
+    interpretations.
+    """
     samples = draw(rows, n_samples, seed)
     found = tuple(
         total(rows, samples, scope=scope, axis=axis, interpretation=kind, confidence=confidence)

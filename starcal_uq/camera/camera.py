@@ -1,7 +1,7 @@
 """The camera: detector, optics and distortion, with units in every name.
 
-Pixels: x to the right, y down, (0, 0) is the *centre* of the first pixel; the detector therefore spans
-[-0.5, width_px - 0.5] x [-0.5, height_px - 0.5].
+Pixels: x to the right, y down, (0, 0) is the *centre* of the first pixel; the detector therefore
+spans [-0.5, width_px - 0.5] x [-0.5, height_px - 0.5].
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Camera(Shown):
     Raises
     ------
     CameraError
-        If a value is not finite, the focal length is neither given in pixels nor with the pitch, a size is not
-        positive, or the coefficients do not fit the distortion model.
+        If a value is not finite, the focal length is neither given in pixels nor with the pitch, a
+        size is not positive, or the coefficients do not fit the distortion model.
     """
 
     width_px: int
@@ -91,7 +91,8 @@ class Camera(Shown):
                 self._set("focal_mm", self.length_mm(self.focal_px))
         elif self.pixel_um is None:
             raise CameraError(
-                f"camera: focal_mm is {self.focal_mm!r}, but the pixel pitch is unknown: give pixel_um as well, or "
+                f"camera: focal_mm is {self.focal_mm!r}, but the pixel pitch is unknown: give "
+                "pixel_um as well, or "
                 "focal_px in its place."
             )
         if self.focal_mm is not None and self.pixel_um is not None:
@@ -120,7 +121,9 @@ class Camera(Shown):
 
     @property
     def fov_deg(self) -> tuple[float, float]:
-        """Full horizontal and vertical field of an ideal pinhole centred on the detector, degrees."""
+        """Full horizontal and vertical field of an ideal pinhole centred on the detector,
+        degrees.
+        """
         f = self.focal_px
         return (
             math.degrees(2.0 * math.atan(self.width_px / (2.0 * f))),
@@ -153,11 +156,16 @@ class Camera(Shown):
             If the pixel pitch is unknown.
         """
         if self.pixel_um is None:
-            raise CameraError("camera: nothing is in millimetres, because the pixel pitch is unknown; state pixel_um.")
+            raise CameraError(
+                "camera: nothing is in millimetres, because the pixel pitch is unknown; state "
+                "pixel_um."
+            )
         return length_px * self.pixel_um / 1000.0
 
     def length_text(self, length_px: float, digits: int) -> str:
-        """A length on the detector, such as the focal length: in millimetres, or in pixels of unknown pitch."""
+        """A length on the detector, such as the focal length: in millimetres, or in pixels of
+        unknown pitch.
+        """
         if self.pixel_um is None:
             return f"{length_px:.{digits}g} px"
         return f"{self.length_mm(length_px):.{digits}g} mm"
@@ -204,9 +212,9 @@ class Camera(Shown):
     def replace(self, **changes: Any) -> Camera:
         """A copy with some attributes changed.
 
-        With another `distortion` and no `coefficients`, those of the same name are kept and the others are
-        zero; between a forward and an inverse model nothing can be kept. A `pixel_um` where there was none keeps
-        `focal_px`, and so does None.
+        With another `distortion` and no `coefficients`, those of the same name are kept and the
+        others are zero; between a forward and an inverse model nothing can be kept. A `pixel_um`
+        where there was none keeps `focal_px`, and so does None.
         """
         if "distortion" in changes and "coefficients" not in changes:
             try:
@@ -220,7 +228,9 @@ class Camera(Shown):
             changes["coefficients"] = tuple(kept.get(c.name, 0.0) for c in new.coefficients)
         known = {field.name for field in dataclasses.fields(self)}
         if unknown := sorted(set(changes) - known):
-            raise CameraError(f"camera: no attribute {unknown[0]!r}; use one of {', '.join(sorted(known))}.")
+            raise CameraError(
+                f"camera: no attribute {unknown[0]!r}; use one of {', '.join(sorted(known))}."
+            )
         if "focal_px" in changes or None in (self.pixel_um, changes.get("pixel_um", self.pixel_um)):
             changes.setdefault("focal_mm", None)
         return dataclasses.replace(self, **changes)
@@ -228,7 +238,10 @@ class Camera(Shown):
     def to_dict(self) -> dict[str, Any]:
         """The [camera] table: plain values, coefficients under their own names."""
         table = dataclasses.asdict(self)
-        for key in ("coefficients", *(("focal_px",) if self.pixel_um is not None else ("pixel_um", "focal_mm"))):
+        for key in (
+            "coefficients",
+            *(("focal_px",) if self.pixel_um is not None else ("pixel_um", "focal_mm")),
+        ):
             del table[key]
         name = table.pop("name")
         names = (c.name for c in get_model(self.distortion).coefficients)
@@ -237,7 +250,8 @@ class Camera(Shown):
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Camera:
-        """A camera from the [camera] table; distortion (brown), coefficients (zero) and name may be left out.
+        """A camera from the [camera] table; distortion (brown), coefficients (zero) and name may be
+        left out.
 
         Raises
         ------
@@ -248,24 +262,35 @@ class Camera(Shown):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Camera:
-        """Read a camera from a TOML file, or from one of OpenCV, ROS, Kalibr or mrcal by its ending.
+        """Read a camera from a TOML file, or from one of OpenCV, ROS, Kalibr or mrcal by its
+        ending.
 
         Raises
         ------
         CameraError
-            If the file cannot be read or its content does not fit; the message names file, key and remedy.
+            If the file cannot be read or its content does not fit; the message names file, key and
+            remedy.
         """
         if os.fspath(path).endswith((*ENDINGS.values(), ".yml")):
             return cls._of_others(path)
-        return cls(**_checked(read_section(path, "camera", CameraError), f"{path}, section [camera]"))
+        return cls(
+            **_checked(read_section(path, "camera", CameraError), f"{path}, section [camera]")
+        )
 
     @classmethod
     def _of_others(cls, path: str | os.PathLike[str]) -> Camera:
-        with reading(path, "a camera of OpenCV, ROS, Kalibr or mrcal", "check the file", CameraError):
+        with reading(
+            path, "a camera of OpenCV, ROS, Kalibr or mrcal", "check the file", CameraError
+        ):
             held = read_pinhole(Path(path).read_text(encoding="utf-8"))
         try:
             return cls.from_opencv(
-                held.matrix, held.dist_coeffs, held.width_px, held.height_px, held.pixel_um, name=held.name
+                held.matrix,
+                held.dist_coeffs,
+                held.width_px,
+                held.height_px,
+                held.pixel_um,
+                name=held.name,
             )
         except CameraError as error:
             raise CameraError(f"{path}: {error}") from None
@@ -285,7 +310,8 @@ class Camera(Shown):
     def to_opencv(self) -> tuple[FloatArray, FloatArray]:
         """The same camera for OpenCV, whose pixel origin is ours.
 
-        OpenCV distorts normalised coordinates: k1_cv = k1 f^2, k2_cv = k2 f^4, k3_cv = k3 f^6, p_cv = p f.
+        OpenCV distorts normalised coordinates: k1_cv = k1 f^2, k2_cv = k2 f^4, k3_cv = k3 f^6, p_cv
+        = p f.
 
         Returns
         -------
@@ -320,12 +346,13 @@ class Camera(Shown):
         camera_matrix
             Shape (3, 3), pixels.
         dist_coeffs
-            k1, k2[, p1, p2[, k3]], any shape; None or empty for none. Further coefficients must be zero.
+            k1, k2[, p1, p2[, k3]], any shape; None or empty for none. Further coefficients must be
+            zero.
         width_px, height_px, pixel_um
             The detector, of which OpenCV keeps no record; the pitch may be None.
         distortion
-            Distortion model to use; by default the smallest of brown, brown3 and brown_tangential that
-            holds the coefficients.
+            Distortion model to use; by default the smallest of brown, brown3 and brown_tangential
+            that holds the coefficients.
 
         Raises
         ------
@@ -386,7 +413,10 @@ _DIRECTION = {
 _WORDS = {
     "width_px": "the width of the detector in pixels",
     "height_px": "the height of the detector in pixels",
-    "pixel_um": "the pitch of the square pixels in micrometres (if it is unknown, focal_px in place of focal_mm)",
+    "pixel_um": (
+        "the pitch of the square pixels in micrometres (if it is unknown, focal_px in place of "
+        "focal_mm)"
+    ),
     "focal_mm": "the focal length in millimetres",
     "focal_px": "the focal length in pixels",
     "x0_px": "the principal point along x in pixels",
@@ -413,7 +443,8 @@ class _CameraSection(Section):
         if not models:
             return unknown_key(key, self.keys)
         return (
-            f"key {key} is no coefficient of distortion {self.distortion!r} (it has {', '.join(own) or 'none'}); "
+            f"key {key} is no coefficient of distortion {self.distortion!r} (it has "
+            f"{', '.join(own) or 'none'}); "
             f"remove it or set distortion to {' or '.join(map(repr, models))}"
         )
 
@@ -421,10 +452,17 @@ class _CameraSection(Section):
 @lru_cache
 def _section(distortion: str, in_pixels: bool) -> Section:
     """Schema for a focal length in pixels, where the pitch may be unknown, or in millimetres."""
-    keys = {name: key for name, key in _KEYS.items() if name != ("focal_mm" if in_pixels else "focal_px")}
+    keys = {
+        name: key
+        for name, key in _KEYS.items()
+        if name != ("focal_mm" if in_pixels else "focal_px")
+    }
     if in_pixels:
         keys["pixel_um"] = Key.number(KEYS["pixel_um"], _WORDS["pixel_um"])
-    own = {c.name: Key.number(KEYS["coefficient"], "the coefficient") for c in get_model(distortion).coefficients}
+    own = {
+        c.name: Key.number(KEYS["coefficient"], "the coefficient")
+        for c in get_model(distortion).coefficients
+    }
     return _CameraSection({**keys, **own}, CameraError, distortion)
 
 
@@ -432,7 +470,9 @@ def _checked(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Arguments of ``Camera`` from a [camera] table, which `where` names in messages."""
     distortion = table.get("distortion", "brown")
     if not isinstance(distortion, str):
-        raise CameraError(f"{where}: key distortion is {distortion!r}; write {_KEYS['distortion'].wanted}.")
+        raise CameraError(
+            f"{where}: key distortion is {distortion!r}; write {_KEYS['distortion'].wanted}."
+        )
     try:
         coefficients = get_model(distortion).coefficients
     except DistortionError as error:

@@ -1,12 +1,13 @@
 """Loops over stars compiled by Numba, where it is installed, and kept on disk.
 
-The extra ``starcal-uq[compiled]`` installs it. Which path runs is decided by one switch, the environment variable
-``STARCAL_UQ_KERNELS`` (`use` sets it): ``numpy``, ``numba``, or ``auto`` (the default), which compiles nothing for a
-job that would be done before the compiler is. Both give the same to rounding; provenance says which one ran.
+The extra ``starcal-uq[compiled]`` installs it. Which path runs is decided by one switch, the
+environment variable ``STARCAL_UQ_KERNELS`` (`use` sets it): ``numpy``, ``numba``, or ``auto`` (the
+default), which compiles nothing for a job that would be done before the compiler is. Both give the
+same to rounding; provenance says which one ran.
 
-The source is generated from CasADi's instructions, like that of the NumPy kernels, and stands in a folder of the user
-named by its content and the versions that compile it, because Numba keeps machine code beside a file. Where that folder
-cannot be written, everything is compiled in memory.
+The source is generated from CasADi's instructions, like that of the NumPy kernels, and stands in a
+folder of the user named by its content and the versions that compile it, because Numba keeps
+machine code beside a file. Where that folder cannot be written, everything is compiled in memory.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from starcal_uq.core.provenance import installed_version
 
 SWITCH = "STARCAL_UQ_KERNELS"
 CHOICES = ("auto", "numpy", "numba")
-# Stars from which loading compiled loops (0.6 s) is worth it, and from which compiling them (half a minute) is.
+# Stars from which loading compiled loops (0.6 s) is worth it, and from which compiling them (half a
+# minute) is.
 WORTH_LOADING, WORTH_COMPILING = 200_000, 10_000_000
 _loaded: dict[str, ModuleType] = {}
 
@@ -56,7 +58,9 @@ def using(choice: str) -> Iterator[None]:
 
 def _check(choice: str) -> None:
     if choice not in CHOICES:
-        raise StarcalError(f"kernels {choice!r} are unknown: set {SWITCH} to one of {', '.join(CHOICES)}.")
+        raise StarcalError(
+            f"kernels {choice!r} are unknown: set {SWITCH} to one of {', '.join(CHOICES)}."
+        )
     if choice == "numba" and not installed():
         with extra("compiled", "compiled kernels", f"set {SWITCH}=numpy"):
             raise ModuleNotFoundError(name="numba")
@@ -68,7 +72,9 @@ def installed() -> bool:
 
 
 def chosen(n_stars: int, source: Callable[[], str]) -> str:
-    """``numpy`` or ``numba`` for a job of so many stars, with loops of the source that a function gives."""
+    """``numpy`` or ``numba`` for a job of so many stars, with loops of the source that a function
+    gives.
+    """
     choice = os.environ.get(SWITCH, "auto").strip().lower() or "auto"
     _check(choice)
     if choice != "auto":
@@ -95,7 +101,9 @@ def _folder(source: str) -> Path:
 
 
 def load(name: str, source: str) -> Any:
-    """Import a generated module, its functions compiled; the machine code of earlier processes is used."""
+    """Import a generated module, its functions compiled; the machine code of earlier processes is
+    used.
+    """
     found = _loaded.get(source)
     if found is None:
         found = _loaded[source] = _import(name, source)
@@ -110,7 +118,9 @@ def _import(name: str, source: str) -> ModuleType:
             with atomic_path(path) as temporary:
                 temporary.write_text(source, encoding="utf-8")
         # A folder that another user may write to would let him run what he likes.
-        writable = os.access(path.parent, os.W_OK) and (os.name == "nt" or path.stat().st_uid == os.getuid())
+        writable = os.access(path.parent, os.W_OK) and (
+            os.name == "nt" or path.stat().st_uid == os.getuid()
+        )
     except (OSError, RuntimeError, StarcalError):
         writable = False
     if writable:
@@ -121,12 +131,17 @@ def _import(name: str, source: str) -> ModuleType:
         module = sys.modules[title] = importlib.util.module_from_spec(spec)
         # Whatever is wrong with what was kept, it can be made again.
         with contextlib.suppress(Exception):
-            # Signatures are written in the source: all of it is compiled here, or read from beside it.
+            # Signatures are written in the source: all of it is compiled here, or read from beside
+            # it.
             spec.loader.exec_module(module)
             path.with_name("ready").touch()
             return module
         del sys.modules[title]
     module = ModuleType(f"starcal_uq_compiled_{name}")
-    # Generated above from CasADi's instructions and this package's own loops; nothing comes from outside.
-    exec(compile(source.replace("cache=True", "cache=False"), f"<compiled {name}>", "exec"), module.__dict__)
+    # Generated above from CasADi's instructions and this package's own loops; nothing comes from
+    # outside.
+    exec(
+        compile(source.replace("cache=True", "cache=False"), f"<compiled {name}>", "exec"),
+        module.__dict__,
+    )
     return module

@@ -1,8 +1,8 @@
 """The registry of distortion models: the only place where a distortion formula is written.
 
-Each entry holds a displacement in plain arithmetic, so that the same function serves CasADi symbols (from which every
-kernel and derivative is generated) and numbers. Pixel convention, direction and parameter order are those of
-``docs/explanation/conventions.md``.
+Each entry holds a displacement in plain arithmetic, so that the same function serves CasADi symbols
+(from which every kernel and derivative is generated) and numbers. Pixel convention, direction and
+parameter order are those of ``docs/explanation/conventions.md``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ class Parameter:
 
     name: str  # Name in files, tables and draws
     unit: str  # Unit of the value used in computations
-    scale: float  # Stored and printed values are ``value / scale``: diagnostics lose tiny numbers otherwise
+    # Stored and printed values are ``value / scale``: diagnostics lose tiny numbers otherwise
+    scale: float
     scaled_unit: str  # Unit of the scaled value
     description: str  # Meaning, in words
 
@@ -47,7 +48,8 @@ class DistortionModel:
     direction : {"forward", "inverse"}
         ``forward`` maps ideal to distorted points, ``inverse`` maps distorted to ideal points.
     displacement : callable
-        ``(u, v, k) -> (du, dv)``: displacement in pixels at offset (u, v) px from the principal point.
+        ``(u, v, k) -> (du, dv)``: displacement in pixels at offset (u, v) px from the principal
+        point.
     source : str
         Source of the formula.
     """
@@ -99,7 +101,9 @@ _MODELS = {
         DistortionModel("none", (), "forward", _none, "pinhole"),
         DistortionModel("k1", (_K1,), "forward", _radial, _EQ14 + ", first term"),
         DistortionModel("brown", (_K1, _K2), "forward", _radial, _EQ14),
-        DistortionModel("brown3", (_K1, _K2, _K3), "forward", _radial, _EQ14 + ", with a third term"),
+        DistortionModel(
+            "brown3", (_K1, _K2, _K3), "forward", _radial, _EQ14 + ", with a third term"
+        ),
         DistortionModel(
             "brown_tangential",
             (_K1, _K2, _P1, _P2),
@@ -108,7 +112,11 @@ _MODELS = {
             "Brown 1971; p1 and p2 in OpenCV's order",
         ),
         DistortionModel(
-            "inverse", (_K1, _K2), "inverse", _radial, "Ye & Yang 2017, eq. 6 (distorted to ideal), in pixels"
+            "inverse",
+            (_K1, _K2),
+            "inverse",
+            _radial,
+            "Ye & Yang 2017, eq. 6 (distorted to ideal), in pixels",
         ),
     )
 }
@@ -119,7 +127,9 @@ _OPTICS = (
     Parameter("f", "px", 1.0, "px", "focal length"),
 )
 _SIGMA = Parameter("sigma", "px", 1.0, "px", "centroid noise per axis")
-_SIGMA_SCALE = Parameter("sigma_scale", "1", 1.0, "1", "common factor on the stated noise of the stars")
+_SIGMA_SCALE = Parameter(
+    "sigma_scale", "1", 1.0, "1", "common factor on the stated noise of the stars"
+)
 
 
 def model_names() -> tuple[str, ...]:
@@ -132,22 +142,29 @@ def get_model(name: str) -> DistortionModel:
     try:
         return _MODELS[name]
     except KeyError:
-        raise DistortionError(f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}.") from None
+        raise DistortionError(
+            f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}."
+        ) from None
 
 
 def simpler_models(name: str) -> tuple[str, ...]:
-    """Models that a model becomes when some of its coefficients are zero; without any, both directions are one."""
+    """Models that a model becomes when some of its coefficients are zero; without any, both
+    directions are one.
+    """
     own, names = get_model(name), {c.name for c in get_model(name).coefficients}
     return tuple(
         other.name
         for other in _MODELS.values()
-        if {c.name for c in other.coefficients} < names and (other.direction == own.direction or not other.coefficients)
+        if {c.name for c in other.coefficients} < names
+        and (other.direction == own.direction or not other.coefficients)
     )
 
 
 def next_simpler(name: str) -> str:
     """The richest of `simpler_models`; empty where there is none."""
-    return max(simpler_models(name), key=lambda other: len(get_model(other).coefficients), default="")
+    return max(
+        simpler_models(name), key=lambda other: len(get_model(other).coefficients), default=""
+    )
 
 
 def parameters(model_name: str) -> tuple[Parameter, ...]:
@@ -170,7 +187,9 @@ def parameter_called(name: str) -> Parameter:
     try:
         return PARAMETERS[name]
     except KeyError:
-        raise DistortionError(f"parameter {name!r} is unknown: use one of {', '.join(PARAMETERS)}.") from None
+        raise DistortionError(
+            f"parameter {name!r} is unknown: use one of {', '.join(PARAMETERS)}."
+        ) from None
 
 
 def sigma_parameter(per_star: bool) -> Parameter:

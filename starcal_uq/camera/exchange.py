@@ -1,6 +1,8 @@
-"""A camera for other programs: what their own files can hold of it, and how far that is from the camera itself.
+"""A camera for other programs: what their own files can hold of it, and how far that is from the
+camera itself.
 
-Where a format has the same terms, nothing is lost; where not, its terms are fitted to the camera over the detector.
+Where a format has the same terms, nothing is lost; where not, its terms are fitted to the camera
+over the detector.
 """
 
 from __future__ import annotations
@@ -34,10 +36,11 @@ _EXACT_PX = 1e-6
 
 @dataclass(frozen=True)
 class Exported:
-    """A camera in the words of another program: the file, and one sentence on what it holds and how near it is.
+    """A camera in the words of another program: the file, and one sentence on what it holds and how
+    near it is.
 
-    `error_px` is the largest distance over the detector between what the file and the camera make of the same
-    direction, px; 0 where the format has the camera's own terms.
+    `error_px` is the largest distance over the detector between what the file and the camera make
+    of the same direction, px; 0 where the format has the camera's own terms.
     """
 
     path: Path
@@ -46,15 +49,23 @@ class Exported:
 
 
 def export_camera(camera: Camera, to: str, path: PathLike, *, force: bool = False) -> Exported:
-    """Write a camera for another program, one of `CAMERA_FORMATS`; without `Camera.name` the file gets a neutral one.
+    """Write a camera for another program, one of `CAMERA_FORMATS`; without `Camera.name` the file
+    gets a neutral one.
 
     CameraError for an unknown format or a camera that folds over within its detector.
     """
     if to not in CAMERA_FORMATS:
-        raise CameraError(f"{to!r} is no format for a camera: use one of {', '.join(CAMERA_FORMATS)}.")
+        raise CameraError(
+            f"{to!r} is no format for a camera: use one of {', '.join(CAMERA_FORMATS)}."
+        )
     ensure_new(path, force)
-    if fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px) <= camera.corner_radius_px:
-        raise CameraError("the distortion folds over within the detector: a camera that does has no counterpart.")
+    if (
+        fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px)
+        <= camera.corner_radius_px
+    ):
+        raise CameraError(
+            "the distortion folds over within the detector: a camera that does has no counterpart."
+        )
     with atomic_path(Path(path)) as temporary:
         error, note = CAMERA_FORMATS[to].write(camera, temporary)
     return Exported(Path(path), error, note)
@@ -67,9 +78,11 @@ def _grid(camera: Camera, points: int) -> FloatArray:
 
 
 def nearest(camera: Camera, distortion: str) -> tuple[Camera, float]:
-    """The camera with this distortion model that differs least over the detector, and by how much at most, px.
+    """The camera with this distortion model that differs least over the detector, and by how much
+    at most, px.
 
-    All its parameters are fitted to the directions of a grid of pixels; the axes of the camera stay.
+    All its parameters are fitted to the directions of a grid of pixels; the axes of the camera
+    stay.
     """
     from scipy.optimize import least_squares
 
@@ -85,33 +98,52 @@ def nearest(camera: Camera, distortion: str) -> tuple[Camera, float]:
         moved = start.with_theta(start.theta + scale * step)
         return np.asarray(project(moved, seen) - pixels).ravel()
 
-    step = least_squares(off, np.zeros(len(scale)), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    step = least_squares(
+        off, np.zeros(len(scale)), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
+    ).x
     found = start.with_theta(start.theta + scale * step)
     between = _grid(camera, 2 * _POINTS + 1)
-    return found, float(np.max(np.linalg.norm(project(found, unproject(camera, between)) - between, axis=1)))
+    return found, float(
+        np.max(np.linalg.norm(project(found, unproject(camera, between)) - between, axis=1))
+    )
 
 
 def _held(camera: Camera, kept: tuple[str, ...]) -> tuple[Camera, float]:
     """The camera itself if a format keeps its coefficients, or the nearest one that it can hold."""
     model = get_model(camera.distortion)
-    used = {c.name for c, value in zip(model.coefficients, camera.coefficients, strict=True) if value != 0.0}
+    used = {
+        c.name
+        for c, value in zip(model.coefficients, camera.coefficients, strict=True)
+        if value != 0.0
+    }
     if not used or (model.direction == "forward" and used <= set(kept)):
         return camera, 0.0
-    wanted = "brown3" if model.radial and "k3" in kept else "brown" if model.radial else "brown_tangential"
+    wanted = (
+        "brown3"
+        if model.radial and "k3" in kept
+        else "brown"
+        if model.radial
+        else "brown_tangential"
+    )
     return nearest(camera, wanted)
 
 
 def _said(error: float, what: str) -> str:
     if error <= _EXACT_PX:
         return f"{what}: the same camera, to rounding."
-    return f"{what}: fitted, because it lacks this camera's terms; up to {error:.2g} px off over the detector."
+    return (
+        f"{what}: fitted, because it lacks this camera's terms; up to {error:.2g} px off over "
+        "the detector."
+    )
 
 
 def _pinhole_file(to: str, what: str) -> Callable[[Camera, Path], tuple[float, str]]:
     def write(camera: Camera, path: Path) -> tuple[float, str]:
         held, error = _held(camera, KEPT[to])
         matrix, coefficients = held.to_opencv() if any(held.coefficients) else _bare(held)
-        plain = Pinhole(held.width_px, held.height_px, matrix, coefficients, held.pixel_um, held.name)
+        plain = Pinhole(
+            held.width_px, held.height_px, matrix, coefficients, held.pixel_um, held.name
+        )
         path.write_text(write_pinhole(plain, to), encoding="utf-8")
         return error, _said(error, what)
 
@@ -131,16 +163,20 @@ def _tetra3rs(camera: Camera, path: Path) -> tuple[float, str]:
     terms: dict[str, Any] = dict(zip(names, held.coefficients, strict=True))
     centre = np.subtract((held.x0_px, held.y0_px), held.centre_px)
     distortion = library.RadialDistortion(**terms) if any(terms.values()) else None
-    library.CameraModel(held.focal_px, held.width_px, held.height_px, centre.tolist(), False, distortion).save_to_file(
-        os.fspath(path)
+    library.CameraModel(
+        held.focal_px, held.width_px, held.height_px, centre.tolist(), False, distortion
+    ).save_to_file(os.fspath(path))
+    return error, _said(
+        error, "tetra3rs, CameraModel.load_from_file (pixels from the image's centre)"
     )
-    return error, _said(error, "tetra3rs, CameraModel.load_from_file (pixels from the image's centre)")
 
 
 def _tetra3(camera: Camera, path: Path) -> tuple[float, str]:
-    """`fov_estimate` and `distortion` of tetra3 and cedar-solve: r_u = r_d (1 - k (2 r_d / width)^2) / (1 - k).
+    """`fov_estimate` and `distortion` of tetra3 and cedar-solve: r_u = r_d (1 - k (2 r_d /
+    width)^2) / (1 - k).
 
-    They have the centre of the image for a principal point; what a tilt of the attitude takes up is not counted.
+    They have the centre of the image for a principal point; what a tilt of the attitude takes up is
+    not counted.
     """
     from scipy.optimize import least_squares
 
@@ -158,19 +194,25 @@ def _tetra3(camera: Camera, path: Path) -> tuple[float, str]:
         return np.asarray(ideal - offsets * (1.0 - k * fraction) / (1.0 - k)).ravel()
 
     tilt = np.subtract((camera.x0_px, camera.y0_px), camera.centre_px) / camera.focal_px
-    found = least_squares(off, [1.0, 0.0, -tilt[1], tilt[0]], x_scale=[1e-3, 1e-2, 1e-3, 1e-3], xtol=1e-14, ftol=1e-14)
+    found = least_squares(
+        off, [1.0, 0.0, -tilt[1], tilt[0]], x_scale=[1e-3, 1e-2, 1e-3, 1e-3], xtol=1e-14, ftol=1e-14
+    )
     error = float(np.max(np.linalg.norm(off(found.x).reshape(-1, 2), axis=1)))
     field = float(np.degrees(2.0 * np.arctan(half / (found.x[0] * camera.focal_px))))
-    path.write_text(json.dumps({"fov_estimate": field, "distortion": float(found.x[1])}, indent=1) + "\n")
+    path.write_text(
+        json.dumps({"fov_estimate": field, "distortion": float(found.x[1])}, indent=1) + "\n"
+    )
     return error, _said(error, "tetra3 and cedar-solve, arguments of solve_from_centroids")
 
 
 def sip_header(camera: Camera) -> tuple[Any, float]:
-    """FITS header (TAN-SIP) of a camera that looks at right ascension and declination 0, and its largest error, px.
+    """FITS header (TAN-SIP) of a camera that looks at right ascension and declination 0, and its
+    largest error, px.
 
-    CRVAL and a rotation of CD make it that of a frame. A and B carry pixels to the tangent plane, AP and BP back; their
-    order is the least that is near enough. Pixels count from 1, as FITS does. Source: Shupe et al. 2005, "The SIP
-    convention for representing distortion in FITS image headers".
+    CRVAL and a rotation of CD make it that of a frame. A and B carry pixels to the tangent plane,
+    AP and BP back; their order is the least that is near enough. Pixels count from 1, as FITS does.
+    Source: Shupe et al. 2005, "The SIP convention for representing distortion in FITS image
+    headers".
     """
     with extra("images", "FITS headers"):
         from astropy.io import fits
@@ -184,9 +226,14 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
     header["WCSAXES"], header["IMAGEW"], header["IMAGEH"] = 2, camera.width_px, camera.height_px
     sides = (("RA---TAN-SIP", camera.x0_px), ("DEC--TAN-SIP", camera.y0_px))
     for axis, (kind, centre) in enumerate(sides, 1):
-        header[f"CTYPE{axis}"], header[f"CRPIX{axis}"], header[f"CRVAL{axis}"] = kind, centre + 1.0, 0.0
+        header[f"CTYPE{axis}"], header[f"CRPIX{axis}"], header[f"CRVAL{axis}"] = (
+            kind,
+            centre + 1.0,
+            0.0,
+        )
         header[f"CUNIT{axis}"] = "deg"
-        # x and y of a pixel run against right ascension and declination for who looks at the sky from within.
+        # x and y of a pixel run against right ascension and declination for who looks at the sky
+        # from within.
         header[f"CD{axis}_{axis}"] = -np.degrees(1.0 / camera.focal_px)
         header[f"CD{axis}_{3 - axis}"] = 0.0
     worst = 0.0
@@ -220,7 +267,8 @@ def _sip(camera: Camera, path: Path) -> tuple[float, str]:
     header, error = sip_header(camera)
     path.write_text(header.tostring(sep="\n", endcard=True, padding=False) + "\n", encoding="ascii")
     return error, (
-        f"FITS header with TAN-SIP polynomials: up to {error:.2g} px off over the detector; set CRVAL and turn CD for "
+        f"FITS header with TAN-SIP polynomials: up to {error:.2g} px off over the detector; set "
+        "CRVAL and turn CD for "
         "a frame."
     )
 
@@ -240,7 +288,9 @@ def _asdf(camera: Camera, path: Path) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """The ending of a file's name, and ``write(camera, path) -> (largest error in px, sentence)``."""
+    """The ending of a file's name, and ``write(camera, path) -> (largest error in px,
+    sentence)``.
+    """
 
     ending: str
     write: Callable[[Camera, Path], tuple[float, str]]

@@ -1,4 +1,6 @@
-"""Directions over the detector: grid, tangent axes, and the rotation that fits a field of displacements best."""
+"""Directions over the detector: grid, tangent axes, and the rotation that fits a field of
+displacements best.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ if TYPE_CHECKING:
 
 
 def detector_axes(camera: Camera, n: int) -> tuple[FloatArray, FloatArray]:
-    """Grid lines x (n,) and y (n,) in px, from edge to edge of the detector; ValueError for fewer than two."""
+    """Grid lines x (n,) and y (n,) in px, from edge to edge of the detector; ValueError for fewer
+    than two.
+    """
     if n < 2:
         raise ValueError(f"a map needs at least 2 grid points along each side, not {n}.")
     return np.linspace(-0.5, camera.width_px - 0.5, n), np.linspace(-0.5, camera.height_px - 0.5, n)
@@ -25,7 +29,9 @@ def grid_points(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def area_weights(n: int) -> FloatArray:
-    """Weights (n * n,) by the trapezoidal rule, of sum one: points on an edge stand for half the area."""
+    """Weights (n * n,) by the trapezoidal rule, of sum one: points on an edge stand for half the
+    area.
+    """
     side = np.ones(n)
     side[[0, -1]] = 0.5
     weights = np.outer(side, side).ravel()
@@ -34,14 +40,17 @@ def area_weights(n: int) -> FloatArray:
 
 
 def tangent_axes(b: FloatArray) -> FloatArray:
-    """Axes (N, 2, 3) of the tangent planes of directions b (N, 3): camera X laid into the plane, and b cross that."""
+    """Axes (N, 2, 3) of the tangent planes of directions b (N, 3): camera X laid into the plane,
+    and b cross that.
+    """
     along_x = np.array([1.0, 0.0, 0.0]) - b[:, :1] * b
     along_x /= np.linalg.norm(along_x, axis=1, keepdims=True)
     return np.stack([along_x, np.cross(b, along_x)], axis=1)
 
 
 def rotation_response(b: FloatArray, B: FloatArray, w: FloatArray) -> FloatArray:
-    """Rotation (3, p) that fits the displacements B (N, 3, p) of directions b (N, 3) best, with weights w (N,).
+    """Rotation (3, p) that fits the displacements B (N, 3, p) of directions b (N, 3) best, with
+    weights w (N,).
 
     A phi = phi x b, so that A^T A = I - b b^T and A^T B = b x B.
     """

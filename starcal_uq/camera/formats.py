@@ -1,10 +1,12 @@
 """Camera files of OpenCV, ROS, Kalibr and mrcal: the same optics, each in its own words.
 
-All four hold a pinhole with OpenCV's dimensionless k1, k2, p1, p2, k3, and a pixel origin at the centre of the first
-pixel. None has a place for the pixel pitch, which a comment keeps: ``# pixel_um: 6.9``.
+All four hold a pinhole with OpenCV's dimensionless k1, k2, p1, p2, k3, and a pixel origin at the
+centre of the first pixel. None has a place for the pixel pitch, which a comment keeps: ``#
+pixel_um: 6.9``.
 
-Sources: OpenCV, "FileStorage" and "Camera Calibration and 3D Reconstruction"; ROS, sensor_msgs/CameraInfo as
-camera_calibration_parsers writes it; Kalibr, "YAML formats"; mrcal, "Camera models".
+Sources: OpenCV, "FileStorage" and "Camera Calibration and 3D Reconstruction"; ROS,
+sensor_msgs/CameraInfo as camera_calibration_parsers writes it; Kalibr, "YAML formats"; mrcal,
+"Camera models".
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ _PITCH = re.compile(r"^\s*# pixel_um: (\S+)\s*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Pinhole:
-    """What such a file holds: size and matrix (3, 3) in px, and k1, k2, p1, p2, k3 (5,), dimensionless.
+    """What such a file holds: size and matrix (3, 3) in px, and k1, k2, p1, p2, k3 (5,),
+    dimensionless.
 
     `pixel_um` is the pixel pitch, micrometres, where it is stated.
     """
@@ -44,14 +47,19 @@ class Pinhole:
 def write_pinhole(camera: Pinhole, to: str) -> str:
     """Content of a file in the format of ``opencv``, ``ros``, ``kalibr`` or ``mrcal``."""
     f, x0, y0 = (repr(float(camera.matrix[i])) for i in ((0, 0), (0, 2), (1, 2)))
-    width, height, d = camera.width_px, camera.height_px, [repr(float(value)) for value in camera.dist_coeffs]
+    width, height, d = (
+        camera.width_px,
+        camera.height_px,
+        [repr(float(value)) for value in camera.dist_coeffs],
+    )
     matrix = f"{f}, 0.0, {x0}, 0.0, {f}, {y0}, 0.0, 0.0, 1.0"
     pitch = "" if camera.pixel_um is None else f"# pixel_um: {camera.pixel_um!r}\n"
     # A name is free text; these files get what cannot end a line or a quotation.
     name = re.sub(r"[^\w .+-]", "_", camera.name, flags=re.ASCII) or "star_camera"
     if to == "opencv":
         return (
-            f'%YAML:1.0\n---\n{pitch}camera_name: "{name}"\nimage_width: {width}\nimage_height: {height}\n'
+            f'%YAML:1.0\n---\n{pitch}camera_name: "{name}"\nimage_width: {width}\nimage_height: '
+            f"{height}\n"
             f"camera_matrix: {_opencv_matrix(3, 3, matrix)}distortion_coefficients: "
             f"{_opencv_matrix(1, 5, ', '.join(d))}"
         )
@@ -71,8 +79,10 @@ def write_pinhole(camera: Pinhole, to: str) -> str:
             f"  resolution: [{width}, {height}]\n  rostopic: /cam0/image_raw\n"
         )
     return (
-        f"{pitch}{{\n    'lensmodel': 'LENSMODEL_OPENCV5',\n\n    # fx, fy, cx, cy, k1, k2, p1, p2, k3\n"
-        f"    'intrinsics': [{', '.join([f, f, x0, y0, *d])}],\n\n    'extrinsics': [0, 0, 0, 0, 0, 0],\n\n"
+        f"{pitch}{{\n    'lensmodel': 'LENSMODEL_OPENCV5',\n\n    # fx, fy, cx, cy, k1, k2, p1, "
+        "p2, k3\n"
+        f"    'intrinsics': [{', '.join([f, f, x0, y0, *d])}],\n\n    'extrinsics': [0, 0, 0, 0, "
+        "0, 0],\n\n"
         f"    'imagersize': [{width}, {height}],\n}}\n"
     )
 
@@ -92,11 +102,15 @@ def read_pinhole(text: str) -> Pinhole:
     read = _reader(content)
     width, height, name, intrinsics, coefficients = read(content)
     numbers = [*intrinsics, *coefficients]
-    if not all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in numbers):
+    if not all(
+        isinstance(value, (int, float)) and not isinstance(value, bool) for value in numbers
+    ):
         raise ValueError("a value of the optics is no number")
     fx, fy, x0, y0 = intrinsics
     if any(coefficients[5:]):
-        raise ValueError("it has rational, thin-prism or tilt terms, which have no counterpart here")
+        raise ValueError(
+            "it has rational, thin-prism or tilt terms, which have no counterpart here"
+        )
     found = np.zeros(5)
     found[: min(5, len(coefficients))] = coefficients[:5]
     matrix = np.array([[fx, 0.0, x0], [0.0, fy, y0], [0.0, 0.0, 1.0]], dtype=np.float64)
@@ -128,14 +142,18 @@ def _reader(content: Mapping[str, Any]) -> Any:
         return _kalibr
     if "camera_matrix" in content:
         return _opencv
-    raise ValueError("it has none of camera_matrix (OpenCV, ROS), cam0 (Kalibr) and lensmodel (mrcal)")
+    raise ValueError(
+        "it has none of camera_matrix (OpenCV, ROS), cam0 (Kalibr) and lensmodel (mrcal)"
+    )
 
 
 def _opencv(content: Mapping[str, Any]) -> _Read:
     """OpenCV's sample programs and ROS use the same keys."""
     kind = content.get("distortion_model", "plumb_bob")
     if kind not in ("plumb_bob", "rational_polynomial"):
-        raise ValueError(f"its distortion model is {kind!r}, and only plumb_bob has a counterpart here")
+        raise ValueError(
+            f"its distortion model is {kind!r}, and only plumb_bob has a counterpart here"
+        )
     matrix = [float(value) for value in content["camera_matrix"]["data"]]
     if len(matrix) != 9 or matrix[1] or matrix[3]:
         raise ValueError("its camera matrix has skew, or not nine numbers")
@@ -152,14 +170,21 @@ def _kalibr(content: Mapping[str, Any]) -> _Read:
     camera = content["cam0"]
     model, lens = camera.get("camera_model"), camera.get("distortion_model")
     if model != "pinhole" or lens not in ("radtan", "none"):
-        raise ValueError(f"its cam0 is {model} with {lens}, and only pinhole with radtan has a counterpart here")
+        raise ValueError(
+            f"its cam0 is {model} with {lens}, and only pinhole with radtan has a counterpart here"
+        )
     width, height = camera["resolution"]
     return int(width), int(height), "", camera["intrinsics"], camera.get("distortion_coeffs", [])
 
 
 def _mrcal(content: Mapping[str, Any]) -> _Read:
     lens = content["lensmodel"]
-    if lens not in ("LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8"):
+    if lens not in (
+        "LENSMODEL_PINHOLE",
+        "LENSMODEL_OPENCV4",
+        "LENSMODEL_OPENCV5",
+        "LENSMODEL_OPENCV8",
+    ):
         raise ValueError(f"its lens is {lens!r}, and only OpenCV's have a counterpart here")
     width, height = content["imagersize"]
     return int(width), int(height), "", content["intrinsics"][:4], content["intrinsics"][4:]

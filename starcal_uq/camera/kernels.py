@@ -1,7 +1,9 @@
-"""From a CasADi function to vectorised NumPy: the same operations, in the same order, on arrays of stars.
+"""From a CasADi function to vectorised NumPy: the same operations, in the same order, on arrays of
+stars.
 
-CasADi evaluates one star at a time; walking its instruction list once and emitting every instruction as a NumPy
-operation gives kernels that need no compiler and agree with CasADi to rounding.
+CasADi evaluates one star at a time; walking its instruction list once and emitting every
+instruction as a NumPy operation gives kernels that need no compiler and agree with CasADi to
+rounding.
 """
 
 from __future__ import annotations
@@ -51,12 +53,13 @@ def emit_source(
     read: Callable[[int, int], str] = "inputs[{}][{}]".format,
     write: Callable[[int, int], str] = "out[{}][{}]".format,
 ) -> str:
-    """Write the instruction list of a dense CasADi SX function as Python source, ``def name(inputs, out)``.
+    """Write the instruction list of a dense CasADi SX function as Python source, ``def name(inputs,
+    out)``.
 
-    `inputs` is a sequence (one entry per input) of sequences of scalars or (n,) arrays, one per element; `out` is a
-    sequence of (n_elements, n) arrays, one per output, which are filled. `read` and `write` make what stands in the
-    source for an input or output from its number and that of its element. NotImplementedError for an operation without
-    a NumPy counterpart in this module.
+    `inputs` is a sequence (one entry per input) of sequences of scalars or (n,) arrays, one per
+    element; `out` is a sequence of (n_elements, n) arrays, one per output, which are filled. `read`
+    and `write` make what stands in the source for an input or output from its number and that of
+    its element. NotImplementedError for an operation without a NumPy counterpart in this module.
     """
     import casadi as ca
 
@@ -76,7 +79,9 @@ def emit_source(
             expression = templates[operation].format(*(f"w{source}" for source in sources))
             lines.append(f"    w{targets[0]} = {expression}")
         else:
-            raise NotImplementedError(f"CasADi operation {operation} has no NumPy template in kernels.py")
+            raise NotImplementedError(
+                f"CasADi operation {operation} has no NumPy template in kernels.py"
+            )
     return "\n".join(lines) + "\n"
 
 
@@ -84,8 +89,8 @@ def emit_source(
 class Kernel:
     """A vectorised function generated from CasADi.
 
-    `function` is the symbolic original, kept so that tests can compare, `run` the emitted NumPy function, and `shapes`
-    those of the outputs, without the trailing axis of stars.
+    `function` is the symbolic original, kept so that tests can compare, `run` the emitted NumPy
+    function, and `shapes` those of the outputs, without the trailing axis of stars.
     """
 
     function: Any
@@ -93,7 +98,9 @@ class Kernel:
     shapes: tuple[tuple[int, ...], ...]
 
     def __call__(self, n: int, *inputs: Any) -> tuple[FloatArray, ...]:
-        """Outputs ``(*shape, n)`` for `n` stars; inputs (elements,) are shared by all, others are (elements, n)."""
+        """Outputs ``(*shape, n)`` for `n` stars; inputs (elements,) are shared by all, others are
+        (elements, n).
+        """
         outputs = [np.empty((int(np.prod(shape)), n)) for shape in self.shapes]
         arrays = [np.asarray(value, dtype=np.float64) for value in inputs]
         # Python floats keep the arithmetic of shared scalars cheap.
@@ -107,18 +114,28 @@ class Kernel:
                 ],
                 [output[:, block] for output in outputs],
             )
-        return tuple(output.reshape(*shape, n) for output, shape in zip(outputs, self.shapes, strict=True))
+        return tuple(
+            output.reshape(*shape, n) for output, shape in zip(outputs, self.shapes, strict=True)
+        )
 
     def into(self, inputs: Sequence[FloatArray], outputs: Sequence[FloatArray]) -> None:
-        """Evaluate stars whose arrays fit into the cache, into arrays (elements, n) that the caller keeps."""
+        """Evaluate stars whose arrays fit into the cache, into arrays (elements, n) that the caller
+        keeps.
+        """
         self.run([value.tolist() if value.ndim == 1 else value for value in inputs], outputs)
 
 
-def build_kernel(name: str, inputs: Sequence[Any], outputs: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> Kernel:
-    """Build a kernel from CasADi symbols and expressions; elements of an output lie row-major over its shape."""
+def build_kernel(
+    name: str, inputs: Sequence[Any], outputs: Sequence[Any], shapes: Sequence[tuple[int, ...]]
+) -> Kernel:
+    """Build a kernel from CasADi symbols and expressions; elements of an output lie row-major over
+    its shape.
+    """
     import casadi as ca
 
-    function = ca.Function(name, list(inputs), [ca.densify(ca.vec(ca.SX(output))) for output in outputs], {"cse": True})
+    function = ca.Function(
+        name, list(inputs), [ca.densify(ca.vec(ca.SX(output))) for output in outputs], {"cse": True}
+    )
     scope: dict[str, Any] = {"np": np}
     # The source is generated from CasADi's instruction list above and holds nothing from outside.
     exec(compile(emit_source(function, name), f"<kernel {name}>", "exec"), scope)

@@ -1,7 +1,8 @@
 """Conversion of a camera's parameters to OpenCV's matrix and distortion coefficients, and back.
 
-OpenCV distorts normalised coordinates (x - x0) / f, this package offsets in pixels; the pixel origin is the same. So
-k1_cv = k1 f^2, k2_cv = k2 f^4, k3_cv = k3 f^6 and p_cv = p f (OpenCV, "Camera Calibration and 3D Reconstruction").
+OpenCV distorts normalised coordinates (x - x0) / f, this package offsets in pixels; the pixel
+origin is the same. So k1_cv = k1 f^2, k2_cv = k2 f^4, k3_cv = k3 f^6 and p_cv = p f (OpenCV,
+"Camera Calibration and 3D Reconstruction").
 """
 
 from __future__ import annotations
@@ -15,21 +16,24 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CameraError, DistortionError
 from starcal_uq.core.types import FloatArray
 
-# Place in OpenCV's (k1, k2, p1, p2, k3), and the power of f that makes our coefficient dimensionless.
+# Place in OpenCV's (k1, k2, p1, p2, k3), and the power of f that makes our coefficient
+# dimensionless.
 _OPENCV = {"k1": (0, 2), "k2": (1, 4), "p1": (2, 1), "p2": (3, 1), "k3": (4, 6)}
 # fx and fy of one focal length may differ by rounding in a text file, not by more.
 _SQUARE_RTOL = 1e-9
 
 
 def to_opencv(distortion: str, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Camera matrix (3, 3) in pixels and coefficients k1, k2, p1, p2, k3 (5,) from x0, y0, f, k... in pixels.
+    """Camera matrix (3, 3) in pixels and coefficients k1, k2, p1, p2, k3 (5,) from x0, y0, f, k...
+    in pixels.
 
     CameraError for an inverse distortion model.
     """
     model = get_model(distortion)
     if model.direction != "forward":
         raise CameraError(
-            f"camera: distortion {distortion!r} maps distorted to ideal points, which OpenCV has no "
+            f"camera: distortion {distortion!r} maps distorted to ideal points, which OpenCV has "
+            "no "
             "coefficients for; calibrate with 'brown' to use OpenCV."
         )
     x0, y0, f, *coefficients = theta.tolist()
@@ -65,7 +69,8 @@ def from_opencv(
         lost = ["coefficients that map ideal to distorted points"]
     if lost:
         raise CameraError(
-            f"dist_coeffs: distortion {model.name!r} cannot hold {', '.join(lost)}; choose another distortion, "
+            f"dist_coeffs: distortion {model.name!r} cannot hold {', '.join(lost)}; choose "
+            "another distortion, "
             "or repeat OpenCV's calibration with k3, or p1 and p2, fixed at zero."
         )
     return model.name, [x0, y0, f, *(values[key] for key in own)]
@@ -83,7 +88,10 @@ def _pinhole(matrix: FloatArray) -> tuple[float, float, float]:
             "repeat OpenCV's calibration with CALIB_FIX_ASPECT_RATIO."
         )
     if matrix[0, 1] != 0.0 or matrix[1, 0] != 0.0 or tuple(matrix[2]) != (0.0, 0.0, 1.0):
-        raise CameraError("camera_matrix: it has skew or a scaled last row; give [[f, 0, x0], [0, f, y0], [0, 0, 1]].")
+        raise CameraError(
+            "camera_matrix: it has skew or a scaled last row; give [[f, 0, x0], [0, f, y0], [0, "
+            "0, 1]]."
+        )
     return float(matrix[0, 2]), float(matrix[1, 2]), fx
 
 

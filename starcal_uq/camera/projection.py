@@ -1,11 +1,13 @@
 """The camera model: one symbolic formula, and the vectorised kernels generated from it.
 
-A direction ``b`` in the camera frame falls on the ideal point ``(u, v) = f (b_x, b_y) / b_z`` relative to the principal
-point; a distortion model of the registry moves it (``forward``) or moves the measured point back (``inverse``). The
-direction in which a model is not explicit is found by Newton's method, and its derivatives by taking further Newton
-steps symbolically from the root: one step carries exact first derivatives, two carry exact second derivatives.
+A direction ``b`` in the camera frame falls on the ideal point ``(u, v) = f (b_x, b_y) / b_z``
+relative to the principal point; a distortion model of the registry moves it (``forward``) or moves
+the measured point back (``inverse``). The direction in which a model is not explicit is found by
+Newton's method, and its derivatives by taking further Newton steps symbolically from the root: one
+step carries exact first derivatives, two carry exact second derivatives.
 
-Arrays inside have the star axis last (structure of arrays), the layout in which sums over stars are matrix products.
+Arrays inside have the star axis last (structure of arrays), the layout in which sums over stars are
+matrix products.
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ from starcal_uq.core.errors import DistortionError
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 
 _NEWTON_STEPS = 60
-# After a last step of this size the error is its square times what the distortion bends per px, below rounding; the
-# kernels take one more Newton step from the root, which squares it again.
+# After a last step of this size the error is its square times what the distortion bends per px,
+# below rounding; the kernels take one more Newton step from the root, which squares it again.
 _NEWTON_TOLERANCE_PX = 1e-5
 # Of a radius, until a fold is told to a millionth of it.
 _HALVINGS = 20
@@ -46,7 +48,9 @@ def _symbols(model_name: str) -> Symbols:
     import casadi as ca
 
     n_parameters = 3 + len(get_model(model_name).coefficients)
-    return Symbols(*(ca.SX.sym(n, k) for n, k in zip("tbpxr", (n_parameters, 3, 3, 2, 2), strict=True)))
+    return Symbols(
+        *(ca.SX.sym(n, k) for n, k in zip("tbpxr", (n_parameters, 3, 3, 2, 2), strict=True))
+    )
 
 
 def _displaced(model_name: str, point: Any, theta: Any) -> Any:
@@ -68,12 +72,17 @@ def _newton_step(model_name: str, point: Any, target: Any, theta: Any) -> tuple[
     residual = ca.substitute(displaced, free, point) - target
     a, b, c, d = jacobian[0, 0], jacobian[0, 1], jacobian[1, 0], jacobian[1, 1]
     determinant = a * d - b * c
-    step = ca.vertcat(d * residual[0] - b * residual[1], a * residual[1] - c * residual[0]) / determinant
+    step = (
+        ca.vertcat(d * residual[0] - b * residual[1], a * residual[1] - c * residual[0])
+        / determinant
+    )
     return point - step, determinant
 
 
 def _rotated(b: Any, phi: Any) -> Any:
-    """``exp([phi]x) b`` to second order, which is exact for derivatives of up to second order at phi = 0."""
+    """``exp([phi]x) b`` to second order, which is exact for derivatives of up to second order at
+    phi = 0.
+    """
     import casadi as ca
 
     first = ca.cross(phi, b)
@@ -117,7 +126,9 @@ def second_index(n: int) -> tuple[IntArray, IntArray]:
 
 @lru_cache(maxsize=32)
 def bent_index(model_name: str) -> tuple[IntArray, IntArray]:
-    """Rows and columns (row <= column) of the second derivatives over (theta, phi) that are not zero everywhere."""
+    """Rows and columns (row <= column) of the second derivatives over (theta, phi) that are not
+    zero everywhere.
+    """
     import casadi as ca
 
     s = _symbols(model_name)
@@ -125,7 +136,12 @@ def bent_index(model_name: str) -> tuple[IntArray, IntArray]:
     xy = forward_expression(model_name, s, newton_steps=2)
     patterns = [ca.hessian(xy[axis], variables)[0].sparsity() for axis in range(2)]
     n = variables.numel()
-    there = [(i, j) for i in range(n) for j in range(i, n) if any(pattern.has_nz(i, j) for pattern in patterns)]
+    there = [
+        (i, j)
+        for i in range(n)
+        for j in range(i, n)
+        if any(pattern.has_nz(i, j) for pattern in patterns)
+    ]
     rows, columns = np.array(there, dtype=np.int64).T
     return rows, columns
 
@@ -134,8 +150,8 @@ def bent_index(model_name: str) -> tuple[IntArray, IntArray]:
 def forward_kernel(model_name: str, order: str) -> Kernel:
     """Kernel of the forward model at phi = 0.
 
-    `order` is "value" (2,); "attitude", also d/dphi (3, 2); "first", also d/dtheta (p, 2) before it; "bent", also the
-    second derivatives over (theta, phi) of `bent_index`, (n, 2).
+    `order` is "value" (2,); "attitude", also d/dphi (3, 2); "first", also d/dtheta (p, 2) before
+    it; "bent", also the second derivatives over (theta, phi) of `bent_index`, (n, 2).
     """
     import casadi as ca
 
@@ -156,7 +172,11 @@ def forward_kernel(model_name: str, order: str) -> Kernel:
         variables = ca.vertcat(s.theta, s.phi)
         hessians = [ca.hessian(xy[axis], variables)[0] for axis in range(2)]
         rows, columns = bent_index(model_name)
-        entries = [hessians[axis][int(i), int(j)] for i, j in zip(rows, columns, strict=True) for axis in range(2)]
+        entries = [
+            hessians[axis][int(i), int(j)]
+            for i, j in zip(rows, columns, strict=True)
+            for axis in range(2)
+        ]
         outputs.append(ca.vertcat(*entries))
         shapes.append((len(rows), 2))
     outputs = [ca.substitute(ca.densify(output), s.phi, ca.SX.zeros(3)) for output in outputs]
@@ -175,12 +195,16 @@ def backward_kernel(model_name: str, derivatives: bool) -> Kernel:
     if derivatives:
         outputs.append(ca.jacobian(direction, s.theta))
         shapes.append((s.theta.numel(), 3))
-    return build_kernel(f"backward_{model_name}_{derivatives}", [s.theta, s.pixel, s.root], outputs, shapes)
+    return build_kernel(
+        f"backward_{model_name}_{derivatives}", [s.theta, s.pixel, s.root], outputs, shapes
+    )
 
 
 @lru_cache(maxsize=32)
 def backward_second_kernel(model_name: str) -> Kernel:
-    """Kernel from pixels to unit vectors (3,), d/dtheta (p, 3), and unique second derivatives (p (p + 1) / 2, 3)."""
+    """Kernel from pixels to unit vectors (3,), d/dtheta (p, 3), and unique second derivatives (p (p
+    + 1) / 2, 3).
+    """
     import casadi as ca
 
     s = _symbols(model_name)
@@ -188,25 +212,37 @@ def backward_second_kernel(model_name: str) -> Kernel:
     direction = backward_expression(model_name, s, newton_steps=2)
     hessians = [ca.hessian(direction[axis], s.theta)[0] for axis in range(3)]
     rows, columns = second_index(p)
-    entries = [hessians[axis][int(i), int(j)] for i, j in zip(rows, columns, strict=True) for axis in range(3)]
+    entries = [
+        hessians[axis][int(i), int(j)]
+        for i, j in zip(rows, columns, strict=True)
+        for axis in range(3)
+    ]
     outputs = [direction, ca.jacobian(direction, s.theta), ca.vertcat(*entries)]
     shapes = [(3,), (p, 3), (len(rows), 3)]
-    return build_kernel(f"backward_second_{model_name}", [s.theta, s.pixel, s.root], outputs, shapes)
+    return build_kernel(
+        f"backward_second_{model_name}", [s.theta, s.pixel, s.root], outputs, shapes
+    )
 
 
 @lru_cache(maxsize=32)
 def newton_kernel(model_name: str) -> Kernel:
-    """Kernel of one Newton step: next point (2,) and Jacobian determinant at the present one (1,)."""
+    """Kernel of one Newton step: next point (2,) and Jacobian determinant at the present one
+    (1,).
+    """
     s = _symbols(model_name)
     point, determinant = _newton_step(model_name, s.root, s.pixel, s.theta)
-    return build_kernel(f"newton_{model_name}", [s.theta, s.pixel, s.root], [point, determinant], [(2,), (1,)])
+    return build_kernel(
+        f"newton_{model_name}", [s.theta, s.pixel, s.root], [point, determinant], [(2,), (1,)]
+    )
 
 
 def solve_displacement(model_name: str, theta: FloatArray, target: FloatArray) -> FloatArray:
-    """Offsets (2, n) from the principal point, px, that solve ``point + displacement(point) = target``.
+    """Offsets (2, n) from the principal point, px, that solve ``point + displacement(point) =
+    target``.
 
-    Newton's method starts from the target, whence it converges monotonically for radial distortion that does not fold.
-    Where it meets a fold they are not finite, but it may step over one (`before_fold`).
+    Newton's method starts from the target, whence it converges monotonically for radial distortion
+    that does not fold. Where it meets a fold they are not finite, but it may step over one
+    (`before_fold`).
     """
     kernel = newton_kernel(model_name)
     n, point = target.shape[1], target
@@ -221,19 +257,25 @@ def solve_displacement(model_name: str, theta: FloatArray, target: FloatArray) -
             point = moved
             if change < _NEWTON_TOLERANCE_PX:
                 return point
-        settled = np.abs(point - kernel(n, theta, target, point)[0]).max(axis=0) < _NEWTON_TOLERANCE_PX
+        settled = (
+            np.abs(point - kernel(n, theta, target, point)[0]).max(axis=0) < _NEWTON_TOLERANCE_PX
+        )
     return np.where(settled, point, np.nan)
 
 
 def forward_root(model_name: str, theta: FloatArray, b: FloatArray) -> FloatArray:
-    """The `root` input of a forward kernel for directions b (3, n): (2,) zeros where the model is explicit."""
+    """The `root` input of a forward kernel for directions b (3, n): (2,) zeros where the model is
+    explicit.
+    """
     if get_model(model_name).direction == "forward":
         return np.zeros(2)
     return solve_displacement(model_name, theta, theta[2] * b[:2] / b[2])
 
 
 def backward_root(model_name: str, theta: FloatArray, pixel: FloatArray) -> FloatArray:
-    """The `root` input of a backward kernel for pixels (2, n): (2,) zeros where the model is explicit."""
+    """The `root` input of a backward kernel for pixels (2, n): (2,) zeros where the model is
+    explicit.
+    """
     if get_model(model_name).direction == "inverse":
         return np.zeros(2)
     centre = theta[:2] if theta.ndim == 2 else theta[:2, None]
@@ -241,7 +283,8 @@ def backward_root(model_name: str, theta: FloatArray, pixel: FloatArray) -> Floa
 
 
 def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolArray:
-    """Whether the displacement does not fold over between the principal point and each point (2, n); of NaN it is True.
+    """Whether the displacement does not fold over between the principal point and each point (2,
+    n); of NaN it is True.
 
     `theta` is (p,), or a column (p, n) each.
     """
@@ -249,7 +292,12 @@ def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolAr
     before = np.ones(point.shape[1], dtype=bool)
     with np.errstate(all="ignore"):
         square, size = point[0] ** 2 + point[1] ** 2, np.abs(theta[3:])
-        if not _bend(model_name, np.sqrt(np.fmax.reduce(square, initial=0.0)), [np.max(k) for k in size]) > 1.0:
+        if (
+            not _bend(
+                model_name, np.sqrt(np.fmax.reduce(square, initial=0.0)), [np.max(k) for k in size]
+            )
+            > 1.0
+        ):
             return before
         bend = _bend(model_name, np.sqrt(square), size)
         far = np.flatnonzero((bend > 1.0) & np.isfinite(bend))
@@ -263,7 +311,11 @@ def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolAr
                 determinant = newton_kernel(model_name)(far.size, own, at, at)[1][0]
                 # A parabola through three steps has the minimum between them.
                 bend = inner - 2.0 * outer + determinant
-                dips = (outer < inner) & (outer <= determinant) & (8.0 * bend * outer <= (determinant - inner) ** 2)
+                dips = (
+                    (outer < inner)
+                    & (outer <= determinant)
+                    & (8.0 * bend * outer <= (determinant - inner) ** 2)
+                )
                 before[far] &= (determinant > 0.0) & ~dips
                 inner, outer = outer, determinant
     return before
@@ -271,37 +323,50 @@ def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolAr
 
 def _bend(model_name: str, radius: FloatArray, k: Iterable[FloatArray]) -> FloatArray:
     """Largest change of the displacement, px per px, up to a radius; below one, nothing folds."""
-    # A radial term k r^m bends by m k r^(m - 1) px per px at most, a decentring one (even m) by three times that.
+    # A radial term k r^m bends by m k r^(m - 1) px per px at most, a decentring one (even m) by
+    # three times that.
     terms = get_model(model_name).coefficients
     steep = [(1.0 if c.order % 2 else 3.0) * c.order * radius ** (c.order - 1) for c in terms]
     return sum((a * b for a, b in zip(steep, k, strict=True)), np.zeros(1))
 
 
 def cannot_fold(model_name: str, thetas: FloatArray, xy: FloatArray) -> bool:
-    """Whether no parameters (D, p) fold at any pixel (N, 2), by a bound; False where that takes a closer look."""
+    """Whether no parameters (D, p) fold at any pixel (N, 2), by a bound; False where that takes a
+    closer look.
+    """
     if get_model(model_name).direction != "forward":
         return False
     low, high = thetas[:, :2].min(axis=0), thetas[:, :2].max(axis=0)
     reach = np.hypot(*np.maximum(np.abs(xy - low), np.abs(xy - high)).max(axis=0))
-    # Where nothing bends by more than a half, an ideal point is at most twice as far out as its image.
-    return bool(_bend(model_name, np.array([2.0 * reach]), list(np.abs(thetas[:, 3:]).max(axis=0)))[0] < 0.5)
+    # Where nothing bends by more than a half, an ideal point is at most twice as far out as its
+    # image.
+    return bool(
+        _bend(model_name, np.array([2.0 * reach]), list(np.abs(thetas[:, 3:]).max(axis=0)))[0] < 0.5
+    )
 
 
 def unproject_theta(model_name: str, theta: FloatArray, xy: FloatArray) -> FloatArray:
-    """Unit vectors (N, 3) in the camera frame of pixels xy (N, 2) for parameters theta (p,), or a column each.
+    """Unit vectors (N, 3) in the camera frame of pixels xy (N, 2) for parameters theta (p,), or a
+    column each.
 
     Not finite where a pixel has no ideal point before the distortion folds over.
     """
     return _unprojected(model_name, theta, xy, derivatives=False)[0].T
 
 
-def unproject_jacobian(model_name: str, theta: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors b (N, 3) of pixels xy (N, 2), as by `unproject_theta`, and their derivatives db/dtheta (N, 3, p)."""
+def unproject_jacobian(
+    model_name: str, theta: FloatArray, xy: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors b (N, 3) of pixels xy (N, 2), as by `unproject_theta`, and their derivatives
+    db/dtheta (N, 3, p).
+    """
     b, db = _unprojected(model_name, theta, xy, derivatives=True)
     return b.T, db.transpose(2, 1, 0)
 
 
-def _unprojected(model_name: str, theta: FloatArray, xy: FloatArray, derivatives: bool) -> tuple[FloatArray, ...]:
+def _unprojected(
+    model_name: str, theta: FloatArray, xy: FloatArray, derivatives: bool
+) -> tuple[FloatArray, ...]:
     pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
     theta = np.asarray(theta, dtype=np.float64)
     root = backward_root(model_name, theta, pixel)
@@ -315,19 +380,28 @@ def _unprojected(model_name: str, theta: FloatArray, xy: FloatArray, derivatives
 
 
 def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> float:
-    """Smallest radius up to `max_radius_px` at which the distortion folds over; infinity when it does not.
+    """Smallest radius up to `max_radius_px` at which the distortion folds over; infinity when it
+    does not.
 
-    The map folds where the determinant of its Jacobian is not positive (`before_fold`), in any of 36 directions; a
-    radial model is the same in all of them.
+    The map folds where the determinant of its Jacobian is not positive (`before_fold`), in any of
+    36 directions; a radial model is the same in all of them.
     """
-    angle = np.zeros(1) if get_model(model_name).radial else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    angle = (
+        np.zeros(1)
+        if get_model(model_name).radial
+        else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    )
     rim = max_radius_px * np.stack([np.cos(angle), np.sin(angle)])
     clear, folded = 0.0, 1.0
     if before_fold(model_name, theta, rim).all():
         return float("inf")
     for _ in range(_HALVINGS):
         middle = 0.5 * (clear + folded)
-        clear, folded = (middle, folded) if before_fold(model_name, theta, middle * rim).all() else (clear, middle)
+        clear, folded = (
+            (middle, folded)
+            if before_fold(model_name, theta, middle * rim).all()
+            else (clear, middle)
+        )
     return max_radius_px * folded
 
 
@@ -361,10 +435,13 @@ def project(camera: Camera, b_cam: FloatArray) -> FloatArray:
     root = forward_root(camera.distortion, theta, seen)
     if get_model(camera.distortion).direction == "forward":
         radius = float(np.max(np.hypot(seen[0] / seen[2], seen[1] / seen[2]))) * theta[2]
-        fold = fold_radius_px(camera.distortion, theta, radius) if np.any(theta[3:]) else float("inf")
+        fold = (
+            fold_radius_px(camera.distortion, theta, radius) if np.any(theta[3:]) else float("inf")
+        )
         if fold <= radius:
             raise DistortionError(
-                f"the distortion {camera.distortion!r} folds over {fold:.0f} px from the principal point, inside the "
+                f"the distortion {camera.distortion!r} folds over {fold:.0f} px from the "
+                "principal point, inside the "
                 f"{radius:.0f} px asked for: use smaller coefficients or stay within that radius."
             )
     elif not np.isfinite(root).all():
@@ -406,13 +483,16 @@ def unproject(camera: Camera, xy_px: FloatArray) -> FloatArray:
 def _no_inverse(camera: Camera) -> DistortionError:
     fold = fold_radius_px(camera.distortion, camera.theta, 4.0 * camera.corner_radius_px)
     return DistortionError(
-        f"the distortion {camera.distortion!r} folds over {fold:.0f} px from the principal point and cannot be "
+        f"the distortion {camera.distortion!r} folds over {fold:.0f} px from the principal point "
+        "and cannot be "
         "inverted beyond: use smaller coefficients or stay within that radius."
     )
 
 
 def monotonic_expression(model_name: str, theta: Any, max_radius_px: float) -> Any:
-    """Jacobian determinants of the distortion up to a radius, px, as a CasADi vector that is positive without folds."""
+    """Jacobian determinants of the distortion up to a radius, px, as a CasADi vector that is
+    positive without folds.
+    """
     import casadi as ca
 
     if not get_model(model_name).coefficients:

@@ -24,7 +24,8 @@ class Answer:
     results : mapping of str to object
         Results, paths, tables or plain values; read only where a document is asked for.
     status : int
-        Exit status: 0, 1 for a result that should not be trusted, or 130 for one that is not complete.
+        Exit status: 0, 1 for a result that should not be trusted, or 130 for one that is not
+        complete.
     """
 
     results: Mapping[str, Any]
@@ -48,7 +49,9 @@ def deliver(name: str, answer: Answer, as_json: bool) -> None:
 
 
 def deliver_error(sentence: str, status: int) -> None:
-    """Print what went wrong as a document, where the call asks for one, be it wrong itself, and got none yet."""
+    """Print what went wrong as a document, where the call asks for one, be it wrong itself, and got
+    none yet.
+    """
     if "--json" in sys.argv[1:] and not _printed:
         _print("error", {"error": sentence}, status)
 

@@ -1,8 +1,9 @@
 """The command line's entry, which catches what comes out of the commands.
 
-Exit status 0 when all is well, 1 when a result is there but should not be trusted, 2 for bad input, 70 for a fault of
-the program, and 130 or 143 when Ctrl-C or SIGTERM has ended the work; but for 0, always with one sentence that says
-what to do. Nothing that takes time is loaded before the signals are caught.
+Exit status 0 when all is well, 1 when a result is there but should not be trusted, 2 for bad input,
+70 for a fault of the program, and 130 or 143 when Ctrl-C or SIGTERM has ended the work; but for 0,
+always with one sentence that says what to do. Nothing that takes time is loaded before the signals
+are caught.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ def program() -> NoReturn:
 
 
 def main() -> None:
-    """Run a command: every error a user can make is one sentence on standard error, never a traceback."""
+    """Run a command: every error a user can make is one sentence on standard error, never a
+    traceback.
+    """
     before = _catch(_end_at_once)
     try:
         _main()
@@ -54,8 +57,8 @@ def _main() -> None:
     begin()
     caught_signal()
     _catch(interrupt)
-    # Imports and figures make a million objects that live as long as the command; to look through them every 700 new
-    # ones for what could be thrown away takes a twentieth of the time.
+    # Imports and figures make a million objects that live as long as the command; to look through
+    # them every 700 new ones for what could be thrown away takes a twentieth of the time.
     gc.set_threshold(50_000, 20, 50)
     try:
         code = app(standalone_mode=False)
@@ -67,7 +70,10 @@ def _main() -> None:
         # Libraries make other errors of a KeyboardInterrupt that they meet.
         number = caught_signal()
         if number is not None or isinstance(error, Abort | KeyboardInterrupt):
-            words = "interrupted; what was complete is kept: give the same command again, and it goes on."
+            words = (
+                "interrupted; what was complete is kept: give the same command again, and it "
+                "goes on."
+            )
             _fail(words, 128 + (number or signal.SIGINT))
         if isinstance(error, Exit):
             sys.exit(error.exit_code)
@@ -79,14 +85,25 @@ def _main() -> None:
             _fail("there is not enough memory for this: ask for fewer draws, frames or samples.", 2)
         if isinstance(error, OSError):
             place = f"{error.filename}: " if error.filename else ""
-            _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)
+            _fail(
+                (
+                    f"{place}{error.strerror or error}; check the path, its permissions and the "
+                    "space on the disk."
+                ),
+                2,
+            )
         traceback.print_exception(error)
-        words = "this is a fault of starcal-uq and not of the input: report it with the lines above and the command."
+        words = (
+            "this is a fault of starcal-uq and not of the input: report it with the lines above "
+            "and the command."
+        )
         _fail(f"{type(error).__name__}: {words}", FAULT)
 
 
 def _own_words(sentence: str) -> str:
-    """A sentence whose command for a calibration is the one that was given, and what it asks for."""
+    """A sentence whose command for a calibration is the one that was given, and what it asks
+    for.
+    """
     from starcal_uq.core.status import CALIBRATE
 
     given = shlex.join(["starcal-uq", *sys.argv[1:]])
@@ -95,7 +112,9 @@ def _own_words(sentence: str) -> str:
 
 
 def _catch(handler: Callable[[int, Any], None] | signal.Handlers) -> dict[signal.Signals, Any]:
-    """Let a function take the signals that end a program; those of before, but for signals that were ignored."""
+    """Let a function take the signals that end a program; those of before, but for signals that
+    were ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         return {}
     caught = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
@@ -109,7 +128,9 @@ def _end_at_once(number: int, _frame: Any) -> None:
 
 
 def _again(unraisable: Any) -> None:
-    """An interrupt that came where none can be raised, such as in a finaliser, comes again a moment later."""
+    """An interrupt that came where none can be raised, such as in a finaliser, comes again a moment
+    later.
+    """
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
         threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
     else:

@@ -26,11 +26,17 @@ from starcal_uq.core.types import AnyDict
 
 app = typer.Typer(
     name="starcal-uq",
-    help="Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error.",
+    help=(
+        "Probabilistic calibration of star sensors: from identified stars to a posterior and its "
+        "attitude error."
+    ),
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    epilog="Start with `starcal-uq demo`: the experiment of Ye & Yang 2017, from a star catalogue to a report.",
+    epilog=(
+        "Start with `starcal-uq demo`: the experiment of Ye & Yang 2017, from a star catalogue "
+        "to a report."
+    ),
 )
 
 
@@ -45,10 +51,15 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def common(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
     ] = False,
 ) -> None:
-    """Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error."""
+    """Probabilistic calibration of star sensors: from identified stars to a posterior and its
+    attitude error.
+    """
 
 
 # What one wants -> the commands, in the order of the help.
@@ -93,7 +104,11 @@ def usage_sentence(error: Exception) -> str:
     if isinstance(error, typer.BadParameter) and parameter is not None:
         if not error.message and cause is None:
             return _missing(error.ctx, parameter)
-        name = max(parameter.opts, key=len) if parameter.opts[0].startswith("-") else parameter.display_name_raw
+        name = (
+            max(parameter.opts, key=len)
+            if parameter.opts[0].startswith("-")
+            else parameter.display_name_raw
+        )
         problems: list[AnyDict] = getattr(cause, "errors", list)()
         return f"{name} {_problem(parameter, problems[0]['input']) if problems else error.message}"
     if isinstance(error, typer.BadParameter):
@@ -106,7 +121,9 @@ def usage_sentence(error: Exception) -> str:
 def _missing(context: Any, parameter: Any) -> str:
     """A parameter that a call lacks, what it is, and all that the command cannot do without."""
     command = context.command
-    call = " ".join(["starcal-uq", command.name, *(_word(other) for other in command.params if other.required)])
+    call = " ".join(
+        ["starcal-uq", command.name, *(_word(other) for other in command.params if other.required)]
+    )
     what = re.split(r"[.:;(]", parameter.help or "")[0].strip()
     what = what if what[:2].isupper() else what[:1].lower() + what[1:]
     return f"{_word(parameter)} is missing{f' ({what})' if what else ''}: give `{call}`."

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 # `!starcal-uq` of a notebook has a terminal of 80 columns, which keeps every state of a bar.
 _IN_NOTEBOOK = "JPY_PARENT_PID" in os.environ
-# What is no terminal has no width of its own: tables get the room that they need there, or what COLUMNS says.
+# What is no terminal has no width of its own: tables get the room that they need there, or what
+# COLUMNS says.
 _WIDTH = None if (sys.stdout.isatty() and not _IN_NOTEBOOK) or "COLUMNS" in os.environ else 110
 STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
 # Names of files, runs and requirements may hold square brackets and colons, which are no markup.
@@ -49,9 +50,15 @@ def say(words: str, style: str | None = None) -> None:
 
 
 def tell(words: str) -> None:
-    """What a user should know beside the answer: on standard error; notes and warnings in colour."""
+    """What a user should know beside the answer: on standard error; notes and warnings in
+    colour.
+    """
     kind = words.partition(":")[0]
-    err.print(words, style={"note": "yellow", "warning": "yellow", "violated": "red"}.get(kind), soft_wrap=True)
+    err.print(
+        words,
+        style={"note": "yellow", "warning": "yellow", "violated": "red"}.get(kind),
+        soft_wrap=True,
+    )
 
 
 @contextmanager
@@ -67,14 +74,20 @@ def quiet(wanted: bool) -> Iterator[None]:
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
     """Table of start, estimate and sigma; with a truth, also truth and z."""
     from starcal_uq.estimation.fallback import fallback_words
-    from starcal_uq.presentation.words.estimation import calibration_table, fitted_noise_text, focal_length
+    from starcal_uq.presentation.words.estimation import (
+        calibration_table,
+        fitted_noise_text,
+        focal_length,
+    )
     from starcal_uq.presentation.words.inputs import PITCH_UNKNOWN
 
     print_table(calibration_table(calibration, truth))
     say(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
     if calibration.camera.pixel_um is None:
         say(PITCH_UNKNOWN)
-    for words in filter(None, (fitted_noise_text(calibration).strip(), fallback_words(calibration))):
+    for words in filter(
+        None, (fitted_noise_text(calibration).strip(), fallback_words(calibration))
+    ):
         say(words)
 
 
@@ -95,17 +108,25 @@ def note(message: str) -> None:
 
 def print_table(table: TextTable) -> None:
     """Draw a table; its marks become colours."""
-    # Words and numbers are never cut off: a table that is too wide with its lines goes without them.
+    # Words and numbers are never cut off: a table that is too wide with its lines goes without
+    # them.
     columns = [[head, *cells] for head, *cells in zip(table.heads, *table.rows, strict=True)]
-    least = [max((len(word) for cell in column for word in cell.split()), default=1) for column in columns]
+    least = [
+        max((len(word) for cell in column for word in cell.split()), default=1)
+        for column in columns
+    ]
     wide = sum(least) + 3 * len(least) + 1 > out.width
     widths = [max(map(len, column)) for column in columns]
     gap = int(sum(least) + 2 * len(least) - 1 <= out.width)
     spare = out.width - ((1 + gap) * len(least) - 1 if wide else 3 * len(least) + 1)
-    while sum(widths) > spare:  # the console's own shares would be cut off at its edge; words break last
+    while (
+        sum(widths) > spare
+    ):  # the console's own shares would be cut off at its edge; words break last
         place = max(range(len(least)), key=lambda i: (widths[i] - least[i], widths[i]))
         widths[place] -= 1
-    look: AnyDict = {"box": SIMPLE_HEAD, "padding": (0, gap, 0, 0), "show_edge": False} if wide else {}
+    look: AnyDict = (
+        {"box": SIMPLE_HEAD, "padding": (0, gap, 0, 0), "show_edge": False} if wide else {}
+    )
     drawn = Table(title=table.title or None, title_justify="left", **look)
     for place, (head, side) in enumerate(zip(table.heads, table.align, strict=True)):
         style = "bold" if place == 0 and side == "l" else None
@@ -145,7 +166,9 @@ def show_screening(screening: Screening) -> None:
 
 
 def show_summary(run: Run, page: Path) -> None:
-    """The run in a screen of 80 columns, with what to try, the place of the report, and the verdict last."""
+    """The run in a screen of 80 columns, with what to try, the place of the report, and the verdict
+    last.
+    """
     from starcal_uq.presentation.report.summary import terminal_summary, verdict_lines
 
     results = run.results
@@ -165,24 +188,30 @@ def warn_air(obs: Observations | PartitionedObservations, cal: Calibration) -> N
 
 
 def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera) -> None:
-    """Say what follows for this camera when nothing is known of the observer's motion, and what was left out."""
+    """Say what follows for this camera when nothing is known of the observer's motion, and what was
+    left out.
+    """
     from starcal_uq.diagnostics.verdict.observed import aberration_size
 
     if not obs.directions_declared:
         words = (
-            f"warning: Neither time nor observer velocity was declared: annual aberration {aberration_size(camera)}. "
+            "warning: Neither time nor observer velocity was declared: annual aberration "
+            f"{aberration_size(camera)}. "
             "Declare --directions apparent, or --directions catalogue with a time_utc column."
         )
         tell(words)
     floor = obs.meta.get("noise_floor_px")
     if floor:
         words = (
-            f"note: even bright stars scatter by {significant(floor)} px; this was added to the noise of every star."
+            f"note: even bright stars scatter by {significant(floor)} px; this was added to the "
+            "noise of every star."
         )
         tell(words)
     low = obs.meta.get("low_stars", 0)
     if low:
-        words = f"note: {plural(int(low), 'star')} left out, because they stood lower than 10 degrees."
+        words = (
+            f"note: {plural(int(low), 'star')} left out, because they stood lower than 10 degrees."
+        )
         tell(words)
     if "frame_names" in obs.meta:
         tell(f"note: frames were numbered as they come: {obs.meta['frame_names']}.")
@@ -194,12 +223,23 @@ def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera)
 @contextmanager
 def progress_bar(label: str) -> Iterator[Progress | None]:
     """Yield a function ``(done, total)`` that moves a bar; None where nobody would see it."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     if not err.is_terminal or _IN_NOTEBOOK:
         yield None
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task(label, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)

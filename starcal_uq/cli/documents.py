@@ -75,7 +75,9 @@ class Merge(Part):
 
     run: str = says("Run folder")
     calibration: Calibration = says("The estimate from all of them")
-    consistency: Consistency | None = says("Whether they show the same camera; null where that cannot be said")
+    consistency: Consistency | None = says(
+        "Whether they show the same camera; null where that cannot be said"
+    )
 
 
 class Sample(Part):
@@ -97,15 +99,23 @@ class Propagate(Part):
 
     run: str = says("Run folder")
     attitude: Attitude = says("Attitude errors")
-    spectrum: str | None = says("Spectrum of the errors along a profile, in words; null without a profile")
+    spectrum: str | None = says(
+        "Spectrum of the errors along a profile, in words; null without a profile"
+    )
 
 
 class Diagnosis(Part):
     """What questions the model of a run."""
 
-    misfit: Annotated[list[Any], Of("diagnostics.misfit:MisfitTest")] = says("Tests for structure in the residuals")
-    jackknife: list[Jackknifed] = says("Parameters by the scatter over frames; empty for fewer than three frames")
-    stars: list[OfStars] = says("Parameters by the scatter over stars; empty where that is not known")
+    misfit: Annotated[list[Any], Of("diagnostics.misfit:MisfitTest")] = says(
+        "Tests for structure in the residuals"
+    )
+    jackknife: list[Jackknifed] = says(
+        "Parameters by the scatter over frames; empty for fewer than three frames"
+    )
+    stars: list[OfStars] = says(
+        "Parameters by the scatter over stars; empty where that is not known"
+    )
     models: Annotated[list[Any], Of("diagnostics.models:ModelScore")] = says(
         "Distortion models, the best first; empty where none were compared"
     )
@@ -167,7 +177,9 @@ class Export(Part):
 
     file: str = says("The file")
     to: str = says("Its format")
-    error_px: Number = says("Largest distance from the camera over the detector; null for a file without a camera")
+    error_px: Number = says(
+        "Largest distance from the camera over the detector; null for a file without a camera"
+    )
     text: str = says("What it holds and how near it is, in words")
 
 
@@ -176,7 +188,9 @@ class Run(Part):
 
     run: str = says("Run folder")
     report: str = says("Its report")
-    verdict: Annotated[Any, Of("diagnostics.verdict.judge:Verdict")] = says("Whether its numbers may be used")
+    verdict: Annotated[Any, Of("diagnostics.verdict.judge:Verdict")] = says(
+        "Whether its numbers may be used"
+    )
     calibration: Calibration = says("The estimate")
     screening: Screening | None = says("Stars left out by --screen; null without it")
     posterior: Posterior = says("The posterior")
@@ -191,9 +205,13 @@ class Difference(Part):
     quantity: str = says("Quantity")
     unit: str = says("Unit of its numbers")
     difference: Number = says("Second minus first", "that of the row")
-    expected: Number = says("Standard deviation, or for a map the root mean square, that the uncertainties give")
+    expected: Number = says(
+        "Standard deviation, or for a map the root mean square, that the uncertainties give"
+    )
     ratio: Number = says("Difference over expected")
-    p_value: Number = says("Probability of such a difference by chance; null where it is not tested by itself")
+    p_value: Number = says(
+        "Probability of such a difference by chance; null where it is not tested by itself"
+    )
 
 
 class Compare(Part):
@@ -207,14 +225,20 @@ class Compare(Part):
     level: Number = says("Probability of a verdict of difference when nothing differs")
     rule: str = says("How the covariance of the difference comes about")
     p_map: Number = says("Probability of such a map by chance; null where that was not tested")
-    p_parameters: Number = says("Probability of such parameters by chance; null where that was not tested")
-    rotation_arcsec: list[Number] = says("Rotation between the two, taken out, about the axes of the camera")
+    p_parameters: Number = says(
+        "Probability of such parameters by chance; null where that was not tested"
+    )
+    rotation_arcsec: list[Number] = says(
+        "Rotation between the two, taken out, about the axes of the camera"
+    )
     rotation_sigma_arcsec: list[Number] = says("Its standard deviations")
     differences: list[Difference] = says("What is left, and the parameters")
     x_px: list[Number] = says("Columns of the maps")
     y_px: list[Number] = says("Rows of the maps")
     difference_px: list[list[list[Number]]] = says("Map of the difference: rows, columns, x and y")
-    sigma_arcsec: list[list[Number]] = says("Map of the expected length of the difference: rows, columns")
+    sigma_arcsec: list[list[Number]] = says(
+        "Map of the expected length of the difference: rows, columns"
+    )
     messages: list[str] = says("What deserves attention")
     text: str = says("The verdict in words")
     provenance: AnyDict = says("Of both, and settings")
@@ -224,7 +248,9 @@ class Forecast(Part):
     """What a campaign of one size will give."""
 
     n_frames: int = says("Frames")
-    sigma: dict[str, Number] = says("Standard deviation by quantity, whose name ends in the unit; null: not determined")
+    sigma: dict[str, Number] = says(
+        "Standard deviation by quantity, whose name ends in the unit; null: not determined"
+    )
     noise_relative: Number = says("Relative standard error of the noise")
     radius_arcsec: Number = says("Two-axis error at the confidence")
     radius_low_arcsec: Number = says("Lower end of the range of 90 % of the campaigns")
@@ -247,7 +273,9 @@ class Chosen(Part):
     qz: Number = says("The same")
     qw: Number = says("The same")
     n_stars: int = says("Stars")
-    score: Number = says("What is left of the uncertainty with it and all before, as the criterion counts it")
+    score: Number = says(
+        "What is left of the uncertainty with it and all before, as the criterion counts it"
+    )
 
 
 class Checked(Part):
@@ -307,7 +335,9 @@ class Plan(Part):
     def take(cls, result: Any) -> Mapping[str, Any]:
         open_radii = {"radius_least_arcsec": None, "radius_most_arcsec": None}
         forecast = [
-            open_radii | row | {"sigma": {key: row[key] for key in row if key not in Forecast.model_fields}}
+            open_radii
+            | row
+            | {"sigma": {key: row[key] for key in row if key not in Forecast.model_fields}}
             for row in result.to_dataframe().to_dict("records")
         ]
         return {**super().take(result), "camera": result.camera.to_dict(), "forecast": forecast}

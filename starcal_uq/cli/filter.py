@@ -40,29 +40,52 @@ def filter_command(
     out: NewRun,
     method: Annotated[
         settings.RecursiveMethod,
-        typer.Option(help="griffith (recursive least squares) or samaan (Kalman filter, distortion afterwards)."),
+        typer.Option(
+            help=(
+                "griffith (recursive least squares) or samaan (Kalman filter, distortion "
+                "afterwards)."
+            )
+        ),
     ] = "griffith",
     parameters: Annotated[
         settings.Filtered,
-        typer.Option(help="optics (x0, y0, f; the distortion is ignored, as in the source) or all (griffith only)."),
+        typer.Option(
+            help=(
+                "optics (x0, y0, f; the distortion is ignored, as in the source) or all "
+                "(griffith only)."
+            )
+        ),
     ] = "all",
     pair_covariance: Annotated[
         settings.PairCovariance,
-        typer.Option(help="full, or diagonal: pairs that share a star taken as independent, as filters used to."),
+        typer.Option(
+            help=(
+                "full, or diagonal: pairs that share a star taken as independent, as filters "
+                "used to."
+            )
+        ),
     ] = "full",
     forgetting: Annotated[
-        float, number(_FORGETTING, "Weight of all earlier frames against the next, above 0 and up to 1 (griffith).")
+        float,
+        number(
+            _FORGETTING,
+            "Weight of all earlier frames against the next, above 0 and up to 1 (griffith).",
+        ),
     ] = 1.0,
     process_noise: Annotated[
-        float | None, number(_WALK_PX, "Random walk of the optics, px per frame; needs --sigma (samaan).")
+        float | None,
+        number(_WALK_PX, "Random walk of the optics, px per frame; needs --sigma (samaan)."),
     ] = None,
     sigma: Annotated[
-        float | None, number("sigma_px", "Stated centroid noise, px per axis.", least=LEAST_SIGMA_PX)
+        float | None,
+        number("sigma_px", "Stated centroid noise, px per axis.", least=LEAST_SIGMA_PX),
     ] = None,
     column: Columns = None,
     force: Force = False,
 ) -> Answer:
-    """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an interrupted call goes on."""
+    """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an
+    interrupted call goes on.
+    """
     from starcal_uq.runs.folder import HISTORY
     from starcal_uq.runs.streams import filter_run
 
@@ -83,5 +106,8 @@ def filter_command(
         force=force,
     )
     show_calibration(calibration, None)
-    say(f"Run folder: {out}; estimates after every frame: {out / HISTORY}. Next: starcal-uq sample {out}")
+    say(
+        f"Run folder: {out}; estimates after every frame: {out / HISTORY}. Next: starcal-uq "
+        f"sample {out}"
+    )
     return Answer({"run": out, "history": out / HISTORY, "calibration": calibration})

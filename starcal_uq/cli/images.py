@@ -44,42 +44,66 @@ def centroid_command(
     images: Annotated[
         list[Path],
         typer.Argument(
-            metavar="IMAGES...", help="FITS, TIFF, PNG, JPEG, BMP or raw files, or folders of them.", parser=read_path
+            metavar="IMAGES...",
+            help="FITS, TIFF, PNG, JPEG, BMP or raw files, or folders of them.",
+            parser=read_path,
         ),
     ],
     out: Annotated[
         Path,
         typer.Option(
-            "-o", "--out", metavar="CENTROIDS", help="Table to write (.csv, .ecsv, .parquet).", parser=write_file
+            "-o",
+            "--out",
+            metavar="CENTROIDS",
+            help="Table to write (.csv, .ecsv, .parquet).",
+            parser=write_file,
         ),
     ],
     camera: Annotated[
         Path | None,
-        typer.Option("--camera", help="Camera (TOML): images of another size are left out.", parser=read_file),
+        typer.Option(
+            "--camera", help="Camera (TOML): images of another size are left out.", parser=read_file
+        ),
     ] = None,
     gain: Annotated[
-        float | None, number("gain_e_per_count", "Electrons per count, where the files do not say it.")
+        float | None,
+        number("gain_e_per_count", "Electrons per count, where the files do not say it."),
     ] = None,
     read_noise: Annotated[
         float | None, number("read_noise_e", "Read noise, electrons per pixel (needs the gain).")
     ] = None,
-    saturation: Annotated[float | None, number("saturation", "Counts at which a pixel is saturated.")] = None,
-    threshold: Annotated[float, number("threshold_sigma", "Detection threshold, standard deviations.")] = 5.0,
+    saturation: Annotated[
+        float | None, number("saturation", "Counts at which a pixel is saturated.")
+    ] = None,
+    threshold: Annotated[
+        float, number("threshold_sigma", "Detection threshold, standard deviations.")
+    ] = 5.0,
     psf_sigma: Annotated[
         float | None, number("psf_sigma_px", "Width of the star images, px; measured by default.")
     ] = None,
-    max_stars: Annotated[int | None, number("max_stars", "Keep the brightest so many per frame.")] = None,
+    max_stars: Annotated[
+        int | None, number("max_stars", "Keep the brightest so many per frame.")
+    ] = None,
     pixel_phase: Annotated[
-        bool, typer.Option(help="Take out errors that repeat with the place within a pixel, where images show them.")
+        bool,
+        typer.Option(
+            help=(
+                "Take out errors that repeat with the place within a pixel, where images show them."
+            )
+        ),
     ] = True,
     time: TimeUtc = None,
     bayer: BayerMosaic = None,
     workers: Annotated[
-        int | None, number("workers", "Processes; as many as processors from a hundred images on, 0 for this one.")
+        int | None,
+        number(
+            "workers", "Processes; as many as processors from a hundred images on, 0 for this one."
+        ),
     ] = None,
     force: Force = False,
 ) -> Answer:
-    """Find the stars in images, with a covariance for each; a frame that cannot be used is named and left out.
+    """Find the stars in images, with a covariance for each; a frame that cannot be used is named
+    and left out.
 
     An interrupted command over a hundred images or more goes on.
     """
@@ -120,29 +144,49 @@ def centroid_command(
 
 def identify_command(
     centroids: Annotated[
-        Path, typer.Argument(metavar="CENTROIDS", help="Table made by `starcal-uq centroid`.", parser=read_file)
+        Path,
+        typer.Argument(
+            metavar="CENTROIDS", help="Table made by `starcal-uq centroid`.", parser=read_file
+        ),
     ],
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", metavar="OBS", help=f"Table to write ({', '.join(WRITTEN)}).", parser=write_file),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="OBS",
+            help=f"Table to write ({', '.join(WRITTEN)}).",
+            parser=write_file,
+        ),
     ],
     camera: OptionalCamera = None,
     max_mag: Annotated[
-        float | None, number(MAGNITUDES, "Magnitude limit, Gaia G; as deep as the frames need by default.")
+        float | None,
+        number(MAGNITUDES, "Magnitude limit, Gaia G; as deep as the frames need by default."),
     ] = None,
     epoch: Annotated[
-        float | None, number(EPOCH, "Julian year of the star positions; the images' own by default.")
+        float | None,
+        number(EPOCH, "Julian year of the star positions; the images' own by default."),
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Run folder of this camera: its uncertainty takes the tolerances' place.", parser=read_path),
+        typer.Option(
+            help="Run folder of this camera: its uncertainty takes the tolerances' place.",
+            parser=read_path,
+        ),
     ] = None,
-    focal_tolerance: Annotated[float, number("focal_tolerance", "Relative error of the nominal focal length.")] = 0.03,
+    focal_tolerance: Annotated[
+        float, number("focal_tolerance", "Relative error of the nominal focal length.")
+    ] = 0.03,
     centre_tolerance: Annotated[
         float | None,
         number(
             "centre_tolerance_px",
-            "Error of the nominal principal point, px; by default 2 % of the width, but not more than 20.",
+            (
+                "Error of the nominal principal point, px; by default 2 % of the width, but not "
+                "more "
+                "than 20."
+            ),
         ),
     ] = None,
     engine: Engine = "pyramid",
@@ -150,9 +194,11 @@ def identify_command(
     place: PlaceSettings,
     force: Force = False,
 ) -> Answer:
-    """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named.
+    """Identify the stars of every frame without knowing where the camera pointed; frames that do
+    not fit are named.
 
-    The stars are identified with the nominal camera and again with what they tell of it, as `run` does.
+    The stars are identified with the nominal camera and again with what they tell of it, as `run`
+    does.
     """
     from starcal_uq.pipeline.images import observations_from_centroids, of_one_size
     from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
@@ -191,10 +237,16 @@ def identify_command(
         best = images.calibration if images is not None else known
         obs.save(out, force=force, camera=found.nominal if best is None else best.camera)
         if images is None and known is None:
-            note("the stars do not determine the camera, so they were identified once: give more frames.")
+            note(
+                "the stars do not determine the camera, so they were identified once: give more "
+                "frames."
+            )
         kind = obs.meta["directions"]
         if out.suffix == ".csv" and obs.directions_declared:
-            note(f"{out} does not say that its directions are {kind}: calibrate it with --directions {kind}.")
+            note(
+                f"{out} does not say that its directions are {kind}: calibrate it with "
+                f"--directions {kind}."
+            )
         start = found.nominal if images is None else images.rounds[0][0].nominal
         if start is not nominal and known is None:
             start.save(sheet, force=force)
@@ -204,13 +256,19 @@ def identify_command(
     several = out.suffix == ".corr" and obs is not None and obs.n_frames > 1
     written = None if obs is None else out.with_name(f"{out.stem}_*.corr") if several else out
     say(f"{found.text}{'' if written is None else f' Table: {written}'}")
-    return Answer({"table": written, "frames": found.frames, "text": found.text}, int(not found.n_identified))
+    return Answer(
+        {"table": written, "frames": found.frames, "text": found.text}, int(not found.n_identified)
+    )
 
 
 def inspect_command(
     run: Annotated[
         Path,
-        typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq run IMAGES... -o RUN`.", parser=read_path),
+        typer.Argument(
+            metavar="RUN",
+            help="Run folder made by `starcal-uq run IMAGES... -o RUN`.",
+            parser=read_path,
+        ),
     ],
     frames: Annotated[
         list[str] | None,
@@ -223,19 +281,27 @@ def inspect_command(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", metavar="PAGE", help="Page to write (.html); RUN/frames.html by default.", parser=write_file
+            "-o",
+            "--out",
+            metavar="PAGE",
+            help="Page to write (.html); RUN/frames.html by default.",
+            parser=write_file,
         ),
     ] = None,
     most: Annotated[int, number("gallery_frames", "Frames at most, where none is named.")] = 24,
     images: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="PATH", help="Images, or a folder of them, where they have moved; repeatable.", parser=read_path
+            metavar="PATH",
+            help="Images, or a folder of them, where they have moved; repeatable.",
+            parser=read_path,
         ),
     ] = None,
     force: Force = False,
 ) -> Answer:
-    """Look at the frames of a run: their stars identified, rejected, expected and missed, and what to do next."""
+    """Look at the frames of a run: their stars identified, rejected, expected and missed, and what
+    to do next.
+    """
     from starcal_uq.presentation.words.images import frame_text
 
     if out is not None:
@@ -258,7 +324,9 @@ def load_images(
     keep: Path,
     seen: Callable[[Centroids, Identification | None], None],
 ) -> tuple[Observations, Camera, Centroids, ImageCalibration]:
-    """Observations of images with the nominal camera, and what is worth telling; `keep` is a folder to go on from."""
+    """Observations of images with the nominal camera, and what is worth telling; `keep` is a folder
+    to go on from.
+    """
     from starcal_uq.pipeline.images import observations_from_images
 
     known, camera = sky.options(), None if camera_path is None else sc.Camera.load(camera_path)
@@ -293,9 +361,14 @@ def load_images(
 
 def _say_epoch(centroids: Centroids, epoch: float | None) -> None:
     if epoch is None and not (centroids.time_utc != "").any():
-        note("the images have no time: the stars are taken where they were in 2016; --epoch says when it was.")
+        note(
+            "the images have no time: the stars are taken where they were in 2016; --epoch says "
+            "when it was."
+        )
 
 
 def _say_disturbed(obs: Observations) -> None:
     if left_out := obs.meta.get("disturbed_stars", 0):
-        tell(f"{plural(left_out, 'star')} left out, because the light of a neighbour displaces them.")
+        tell(
+            f"{plural(left_out, 'star')} left out, because the light of a neighbour displaces them."
+        )

@@ -48,7 +48,9 @@ _PERCENT = Limit(-30.0, 30.0, whole=False)
 
 
 def check_output(out: Path | None, command: str, force: bool) -> None:
-    """Refuse a folder that holds something, and one of another command's results even with `force`."""
+    """Refuse a folder that holds something, and one of another command's results even with
+    `force`.
+    """
     if out is not None:
         refuse_others(out, (command,))
         check_new_folder(out, force)
@@ -97,13 +99,17 @@ def budget_command(
         raise typer.BadParameter(f"--template would write over {file}: name another file.")
     for path in out or []:
         if path.suffix.lower() not in FORMATS:
-            raise typer.BadParameter(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
+            raise typer.BadParameter(
+                f"{path}: the ending names the format; use one of {', '.join(FORMATS)}."
+            )
         ensure_new(path, force)
     opened = sc.Run(run, tell=note)
     if template is not None:
         rows = sc.budget(opened.posterior, opened.observations, opened.attitude, seed=seed).rows
         sc.budgeting.write_budget_template(template, rows, force=force)
-        say(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --budget {template}")
+        say(
+            f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --budget {template}"
+        )
         return Answer({"run": run, "files": [], "template": template, "budget": None})
     # Without a question of its own, the call shows what is there.
     if opened.has("budget") and file is None and confidence is None and not force:
@@ -122,7 +128,11 @@ def budget_command(
 
 def show_budget(found: Budget) -> None:
     """Contributors, totals, requirements and what must be read with them, in the terminal."""
-    from starcal_uq.presentation.words.budgeting import contributors_table, explanations, totals_table
+    from starcal_uq.presentation.words.budgeting import (
+        contributors_table,
+        explanations,
+        totals_table,
+    )
 
     print_table(contributors_table(found))
     print_table(totals_table(found))
@@ -142,11 +152,19 @@ def tell_violations(found: Budget) -> None:
 def compare_command(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN_A RUN_B", help="Two run folders; one, with --split.", parser=read_path),
+        typer.Argument(
+            metavar="RUN_A RUN_B", help="Two run folders; one, with --split.", parser=read_path
+        ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="Folder for the page, tables and figure.", parser=write_path),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="DIR",
+            help="Folder for the page, tables and figure.",
+            parser=write_path,
+        ),
     ] = None,
     split: Annotated[
         settings.Split | None,
@@ -162,13 +180,20 @@ def compare_command(
     ] = None,
     same_data: Annotated[
         bool | None,
-        typer.Option("--same-data/--other-data", help="Whether both rest on the same frames, if files cannot tell."),
+        typer.Option(
+            "--same-data/--other-data",
+            help="Whether both rest on the same frames, if files cannot tell.",
+        ),
     ] = None,
-    level: Annotated[float, number(PROBABILITY, "Probability of a verdict 'differ' when nothing does.")] = 0.01,
+    level: Annotated[
+        float, number(PROBABILITY, "Probability of a verdict 'differ' when nothing does.")
+    ] = 0.01,
     seed: Seed = 0,
     force: Force = False,
 ) -> Answer:
-    """Do two calibrations differ by more than chance? The rotation between them is taken out and stated."""
+    """Do two calibrations differ by more than chance? The rotation between them is taken out and
+    stated.
+    """
     from starcal_uq.presentation.pages.write import write_page
     from starcal_uq.presentation.words.comparison import comparison_table
 
@@ -184,13 +209,20 @@ def compare_command(
     if split is None:
         found = sc.runs.compare_runs(*runs, labels=names, same_data=same_data, **options)
     else:
-        found = sc.runs.compare_split(runs[0], split, **(options if names is None else options | {"labels": names}))
+        found = sc.runs.compare_split(
+            runs[0], split, **(options if names is None else options | {"labels": names})
+        )
     page = None if out is None else write_page(found, out)
     print_table(comparison_table(found))
     say(found.text)
     if page is not None:
         say(f"Page: {page.resolve()}")
-    own = {"page": page, "differences": found.to_dataframe(), "text": found.text, "agree": found.agree}
+    own = {
+        "page": page,
+        "differences": found.to_dataframe(),
+        "text": found.text,
+        "agree": found.agree,
+    }
     return Answer({**found.to_dict(), **own, "rotation_sigma_arcsec": found.rotation_sigma_arcsec})
 
 
@@ -198,11 +230,18 @@ def plan_command(
     camera: CameraFile,
     target: Annotated[
         float | None,
-        number(ARCSEC, "Two-axis error across the boresight to keep.", "--target-arcsec", metavar="T"),
+        number(
+            ARCSEC, "Two-axis error across the boresight to keep.", "--target-arcsec", metavar="T"
+        ),
     ] = None,
-    confidence: Annotated[float, number(PROBABILITY, "Probability of keeping it (0.997, not 99.7).")] = 0.997,
+    confidence: Annotated[
+        float, number(PROBABILITY, "Probability of keeping it (0.997, not 99.7).")
+    ] = 0.997,
     scope: Annotated[
-        settings.Scope, typer.Option(help="Part of the error the target is for: common, rest, calibration, or total.")
+        settings.Scope,
+        typer.Option(
+            help="Part of the error the target is for: common, rest, calibration, or total."
+        ),
     ] = "common",
     sigma: Annotated[
         float | None,
@@ -213,14 +252,25 @@ def plan_command(
         ),
     ] = None,
     max_mag: MaxMag = 6.0,
-    min_stars: Annotated[int, number("min_stars", "Frames with fewer stars are not used.", least=3)] = 10,
+    min_stars: Annotated[
+        int, number("min_stars", "Frames with fewer stars are not used.", least=3)
+    ] = 10,
     frames: Annotated[
         list[int] | None,
-        number("n_frames", "Size of a campaign to forecast; repeatable (10, 30, 100, 300, 1000 and 3000 by default)."),
+        number(
+            "n_frames",
+            (
+                "Size of a campaign to forecast; repeatable (10, 30, 100, 300, 1000 and 3000 by "
+                "default)."
+            ),
+        ),
     ] = None,
-    choose: Annotated[int | None, number(_CHOSEN, "Also choose the N frames that help most.", metavar="N")] = None,
+    choose: Annotated[
+        int | None, number(_CHOSEN, "Also choose the N frames that help most.", metavar="N")
+    ] = None,
     criterion: Annotated[
-        settings.Criterion, typer.Option(help="What the choice is for: A (attitude error) or D (parameters).")
+        settings.Criterion,
+        typer.Option(help="What the choice is for: A (attitude error) or D (parameters)."),
     ] = "A",
     after: Annotated[
         Path | None,
@@ -234,18 +284,30 @@ def plan_command(
         tuple[float, float] | None,
         number(
             _PERCENT,
-            "Distortion that a sheet with zero coefficients leaves open: displacement of the corner, per cent, "
+            "Distortion that a sheet with zero coefficients leaves open: displacement of the "
+            "corner, per cent, "
             "barrel negative; from an f-theta lens to as much pincushion by default.",
             metavar="LOW HIGH",
         ),
     ] = None,
     check: Annotated[
         int | None,
-        number("n_campaigns", "Also simulate N campaigns of each size and compare.", least=10, metavar="N"),
+        number(
+            "n_campaigns",
+            "Also simulate N campaigns of each size and compare.",
+            least=10,
+            metavar="N",
+        ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="DIR", help="Folder for the page, tables and figures.", parser=write_path),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="DIR",
+            help="Folder for the page, tables and figures.",
+            parser=write_path,
+        ),
     ] = None,
     epoch: Epoch = 2026.9,
     seed: Seed = 0,
@@ -257,7 +319,9 @@ def plan_command(
 
     check_output(out, "plan", force)
     if after is not None and check is not None:
-        raise typer.BadParameter("--check simulates campaigns from nothing: leave it out with --after.")
+        raise typer.BadParameter(
+            "--check simulates campaigns from nothing: leave it out with --after."
+        )
     sheet, known = sc.Camera.load(camera), None
     noise: float | NoiseModel = 0.05
     if after is not None:
@@ -317,9 +381,16 @@ def plan_command(
     return Answer(results, int(target is not None and found.frames_needed is None))
 
 
-def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None) -> list[str]:
+def _show_plan(
+    found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None
+) -> list[str]:
     """Show the plan; the sentences beside its own text."""
-    from starcal_uq.presentation.words.planning import choice_table, distortion_sentence, need_sentence, plan_table
+    from starcal_uq.presentation.words.planning import (
+        choice_table,
+        distortion_sentence,
+        need_sentence,
+        plan_table,
+    )
 
     print_table(plan_table(found))
     notes = [distortion_sentence(found), *(need_sentence(found, need) for need in found.needs)]
@@ -336,7 +407,9 @@ def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck
 
 
 def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float | NoiseModel]:
-    """Calibration of a run of this sensor, and its noise in px: the median where stars state their own."""
+    """Calibration of a run of this sensor, and its noise in px: the median where stars state their
+    own.
+    """
     from dataclasses import replace
 
     import numpy as np
@@ -347,5 +420,9 @@ def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float | N
     model = calibration.noise_model
     if model is not None and model.varies and not model.multiplies:
         return calibration, replace(model, level_px=model.level_px * calibration.sigma)
-    stated = 1.0 if obs.sigma_px is None or calibration.sigma_name == "sigma" else float(np.median(obs.sigma_px))
+    stated = (
+        1.0
+        if obs.sigma_px is None or calibration.sigma_name == "sigma"
+        else float(np.median(obs.sigma_px))
+    )
     return calibration, float(calibration.sigma) * stated

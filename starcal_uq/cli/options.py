@@ -26,8 +26,16 @@ _VELOCITY = Limit(-1e5, 1e5, whole=False)
 _LONGEST_LABELS, _LONGEST_ADDRESS = 200, 500
 
 
-def number(limit: str | Limit, text: str, *names: str, least: float | None = None, metavar: str | None = None) -> Any:
-    """Option of a number within limits, of a parameter of Python or of its own; a command may ask for more."""
+def number(
+    limit: str | Limit,
+    text: str,
+    *names: str,
+    least: float | None = None,
+    metavar: str | None = None,
+) -> Any:
+    """Option of a number within limits, of a parameter of Python or of its own; a command may ask
+    for more.
+    """
     limit = LIMITS[limit] if isinstance(limit, str) else limit
     low = limit.low if least is None else least
     return typer.Option(*names, min=low, max=limit.high, help=text, metavar=metavar)
@@ -44,7 +52,9 @@ def _mode(path: Path) -> int | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as error:
-        raise _refuse(path, f"cannot be looked at ({getattr(error, 'strerror', None) or error}); check it") from None
+        raise _refuse(
+            path, f"cannot be looked at ({getattr(error, 'strerror', None) or error}); check it"
+        ) from None
     if stat.S_ISCHR(mode) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):
         raise _refuse(path, "is a device; name a file or a folder")
     return mode
@@ -62,7 +72,10 @@ def read_path(value: str | Path) -> Path:
     if _mode(path) is None:
         # Files of these names are what `new` writes.
         new = path.stem in get_args(settings.Starter) and path.suffix == ".toml"
-        raise _refuse(path, f"does not exist; check the path{f', or starcal-uq new {path.stem}' if new else ''}")
+        raise _refuse(
+            path,
+            f"does not exist; check the path{f', or starcal-uq new {path.stem}' if new else ''}",
+        )
     if not os.access(path, os.R_OK):
         raise _refuse(path, "cannot be read; check its permissions")
     return path
@@ -103,7 +116,9 @@ def parse_columns(pairs: list[str] | None) -> dict[str, str]:
     for pair in pairs or []:
         name, separator, in_file = pair.partition("=")
         if not (name and separator and in_file):
-            raise typer.BadParameter(f"{shown(pair)} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg.")
+            raise typer.BadParameter(
+                f"{shown(pair)} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg."
+            )
         found[name] = in_file
     return found
 
@@ -115,7 +130,9 @@ def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"{shown(text)} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
+        raise typer.BadParameter(
+            f"{shown(text)} is not three numbers in km/s, such as 7.5,0.0,0.0."
+        ) from None
     if not _VELOCITY.holds([x, y, z]):
         raise typer.BadParameter(f"{shown(text)} is no velocity in km/s: {_VELOCITY.wanted()}.")
     return x, y, z
@@ -131,7 +148,9 @@ def parse_start(text: str | None) -> dict[str, float]:
         except ValueError:
             name = ""
         if name not in ("focal_mm", "focal_px", "x0_px", "y0_px"):
-            raise typer.BadParameter(f"{shown(pair)} is no start, such as focal_mm=50.2 or x0_px=511.5,y0_px=511.5.")
+            raise typer.BadParameter(
+                f"{shown(pair)} is no start, such as focal_mm=50.2 or x0_px=511.5,y0_px=511.5."
+            )
     return found
 
 
@@ -164,8 +183,15 @@ def parse_labels(text: str | None) -> tuple[str, str] | None:
     if text is None:
         return None
     first, comma, second = (part.strip() for part in text.partition(","))
-    if not (first and comma and second) or first == second or not text.isprintable() or len(text) > _LONGEST_LABELS:
-        raise typer.BadParameter(f"{shown(text)} is not two different short names such as cold,hot.")
+    if (
+        not (first and comma and second)
+        or first == second
+        or not text.isprintable()
+        or len(text) > _LONGEST_LABELS
+    ):
+        raise typer.BadParameter(
+            f"{shown(text)} is not two different short names such as cold,hot."
+        )
     return first, second
 
 
@@ -192,7 +218,9 @@ def check_names(texts: list[str] | None) -> None:
     """Refuse what is no name of a file."""
     for text in texts or ():
         if not _is_name(text):
-            raise typer.BadParameter(f"{shown(text)} is no frame's number or name, such as 3 or night-003.fits.")
+            raise typer.BadParameter(
+                f"{shown(text)} is no frame's number or name, such as 3 or night-003.fits."
+            )
 
 
 def check_word_or_file(text: str) -> None:
@@ -215,9 +243,12 @@ ObsFile = Annotated[
     Path,
     typer.Argument(
         metavar="OBS",
-        help="Stars in pixels: CSV, ECSV, Parquet or a FITS binary table with columns frame, x_px, y_px, ra_deg, "
-        "dec_deg and optionally sigma_px, star_id, mag, direction_mas, time_utc, temperature_c; a .corr file of "
-        "astrometry.net, or matches (.json); or a folder of Parquet files of whole frames, which may exceed memory.",
+        help="Stars in pixels: CSV, ECSV, Parquet or a FITS binary table with columns frame, "
+        "x_px, y_px, ra_deg, "
+        "dec_deg and optionally sigma_px, star_id, mag, direction_mas, time_utc, temperature_c; "
+        "a .corr file of "
+        "astrometry.net, or matches (.json); or a folder of Parquet files of whole frames, which "
+        "may exceed memory.",
         parser=read_path,
     ),
 ]
@@ -233,23 +264,35 @@ OptionalCamera = Annotated[
     Path | None,
     typer.Argument(
         metavar="[CAMERA]",
-        help="Nominal camera (TOML with a [camera] table); without one, the stars tell the focal length.",
+        help=(
+            "Nominal camera (TOML with a [camera] table); without one, the stars tell the focal "
+            "length."
+        ),
         parser=read_file,
     ),
 ]
 RunPath = Annotated[
-    Path, typer.Argument(metavar="RUN", help="Run folder of `starcal-uq calibrate` or `run`.", parser=read_path)
+    Path,
+    typer.Argument(
+        metavar="RUN", help="Run folder of `starcal-uq calibrate` or `run`.", parser=read_path
+    ),
 ]
-NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.", parser=write_path)]
+NewRun = Annotated[
+    Path,
+    typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.", parser=write_path),
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
-Json = Annotated[bool, typer.Option("--json", help="Answer with one JSON document: see `starcal-uq schema`.")]
+Json = Annotated[
+    bool, typer.Option("--json", help="Answer with one JSON document: see `starcal-uq schema`.")
+]
 Seed = Annotated[int, number("seed", "Seed; the same seed repeats the result bit for bit.")]
 Columns = Annotated[
     list[str] | None,
     typer.Option(
         "--column",
         metavar="NAME=IN_FILE",
-        help='A column that is called otherwise, or in another unit: `--column "ra_deg=RA [h] * 15"`, '
+        help='A column that is called otherwise, or in another unit: `--column "ra_deg=RA [h] * '
+        '15"`, '
         '`--column "x_px=X - 1"`; repeatable.',
         callback=checked(parse_columns),
     ),
@@ -259,7 +302,8 @@ TimeUtc = Annotated[
     typer.Option(
         "--time",
         metavar="UTC",
-        help="Middle of the exposure of images, or rows of a table, that do not say it; goes before a time in an "
+        help="Middle of the exposure of images, or rows of a table, that do not say it; goes "
+        "before a time in an "
         "image's name.",
         callback=checked(_check_time),
     ),
@@ -268,12 +312,14 @@ BayerMosaic = Annotated[
     settings.Bayer | None,
     typer.Option(
         "--bayer",
-        help="Colours of the first 2 x 2 pixels, row by row, where each pixel sees one colour and the files do "
+        help="Colours of the first 2 x 2 pixels, row by row, where each pixel sees one colour and "
+        "the files do "
         "not say it: RGGB, BGGR, GRBG or GBRG; none for none.",
     ),
 ]
 Engine = Annotated[
-    settings.Engine, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")
+    settings.Engine,
+    typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name)."),
 ]
 SchedulerAddress = Annotated[
     str | None,
@@ -286,13 +332,20 @@ SchedulerAddress = Annotated[
 ]
 FileWorkers = Annotated[
     int | None,
-    number("workers", "Local processes for a folder of partitions; one for each processor by default.", "--workers"),
+    number(
+        "workers",
+        "Local processes for a folder of partitions; one for each processor by default.",
+        "--workers",
+    ),
 ]
-Workers = Annotated[int | None, number("workers", "Processes; as many as processors by default.", least=1)]
+Workers = Annotated[
+    int | None, number("workers", "Processes; as many as processors by default.", least=1)
+]
 Duplicates = Annotated[
     settings.Duplicates,
     typer.Option(
-        help="Frames that hold the same measurement as an earlier one: refuse, drop (leave them out), or keep (they "
+        help="Frames that hold the same measurement as an earlier one: refuse, drop (leave them "
+        "out), or keep (they "
         "are exposures of their own)."
     ),
 ]
@@ -300,12 +353,18 @@ Alignment = Annotated[
     str,
     typer.Option(
         metavar="random|observed|FILE",
-        help="Frames on which alignment is calibrated in flight: random sky, those of the calibration, or a table.",
+        help=(
+            "Frames on which alignment is calibrated in flight: random sky, those of the "
+            "calibration, or a table."
+        ),
         callback=checked(check_word_or_file),
     ),
 ]
 AlignmentFrames = Annotated[
-    int | None, number("alignment_frames", "Number of alignment frames of random sky; 100 by default.", metavar="N")
+    int | None,
+    number(
+        "alignment_frames", "Number of alignment frames of random sky; 100 by default.", metavar="N"
+    ),
 ]
 Draws = Annotated[int, number("n_draws", "Posterior draws that go through QUEST.", least=50)]
 Epoch = Annotated[float, number(EPOCH, "Julian year of the star positions.")]
@@ -313,7 +372,9 @@ MaxMag = Annotated[float, number(MAGNITUDES, "Magnitude limit, Gaia G.")]
 
 
 def check_same_sensor(calibrated: Camera, run: Path, sheet: Camera, path: Path) -> None:
-    """Refuse a run whose camera cannot be that of the file: another detector, or a focal length 10 % off."""
+    """Refuse a run whose camera cannot be that of the file: another detector, or a focal length 10
+    % off.
+    """
     same = (calibrated.width_px, calibrated.height_px) == (sheet.width_px, sheet.height_px)
     pixels = 0.0
     if calibrated.pixel_um is not None and sheet.pixel_um is not None:
@@ -322,7 +383,8 @@ def check_same_sensor(calibrated: Camera, run: Path, sheet: Camera, path: Path) 
     if not same or pixels > 1e-6 or focal > 0.1:
         own, its = (_size_words(camera) for camera in (calibrated, sheet))
         raise typer.BadParameter(
-            f"{run}: its camera ({own}) is not that of {path} ({its}): give the file and the run of one sensor."
+            f"{run}: its camera ({own}) is not that of {path} ({its}): give the file and the run "
+            "of one sensor."
         )
 
 

@@ -18,26 +18,39 @@ if TYPE_CHECKING:
 
 Out = Annotated[
     Path,
-    typer.Option("-o", "--out", metavar="DIR", help="Folder for report, tables and figures.", parser=write_path),
+    typer.Option(
+        "-o",
+        "--out",
+        metavar="DIR",
+        help="Folder for report, tables and figures.",
+        parser=write_path,
+    ),
 ]
 
 
 def reproduce_command(
     out: Out,
     replicates: Annotated[
-        int, number("n_replicates", "Repetitions of the experiment, each with its own seed.", least=8)
+        int,
+        number("n_replicates", "Repetitions of the experiment, each with its own seed.", least=8),
     ] = 200,
     frames: Annotated[int, number("n_frames", "Frames in each.", least=20)] = 1000,
     convention: Annotated[
         settings.Convention,
-        typer.Option(help="eq14 (ideal to distorted, as everybody's models) or eq6 (distorted to ideal)."),
+        typer.Option(
+            help="eq14 (ideal to distorted, as everybody's models) or eq6 (distorted to ideal)."
+        ),
     ] = "eq14",
-    study: Annotated[bool, typer.Option(help="Also study the interaction of optics and distortion.")] = True,
+    study: Annotated[
+        bool, typer.Option(help="Also study the interaction of optics and distortion.")
+    ] = True,
     workers: Workers = None,
     seed: Seed = 2017,
     force: Force = False,
 ) -> Answer:
-    """Run Ye & Yang 2017 again: each of its numbers beside ours, with the uncertainty that they lack."""
+    """Run Ye & Yang 2017 again: each of its numbers beside ours, with the uncertainty that they
+    lack.
+    """
     from starcal_uq.paper.reproduction import reproduce
 
     with progress_bar("reproduction") as progress:
@@ -61,17 +74,25 @@ def reproduce_command(
 
 def reproduce_field_command(
     out: Out,
-    frames: Annotated[int, number("n_frames", "Frames identified and solved; as many calibrate.", least=20)] = 200,
+    frames: Annotated[
+        int, number("n_frames", "Frames identified and solved; as many calibrate.", least=20)
+    ] = 200,
     reading: Annotated[
         settings.FieldReading,
-        typer.Option(help="window (the middle of a larger detector, 10.8 degrees) or full (all of it)."),
+        typer.Option(
+            help="window (the middle of a larger detector, 10.8 degrees) or full (all of it)."
+        ),
     ] = "window",
-    replicates: Annotated[int, number("n_replicates", "Repetitions behind the ranges of the errors.", least=20)] = 100,
+    replicates: Annotated[
+        int, number("n_replicates", "Repetitions behind the ranges of the errors.", least=20)
+    ] = 100,
     workers: Workers = None,
     seed: Seed = 2017,
     force: Force = False,
 ) -> Answer:
-    """The paper's Table 3 from rendered frames: identification and attitude with four cameras, and why they differ."""
+    """The paper's Table 3 from rendered frames: identification and attitude with four cameras, and
+    why they differ.
+    """
     from starcal_uq.paper.field.experiment import field_experiment
 
     with progress_bar("field experiment") as progress:
@@ -99,7 +120,8 @@ def _readable(published: pd.DataFrame) -> pd.DataFrame:
 
     table = published[["place", "method", "quantity", "printed"]].copy()
     table["ours"] = [
-        plus_minus(mean, spread) for mean, spread in zip(published["main_mean"], published["main_spread"], strict=True)
+        plus_minus(mean, spread)
+        for mean, spread in zip(published["main_mean"], published["main_spread"], strict=True)
     ]
     table["z"] = published["main_z"]
     table["outcome"] = published["outcome"]
@@ -107,7 +129,9 @@ def _readable(published: pd.DataFrame) -> pd.DataFrame:
 
 
 def _readable_table_3(table: pd.DataFrame) -> pd.DataFrame:
-    """The columns that fit a terminal: printed, ours as it stands, ours after alignment, and which of them agrees."""
+    """The columns that fit a terminal: printed, ours as it stands, ours after alignment, and which
+    of them agrees.
+    """
     import pandas as pd
 
     from starcal_uq.core.formatting import significant
@@ -118,7 +142,12 @@ def _readable_table_3(table: pd.DataFrame) -> pd.DataFrame:
         ends = " to ".join(significant(float(row[f"{prefix}{end}"]), 3) for end in ("low", "high"))
         return f"{significant(float(row[value]), 3)} ({ends})"
 
-    words = {"rate_percent": "rate", "pitch_arcsec": "pitch", "yaw_arcsec": "yaw", "roll_arcsec": "roll"}
+    words = {
+        "rate_percent": "rate",
+        "pitch_arcsec": "pitch",
+        "yaw_arcsec": "yaw",
+        "roll_arcsec": "roll",
+    }
     return pd.DataFrame(
         {
             "method": [method.replace("_", " ") for method in table["method"]],

@@ -14,7 +14,9 @@ OWN = "that of the parameter"
 class Estimate(Part):
     """One parameter of the camera, or the noise, which comes last."""
 
-    parameter: str = says("x0, y0, f, the coefficients of the distortion, then sigma or sigma_scale")
+    parameter: str = says(
+        "x0, y0, f, the coefficients of the distortion, then sigma or sigma_scale"
+    )
     unit: str = says("Unit of its numbers; 1 for a factor")
     start: Number = says("Value of the nominal camera", OWN)
     estimate: Number = says("Estimate", OWN)
@@ -56,7 +58,9 @@ class Calibration(Part):
             "focal_mm": cal.camera.focal_mm,
             "focal_sigma_mm": None if pitch is None else cal.sigmas[2] * pitch * 1e-3,
             "parameters": table,
-            "notes": [words for words in (fitted_noise_text(cal).strip(), fallback_words(cal)) if words],
+            "notes": [
+                words for words in (fitted_noise_text(cal).strip(), fallback_words(cal)) if words
+            ],
         }
 
 
@@ -112,7 +116,9 @@ class Coupled(Part):
     crlb_sigma: Number = says("Cramér-Rao bound of the standard deviation", OWN)
     prior_sigma: Number = says("Standard deviation of the prior; null without a posterior", OWN)
     contraction: Number = says("1 - (posterior over prior variance); null without a posterior")
-    correlation: dict[str, Number] = says("Correlation with every parameter, and with pitch, yaw and roll")
+    correlation: dict[str, Number] = says(
+        "Correlation with every parameter, and with pitch, yaw and roll"
+    )
 
 
 class Coupling(Part):
@@ -123,12 +129,17 @@ class Coupling(Part):
 
     @classmethod
     def take(cls, result: Any) -> Mapping[str, Any]:
-        rows = result.to_dataframe().assign(prior_sigma=result.prior_sigma, contraction=result.contraction)
+        rows = result.to_dataframe().assign(
+            prior_sigma=result.prior_sigma, contraction=result.contraction
+        )
         parameters = [
             row | {"correlation": {name: row[f"corr_{name}"] for name in result.extended_names}}
             for row in rows.to_dict("records")
         ]
-        return {"parameters": parameters, "directions": [direction.words for direction in result.weak_directions]}
+        return {
+            "parameters": parameters,
+            "directions": [direction.words for direction in result.weak_directions],
+        }
 
 
 class AttitudeRow(Part):
@@ -137,13 +148,17 @@ class AttitudeRow(Part):
     contributor: str = says("Contributor")
     axis: str = says("pitch, yaw, roll or cross-boresight")
     if_model_holds_arcsec: Number = says("Standard deviation by the posterior alone")
-    with_misfit_found_arcsec: Number = says("With what the tests of the model found; null: not assessed")
+    with_misfit_found_arcsec: Number = says(
+        "With what the tests of the model found; null: not assessed"
+    )
     p95_if_model_holds_arcsec: Number = says("Half-width that holds 95 %")
     p95_with_misfit_found_arcsec: Number = says("The same with the misfit found")
     p997_if_model_holds_arcsec: Number = says("Half-width that holds 99.7 %")
     p997_with_misfit_found_arcsec: Number = says("The same with the misfit found")
     first_order_arcsec: Number = says("Standard deviation by first-order propagation")
-    choice_of_model_arcsec: Number = says("Shift by models as good, in no other figure; null: not assessed")
+    choice_of_model_arcsec: Number = says(
+        "Shift by models as good, in no other figure; null: not assessed"
+    )
     absorbed_by_alignment: str = says("yes, no or in part")
 
 
@@ -174,9 +189,13 @@ class Budget(Part):
 
     title: str = says("Title")
     confidence: Number = says("Confidence of the totals")
-    contributors: Annotated[list[Any], Of("budgeting.rows:Contributor")] = says("Contributors by axis")
+    contributors: Annotated[list[Any], Of("budgeting.rows:Contributor")] = says(
+        "Contributors by axis"
+    )
     classes: list[ClassSum] = says("Classes of the standard by axis, after alignment")
-    totals: Annotated[list[Any], Of("budgeting.totals:Total")] = says("Totals by scope, axis and interpretation")
+    totals: Annotated[list[Any], Of("budgeting.totals:Total")] = says(
+        "Totals by scope, axis and interpretation"
+    )
     requirements: Annotated[
         list[Any],
         Of(
@@ -197,7 +216,9 @@ class Budget(Part):
 
     @classmethod
     def take(cls, result: Any) -> Mapping[str, Any]:
-        totals = result.totals_dataframe().assign(not_assessed=[total.not_assessed for total in result.totals])
+        totals = result.totals_dataframe().assign(
+            not_assessed=[total.not_assessed for total in result.totals]
+        )
         return {**result.to_dict(), "totals": totals}
 
 

@@ -70,7 +70,10 @@ _FAILED_FRAMES = 24
 
 def demo(
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.", parser=write_path)
+        Path,
+        typer.Option(
+            "--out", "-o", metavar="DIR", help="Folder for the results.", parser=write_path
+        ),
     ] = Path("starcal-demo"),
     frames: Annotated[int, number("n_frames", "Number of frames.", least=20)] = 1000,
     seed: Seed = 2017,
@@ -84,7 +87,10 @@ def demo(
     with run.making(command, force=force, words=typed_words(sys.argv[1:])), Ahead() as ahead:
         truth = sc.paper.paper_camera()
         if not run.did("calibrate"):
-            tell(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
+            tell(
+                f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, "
+                f"seed {seed}) ..."
+            )
             stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
             obs = sc.simulate(stars, truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed)
             tell("Calibrating from f = 72 mm and the detector's centre ...")
@@ -99,9 +105,11 @@ def run_command(
         list[Path],
         typer.Argument(
             metavar="OBS|IMAGES... [CAMERA]",
-            help="A table of identified stars (CSV, ECSV, Parquet, a FITS binary table and others, see `calibrate`) "
+            help="A table of identified stars (CSV, ECSV, Parquet, a FITS binary table and "
+            "others, see `calibrate`) "
             "or a folder of partitions, or images (FITS, TIFF, PNG, "
-            "JPEG) or folders of them, whose stars are then found and identified; then the nominal camera (TOML with a "
+            "JPEG) or folders of them, whose stars are then found and identified; then the "
+            "nominal camera (TOML with a "
             "[camera] table), which images can do without: the stars tell the focal length.",
             parser=read_path,
         ),
@@ -124,7 +132,9 @@ def run_command(
     ] = None,
     force: Force = False,
 ) -> Answer:
-    """Calibrate, sample, couple, propagate, budget and report: all from stars or images to RUN/report.html."""
+    """Calibrate, sample, couple, propagate, budget and report: all from stars or images to
+    RUN/report.html.
+    """
     from starcal_uq.pipeline.images import are_images
     from starcal_uq.presentation.report.drawing import Ahead
 
@@ -146,12 +156,22 @@ def run_command(
     if cameras := [path for path in given if path.suffix.lower() == ".toml"]:
         raise typer.BadParameter(f"{cameras[0]} is a camera: give it last.")
     if len(inputs) > 1 and not from_images and not all(path.suffix == ".corr" for path in inputs):
-        raise typer.BadParameter(f"{inputs[1]} is no image: give one table, .corr files only, or images only.")
+        raise typer.BadParameter(
+            f"{inputs[1]} is no image: give one table, .corr files only, or images only."
+        )
     if camera is None and not from_images:
-        raise typer.BadParameter("a table of stars needs the nominal camera (TOML) after it; only images do without.")
+        raise typer.BadParameter(
+            "a table of stars needs the nominal camera (TOML) after it; only images do without."
+        )
     aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
     refuse_conflicts(settings_of(estimation, sky, sampling, partitioned=folder, **aligning))
-    settings = {"estimation": estimation, "sky": sky, "images": images, "sampling": sampling, "draws": draws}
+    settings = {
+        "estimation": estimation,
+        "sky": sky,
+        "images": images,
+        "sampling": sampling,
+        "draws": draws,
+    }
     files = {f"input {number}": path for number, path in enumerate(inputs)}
     files |= {} if camera is None else {"camera": camera}
     command = command_of("run", settings | aligning | {"budget": budget}, files)
@@ -182,13 +202,21 @@ def _calibrate(
     try:
         if from_images:
             obs, nominal, centroids, identified = load_images(
-                inputs, camera, images, sky, estimation.model, run.folder.path, lambda *known: seen.append(known)
+                inputs,
+                camera,
+                images,
+                sky,
+                estimation.model,
+                run.folder.path,
+                lambda *known: seen.append(known),
             )
         elif camera is not None:
             obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
         with progress_bar("passes over the files") as progress:
             nominal = estimation.started(nominal)
-            run.calibrate(obs, nominal, undetermined=undetermined, progress=progress, **estimation.options())
+            run.calibrate(
+                obs, nominal, undetermined=undetermined, progress=progress, **estimation.options()
+            )
     except (IdentificationError, CalibrationError) as error:
         # Where no image could be measured there is nothing to be looked at.
         if seen and seen[-1][0].meta.get("optics"):
@@ -204,7 +232,14 @@ def _calibrate(
 
 
 # Options that hold for the images of another camera as well, and whether a value follows.
-_OF_ANY_CAMERA = {"--time": 1, "--epoch": 1, "--site": 1, "--directions": 1, "--max-mag": 1, "--in-space": 0}
+_OF_ANY_CAMERA = {
+    "--time": 1,
+    "--epoch": 1,
+    "--site": 1,
+    "--directions": 1,
+    "--max-mag": 1,
+    "--in-space": 0,
+}
 
 
 def _tell_other_cameras(run: Run) -> None:
@@ -213,18 +248,28 @@ def _tell_other_cameras(run: Run) -> None:
     kept: list[str] = []
     for place, word in enumerate(words):
         if word.partition("=")[0] in _OF_ANY_CAMERA:
-            kept += words[place : place + 1 + _OF_ANY_CAMERA[word.partition("=")[0]] * ("=" not in word)]
+            kept += words[
+                place : place + 1 + _OF_ANY_CAMERA[word.partition("=")[0]] * ("=" not in word)
+            ]
     for place, other in enumerate(frames.record.others, 2):
         paths = [str(frames.paths[frame]) for frame in other.frames if frame in frames.paths]
         command = shlex.join(["starcal-uq", "run", *paths, *kept, "-o", f"{run.path}-{place}"])
         images = plural(len(other.frames), "image")
-        note(f"{images} of another camera ({other.words}) left out; to calibrate that one: {command}")
+        note(
+            f"{images} of another camera ({other.words}) left out; to calibrate that one: {command}"
+        )
 
 
 def _keep_failed(
-    run: Run, inputs: list[Path], camera: Path | None, centroids: Centroids, identification: Identification | None
+    run: Run,
+    inputs: list[Path],
+    camera: Path | None,
+    centroids: Centroids,
+    identification: Identification | None,
 ) -> Path:
-    """What there is to be looked at of images that could not be calibrated: their table and a page of their frames."""
+    """What there is to be looked at of images that could not be calibrated: their table and a page
+    of their frames.
+    """
     sheet = None if camera is None else sc.Camera.load(camera)
     if sheet is None and identification is not None and identification.optics is not None:
         sheet = identification.nominal
@@ -252,10 +297,13 @@ def _after_calibration(
     )
 
     apart = None
-    # With fewer stars the other process would take longer to load what it needs than this one takes for all of it.
+    # With fewer stars the other process would take longer to load what it needs than this one takes
+    # for all of it.
     many = run.calibration.partitions is None and len(run.observations) >= _APART_STARS
     if many and not run.did("diagnose"):
-        apart = ahead.begin(partial(diagnose_apart, seed=sampling.seed), run.observations, run.calibration)
+        apart = ahead.begin(
+            partial(diagnose_apart, seed=sampling.seed), run.observations, run.calibration
+        )
     tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
     ahead.draw(run.calibrated, AFTER_CALIBRATION)
     if run.images is not None:

@@ -1,6 +1,8 @@
-"""Every command's document by its name and version, and what it promises as JSON Schema and in words.
+"""Every command's document by its name and version, and what it promises as JSON Schema and in
+words.
 
-A document may get further keys; where a key goes or changes its meaning, the version of its schema rises.
+A document may get further keys; where a key goes or changes its meaning, the version of its schema
+rises.
 """
 
 from __future__ import annotations
@@ -82,7 +84,8 @@ SCHEMAS: Mapping[str, tuple[int, type[Part]]] = {
 _HEAD = {
     "schema": "Name of the schema",
     "version": "Its version",
-    "exit_status": "0, 1 for a result that should not be trusted, 2 for bad input, 70 for a fault of the program, 130 "
+    "exit_status": "0, 1 for a result that should not be trusted, 2 for bad input, 70 for a fault of the "
+    "program, 130 "
     "or 143 after an interrupt",
 }
 
@@ -115,7 +118,9 @@ def json_schema(name: str) -> AnyDict:
 
 
 def keys(name: str) -> Iterator[tuple[str, str, str, str]]:
-    """Every key of a document with its type, unit and meaning; ``a[].b`` is b of every object in the list a."""
+    """Every key of a document with its type, unit and meaning; ``a[].b`` is b of every object in
+    the list a.
+    """
     schema = json_schema(name)
     yield from _keys(schema, schema.get("$defs", {}), "")
 
@@ -125,13 +130,17 @@ def _keys(place: AnyDict, parts: AnyDict, above: str) -> Iterator[tuple[str, str
         kind, inner = type_words(content), _inner(content)
         yield f"{above}{key}", kind, content.get("unit", ""), content.get("description", "")
         if inner:
-            yield from _keys(parts[inner], parts, f"{above}{key}{'[]' if kind.startswith('list') else ''}.")
+            yield from _keys(
+                parts[inner], parts, f"{above}{key}{'[]' if kind.startswith('list') else ''}."
+            )
 
 
 def type_words(content: AnyDict) -> str:
     """The type of a key in words."""
     if "const" in content:
-        return f'"{content["const"]}"' if isinstance(content["const"], str) else str(content["const"])
+        return (
+            f'"{content["const"]}"' if isinstance(content["const"], str) else str(content["const"])
+        )
     if "anyOf" in content:
         return " or ".join(map(type_words, content["anyOf"]))
     kind = content.get("type", "object")
@@ -148,4 +157,8 @@ def _several(content: AnyDict) -> str:
 def _inner(content: AnyDict) -> str:
     """The name of the part that a key, or a list of it, is made of; empty where there is none."""
     within = [content.get("items", {}), *content.get("anyOf", ())]
-    return str(content["$ref"].rpartition("/")[2]) if "$ref" in content else "".join(map(_inner, filter(None, within)))
+    return (
+        str(content["$ref"].rpartition("/")[2])
+        if "$ref" in content
+        else "".join(map(_inner, filter(None, within)))
+    )

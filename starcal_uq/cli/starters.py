@@ -1,4 +1,6 @@
-"""Starter files: one with comments for each file that people write, and an example to try everything on."""
+"""Starter files: one with comments for each file that people write, and an example to try
+everything on.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,10 @@ from starcal_uq.core import settings
 
 
 def new_command(
-    what: Annotated[settings.Starter, typer.Argument(metavar="camera|site|budget|study|example", help="Kind of file.")],
+    what: Annotated[
+        settings.Starter,
+        typer.Argument(metavar="camera|site|budget|study|example", help="Kind of file."),
+    ],
     out: Annotated[
         Path | None,
         typer.Option(
@@ -30,7 +35,10 @@ def new_command(
         settings.StudyTemplate | None,
         typer.Option(
             metavar="NAME",
-            help="Of a study: fov-distortion (the default), frames-stars, magnitude-noise or distortion-models.",
+            help=(
+                "Of a study: fov-distortion (the default), frames-stars, magnitude-noise or "
+                "distortion-models."
+            ),
         ),
     ] = None,
     near: Annotated[
@@ -45,7 +53,9 @@ def new_command(
     ] = None,
     force: Force = False,
 ) -> Answer:
-    """Write a starter file with comments (camera, site, budget, study), or real data to try everything on."""
+    """Write a starter file with comments (camera, site, budget, study), or real data to try
+    everything on.
+    """
     if template is not None and what != "study":
         raise typer.BadParameter(f"--template belongs to a study, and this is a new {what}.")
     if near is not None and what != "site":
@@ -54,7 +64,8 @@ def new_command(
     if what == "example":
         sc.example_data("esa").save(path, force=force)
         files = ", ".join(
-            str(path / name) for name in ("stars.ecsv", "camera.toml", "site.toml", "NOTICE (whose data)")
+            str(path / name)
+            for name in ("stars.ecsv", "camera.toml", "site.toml", "NOTICE (whose data)")
         )
         following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN"
     elif what == "camera":
@@ -64,12 +75,18 @@ def new_command(
         start.replace(name="my camera", x0_px=x0, y0_px=y0).save(path, force=force)
         following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"
     elif what == "site":
-        example = sc.sky.Site(52.0, 4.4, 10.0, pressure_hpa=1013.0, temperature_c=15.0, relative_humidity=0.5)
+        example = sc.sky.Site(
+            52.0, 4.4, 10.0, pressure_hpa=1013.0, temperature_c=15.0, relative_humidity=0.5
+        )
         (example if near is None else sc.sky.Site(*near)).save(path, force=force)
-        following = f"put in where the camera stood, then starcal-uq run OBS CAMERA -o RUN --site {path}"
+        following = (
+            f"put in where the camera stood, then starcal-uq run OBS CAMERA -o RUN --site {path}"
+        )
     elif what == "budget":
         sc.budgeting.write_budget_template(path, force=force)
-        following = f"take away the marks before what you know, then starcal-uq budget RUN --budget {path}"
+        following = (
+            f"take away the marks before what you know, then starcal-uq budget RUN --budget {path}"
+        )
     else:
         sc.studies.write_study_template(template or "fov-distortion", path, force)
         following = f"change what is varied, then starcal-uq study {path} -o DIR"

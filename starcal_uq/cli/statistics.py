@@ -38,32 +38,45 @@ def validate_command(
             "-o",
             "--out",
             metavar="DIR",
-            help="Folder for figure and table, in which an interrupted command goes on; without one, nothing is "
+            help="Folder for figure and table, in which an interrupted command goes on; without "
+            "one, nothing is "
             "written.",
             parser=write_path,
         ),
     ] = None,
-    replicates: Annotated[int, number("n_replicates", "Data sets to simulate, calibrate and sample.", least=20)] = 1000,
+    replicates: Annotated[
+        int, number("n_replicates", "Data sets to simulate, calibrate and sample.", least=20)
+    ] = 1000,
     frames: Annotated[int, number("n_frames", "Frames in each.", least=2)] = 50,
     min_stars: Annotated[int, number("min_stars", "Least stars in a frame.", least=3)] = 10,
-    sigma: Annotated[float, number("sigma_px", "Centroid noise, px per axis.", least=LEAST_SIGMA_PX)] = 0.05,
+    sigma: Annotated[
+        float, number("sigma_px", "Centroid noise, px per axis.", least=LEAST_SIGMA_PX)
+    ] = 0.05,
     max_mag: MaxMag = 6.0,
     truth: Annotated[
         settings.Truth,
-        typer.Option(help="fixed (this camera every time) or prior (drawn from narrow priors around it)."),
+        typer.Option(
+            help="fixed (this camera every time) or prior (drawn from narrow priors around it)."
+        ),
     ] = "fixed",
     workers: Workers = None,
     seed: Seed = 0,
     force: Force = False,
 ) -> Answer:
-    """Show that the intervals are right for this sensor and this volume of data, by simulation-based calibration.
+    """Show that the intervals are right for this sensor and this volume of data, by
+    simulation-based calibration.
 
-    With `-o`, replicates are kept as they are made: an interrupted command goes on, also with more of them.
+    With `-o`, replicates are kept as they are made: an interrupted command goes on, also with more
+    of them.
     """
     from starcal_uq.presentation.words.diagnostics import validation_table
 
     sensor = sc.Camera.load(camera)
-    with nullcontext() if out is None else making(out, "validate", "validation.npz", force=force) as stage:
+    with (
+        nullcontext()
+        if out is None
+        else making(out, "validate", "validation.npz", force=force) as stage
+    ):
         with progress_bar("replicates") as progress:
             found = sc.validate(
                 sensor,
@@ -101,7 +114,9 @@ def diagnose_command(
     seed: Seed = 0,
     force: Force = False,
 ) -> Answer:
-    """Question the model: misfit, jackknife, other distortion models, predictive checks, other starts."""
+    """Question the model: misfit, jackknife, other distortion models, predictive checks, other
+    starts.
+    """
     from starcal_uq.presentation.words.diagnostics import (
         jackknife_table,
         misfit_table,
@@ -111,7 +126,9 @@ def diagnose_command(
     )
 
     with progress_bar("diagnosis") as progress:
-        found = sc.Run(run, tell=note).diagnose(n_starts=starts, seed=seed, force=force, progress=progress)
+        found = sc.Run(run, tell=note).diagnose(
+            n_starts=starts, seed=seed, force=force, progress=progress
+        )
     print_table(misfit_table(found.misfit, found_only=True))
     if found.jackknife is not None:
         print_table(jackknife_table(found.jackknife))
@@ -128,27 +145,39 @@ def diagnose_command(
 
 def merge_command(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN...", help="Run folders of the same camera.", parser=read_path)
+        list[Path],
+        typer.Argument(metavar="RUN...", help="Run folders of the same camera.", parser=read_path),
     ],
     out: NewRun,
     noise: Annotated[
         settings.MergedNoise,
         typer.Option(
-            help="common (one noise for all runs), own (each run keeps its estimated noise), or auto (own where the "
+            help="common (one noise for all runs), own (each run keeps its estimated noise), or "
+            "auto (own where the "
             "runs' noises differ)."
         ),
     ] = "auto",
     allow_inconsistent: Annotated[
-        bool, typer.Option("--allow-inconsistent", help="Merge even where the runs disagree on the camera.")
+        bool,
+        typer.Option(
+            "--allow-inconsistent", help="Merge even where the runs disagree on the camera."
+        ),
     ] = False,
     duplicates: Duplicates = "refuse",
     force: Force = False,
 ) -> Answer:
-    """Combine the likelihoods of several runs into one, without going back to the stars; tests that they agree."""
+    """Combine the likelihoods of several runs into one, without going back to the stars; tests that
+    they agree.
+    """
     from starcal_uq.presentation.words.estimation import consistency_table
 
     merged = sc.runs.merge_runs(
-        runs, out, noise=noise, allow_inconsistent=allow_inconsistent, duplicates=duplicates, force=force
+        runs,
+        out,
+        noise=noise,
+        allow_inconsistent=allow_inconsistent,
+        duplicates=duplicates,
+        force=force,
     )
     agreement = sc.estimation.consistency_of(merged)
     if agreement is not None:

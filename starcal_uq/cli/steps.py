@@ -1,4 +1,6 @@
-"""The steps of a run, one command each: simulate, calibrate, sample, coupling, propagate, report, export."""
+"""The steps of a run, one command each: simulate, calibrate, sample, coupling, propagate, report,
+export.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,9 @@ if TYPE_CHECKING:
 def load_table(
     path: Path | list[Path], camera_path: Path, sky: SkySettings
 ) -> tuple[Observations | PartitionedObservations, Camera]:
-    """Observations of a table, several, or a folder of them, with the nominal camera; and what is worth telling."""
+    """Observations of a table, several, or a folder of them, with the nominal camera; and what is
+    worth telling.
+    """
     from starcal_uq.pipeline.tables import observations_from_table, partitions_from_folder
 
     known, camera = sky.options(), sc.Camera.load(camera_path)
@@ -110,16 +114,24 @@ def simulate_command(
     frames: Annotated[int, number("n_frames", "Number of frames, at random attitudes.")] = 1000,
     sigma: Annotated[float, number("sigma_px", "Centroid noise, px per axis.")] = 0.05,
     max_mag: MaxMag = 6.0,
-    min_stars: Annotated[int, number("min_stars", "Attitudes with fewer stars are drawn again.", least=3)] = 10,
+    min_stars: Annotated[
+        int, number("min_stars", "Attitudes with fewer stars are drawn again.", least=3)
+    ] = 10,
     epoch: Epoch = 2026.9,
     images: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Also render the frames as FITS images into this folder.", parser=write_path),
+        typer.Option(
+            metavar="DIR",
+            help="Also render the frames as FITS images into this folder.",
+            parser=write_path,
+        ),
     ] = None,
     sensor: Annotated[
         Path | None,
         typer.Option(
-            help="Detector of the images (TOML with a [sensor] table); a small tracker's by default.",
+            help=(
+                "Detector of the images (TOML with a [sensor] table); a small tracker's by default."
+            ),
             parser=read_file,
         ),
     ] = None,
@@ -127,7 +139,8 @@ def simulate_command(
         int | None,
         number(
             "partition_frames",
-            "Write OBS as a folder of Parquet files of N frames each (10000 is a good size), which may exceed "
+            "Write OBS as a folder of Parquet files of N frames each (10000 is a good size), "
+            "which may exceed "
             "memory; an interrupted command goes on.",
             metavar="N",
         ),
@@ -137,16 +150,22 @@ def simulate_command(
     seed: Seed = 0,
     force: Force = False,
 ) -> Answer:
-    """Simulate identified stars with the embedded catalogue; directions are written as the sensor saw them."""
+    """Simulate identified stars with the embedded catalogue; directions are written as the sensor
+    saw them.
+    """
     if partition_frames is None:
         if not (scheduler is None and workers is None):
-            raise typer.BadParameter("--scheduler and --workers make a folder: give --partition-frames as well.")
+            raise typer.BadParameter(
+                "--scheduler and --workers make a folder: give --partition-frames as well."
+            )
         table_ending(out)
         ensure_new(out, force)
     elif images is not None:
         raise typer.BadParameter("--images belongs to one table: leave out --partition-frames.")
     if sensor is not None and images is None:
-        raise typer.BadParameter("--sensor describes the detector of images: give --images DIR as well.")
+        raise typer.BadParameter(
+            "--sensor describes the detector of images: give --images DIR as well."
+        )
     stars, truth = sc.load_catalogue(max_mag=max_mag, epoch=epoch), sc.Camera.load(camera)
     if partition_frames is not None:
         with progress_bar("files") as progress:
@@ -177,7 +196,9 @@ def simulate_command(
                 images,
                 n_frames=frames,
                 min_stars=min_stars,
-                sensor=sc.simulation.Sensor() if sensor is None else sc.simulation.Sensor.load(sensor),
+                sensor=sc.simulation.Sensor()
+                if sensor is None
+                else sc.simulation.Sensor.load(sensor),
                 seed=seed,
                 sigma_px=sigma,
                 force=force,
@@ -187,7 +208,10 @@ def simulate_command(
     obs.save(out, force=force)
     say(f"{obs.n_stars} stars in {obs.n_frames} frames: {out}")
     if out.suffix.lower() == ".csv":
-        say("CSV holds no metadata: say --directions apparent when you calibrate it (.ecsv and .parquet know).")
+        say(
+            "CSV holds no metadata: say --directions apparent when you calibrate it (.ecsv and "
+            ".parquet know)."
+        )
     sizes = {"n_stars": obs.n_stars, "n_frames": obs.n_frames, "n_files": 1}
     return Answer({"table": out, **sizes, "images": images, "n_images": len(paths)})
 
@@ -208,22 +232,30 @@ def calibrate_command(
     nominal = estimation.started(nominal)
     words = typed_words(sys.argv[1:])
     with progress_bar("passes over the files") as progress:
-        calibration = run.calibrate(obs, nominal, force=force, words=words, progress=progress, **estimation.options())
+        calibration = run.calibrate(
+            obs, nominal, force=force, words=words, progress=progress, **estimation.options()
+        )
     if run.screening is not None:
         show_screening(run.screening)
     warn_air(obs, calibration)
     show_calibration(calibration, run.truth)
     everything = shlex.join(["starcal-uq", "run", *words[1:], "-o", f"{out}-2"])
     say(
-        "No verdict has been made: an optimum was found, and nothing has asked whether the model holds. What asks: "
+        "No verdict has been made: an optimum was found, and nothing has asked whether the model "
+        "holds. What asks: "
         f"{everything}"
     )
-    say(f"Run folder: {out}. Step by step: starcal-uq sample {out}, then propagate, diagnose and report.")
+    say(
+        f"Run folder: {out}. Step by step: starcal-uq sample {out}, then propagate, diagnose and "
+        "report."
+    )
     return Answer({"run": out, "calibration": (calibration, run.truth), "screening": run.screening})
 
 
 def sample_command(run: RunPath, sampling: SamplingSettings, force: Force = False) -> Answer:
-    """Sample the posterior with emcee from the calibration; an interrupted command goes on where it stopped."""
+    """Sample the posterior with emcee from the calibration; an interrupted command goes on where it
+    stopped.
+    """
     posterior = sample_run(sc.Run(run, tell=note), sampling, force=force)
     show_posterior(posterior)
     return Answer({"run": run, "posterior": posterior}, posterior.diagnostics.level.exit_status)
@@ -241,7 +273,9 @@ def sample_run(run: Run, sampling: SamplingSettings, *, force: bool) -> Posterio
 
 
 def coupling_command(run: RunPath, force: Force = False) -> Answer:
-    """Correlations, variance inflation, weak directions and the principal point's near-gauge with the boresight."""
+    """Correlations, variance inflation, weak directions and the principal point's near-gauge with
+    the boresight.
+    """
     coupling = sc.Run(run, tell=note).couple(force=force)
     show_coupling(coupling)
     return Answer({"run": run, "coupling": coupling})
@@ -253,20 +287,29 @@ def propagate_command(
         str,
         typer.Option(
             metavar="observed|random|FILE",
-            help="Frames: those of the calibration, random ones of the mission, or an attitude profile "
+            help="Frames: those of the calibration, random ones of the mission, or an attitude "
+            "profile "
             "(time_s or time_utc, and qx, qy, qz, qw).",
             callback=checked(check_word_or_file),
         ),
     ] = "observed",
-    max_mag: Annotated[float, number(MAGNITUDES, "Mission: magnitude limit in flight, Gaia G.")] = 6.0,
+    max_mag: Annotated[
+        float, number(MAGNITUDES, "Mission: magnitude limit in flight, Gaia G.")
+    ] = 6.0,
     epoch: Annotated[float, number(EPOCH, "Mission: Julian year of the star positions.")] = 2026.9,
-    frames: Annotated[int, number("n_frames", "Mission: number of random attitudes.", least=10)] = 1000,
+    frames: Annotated[
+        int, number("n_frames", "Mission: number of random attitudes.", least=10)
+    ] = 1000,
     min_stars: Annotated[
-        int | None, number("min_stars", "Mission: frames with fewer stars give no attitude (5; profile: 3).")
+        int | None,
+        number("min_stars", "Mission: frames with fewer stars give no attitude (5; profile: 3)."),
     ] = None,
-    rate: Annotated[float | None, number("rate_hz", "Profile: frames per second; its own instants by default.")] = None,
+    rate: Annotated[
+        float | None, number("rate_hz", "Profile: frames per second; its own instants by default.")
+    ] = None,
     scalar: Annotated[
-        settings.Scalar | None, typer.Option(help="Profile: first or last, where its columns are numbered (q0 to q3).")
+        settings.Scalar | None,
+        typer.Option(help="Profile: first or last, where its columns are numbered (q0 to q3)."),
     ] = None,
     sense: Annotated[
         settings.Sense, typer.Option(help="Profile: icrs_to_camera (b = R r) or camera_to_icrs.")
@@ -277,7 +320,9 @@ def propagate_command(
     seed: Seed = 0,
     force: Force = False,
 ) -> Answer:
-    """Attitude error that the calibration contributes, through QUEST: common rotation, the rest, and centroid noise."""
+    """Attitude error that the calibration contributes, through QUEST: common rotation, the rest,
+    and centroid noise.
+    """
     sky = None
     if attitudes != "observed":
         sky = sc.runs.MissionSky(
@@ -291,39 +336,59 @@ def propagate_command(
             sense=sense,
         )
     if sky is None and (rate is not None or scalar is not None):
-        raise typer.BadParameter("--rate and --scalar belong to an attitude profile: give --attitudes FILE.")
+        raise typer.BadParameter(
+            "--rate and --scalar belong to an attitude profile: give --attitudes FILE."
+        )
 
     error, _, spectrum = sc.Run(run, tell=note).propagate(
-        n_draws=draws, seed=seed, sky=sky, alignment=alignment, alignment_frames=alignment_frames, force=force
+        n_draws=draws,
+        seed=seed,
+        sky=sky,
+        alignment=alignment,
+        alignment_frames=alignment_frames,
+        force=force,
     )
     show_attitude(error)
     say(error.text)
     if spectrum is not None:
         say(spectrum.text)
-    return Answer({"run": run, "attitude": error, "spectrum": None if spectrum is None else spectrum.text})
+    return Answer(
+        {"run": run, "attitude": error, "spectrum": None if spectrum is None else spectrum.text}
+    )
 
 
 def report_command(
     run: RunPath,
     notebook: Annotated[
-        bool, typer.Option("--notebook", help="Write an executed Jupyter notebook, RUN/report.ipynb, in its place.")
+        bool,
+        typer.Option(
+            "--notebook", help="Write an executed Jupyter notebook, RUN/report.ipynb, in its place."
+        ),
     ] = False,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="FILE", help="Another notebook to write.", parser=write_file)
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="FILE", help="Another notebook to write.", parser=write_file
+        ),
     ] = None,
     format: Annotated[
         settings.ReportFormat,
-        typer.Option(help="pdf writes RUN/report.pdf as well, by an installed browser or WeasyPrint."),
+        typer.Option(
+            help="pdf writes RUN/report.pdf as well, by an installed browser or WeasyPrint."
+        ),
     ] = "html",
     force: Force = False,
 ) -> Answer:
-    """Write RUN/report.html, one self-contained file, from whatever the run holds; as PDF too, or a notebook.
+    """Write RUN/report.html, one self-contained file, from whatever the run holds; as PDF too, or a
+    notebook.
 
     Status 1 when a check failed or a requirement is violated.
     """
     held = sc.Run(run, tell=note)
     if out is not None and not notebook:
-        raise typer.BadParameter("--out names a notebook: add --notebook; the report has its place in RUN.")
+        raise typer.BadParameter(
+            "--out names a notebook: add --notebook; the report has its place in RUN."
+        )
     if notebook and format != "html":
         raise typer.BadParameter("--format is of the report: leave it or --notebook out.")
     if notebook:
@@ -332,31 +397,46 @@ def report_command(
         say(f"Notebook: {page.resolve()}")
     else:
         with progress_bar("figures") as bar:
-            page = held.pdf(force=force) if format == "pdf" else held.report(force=force, progress=bar)
+            page = (
+                held.pdf(force=force) if format == "pdf" else held.report(force=force, progress=bar)
+            )
         show_summary(held, page)
     return Answer({"run": run, "report": page}, held.verdict.level.exit_status)
 
 
 def export_command(
     source: Annotated[
-        Path, typer.Argument(metavar="RUN|CAMERA", help="Run folder, or a camera file.", parser=read_path)
+        Path,
+        typer.Argument(
+            metavar="RUN|CAMERA", help="Run folder, or a camera file.", parser=read_path
+        ),
     ],
     to: Annotated[
         settings.ExportFormat,
         typer.Option(
             "--to",
-            help="The camera for opencv, ros, kalibr, mrcal, tetra3rs, tetra3, as a sip FITS header or asdf; "
-            "covariance (JSON); draws as csv or netcdf, or with all of ArviZ's groups as arviz; the table of "
+            help="The camera for opencv, ros, kalibr, mrcal, tetra3rs, tetra3, as a sip FITS "
+            "header or asdf; "
+            "covariance (JSON); draws as csv or netcdf, or with all of ArviZ's groups as arviz; "
+            "the table of "
             "parameters in latex or markdown.",
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="FILE", help="File to write; named by default.", parser=write_file),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="FILE",
+            help="File to write; named by default.",
+            parser=write_file,
+        ),
     ] = None,
     force: Force = False,
 ) -> Answer:
-    """Write the calibrated camera, or what is known of it, for another program; say how near that comes."""
+    """Write the calibrated camera, or what is known of it, for another program; say how near that
+    comes.
+    """
     with progress_bar("log likelihood") as progress:
         made = sc.export(source, to, out, force=force, progress=progress)
     say(made.note)

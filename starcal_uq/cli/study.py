@@ -33,16 +33,18 @@ def study_command(
         ),
     ] = Path("study"),
     workers: Annotated[
-        int | None, number("workers", "Processes; as many as processors by default, 0 for this one.")
+        int | None,
+        number("workers", "Processes; as many as processors by default, 0 for this one."),
     ] = None,
     scheduler: SchedulerAddress = None,
     seed: Annotated[int | None, number("seed", "Root seed, instead of that of STUDY.")] = None,
     force: Force = False,
 ) -> Answer:
-    """Vary camera, sky, noise and observation: what couples, what decouples it, and what it does to attitudes.
+    """Vary camera, sky, noise and observation: what couples, what decouples it, and what it does to
+    attitudes.
 
-    Cells that are there already are not computed again; `--force` computes all anew, and then replaces them. Status 1
-    when no cell has numbers.
+    Cells that are there already are not computed again; `--force` computes all anew, and then
+    replaces them. Status 1 when no cell has numbers.
     """
     pages: list[Path] = []
 

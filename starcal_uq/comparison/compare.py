@@ -1,20 +1,24 @@
-"""Compare two calibrated cameras: best rotation removed, difference over the detector, and what chance explains.
+"""Compare two calibrated cameras: best rotation removed, difference over the detector, and what
+chance explains.
 
-At each pixel of a grid, e = R^T b_B - b_A is the difference of the directions that the two cameras assign, after the
-rotation R that fits best over the detector area is removed; every attitude takes that rotation up. To first order e is
-linear in the errors of both sets of parameters,
+At each pixel of a grid, e = R^T b_B - b_A is the difference of the directions that the two cameras
+assign, after the rotation R that fits best over the detector area is removed; every attitude takes
+that rotation up. To first order e is linear in the errors of both sets of parameters,
 
     e = D_B delta_B - D_A delta_A,    D = B + A K    (as in the field map),
 
-so that its covariance, and that of the rotation, follow from those of the parameters. Two tests use them:
+so that its covariance, and that of the rotation, follow from those of the parameters. Two tests use
+them:
 
-- *the map*: the mean square of e over the detector area is a weighted sum of squared normal variables, with the
-  eigenvalues of the covariance as weights; its p-value is exact for Gaussian errors, the degrees of freedom of the
-  noise estimates included. It answers whether the maps differ by more arcsec than they should.
-- *the parameters*: the Mahalanobis length of the whole difference, chi-square (or F). It weighs every direction in
-  which the two can differ by its own uncertainty, and answers whether the two can be the same camera. Where stars cover
-  the detector evenly all directions bend the map by nearly the same amount, and the two tests nearly coincide; where
-  they leave parts of it empty, the first is decided there and the second is not.
+- *the map*: the mean square of e over the detector area is a weighted sum of squared normal
+  variables, with the eigenvalues of the covariance as weights; its p-value is exact for Gaussian
+  errors, the degrees of freedom of the noise estimates included. It answers whether the maps differ
+  by more arcsec than they should.
+- *the parameters*: the Mahalanobis length of the whole difference, chi-square (or F). It weighs
+  every direction in which the two can differ by its own uncertainty, and answers whether the two
+  can be the same camera. Where stars cover the detector evenly all directions bend the map by
+  nearly the same amount, and the two tests nearly coincide; where they leave parts of it empty, the
+  first is decided there and the second is not.
 """
 
 from __future__ import annotations
@@ -82,12 +86,13 @@ def compare(
     labels : (str, str)
         Names of the two in words and figures.
     same_data : bool, optional
-        Whether both rest on the same frames. Without it, the hashes of their data say so, `observations` and
-        `fingerprints`.
+        Whether both rest on the same frames. Without it, the hashes of their data say so,
+        `observations` and `fingerprints`.
     observations : pair of Observations, optional
         The frames of each; shared ones are then found even where the tables differ.
     fingerprints : pair of Fingerprints or None, optional
-        Those of the frames, by which images that were measured anew are found as well; a calibration brings its own.
+        Those of the frames, by which images that were measured anew are found as well; a
+        calibration brings its own.
     n : int
         Grid points along each side of the detector.
     level : float
@@ -100,7 +105,8 @@ def compare(
     Raises
     ------
     ComparisonError
-        For detectors of different size, a calibration that did not converge, or a level outside (0, 1).
+        For detectors of different size, a calibration that did not converge, or a level outside (0,
+        1).
     DistortionError
         When the distortion of a camera folds over within the detector.
     """
@@ -204,25 +210,35 @@ def compare_halves(
 
 def _check(a: Any, b: Any, labels: tuple[str, str], level: float) -> None:
     if not 0.0 < level < 1.0:
-        raise ComparisonError(f"level {level:g} is not a probability of a false alarm: use one such as 0.01.")
+        raise ComparisonError(
+            f"level {level:g} is not a probability of a false alarm: use one such as 0.01."
+        )
     for result, name in zip((a, b), labels, strict=True):
         status = getattr(result, "status", None)
         if status is not None and not status.ok:
             raise ComparisonError(
-                f"{name}: the calibration did not converge ({status.name}), so it cannot be compared: {status.remedy}."
+                f"{name}: the calibration did not converge ({status.name}), so it cannot be "
+                f"compared: {status.remedy}."
             )
     sizes = [(r.camera.width_px, r.camera.height_px) for r in (a, b)]
     if sizes[0] != sizes[1]:
         (w, h), (wide, high) = sizes
         raise ComparisonError(
-            f"{labels[0]} has {w} x {h} pixels and {labels[1]} {wide} x {high}: directions are compared "
+            f"{labels[0]} has {w} x {h} pixels and {labels[1]} {wide} x {high}: directions are "
+            "compared "
             "pixel by pixel, so compare runs of one detector, with the same windowing."
         )
 
 
-def _aligned(moved: FloatArray, reference: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Directions (N, 3) turned back by the rotation that brings them closest to others, and the rotation."""
-    rotation = quest(moved, reference, np.array([0, len(reference)]), weight, covariance=False).rotations[0]
+def _aligned(
+    moved: FloatArray, reference: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Directions (N, 3) turned back by the rotation that brings them closest to others, and the
+    rotation.
+    """
+    rotation = quest(
+        moved, reference, np.array([0, len(reference)]), weight, covariance=False
+    ).rotations[0]
     return moved @ rotation, rotation
 
 
@@ -249,18 +265,22 @@ def _shared_parameters(a: Estimate, b: Estimate, rule: Rule) -> dict[str, Any]:
     }
 
 
-def _messages(a: Any, b: Any, labels: tuple[str, str], rule: Rule, tests: DifferenceTests) -> tuple[str, ...]:
+def _messages(
+    a: Any, b: Any, labels: tuple[str, str], rule: Rule, tests: DifferenceTests
+) -> tuple[str, ...]:
     """What should be known when reading the result."""
     messages = []
     cameras = a.camera, b.camera
     if cameras[0].distortion != cameras[1].distortion:
         messages.append(
-            f"The distortion models differ ({cameras[0].distortion}, {cameras[1].distortion}): what the simpler one "
+            f"The distortion models differ ({cameras[0].distortion}, {cameras[1].distortion}): "
+            "what the simpler one "
             "cannot follow shows here as a difference."
         )
         if tests.outside > 0.0 and tests.outside > 0.1 * tests.expected:
             messages.append(
-                f"{tests.outside:.2g} arcsec rms of the difference cannot come from errors of the parameters: the "
+                f"{tests.outside:.2g} arcsec rms of the difference cannot come from errors of "
+                "the parameters: the "
                 "two models cannot agree that well."
             )
     pitches = [camera.pixel_um for camera in cameras if camera.pixel_um is not None]
@@ -271,13 +291,16 @@ def _messages(a: Any, b: Any, labels: tuple[str, str], rule: Rule, tests: Differ
         )
     if rule.signs is not None and np.isnan(tests.p_map):
         messages.append(
-            "The two estimates are equally certain, so that no noise explains a difference and nothing is tested: "
+            "The two estimates are equally certain, so that no noise explains a difference and "
+            "nothing is tested: "
             "compare estimates from different frames."
         )
     elif rule.signs is not None and np.isnan(tests.p_parameters):
         messages.append(
-            "The covariance of an inefficient estimate is known from the scatter of its frames only: well enough for "
-            "the mean square over the detector, not for single directions. So only the map is tested."
+            "The covariance of an inefficient estimate is known from the scatter of its frames "
+            "only: well enough for "
+            "the mean square over the detector, not for single directions. So only the map is "
+            "tested."
         )
     for result, name in zip((a, b), labels, strict=True):
         messages += _posterior_messages(result, name, rule)
@@ -288,15 +311,20 @@ def _posterior_messages(result: Any, name: str, rule: Rule) -> list[str]:
     priors, diagnostics = getattr(result, "priors", None), getattr(result, "diagnostics", None)
     messages = []
     if diagnostics is not None and not diagnostics.ok:
-        messages.append(f"{name}: the draws miss a criterion of convergence, so its mean and covariance may be off.")
+        messages.append(
+            f"{name}: the draws miss a criterion of convergence, so its mean and covariance may "
+            "be off."
+        )
     if priors is None or rule.signs is None:
         return messages
     ratio = priors.sd(result.camera_names) / np.sqrt(np.diag(result.covariance))
     least = int(np.argmin(ratio))
     if ratio[least] < _WIDE_PRIOR:
         messages.append(
-            f"{name}: the prior has a say in {result.camera_names[least]} (only {ratio[least]:.1f} times as wide as "
-            "the posterior): if both runs share it, their estimates differ by less than their covariances say, and the "
+            f"{name}: the prior has a say in {result.camera_names[least]} (only "
+            f"{ratio[least]:.1f} times as wide as "
+            "the posterior): if both runs share it, their estimates differ by less than their "
+            "covariances say, and the "
             "p-values err to the safe side."
         )
     return messages

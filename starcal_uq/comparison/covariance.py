@@ -1,10 +1,12 @@
 """Which covariance the difference of two estimates has, given what their data have in common.
 
 - Different data: the covariances add.
-- The same data, or data of which one set holds the other: if one estimator is efficient under the model of both, its
-  errors are uncorrelated with the difference, whose covariance is then that of the other estimator *minus* that of the
-  efficient one (Hausman 1978, Econometrica 46(6), 1251-1271).
-- Everything else: the correlation of the two estimates is not known from their covariances, and there is no p-value.
+- The same data, or data of which one set holds the other: if one estimator is efficient under the
+  model of both, its errors are uncorrelated with the difference, whose covariance is then that of
+  the other estimator *minus* that of the efficient one (Hausman 1978, Econometrica 46(6),
+  1251-1271).
+- Everything else: the correlation of the two estimates is not known from their covariances, and
+  there is no p-value.
 """
 
 from __future__ import annotations
@@ -25,15 +27,22 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.fingerprints import Fingerprints
     from starcal_uq.observations.table import Observations
 
-INDEPENDENT, SAME, A_IN_B, B_IN_A, OVERLAP = "independent", "same", "A within B", "B within A", "overlapping"
+INDEPENDENT, SAME, A_IN_B, B_IN_A, OVERLAP = (
+    "independent",
+    "same",
+    "A within B",
+    "B within A",
+    "overlapping",
+)
 
 
 @dataclass(frozen=True)
 class Rule:
-    """How the covariance of the difference follows from those of the two estimates: their sum with `signs`, if known.
+    """How the covariance of the difference follows from those of the two estimates: their sum with
+    `signs`, if known.
 
-    `data` is ``independent``, ``same``, ``A within B``, ``B within A`` or ``overlapping``; `words` are the rule, or why
-    there is none.
+    `data` is ``independent``, ``same``, ``A within B``, ``B within A`` or ``overlapping``; `words`
+    are the rule, or why there is none.
     """
 
     data: str
@@ -51,8 +60,9 @@ def difference_rule(
 ) -> Rule:
     """The rule for two calibrations or posteriors with their labels.
 
-    `same_data` overrules what hashes and frames say. In the `observations`, the frames that each rests on, shared ones
-    are looked for; by `fingerprints` images that were measured anew are found as well.
+    `same_data` overrules what hashes and frames say. In the `observations`, the frames that each
+    rests on, shared ones are looked for; by `fingerprints` images that were measured anew are found
+    as well.
     """
     data, seen = _relation(a, b, same_data, observations, fingerprints)
     if data == INDEPENDENT:
@@ -60,14 +70,21 @@ def difference_rule(
             return Rule(
                 data,
                 (1.0, 1.0),
-                "The data are taken for independent, so the two covariances add: their hashes differ, but whether they "
-                "share frames cannot be checked without fingerprints or observations: calibrate again to have it so.",
+                "The data are taken for independent, so the two covariances add: their hashes "
+                "differ, but whether they "
+                "share frames cannot be checked without fingerprints or observations: calibrate "
+                "again to have it so.",
             )
         return Rule(data, (1.0, 1.0), "The data are independent, so the two covariances add.")
     if data == OVERLAP:
         count = f" ({plural(seen, 'frame')})" if seen else ""
-        why = f"both rest in part on the same data{count}, and how their errors correlate is not known"
-        return Rule(data, None, f"There is no p-value: {why}; compare runs that share all frames, or none.")
+        why = (
+            f"both rest in part on the same data{count}, and how their errors correlate is not "
+            "known"
+        )
+        return Rule(
+            data, None, f"There is no p-value: {why}; compare runs that share all frames, or none."
+        )
     signs = _hausman(a, b, data)
     if signs is None:
         return Rule(data, None, f"There is no p-value: {_why_none(a, b, data)}.")
@@ -79,13 +96,15 @@ def difference_rule(
         return Rule(
             data,
             signs,
-            f"Both rest on the same data. {efficient[:1].upper()}{efficient[1:]} {reason}, so the difference has the "
+            f"Both rest on the same data. {efficient[:1].upper()}{efficient[1:]} {reason}, so "
+            "the difference has the "
             f"covariance of {other} minus that of {efficient} (Hausman 1978).",
         )
     return Rule(
         data,
         signs,
-        f"All data of {other} are in {efficient} too, which is efficient, so the difference has the covariance of "
+        f"All data of {other} are in {efficient} too, which is efficient, so the difference has "
+        "the covariance of "
         f"{other} minus that of {efficient} (Hausman 1978).",
     )
 
@@ -97,7 +116,9 @@ def _relation(
     observations: tuple[Observations, Observations] | None,
     fingerprints: tuple[Fingerprints | None, Fingerprints | None],
 ) -> tuple[str, int | None]:
-    """What the data have in common, and how many frames they were seen to share; None where that was not asked."""
+    """What the data have in common, and how many frames they were seen to share; None where that
+    was not asked.
+    """
     if same_data is not None:
         return (SAME if same_data else INDEPENDENT), 0
     first, second = data_hashes(a.provenance), data_hashes(b.provenance)
@@ -112,7 +133,8 @@ def _relation(
     if observations is not None:
         common, sizes = shared_frames(*observations), [obs.n_frames for obs in observations]
     if a_marks is not None and b_marks is not None and not common:
-        # The same pixels are the same data; the same image measured anew has another error, though nearly the same.
+        # The same pixels are the same data; the same image measured anew has another error, though
+        # nearly the same.
         pairs, sizes = shared(a_marks, b_marks), [len(a_marks.sizes), len(b_marks.sizes)]
         common = len(np.unique(pairs[:, 0]))
         if common and not a_marks.equal(b_marks, pairs):
@@ -127,7 +149,9 @@ def _relation(
 def _prior_hashes(result: Any) -> set[str]:
     """Hashes of the data behind a prior that came from another run."""
     priors = getattr(result, "priors", None)
-    return set(priors.source.get("data_sha256", ())) if isinstance(priors, GaussianPriors) else set()
+    return (
+        set(priors.source.get("data_sha256", ())) if isinstance(priors, GaussianPriors) else set()
+    )
 
 
 def _hausman(a: Any, b: Any, data: str) -> tuple[float, float] | None:
@@ -145,7 +169,9 @@ def _efficient_beside(one: Any, other: Any) -> bool:
 
 
 def _within(one: Any, other: Any) -> bool:
-    """True if the distortion model of `one` is that of `other` with some coefficients zero, or none."""
+    """True if the distortion model of `one` is that of `other` with some coefficients zero, or
+    none.
+    """
     small, large = get_model(one.camera.distortion), get_model(other.camera.distortion)
     names = {c.name for c in large.coefficients}
     nested = all(c.name in names for c in small.coefficients)
@@ -153,21 +179,36 @@ def _within(one: Any, other: Any) -> bool:
 
 
 def is_efficient(result: Any) -> bool:
-    """True for estimates by the attitude-marginalised Gaussian likelihood, where frames scatter as it says."""
-    if getattr(result, "inflation", None) is not None or getattr(result, "coma_factors", None) is not None:
+    """True for estimates by the attitude-marginalised Gaussian likelihood, where frames scatter as
+    it says.
+    """
+    if (
+        getattr(result, "inflation", None) is not None
+        or getattr(result, "coma_factors", None) is not None
+    ):
         return False
     diagnostics = getattr(result, "diagnostics", None)
     if diagnostics is not None:
         return bool(diagnostics.likelihood == "marginal")
     settings = result.provenance.get("settings", {})
-    return bool(result.method == "efficient" and settings.get("likelihood", "marginal") == "marginal")
+    return bool(
+        result.method == "efficient" and settings.get("likelihood", "marginal") == "marginal"
+    )
 
 
 def _why_none(a: Any, b: Any, data: str) -> str:
     if not (is_efficient(a) or is_efficient(b)):
-        return "they share data, and neither estimate is efficient, so how their errors correlate is not known"
+        return (
+            "they share data, and neither estimate is efficient, so how their errors correlate "
+            "is not known"
+        )
     if not (_within(a, b) or _within(b, a)):
         return "they share data, and neither distortion model is contained in the other"
     if data == SAME and a.camera.distortion == b.camera.distortion:
-        return "both are the efficient estimate from the same data, so that no noise explains a difference"
-    return "they share data, and the efficient one of the two has the richer model or the fewer frames"
+        return (
+            "both are the efficient estimate from the same data, so that no noise explains a "
+            "difference"
+        )
+    return (
+        "they share data, and the efficient one of the two has the richer model or the fewer frames"
+    )

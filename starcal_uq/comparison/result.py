@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 class CameraComparison(Shown):
     """Directions of camera B minus those of camera A at the same pixels, the best rotation removed.
 
-    p-values are NaN, and uncertainties of the difference too, where the covariance of the difference is not known.
+    p-values are NaN, and uncertainties of the difference too, where the covariance of the
+    difference is not known.
 
     Attributes
     ----------
@@ -31,7 +32,8 @@ class CameraComparison(Shown):
     models : (str, str)
         Distortion models of the two.
     data : str
-        Relation of their data: ``independent``, ``same``, ``A within B``, ``B within A``, ``overlapping``.
+        Relation of their data: ``independent``, ``same``, ``A within B``, ``B within A``,
+        ``overlapping``.
     rule : str
         How the covariance of the difference was had, in words, or why it is not known.
     level : float
@@ -51,20 +53,22 @@ class CameraComparison(Shown):
     rotation_covariance_arcsec2 : (3, 3) array
         Covariance of the rotation, arcsec^2.
     rms_arcsec, rms_px, expected_rms_arcsec : float
-        Root mean square length over the detector area, and what the joint uncertainty gives on average.
+        Root mean square length over the detector area, and what the joint uncertainty gives on
+        average.
     largest_arcsec, largest_px : float
         Largest length over the grid.
     p_map : float
         Probability of a larger mean square over the detector if both cameras were the same.
     p_parameters : float
-        The same for the squared Mahalanobis length of the whole difference, `statistic`; NaN, like `p_worst`, where the
-        covariance is not known well enough direction by direction.
+        The same for the squared Mahalanobis length of the whole difference, `statistic`; NaN, like
+        `p_worst`, where the covariance is not known well enough direction by direction.
     statistic : float
         Chi-square, or r times F, of the whole difference; NaN where `p_parameters` is.
     n_directions : int
         Independent directions r in which the two can differ and were compared.
     p_worst, p_worst_error : float
-        Probability of a largest `ratio` over the grid beyond the one here, and its Monte Carlo standard error.
+        Probability of a largest `ratio` over the grid beyond the one here, and its Monte Carlo
+        standard error.
     worst_x_px, worst_y_px, worst_ratio : float
         Place where that ratio is largest, px, and the ratio there.
     outside_arcsec : float
@@ -144,7 +148,9 @@ class CameraComparison(Shown):
 
     @property
     def agree(self) -> bool | None:
-        """True where chance explains all differences, False where not, None where that was not tested."""
+        """True where chance explains all differences, False where not, None where that was not
+        tested.
+        """
         return None if not self.tested else self.verdict == "agree"
 
     @property
@@ -153,32 +159,57 @@ class CameraComparison(Shown):
         return np.sqrt(np.diag(self.rotation_covariance_arcsec2))
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per quantity: ``quantity``, ``unit``, ``difference``, ``expected``, ``ratio``, ``p_value``.
+        """One row per quantity: ``quantity``, ``unit``, ``difference``, ``expected``, ``ratio``,
+        ``p_value``.
 
-        ``expected`` is one standard deviation, or for the map the root mean square that the uncertainties give.
+        ``expected`` is one standard deviation, or for the map the root mean square that the
+        uncertainties give.
         """
         import pandas as pd
 
         rows = [
             (f"rotation, {axis}", "arcsec", float(value), float(sigma), np.nan)
-            for axis, value, sigma in zip(AXES, self.rotation_arcsec, self.rotation_sigma_arcsec, strict=True)
+            for axis, value, sigma in zip(
+                AXES, self.rotation_arcsec, self.rotation_sigma_arcsec, strict=True
+            )
         ]
         rows.append(("map, rms", "arcsec", self.rms_arcsec, self.expected_rms_arcsec, self.p_map))
         sigma = float(self.sigma_arcsec[self._worst_index])
         rows.append(
-            ("map, where it stands out most", "arcsec", self.worst_ratio * sigma, sigma, self.p_worst)
+            (
+                "map, where it stands out most",
+                "arcsec",
+                self.worst_ratio * sigma,
+                sigma,
+                self.p_worst,
+            )
             if self.tested
             else ("map, largest", "arcsec", self.largest_arcsec, np.nan, np.nan)
         )
         rows += [
             (name, unit, float(b - a), float(sd), np.nan)
             for name, unit, a, b, sd in zip(
-                self.parameter_names, self.parameter_units, self.theta_a, self.theta_b, self.sd_difference, strict=True
+                self.parameter_names,
+                self.parameter_units,
+                self.theta_a,
+                self.theta_b,
+                self.sd_difference,
+                strict=True,
             )
         ]
         if np.isfinite(self.p_parameters):
-            rows.append(("all parameters", "chi-square", self.statistic, float(self.n_directions), self.p_parameters))
-        table = pd.DataFrame(rows, columns=["quantity", "unit", "difference", "expected", "p_value"])
+            rows.append(
+                (
+                    "all parameters",
+                    "chi-square",
+                    self.statistic,
+                    float(self.n_directions),
+                    self.p_parameters,
+                )
+            )
+        table = pd.DataFrame(
+            rows, columns=["quantity", "unit", "difference", "expected", "p_value"]
+        )
         expected = table["expected"].where(table["expected"] > 0.0)
         table.insert(4, "ratio", table["difference"] / expected)
         return table
@@ -193,7 +224,9 @@ class CameraComparison(Shown):
         )
 
     def field_dataframe(self) -> pd.DataFrame:
-        """One row per grid pixel: place, difference in px and arcsec, its length, and the expected length."""
+        """One row per grid pixel: place, difference in px and arcsec, its length, and the expected
+        length.
+        """
         import pandas as pd
 
         x, y = np.meshgrid(self.x_px, self.y_px)

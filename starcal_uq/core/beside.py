@@ -17,17 +17,23 @@ from starcal_uq.core.tasks import processors
 from starcal_uq.core.temporary import TemporaryFolder
 
 _WAIT_S = 0.005
-_PROGRAM = "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; serve({folder!r}, {parent})"
+_PROGRAM = (
+    "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; "
+    "serve({folder!r}, {parent})"
+)
 
 
 class Beside:
-    """Calls of functions in another process, one after the other; a context, at whose end the process is gone.
+    """Calls of functions in another process, one after the other; a context, at whose end the
+    process is gone.
 
-    It never is the only way to a result: where it could not be started, failed or was killed, `results` has None, and
-    the caller does the work itself. With a single processor nothing is started.
+    It never is the only way to a result: where it could not be started, failed or was killed,
+    `results` has None, and the caller does the work itself. With a single processor nothing is
+    started.
 
-    Calls and results go through files, because a pipe that is full would make this process wait. The other one is a
-    program of its own: those of multiprocessing begin with the caller's main module, which may not expect it.
+    Calls and results go through files, because a pipe that is full would make this process wait.
+    The other one is a program of its own: those of multiprocessing begin with the caller's main
+    module, which may not expect it.
     """
 
     def __init__(self) -> None:
@@ -44,7 +50,8 @@ class Beside:
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
-                    # Ctrl-C reaches every process of a terminal; the first one decides what to do about it.
+                    # Ctrl-C reaches every process of a terminal; the first one decides what to do
+                    # about it.
                     start_new_session=True,
                 )
         return self
@@ -59,7 +66,9 @@ class Beside:
         """Hand a call over, to a function that a module defines at its top level; its number."""
         number, self._n_calls = self._n_calls, self._n_calls + 1
         if self._process is not None:
-            _path(self._folder.name, number, "call").write_bytes(pickle.dumps((function, arguments)))
+            _path(self._folder.name, number, "call").write_bytes(
+                pickle.dumps((function, arguments))
+            )
             # The process may have died.
             with contextlib.suppress(OSError):
                 _pipe(self._process).write(f"{number}\n".encode())
@@ -70,12 +79,18 @@ class Beside:
         """Wait for the call of this number; its result, None if it failed."""
         path = _path(self._folder.name, number, "result")
         failed = _path(self._folder.name, number, "failed")
-        while self._process is not None and not (path.exists() or failed.exists()) and self._process.poll() is None:
+        while (
+            self._process is not None
+            and not (path.exists() or failed.exists())
+            and self._process.poll() is None
+        ):
             time.sleep(_WAIT_S)
         return pickle.loads(path.read_bytes()) if path.exists() else None
 
     def results(self) -> list[Any]:
-        """Wait for all calls; their results, None for those that failed. Nothing can be handed over afterwards."""
+        """Wait for all calls; their results, None for those that failed. Nothing can be handed over
+        afterwards.
+        """
         if self._process is not None:
             with contextlib.suppress(OSError):
                 _pipe(self._process).close()

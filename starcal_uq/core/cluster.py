@@ -1,7 +1,9 @@
-"""Work spread over processes of this machine or of a Dask cluster: the same results in the same order for any of them.
+"""Work spread over processes of this machine or of a Dask cluster: the same results in the same
+order for any of them.
 
-Whatever is added up is added in one fixed tree, so that neither the number of processes nor the order in which they
-finish moves a bit. A process that dies takes its work with it, which Dask gives to another.
+Whatever is added up is added in one fixed tree, so that neither the number of processes nor the
+order in which they finish moves a bit. A process that dies takes its work with it, which Dask gives
+to another.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 T = TypeVar("T")
-# Address of a Dask scheduler (``tcp://host:8786``), a client of one, or None for processes of this machine.
+# Address of a Dask scheduler (``tcp://host:8786``), a client of one, or None for processes of this
+# machine.
 Scheduler: TypeAlias = "str | Client | None"
 
 # Results that are added up at once; a worker holds so many.
@@ -46,7 +49,8 @@ class Cluster:
     ) -> list[T]:
         """Results of a picklable function, in the order of the items.
 
-        `keep` is called with the place of each item and its result as soon as it is there, in any order.
+        `keep` is called with the place of each item and its result as soon as it is there, in any
+        order.
         """
         results: dict[int, T] = {}
 
@@ -112,11 +116,14 @@ class Cluster:
 
 
 @contextmanager
-def cluster(scheduler: Scheduler = None, *, workers: int | None = None, caller: str = "") -> Iterator[Cluster]:
+def cluster(
+    scheduler: Scheduler = None, *, workers: int | None = None, caller: str = ""
+) -> Iterator[Cluster]:
     """Processes to work with, which end with the block unless they are somebody else's.
 
-    Those of a Dask scheduler (its address, or a client of one), or `workers` of this machine: as many as processors by
-    default (one without Dask); 0 or 1 stays in this one. `caller` is the function that users call, for messages.
+    Those of a Dask scheduler (its address, or a client of one), or `workers` of this machine: as
+    many as processors by default (one without Dask); 0 or 1 stays in this one. `caller` is the
+    function that users call, for messages.
     """
     if scheduler is None:
         if workers is None:  # the results are the same, and one process needs no Dask
@@ -129,14 +136,19 @@ def cluster(scheduler: Scheduler = None, *, workers: int | None = None, caller: 
         with extra("cluster", "several processes over one set of files", "use workers=0"):
             from distributed import Client, LocalCluster
 
-        # What its log warns of, such as a slow end, is Dask's to mend. Its page of numbers takes whatever port is free.
+        # What its log warns of, such as a slow end, is Dask's to mend. Its page of numbers takes
+        # whatever port is free.
         try:
             local = LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.ERROR
+                n_workers=workers,
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.ERROR,
             )
         except RuntimeError as error:
             raise ClusterError(
-                f"processes cannot be started ({str(error).splitlines()[0]}): in a script, call {caller or 'this'} "
+                f"processes cannot be started ({str(error).splitlines()[0]}): in a script, call "
+                f"{caller or 'this'} "
                 'below `if __name__ == "__main__":`, or use workers=0.'
             ) from error
         with local, Client(local) as client:
@@ -149,7 +161,8 @@ def cluster(scheduler: Scheduler = None, *, workers: int | None = None, caller: 
             client = Client(scheduler, timeout=_CONNECT_S)
         except (OSError, ValueError) as error:
             raise ClusterError(
-                f"{scheduler}: no Dask scheduler answers there; start one with `dask scheduler` and workers with "
+                f"{scheduler}: no Dask scheduler answers there; start one with `dask scheduler` "
+                "and workers with "
                 f"`dask worker {scheduler}`, or leave the scheduler out."
             ) from error
         with client:
@@ -168,7 +181,10 @@ def _explained() -> Iterator[None]:
         yield
     except KilledWorker as error:
         raise ClusterError(
-            "several Dask workers died over the same part of the work: give them more memory, or smaller partitions."
+            "several Dask workers died over the same part of the work: give them more memory, or "
+            "smaller partitions."
         ) from error
     except FutureCancelledError as error:
-        raise ClusterError("the Dask scheduler lost the work: look at its log, and start the command again.") from error
+        raise ClusterError(
+            "the Dask scheduler lost the work: look at its log, and start the command again."
+        ) from error

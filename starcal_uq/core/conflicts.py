@@ -1,4 +1,6 @@
-"""Options that exclude each other: one table for functions, the command line and the remedies of checks."""
+"""Options that exclude each other: one table for functions, the command line and the remedies of
+checks.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ class Rule:
     allowed: tuple[object, ...]
 
     def broken(self, settings: Mapping[str, object]) -> bool:
-        """Whether settings, by the names of their options, are against it; what they lack is not given."""
+        """Whether settings, by the names of their options, are against it; what they lack is not
+        given.
+        """
         value = settings.get(self.name)
         concerned = value in self.values if self.values else value not in (None, False)
         return concerned and settings.get(self.other) not in self.allowed
@@ -72,7 +76,8 @@ RULES = (
 )
 
 
-# Options of a run that have another name on the command line, or stand for a value; of the flags, their values.
+# Options of a run that have another name on the command line, or stand for a value; of the flags,
+# their values.
 _TYPED = {"--likelihood": "sampled", "--dof": "sampled_dof", "--only-frames": "frames"}
 _FLAGS: dict[str, tuple[str, object]] = {
     "--robust": ("likelihood", "student_t"),
@@ -94,7 +99,9 @@ def named(options: Mapping[str, Sequence[str | None]]) -> dict[str, object]:
     """Options as they are typed by the names that the rules have for them."""
     found: dict[str, object] = {}
     for option, values in options.items():
-        name, value = _FLAGS.get(option, (_TYPED.get(option, option[2:].replace("-", "_")), values[-1]))
+        name, value = _FLAGS.get(
+            option, (_TYPED.get(option, option[2:].replace("-", "_")), values[-1])
+        )
         found[name] = value
     found.setdefault("sampled", found.get("likelihood"))
     return found
@@ -122,14 +129,19 @@ def refuse_conflicts(**settings: object) -> None:
     value = settings[rule.name]
     given = f"{rule.name}={value!r}" if isinstance(value, str | int | float) else rule.name
     if rule.other == "partitioned" and True in rule.allowed:
-        needed = "needs partitioned observations (sc.observations.open_partitions, a folder of Parquet files): leave"
+        needed = (
+            "needs partitioned observations (sc.observations.open_partitions, a folder of "
+            "Parquet files): leave"
+        )
         raise CalibrationError(f"{given} {needed} it out.")
     if rule.other == "partitioned":
         raise CalibrationError(
-            f"{given} and partitioned observations exclude each other: leave it out, or calibrate the frames of "
+            f"{given} and partitioned observations exclude each other: leave it out, or "
+            "calibrate the frames of "
             "`obs.sample()` with it."
         )
     wanted = " or ".join(repr(allowed) for allowed in rule.allowed if allowed is not None)
     raise CalibrationError(
-        f"{given} needs {rule.other}={wanted}, and {rule.other} is {settings.get(rule.other)!r}: change one of them."
+        f"{given} needs {rule.other}={wanted}, and {rule.other} is {settings.get(rule.other)!r}: "
+        "change one of them."
     )

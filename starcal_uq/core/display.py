@@ -1,7 +1,7 @@
 """The one door from a result to its figures, its words and its tables, which all stand above it.
 
-A result knows numbers. Whoever stands above registers how its class is shown, and the result finds that here, by its
-class, when somebody asks.
+A result knows numbers. Whoever stands above registers how its class is shown, and the result finds
+that here, by its class, when somebody asks.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Any
 
 @dataclass(frozen=True)
 class View:
-    """How the results of one class are shown: sentences, HTML for a notebook, and what draws after ``result.plot.``.
+    """How the results of one class are shown: sentences, HTML for a notebook, and what draws after
+    ``result.plot.``.
 
     Every function takes the result first.
     """
@@ -28,12 +29,16 @@ _VIEWS: list[Callable[[], Mapping[type, View]]] = []
 
 
 def register(views: Callable[[], Mapping[type, View]]) -> None:
-    """Add a table of views; `views` is called when a result is first shown, and may import heavily then."""
+    """Add a table of views; `views` is called when a result is first shown, and may import heavily
+    then.
+    """
     _VIEWS.append(views)
 
 
 def view_of(cls: type) -> View:
-    """The view of a class, or of the nearest class that it derives from; `LookupError` where there is none."""
+    """The view of a class, or of the nearest class that it derives from; `LookupError` where there
+    is none.
+    """
     tables = [views() for views in _VIEWS]
     for ancestor in cls.__mro__:
         for table in tables:
@@ -43,7 +48,9 @@ def view_of(cls: type) -> View:
 
 
 class Figures:
-    """The figures of one result: ``result.plot.<name>(...)`` draws, and tab completion lists the names."""
+    """The figures of one result: ``result.plot.<name>(...)`` draws, and tab completion lists the
+    names.
+    """
 
     def __init__(self, result: Any, figures: Mapping[str, Callable[..., Any]]) -> None:
         self._result = result
@@ -52,7 +59,9 @@ class Figures:
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_") or name not in self._figures:
             known = ", ".join(sorted(self._figures)) or "none"
-            raise AttributeError(f"a {type(self._result).__name__} has no figure {name!r}; it has {known}")
+            raise AttributeError(
+                f"a {type(self._result).__name__} has no figure {name!r}; it has {known}"
+            )
         figure = self._figures[name]
         bound = partial(figure, self._result)
         bound.__doc__ = figure.__doc__

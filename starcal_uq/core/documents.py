@@ -1,4 +1,5 @@
-"""JSON documents: how an object of one is declared, by its keys or by a record, and how a result becomes one.
+"""JSON documents: how an object of one is declared, by its keys or by a record, and how a result
+becomes one.
 
 NaN and infinity are null: not known, not determined, or not assessed.
 """
@@ -18,7 +19,14 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, create_model, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    create_model,
+    model_validator,
+)
 from pydantic_core import CoreSchema
 
 from starcal_uq.core.types import AnyDict, unaliased
@@ -33,7 +41,9 @@ def says(text: str, unit: str = "") -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Numbers, texts, lists and mappings for JSON; a result among them is left to the part that takes it."""
+    """Numbers, texts, lists and mappings for JSON; a result among them is left to the part that
+    takes it.
+    """
     if isinstance(value, np.generic | np.ndarray):
         return plain(value.tolist())
     if isinstance(value, float):
@@ -80,7 +90,9 @@ def part_of(record: type) -> type[Part]:
     Properties are in it that its class variable ``DOCUMENTED`` names.
     """
     said: dict[str, str] = {}
-    for names, text in re.findall(r"^(\w[\w, ]*) : .*\n((?: {4}.*\n?)+)", getdoc(record) or "", re.MULTILINE):
+    for names, text in re.findall(
+        r"^(\w[\w, ]*) : .*\n((?: {4}.*\n?)+)", getdoc(record) or "", re.MULTILINE
+    ):
         said |= dict.fromkeys(names.split(", "), " ".join(text.split()).removesuffix("."))
     hints = get_type_hints(record)
     keys: AnyDict = {}
@@ -88,8 +100,12 @@ def part_of(record: type) -> type[Part]:
         getter = getattr(record, name).fget
         text = (getdoc(getter) or "").partition("\n")[0].removesuffix(".")
         keys[name] = (_kind(get_type_hints(getter)["return"]), says(text))
-    keys |= {field.name: (_kind(hints[field.name]), says(said[field.name])) for field in fields(record)}
-    return create_model(record.__name__, __base__=Part, __doc__=(getdoc(record) or "").partition("\n")[0], **keys)
+    keys |= {
+        field.name: (_kind(hints[field.name]), says(said[field.name])) for field in fields(record)
+    }
+    return create_model(
+        record.__name__, __base__=Part, __doc__=(getdoc(record) or "").partition("\n")[0], **keys
+    )
 
 
 def _kind(hint: Any) -> Any:
@@ -110,12 +126,16 @@ def _kind(hint: Any) -> Any:
 
 
 class Of:
-    """A part made of a record, given as ``module:Class``, and more keys; loaded when it is asked for."""
+    """A part made of a record, given as ``module:Class``, and more keys; loaded when it is asked
+    for.
+    """
 
     def __init__(self, record: str, **more: tuple[Any, str]) -> None:
         self._record, self._more = record, more
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         module, name = self._record.split(":")
         part = part_of(getattr(import_module(f"starcal_uq.{module}"), name))
         if self._more:

@@ -1,7 +1,7 @@
 """Errors that a user can act on.
 
-Every message is one complete sentence that names what is wrong, where, and the remedy; the command line prints it as it
-stands and exits with status 2.
+Every message is one complete sentence that names what is wrong, where, and the remedy; the command
+line prints it as it stands and exits with status 2.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ def _one_line(message: str) -> str:
     if message.isprintable() and len(message) <= _LONGEST_WORD:
         return message
     line = printable(" ".join(message.splitlines()))
-    line = re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda word: f"{word[0][:40]}...{word[0][-20:]}", line)
+    line = re.sub(
+        rf"\S{{{_LONGEST_WORD},}}", lambda word: f"{word[0][:40]}...{word[0][-20:]}", line
+    )
     return line if len(line) <= _LONGEST else f"{line[:290]} ... {line[-100:]}"
 
 
@@ -46,7 +48,9 @@ class SettingError(StarcalError, ValueError):
 
 
 class MissingExtraError(StarcalError, ImportError):
-    """A library that only some users need is not installed; the message has the command that installs it."""
+    """A library that only some users need is not installed; the message has the command that
+    installs it.
+    """
 
 
 class CameraError(StarcalError):
@@ -54,7 +58,9 @@ class CameraError(StarcalError):
 
 
 class SensorError(StarcalError):
-    """A sensor description is inconsistent or unreadable, or asks for an image that cannot be rendered."""
+    """A sensor description is inconsistent or unreadable, or asks for an image that cannot be
+    rendered.
+    """
 
 
 class DistortionError(StarcalError):
@@ -69,7 +75,8 @@ class ObservationError(StarcalError):
     message
         The sentence shown to the user.
     row
-        The first bad row: the line in a CSV or ECSV file (the header counts), the row number from 1 otherwise.
+        The first bad row: the line in a CSV or ECSV file (the header counts), the row number from 1
+        otherwise.
     column
         The column of the first problem.
     problems
@@ -106,13 +113,18 @@ class IdentificationError(StarcalError):
 
 
 class CalibrationError(StarcalError):
-    """The estimate was not found; `status` says why and what to do, `undetermined` names what the data leave open.
+    """The estimate was not found; `status` says why and what to do, `undetermined` names what the
+    data leave open.
 
     `calibration` is what was found, where it has residuals to look at.
     """
 
     def __init__(
-        self, message: str, status: Status | None = None, undetermined: Sequence[str] = (), calibration: Any = None
+        self,
+        message: str,
+        status: Status | None = None,
+        undetermined: Sequence[str] = (),
+        calibration: Any = None,
     ) -> None:
         super().__init__(message)
         self.status = status
@@ -120,18 +132,23 @@ class CalibrationError(StarcalError):
         self.calibration = calibration
 
 
-# From observations and a calibration that failed: what is wrong with the former, in a sentence, or None.
+# From observations and a calibration that failed: what is wrong with the former, in a sentence, or
+# None.
 Reason = Callable[[Any, Any], str | None]
 REASONS: list[Callable[[], Reason]] = []
 
 
 def register_reason(load: Callable[[], Reason]) -> None:
-    """Add what those above an estimate know of why it fails; `load` is called when one does, and may import then."""
+    """Add what those above an estimate know of why it fails; `load` is called when one does, and
+    may import then.
+    """
     REASONS.append(load)
 
 
 class RepeatedFramesError(CalibrationError):
-    """Frames hold the same measurement; `pairs` has their numbers, the frame that stays and the one that repeats it."""
+    """Frames hold the same measurement; `pairs` has their numbers, the frame that stays and the one
+    that repeats it.
+    """
 
     def __init__(self, message: str, pairs: Sequence[Sequence[int]] = ()) -> None:
         super().__init__(message)

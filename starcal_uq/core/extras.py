@@ -12,12 +12,14 @@ from starcal_uq.core.errors import MissingExtraError
 def extra(name: str, what: str, instead: str = "") -> Iterator[None]:
     """For a block of imports: a library that is missing is named with the command that installs it.
 
-    `name` is the extra of ``pyproject.toml`` that brings the library, `what` needs it, in the plural, such as "FITS
-    images", and `instead` is another way out, an order, where there is one.
+    `name` is the extra of ``pyproject.toml`` that brings the library, `what` needs it, in the
+    plural, such as "FITS images", and `instead` is another way out, an order, where there is one.
     """
     try:
         yield
     except ModuleNotFoundError as error:
         library = (error.name or str(error)).partition(".")[0]
         otherwise = f", or {instead}" if instead else ""
-        raise MissingExtraError(f'{what} need {library}: run `pip install "starcal-uq[{name}]"`{otherwise}.') from None
+        raise MissingExtraError(
+            f'{what} need {library}: run `pip install "starcal-uq[{name}]"`{otherwise}.'
+        ) from None

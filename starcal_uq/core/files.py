@@ -1,4 +1,6 @@
-"""Files are written whole or not at all, and what is wrong with one that is read is said in a sentence."""
+"""Files are written whole or not at all, and what is wrong with one that is read is said in a
+sentence.
+"""
 
 from __future__ import annotations
 
@@ -41,9 +43,12 @@ _FLUSHERS = 16
 
 
 def ensure_new(path: PathLike, force: bool = False) -> None:
-    """Refuse to write over an existing file unless ``force`` is set, and over what is no regular file."""
+    """Refuse to write over an existing file unless ``force`` is set, and over what is no regular
+    file.
+    """
     path = Path(path)
-    # os.path, because Path.exists raises in a folder that may not be searched; the write itself reports that.
+    # os.path, because Path.exists raises in a folder that may not be searched; the write itself
+    # reports that.
     if not os.path.exists(path):
         return
     if path.is_dir():
@@ -52,12 +57,15 @@ def ensure_new(path: PathLike, force: bool = False) -> None:
         raise RunFolderError(f"{path}: is not a regular file; name a file to write to.")
     if not force:
         raise RunFolderError(
-            f"{path}: the file exists already; choose another name or use --force (force=True in Python)."
+            f"{path}: the file exists already; choose another name or use --force (force=True in "
+            "Python)."
         )
 
 
 def check_new_folder(path: PathLike, force: bool = False) -> None:
-    """Refuse a folder that holds anything, unless forced, or a file in its place; called before any work is done."""
+    """Refuse a folder that holds anything, unless forced, or a file in its place; called before any
+    work is done.
+    """
     path = Path(path)
     _refuse_file(path)
     names = [inside.name for inside in path.iterdir()] if path.is_dir() else []
@@ -66,7 +74,8 @@ def check_new_folder(path: PathLike, force: bool = False) -> None:
         return
     if any(name != STEP and not TEMPORARY.match(name) for name in names):
         raise RunFolderError(
-            f"{path}: the folder exists and is not empty; name another, or replace its results with --force."
+            f"{path}: the folder exists and is not empty; name another, or replace its results "
+            "with --force."
         )
 
 
@@ -90,17 +99,21 @@ def new_folder(path: PathLike) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunFolderError(f"{path}: the folder cannot be made ({error.strerror}); choose another place.") from error
+        raise RunFolderError(
+            f"{path}: the folder cannot be made ({error.strerror}); choose another place."
+        ) from error
     return path
 
 
 @contextmanager
 def atomic_path(path: PathLike, *, durable: bool = True) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds; if not, `path` is as it was.
+    """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds; if not,
+    `path` is as it was.
 
-    The temporary name keeps the ending, because many writers choose the format by it. What is `durable` is on the disk
-    before it is renamed, so that a loss of power, too, leaves the old file or the new one. RunFolderError if the folder
-    is missing, `path` is a directory or a device, or the system refuses the write.
+    The temporary name keeps the ending, because many writers choose the format by it. What is
+    `durable` is on the disk before it is renamed, so that a loss of power, too, leaves the old file
+    or the new one. RunFolderError if the folder is missing, `path` is a directory or a device, or
+    the system refuses the write.
     """
     # A link is followed: replacing it by a file would silently detach the place it points to.
     target = Path(os.path.realpath(path))
@@ -128,7 +141,8 @@ def atomic_path(path: PathLike, *, durable: bool = True) -> Iterator[Path]:
 def _unwritten(path: PathLike, error: OSError) -> RunFolderError:
     reason = error.strerror or str(error)
     return RunFolderError(
-        f"{path}: cannot be written ({reason}); check the permissions of the folder and the free space."
+        f"{path}: cannot be written ({reason}); check the permissions of the folder and the free "
+        "space."
     )
 
 
@@ -143,7 +157,8 @@ _LATER: ContextVar[list[Path] | None] = ContextVar("_LATER", default=None)
 
 @contextmanager
 def flushed_together() -> Iterator[None]:
-    """What this block writes by `atomic_path` is on the disk when it ends: flushed all at once, the disk waits once.
+    """What this block writes by `atomic_path` is on the disk when it ends: flushed all at once, the
+    disk waits once.
 
     For files that count only afterwards. RunFolderError if the system refuses it.
     """
@@ -156,7 +171,9 @@ def flushed_together() -> Iterator[None]:
     finally:
         _LATER.reset(token)
     with ThreadPoolExecutor(_FLUSHERS) as pool:
-        for path, flushed in [(path, pool.submit(_flush, path)) for path in dict.fromkeys(later) if path.exists()]:
+        for path, flushed in [
+            (path, pool.submit(_flush, path)) for path in dict.fromkeys(later) if path.exists()
+        ]:
             try:
                 flushed.result()
             except OSError as error:
@@ -186,7 +203,9 @@ def atomic_write_text(path: PathLike, text: str) -> None:
 
 
 def write_csv(table: pd.DataFrame, path: PathLike) -> None:
-    """Write a table as CSV without its index, to the last digit, all or nothing; texts as `cell_text` has them."""
+    """Write a table as CSV without its index, to the last digit, all or nothing; texts as
+    `cell_text` has them.
+    """
     texts = {
         name: [cell_text(value) if isinstance(value, str) else value for value in column]
         for name, column in table.items()
@@ -196,15 +215,17 @@ def write_csv(table: pd.DataFrame, path: PathLike) -> None:
         table.assign(**texts).to_csv(temporary, index=False, lineterminator="\n")
 
 
-# What spreadsheets take for a formula, whoever wrote the file; the apostrophe is their own mark of a text.
+# What spreadsheets take for a formula, whoever wrote the file; the apostrophe is their own mark of
+# a text.
 _FORMULA = re.compile(r"'*[=+\-@\t\n].", re.DOTALL)
 
 
 def cell_text(text: str) -> str:
     """A text for a cell of a table that may be opened as a spreadsheet.
 
-    One that would be run as a formula gets an apostrophe before it, which `cell_content` takes away again; numbers stay
-    as they are. A carriage return, which would end the row unless it is quoted, becomes a line feed, which is.
+    One that would be run as a formula gets an apostrophe before it, which `cell_content` takes away
+    again; numbers stay as they are. A carriage return, which would end the row unless it is quoted,
+    becomes a line feed, which is.
     """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if not _FORMULA.match(text):
@@ -226,13 +247,19 @@ _MODEST_BYTES, _MODEST_RATIO = 2**28, 100
 
 
 def check_size(declared: int, stored: int) -> None:
-    """Refuse, with ValueError, content of `declared` bytes that no file of ours with `stored` bytes unpacks to."""
+    """Refuse, with ValueError, content of `declared` bytes that no file of ours with `stored` bytes
+    unpacks to.
+    """
     if declared > max(_MODEST_BYTES, _MODEST_RATIO * stored):
-        raise ValueError(f"it declares {float(declared):.3g} bytes of content, far more than it can hold")
+        raise ValueError(
+            f"it declares {float(declared):.3g} bytes of content, far more than it can hold"
+        )
 
 
 def unpack(packed: bytes) -> Iterator[bytes]:
-    """Pieces of what gzip has packed, or all of what it has not; ValueError where that is far more than tables are."""
+    """Pieces of what gzip has packed, or all of what it has not; ValueError where that is far more
+    than tables are.
+    """
     if packed[:2] != b"\x1f\x8b":
         yield packed
         return
@@ -245,21 +272,28 @@ def unpack(packed: bytes) -> Iterator[bytes]:
 
 
 def read_parquet(source: Path | bytes, wanted: Collection[str] | None = None) -> pa.Table:
-    """A Parquet file, or those of its columns that are wanted; one that cannot be what it declares is refused.
+    """A Parquet file, or those of its columns that are wanted; one that cannot be what it declares
+    is refused.
 
     The caller's `reading` makes a sentence of whatever is raised.
     """
     import pyarrow as pa
     from pyarrow import parquet
 
-    with parquet.ParquetFile(source if isinstance(source, Path) else pa.BufferReader(source)) as file:
+    with parquet.ParquetFile(
+        source if isinstance(source, Path) else pa.BufferReader(source)
+    ) as file:
         check_parquet(file, source.stat().st_size if isinstance(source, Path) else len(source))
         names = file.schema_arrow.names
-        return file.read([name for name in names if wanted is None or name in wanted], use_threads=False)
+        return file.read(
+            [name for name in names if wanted is None or name in wanted], use_threads=False
+        )
 
 
 def check_parquet(file: ParquetFile, stored: int) -> None:
-    """Refuse, with ValueError, two columns of one name, and more rows than a file of `stored` bytes can hold."""
+    """Refuse, with ValueError, two columns of one name, and more rows than a file of `stored` bytes
+    can hold.
+    """
     names = file.schema_arrow.names
     if twice := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"column {min(twice)} occurs twice")
@@ -273,7 +307,8 @@ _MOST_AXES = 999
 
 
 def check_fits(content: bytes) -> None:
-    """Refuse, with ValueError, FITS headers whose sizes are none, or that count more axes or columns than FITS knows.
+    """Refuse, with ValueError, FITS headers whose sizes are none, or that count more axes or
+    columns than FITS knows.
 
     Astropy would go through them one by one, or go back by negative sizes, without end.
     """
@@ -286,7 +321,9 @@ def check_fits(content: bytes) -> None:
                 value = card[2].strip()
                 most = _MOST_AXES if card[1] in (b"NAXIS", b"TFIELDS") else sys.maxsize
                 if not (value.isdigit() and int(value) <= most):
-                    raise ValueError(f"its header states {card[1].decode()} as {value[:20].decode('latin-1')}")
+                    raise ValueError(
+                        f"its header states {card[1].decode()} as {value[:20].decode('latin-1')}"
+                    )
             place = content.find(key, place + 1)
 
 
@@ -313,9 +350,11 @@ def sealed(content: bytes) -> bytes:
 
 
 def check_hdf5(path: PathLike) -> None:
-    """Refuse, with ValueError, an HDF5 file that is not as `sealed` left it, or declares more than it can hold.
+    """Refuse, with ValueError, an HDF5 file that is not as `sealed` left it, or declares more than
+    it can hold.
 
-    The HDF5 library does not find that its files were damaged: it may give other numbers, or never come back.
+    The HDF5 library does not find that its files were damaged: it may give other numbers, or never
+    come back.
     """
     import h5py
 
@@ -336,7 +375,9 @@ def check_hdf5(path: PathLike) -> None:
 
 
 def shown(value: Any) -> str:
-    """What stands in a file or was given, for a message: as Python writes it, cut where it is long or deep."""
+    """What stands in a file or was given, for a message: as Python writes it, cut where it is long
+    or deep.
+    """
     try:
         return _SHORT.repr(value)
     except ValueError:
@@ -345,8 +386,13 @@ def shown(value: Any) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Columns of a file for a message, where they are not what they should be: the first ones, none too long."""
-    first = [name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}..." for name in names[:_MOST_NAMES]]
+    """Columns of a file for a message, where they are not what they should be: the first ones, none
+    too long.
+    """
+    first = [
+        name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}..."
+        for name in names[:_MOST_NAMES]
+    ]
     rest = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     return ", ".join(first) + rest
 
@@ -357,8 +403,11 @@ _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
 _SHORT.maxlevel = 3
 _LONGEST_REASON = 160
 # Words that only make sense to whoever wrote the program.
-_INTERNAL = re.compile(r"<class |<\w+\.\w|NoneType|0x[0-9a-f]{6}|\b[A-Z]\w*(Error|Exception)\b|_\w+\(|\(\)")
-# A file that was cut off, or is something else, shows itself by any of these, depending on where it was cut.
+_INTERNAL = re.compile(
+    r"<class |<\w+\.\w|NoneType|0x[0-9a-f]{6}|\b[A-Z]\w*(Error|Exception)\b|_\w+\(|\(\)"
+)
+# A file that was cut off, or is something else, shows itself by any of these, depending on where it
+# was cut.
 _REASONS: tuple[tuple[type[Exception] | tuple[type[Exception], ...], str], ...] = (
     (MemoryError, "it declares more than fits into memory"),
     (RecursionError, "its values are nested too deeply"),
@@ -380,7 +429,11 @@ def reason_of(error: Exception) -> str:
     if isinstance(error, KeyError):
         keys = error.args[0] if error.args and isinstance(error.args[0], tuple) else error.args
         name = " ".join(map(str, keys))
-        return f"{name} is missing" if 0 < len(name) <= 60 and name.isprintable() else "a part of it is missing"
+        return (
+            f"{name} is missing"
+            if 0 < len(name) <= 60 and name.isprintable()
+            else "a part of it is missing"
+        )
     if not isinstance(error, ValueError | StarcalError | csv.Error):
         return "it is damaged or cut off"
     text = " ".join(str(error).split()).removesuffix(".")
@@ -391,11 +444,14 @@ def reason_of(error: Exception) -> str:
 
 
 @contextmanager
-def reading(path: PathLike, what: str, remedy: str, error: type[StarcalError] = RunFolderError) -> Iterator[None]:
-    """For a block that makes a result of a file: whatever goes wrong there becomes one error, of one sentence.
+def reading(
+    path: PathLike, what: str, remedy: str, error: type[StarcalError] = RunFolderError
+) -> Iterator[None]:
+    """For a block that makes a result of a file: whatever goes wrong there becomes one error, of
+    one sentence.
 
-    It says what the file should hold, such as "a field map", and by the remedy, an order, how to get such a file. An
-    error of this package that names the file already is let through.
+    It says what the file should hold, such as "a field map", and by the remedy, an order, how to
+    get such a file. An error of this package that names the file already is let through.
     """
     try:
         yield
@@ -412,7 +468,10 @@ def reading(path: PathLike, what: str, remedy: str, error: type[StarcalError] = 
             sentence = f"{place}: cannot be read ({os.strerror(problem.errno)}); {remedy}."
         else:
             empty = os.path.isfile(path) and not os.path.getsize(path)
-            sentence = f"{path}: is not {what} ({'the file is empty' if empty else reason_of(problem)}); {remedy}."
+            sentence = (
+                f"{path}: is not {what} "
+                f"({'the file is empty' if empty else reason_of(problem)}); {remedy}."
+            )
         raise error(sentence) from problem
 
 
@@ -423,7 +482,9 @@ def table_ending(path: Path, endings: tuple[str, ...] = ENDINGS) -> str:
     """The ending of a table's file name, which decides on its format."""
     ending = path.suffix.lower()
     if ending not in endings:
-        raise ObservationError(f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(endings)}.")
+        raise ObservationError(
+            f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(endings)}."
+        )
     return ending
 
 

@@ -24,7 +24,9 @@ def pretty_unit(unit: str) -> str:
 
 
 def decimals_for(sigma: float, digits: int = 2) -> int:
-    """Decimals that show `sigma` with `digits` significant digits (0 for large, zero or infinite sigmas)."""
+    """Decimals that show `sigma` with `digits` significant digits (0 for large, zero or infinite
+    sigmas).
+    """
     if not (math.isfinite(sigma) and sigma > 0.0):
         return 0
     exponent = int(f"{sigma:.{digits - 1}e}".partition("e")[2])
@@ -85,7 +87,9 @@ SMALLEST_P = 1e-12
 
 
 def p_value(p: float, least: float = SMALLEST_P) -> str:
-    """``0.31``, or a bound where p is nearer to 0 than `least` can tell, or to 1 than the digits."""
+    """``0.31``, or a bound where p is nearer to 0 than `least` can tell, or to 1 than the
+    digits.
+    """
     if p < least:
         return f"< {significant(least, 1).removeprefix('1×')}"
     return f"> {1.0 - least:.3g}" if p > 1.0 - least and least > SMALLEST_P else significant(p)

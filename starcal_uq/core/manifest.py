@@ -1,8 +1,10 @@
-"""The record of a run, ``run.json``: which files belong together, and how a step replaces some of them at once.
+"""The record of a run, ``run.json``: which files belong together, and how a step replaces some of
+them at once.
 
-A step writes its files into a folder within the run, and the record of what the run then holds is the one file whose
-renaming makes them count: before it the run is the old one, after it the new one, whatever comes between. Whoever opens
-the run next moves the files to their places, if the process that should have done it is gone.
+A step writes its files into a folder within the run, and the record of what the run then holds is
+the one file whose renaming makes them count: before it the run is the old one, after it the new
+one, whatever comes between. Whoever opens the run next moves the files to their places, if the
+process that should have done it is gone.
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ _digests: dict[tuple[int, int, int, int], str] = {}
 
 @dataclass(frozen=True)
 class Entry:
-    """One file of a run: its size in bytes, the hash of its content, and the step that it belongs to."""
+    """One file of a run: its size in bytes, the hash of its content, and the step that it belongs
+    to.
+    """
 
     bytes: int
     sha256: str
@@ -57,12 +61,13 @@ class Entry:
 class Manifest:
     """What a run holds.
 
-    `files` are those that the run has written, by their names within the folder; others are the user's. `steps` have
-    the provenance of each step that is done. Of a run that a single command makes, `command` holds settings and hashes
-    of the inputs, `words` the command as it was typed, without the program's name, and `tried` the options and outcomes
-    of the runs of the same data that it has replaced; it is not `complete` while the command is under way, or was
-    interrupted. In the folder `stage`, files of the last step wait to be moved to their
-    places; those that are `gone` rested on what it replaced, and are to be removed.
+    `files` are those that the run has written, by their names within the folder; others are the
+    user's. `steps` have the provenance of each step that is done. Of a run that a single command
+    makes, `command` holds settings and hashes of the inputs, `words` the command as it was typed,
+    without the program's name, and `tried` the options and outcomes of the runs of the same data
+    that it has replaced; it is not `complete` while the command is under way, or was interrupted.
+    In the folder `stage`, files of the last step wait to be moved to their places; those that are
+    `gone` rested on what it replaced, and are to be removed.
     """
 
     files: dict[str, Entry] = field(default_factory=dict)
@@ -98,14 +103,16 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def commit(folder: Path, manifest: Manifest, old: Collection[str]) -> Manifest:
-    """Let the files in ``manifest.stage`` count, and remove those of `old` that are no more; all or nothing.
+    """Let the files in ``manifest.stage`` count, and remove those of `old` that are no more; all or
+    nothing.
 
     Refused if a file is in the way that the run has not written.
     """
     for name in manifest.files:
         if name not in old and os.path.lexists(folder / name):
             raise RunFolderError(
-                f"{folder / name}: is in the way of a result, and not of this run: move it elsewhere, and start again."
+                f"{folder / name}: is in the way of a result, and not of this run: move it "
+                "elsewhere, and start again."
             )
     for place in _folders(folder / manifest.stage, manifest.files):
         flush_folder(place)
@@ -139,7 +146,8 @@ def _settle(folder: Path, manifest: Manifest) -> Manifest:
         write_manifest(folder, settled)
     except OSError as error:
         raise RunFolderError(
-            f"{folder}: its last step cannot be completed ({error.strerror}); check the permissions of the folder and "
+            f"{folder}: its last step cannot be completed ({error.strerror}); check the "
+            "permissions of the folder and "
             "the space on the disk, and start again."
         ) from error
     shutil.rmtree(stage, ignore_errors=True)
@@ -164,7 +172,9 @@ def digest(path: Path) -> str:
 def check_file(path: Path, entry: Entry | None, remedy: str) -> None:
     """Refuse a file that is not the one that the run has written; the remedy is an order."""
     if entry is None:
-        raise RunFolderError(f"{path}: is not a file of this run ({MANIFEST} does not list it); {remedy}.")
+        raise RunFolderError(
+            f"{path}: is not a file of this run ({MANIFEST} does not list it); {remedy}."
+        )
     size = path.stat().st_size
     if size != entry.bytes:
         reason = f"it has {size} bytes and had {entry.bytes}"
@@ -176,29 +186,38 @@ def check_file(path: Path, entry: Entry | None, remedy: str) -> None:
 
 
 def identity(paths: Mapping[str, Path]) -> AnyDict:
-    """What tells inputs from others: hashes of the files, or of those in a folder; size and time of large ones."""
+    """What tells inputs from others: hashes of the files, or of those in a folder; size and time of
+    large ones.
+    """
     found: AnyDict = {}
     for label, path in paths.items():
         if not path.exists():
             # Whoever reads it says so.
             continue
-        files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+        files = (
+            sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+        )
         for file in files:
             state = file.stat()
             large = state.st_size > _MAX_HASHED
             place = file.relative_to(path).as_posix() if path.is_dir() else file.name
-            found[f"{label}: {place}"] = [state.st_size, state.st_mtime_ns] if large else digest(file)
+            found[f"{label}: {place}"] = (
+                [state.st_size, state.st_mtime_ns] if large else digest(file)
+            )
     return found
 
 
 def check_hidden(folder: Path, name: str, ours: Collection[str] = ()) -> None:
-    """Refuse a hidden folder within a run that is a link or a file, or holds what no run has written; nothing goes.
+    """Refuse a hidden folder within a run that is a link or a file, or holds what no run has
+    written; nothing goes.
 
     `ours` are starts of names of files that are the run's without being recorded.
     """
     place = folder / name
     if os.path.islink(place) or (os.path.lexists(place) and not place.is_dir()):
-        raise RunFolderError(f"{place}: is not a folder that a run has made; move it elsewhere, and start again.")
+        raise RunFolderError(
+            f"{place}: is not a folder that a run has made; move it elsewhere, and start again."
+        )
     if name == STEP or not place.is_dir():
         return
     found = read_manifest(place) or Manifest()
@@ -206,7 +225,8 @@ def check_hidden(folder: Path, name: str, ours: Collection[str] = ()) -> None:
     for inside, path in files_in(place).items():
         if not (inside in found.files or inside.startswith(hidden) or TEMPORARY.match(path.name)):
             raise RunFolderError(
-                f"{path}: is not of a run, and would go with its hidden folder; move it elsewhere, and start again."
+                f"{path}: is not of a run, and would go with its hidden folder; move it "
+                "elsewhere, and start again."
             )
 
 
@@ -237,19 +257,24 @@ def staged(folder: Path) -> Iterator[Path]:
 
 def files_in(folder: Path) -> dict[str, Path]:
     """All files in a folder and those within it, by their names in it."""
-    return {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 @contextmanager
 def making(
     folder: PathLike, command: str, main: str, *, force: bool = False, also: Sequence[str] = ()
 ) -> Iterator[Path]:
-    """Yield a folder for all results of a command; they take their places at once, if the block succeeds.
+    """Yield a folder for all results of a command; they take their places at once, if the block
+    succeeds.
 
-    Until then `folder`, in which no other process can make results, holds the results of before. What the command has
-    kept there on its way (`core.store.Kept`) goes when the results are there. `main` is the result that versions
-    without records always wrote; `also` are patterns of results that may be replaced without being recorded, because
-    functions write them one by one.
+    Until then `folder`, in which no other process can make results, holds the results of before.
+    What the command has kept there on its way (`core.store.Kept`) goes when the results are there.
+    `main` is the result that versions without records always wrote; `also` are patterns of results
+    that may be replaced without being recorded, because functions write them one by one.
     """
     place = Path(folder)
     with alone(place):
@@ -261,7 +286,9 @@ def making(
                 yield stage
                 made = {name: entry_of(path, command) for name, path in files_in(stage).items()}
                 known = ("*",) if old is None and os.path.exists(place / main) else also
-                before = {name for name in made for pattern in known if PurePath(name).match(pattern)}
+                before = {
+                    name for name in made for pattern in known if PurePath(name).match(pattern)
+                }
                 before |= set() if old is None else set(old.files)
                 if made:
                     record = provenance(None, {}, None)
@@ -279,7 +306,8 @@ def refuse_others(folder: Path, steps: Collection[str]) -> None:
     of_a_run = os.path.exists(folder / _OF_A_RUN) and "calibrate" not in steps
     if of_a_run if found is None else not set(found.steps) <= set(steps):
         raise RunFolderError(
-            f"{folder}: holds the results of another command, with which these would be mixed; name another folder."
+            f"{folder}: holds the results of another command, with which these would be mixed; "
+            "name another folder."
         )
 
 
@@ -291,7 +319,8 @@ _writing: dict[tuple[int, int], int] = {}
 def alone(folder: PathLike, *, make: bool = True) -> Iterator[None]:
     """Refuse a folder into which another process writes; one that is killed leaves nothing locked.
 
-    A missing folder is made, and removed again if it stays empty; without `make` nothing is locked then.
+    A missing folder is made, and removed again if it stays empty; without `make` nothing is locked
+    then.
     """
     if not (make or os.path.isdir(folder)):
         yield

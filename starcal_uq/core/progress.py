@@ -13,10 +13,11 @@ _EVERY_S = 0.2
 
 
 class ProgressBar:
-    """One line that follows long work: ``sc.sample(obs, cal, progress=sc.core.ProgressBar("sampling"))``.
+    """One line that follows long work: ``sc.sample(obs, cal,
+    progress=sc.core.ProgressBar("sampling"))``.
 
-    In a notebook it is one output, which is replaced and stays when the work is done; in a terminal one line on
-    standard error; elsewhere nothing.
+    In a notebook it is one output, which is replaced and stays when the work is done; in a terminal
+    one line on standard error; elsewhere nothing.
 
     Parameters
     ----------
@@ -39,7 +40,9 @@ class ProgressBar:
         said = f"{self._label} {done} of {total}".strip()
         if self._publish is not None:
             html = f'<progress value="{done}" max="{total}"></progress> {escape(said)}'
-            self._publish({"text/html": html, "text/plain": said}, transient=self._place, update=self._begun)
+            self._publish(
+                {"text/html": html, "text/plain": said}, transient=self._place, update=self._begun
+            )
             self._begun = True
         elif sys.stderr.isatty():
             print(f"\r{said}", end="\n" if done >= total else "", file=sys.stderr, flush=True)

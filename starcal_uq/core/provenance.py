@@ -22,13 +22,18 @@ def installed_version(distribution: str) -> str | None:
         return None
 
 
-def provenance(seed: int | None, settings: Mapping[str, Any], data_hash: str | None) -> dict[str, Any]:
-    """What is needed to repeat a result: time, seed (None where none was drawn), settings, data hash and versions.
+def provenance(
+    seed: int | None, settings: Mapping[str, Any], data_hash: str | None
+) -> dict[str, Any]:
+    """What is needed to repeat a result: time, seed (None where none was drawn), settings, data
+    hash and versions.
 
-    The versions are those of Python and of the packages that decide the numbers; None for one that is not installed.
+    The versions are those of Python and of the packages that decide the numbers; None for one that
+    is not installed.
     """
     versions: dict[str, str | None] = {"python": platform.python_version()}
-    # Read from the installed metadata: importing casadi or arviz to ask for its version would cost a second.
+    # Read from the installed metadata: importing casadi or arviz to ask for its version would cost
+    # a second.
     versions.update({name.replace("-", "_"): installed_version(name) for name in _VERSIONED})
     return {
         "created_utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
@@ -40,7 +45,9 @@ def provenance(seed: int | None, settings: Mapping[str, Any], data_hash: str | N
 
 
 def data_hashes(provenance: AnyDict) -> set[str]:
-    """Hashes of all data that a result rests on: its own, of its partitions, and of the runs it was merged from."""
+    """Hashes of all data that a result rests on: its own, of its partitions, and of the runs it was
+    merged from.
+    """
     parts = provenance.get("merge", {}).get("parts", [])
     hashes = {str(value) for part in parts for value in part["data_sha256"]}
     hashes |= set(provenance.get("partitions", {}).get("data_sha256", ()))

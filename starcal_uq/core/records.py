@@ -1,7 +1,9 @@
-"""One codec for results: frozen dataclasses of arrays, plain values, enumerations, tuples and other such records.
+"""One codec for results: frozen dataclasses of arrays, plain values, enumerations, tuples and other
+such records.
 
-What a field may hold is what its annotation says; anything else is refused, in writing and in reading. Numbers keep
-every bit. A class that has its own form in files (a camera, a prior) says so by `to_dict` and `from_dict`.
+What a field may hold is what its annotation says; anything else is refused, in writing and in
+reading. Numbers keep every bit. A class that has its own form in files (a camera, a prior) says so
+by `to_dict` and `from_dict`.
 """
 
 from __future__ import annotations
@@ -20,7 +22,14 @@ from typing import IO, Any, ClassVar, Literal, TypeVar, Union, get_args, get_ori
 
 import numpy as np
 
-from starcal_uq.core.files import PathLike, atomic_path, atomic_write_text, check_size, reading, shown
+from starcal_uq.core.files import (
+    PathLike,
+    atomic_path,
+    atomic_write_text,
+    check_size,
+    reading,
+    shown,
+)
 from starcal_uq.core.types import AnyDict, unaliased
 
 Record = TypeVar("Record")
@@ -28,23 +37,38 @@ S = TypeVar("S", bound="Saved")
 Arrays = dict[str, Any]
 
 _FORMAT, _DOCUMENT = "format", "document"
-_WORDS: dict[Any, str] = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+_WORDS: dict[Any, str] = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+}
 # Kinds of arrays that each kind may be made of.
 _FROM = {"f": "fiu", "i": "iu", "u": "iu"}
-_SCALARS: dict[Any, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (int, float), str: (str,)}
+_SCALARS: dict[Any, tuple[type, ...]] = {
+    bool: (bool,),
+    int: (int,),
+    float: (int, float),
+    str: (str,),
+}
 # Halves of characters, which JSON can write by their numbers and UTF-8 cannot hold.
 _HALVES = re.compile("[\ud800-\udfff]")
 
 
 def to_plain(
-    record: Any, arrays: Arrays | None = None, apart: Collection[str] | None = None, *, null: bool = False
+    record: Any,
+    arrays: Arrays | None = None,
+    apart: Collection[str] | None = None,
+    *,
+    null: bool = False,
 ) -> Any:
-    """A record, or anything that a record may hold, as dictionaries, lists, numbers and text, for JSON.
+    """A record, or anything that a record may hold, as dictionaries, lists, numbers and text, for
+    JSON.
 
-    `arrays` takes arrays under the names of their fields (``stages`` holds ``stage0_cost``, ``stage1_cost``...), or
-    those of the fields `apart` alone, which are then left out of the result; without it they become lists. `null`
-    writes NaN as None, because strict JSON has no other word for it; `from_plain` reads both. TypeError for a value
-    that no file of ours can hold.
+    `arrays` takes arrays under the names of their fields (``stages`` holds ``stage0_cost``,
+    ``stage1_cost``...), or those of the fields `apart` alone, which are then left out of the
+    result; without it they become lists. `null` writes NaN as None, because strict JSON has no
+    other word for it; `from_plain` reads both. TypeError for a value that no file of ours can hold.
     """
     return _Writer(arrays, apart, null).plain(record, "")
 
@@ -63,13 +87,20 @@ class _Writer:
         if value is None or isinstance(value, bool | int | str):
             return value
         if isinstance(value, list | tuple):
-            return [self.plain(item, f"{name.removesuffix('s')}{index}") for index, item in enumerate(value)]
+            return [
+                self.plain(item, f"{name.removesuffix('s')}{index}")
+                for index, item in enumerate(value)
+            ]
         if isinstance(value, Mapping):
             return self.items(value, name)
         if is_dataclass(value) and not isinstance(value, type):
-            # Both: a class that only tells itself in plain values, for readers, is read field by field.
+            # Both: a class that only tells itself in plain values, for readers, is read field by
+            # field.
             own = getattr(value, "to_dict", None) if hasattr(value, "from_dict") else None
-            return self.items({f.name: getattr(value, f.name) for f in fields(value)} if own is None else own(), name)
+            return self.items(
+                {f.name: getattr(value, f.name) for f in fields(value)} if own is None else own(),
+                name,
+            )
         raise TypeError(f"a file cannot hold {name or 'this'}: {type(value).__name__}")
 
     def items(self, values: Mapping[str, Any], name: str) -> AnyDict:
@@ -89,8 +120,9 @@ class _Writer:
 def from_plain(cls: type[Record], data: Any, arrays: Arrays | None = None) -> Record:
     """Inverse of `to_plain`.
 
-    A field that is missing has its default; a name that is a property of the class was written for readers and is
-    passed over. ValueError or TypeError for a field that is missing, unknown, or holds something else.
+    A field that is missing has its default; a name that is a property of the class was written for
+    readers and is passed over. ValueError or TypeError for a field that is missing, unknown, or
+    holds something else.
     """
     made: Record = _value(cls, data, arrays or {}, "")
     return made
@@ -127,14 +159,19 @@ def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
     if origin in (tuple, list):
         return _sequence(origin, args, data, arrays, name)
     if origin is dict:
-        return {key: _value(args[1], item, arrays, f"{name}_{key}") for key, item in _mapping(data, name).items()}
+        return {
+            key: _value(args[1], item, arrays, f"{name}_{key}")
+            for key, item in _mapping(data, name).items()
+        }
     if isinstance(hint, type) and issubclass(hint, Enum):
         if data not in hint.__members__:
             raise ValueError(f"{name} is {shown(data)}, not one of {', '.join(hint.__members__)}")
         return hint[data]
     if hasattr(hint, "from_dict"):
         start = f"{name}_"
-        inside = {key.removeprefix(start): value for key, value in arrays.items() if key.startswith(start)}
+        inside = {
+            key.removeprefix(start): value for key, value in arrays.items() if key.startswith(start)
+        }
         return hint.from_dict({**_mapping(data, name), **inside})
     if is_dataclass(hint):
         return _record(hint, _mapping(data, name), arrays, name)
@@ -177,7 +214,8 @@ def _sequence(kind: Any, items: tuple[Any, ...], data: Any, arrays: Arrays, name
         raise ValueError(f"{name} has {len(data)} entries, not {len(kinds)}")
     place = name.removesuffix("s")
     return kind(
-        _value(hint, item, arrays, f"{place}{i}") for i, (hint, item) in enumerate(zip(kinds, data, strict=True))
+        _value(hint, item, arrays, f"{place}{i}")
+        for i, (hint, item) in enumerate(zip(kinds, data, strict=True))
     )
 
 
@@ -208,9 +246,9 @@ def _record(cls: Any, data: Mapping[str, Any], arrays: Arrays, name: str) -> Any
 def _check_sizes(record: Any, name: str) -> None:
     """Arrays must have the sizes that the class states, and where it says so no gap.
 
-    ``SHAPES`` of a class are sizes by field (or property): numbers, or names of sizes that are the same wherever they
-    stand, such as ``{"theta": ("p",), "draws": ("n", "p+1")}``; a tuple has its length. Fields in ``FINITE`` hold
-    neither NaN nor infinities.
+    ``SHAPES`` of a class are sizes by field (or property): numbers, or names of sizes that are the
+    same wherever they stand, such as ``{"theta": ("p",), "draws": ("n", "p+1")}``; a tuple has its
+    length. Fields in ``FINITE`` hold neither NaN nor infinities.
     """
     sizes: dict[str, int] = {}
     empty: dict[str, set[str]] = {}
@@ -227,16 +265,22 @@ def _check_sizes(record: Any, name: str) -> None:
             raise ValueError(f"{place} has {len(shape)} dimensions, not {len(wanted)}")
         for size, want in zip(shape, wanted, strict=True):
             letter, _, more = str(want).partition("+")
-            known = sizes.setdefault(letter, int(letter) if letter.isdigit() else size - int(more or 0))
+            known = sizes.setdefault(
+                letter, int(letter) if letter.isdigit() else size - int(more or 0)
+            )
             if size != known + int(more or 0):
-                raise ValueError(f"{place} has {size} entries where there should be {known + int(more or 0)}")
+                raise ValueError(
+                    f"{place} has {size} entries where there should be {known + int(more or 0)}"
+                )
     # A list of JSON does not tell the sizes of an array that holds nothing.
     for place, letters in empty.items():
         if all(int(letter) if letter.isdigit() else sizes.get(letter, 0) for letter in letters):
             raise ValueError(f"{place} holds nothing")
     for field in getattr(record, "FINITE", ()):
         if not np.isfinite(getattr(record, field)).all():
-            raise ValueError(f"{f'{name}_{field}' if name else field} holds a value that is not finite")
+            raise ValueError(
+                f"{f'{name}_{field}' if name else field} holds a value that is not finite"
+            )
 
 
 def write_json(record: Any, path: PathLike) -> None:
@@ -251,9 +295,11 @@ def read_json(cls: type[Record], path: PathLike, what: str, remedy: str) -> Reco
 
 
 def write(record: Any, path: PathLike, kind: str) -> None:
-    """Write a record as one ``.npz`` file: arrays to the last bit, all else as JSON beside them; overwritten.
+    """Write a record as one ``.npz`` file: arrays to the last bit, all else as JSON beside them;
+    overwritten.
 
-    The `kind` says what the file is; it is empty for a record of nothing but arrays, whose file needs no word for it.
+    The `kind` says what the file is; it is empty for a record of nothing but arrays, whose file
+    needs no word for it.
     """
     arrays: Arrays = {}
     document = to_plain(record, arrays)
@@ -273,7 +319,8 @@ def read(cls: type[Record], path: PathLike, kind: str, what: str, remedy: str) -
 
 
 class Saved:
-    """A record with a file of its own, ``.npz`` or JSON; `FILE` says what it is and what to do where it is none.
+    """A record with a file of its own, ``.npz`` or JSON; `FILE` says what it is and what to do
+    where it is none.
 
     A `KIND` is that of `write`; None is JSON.
     """
@@ -297,14 +344,18 @@ class Saved:
         RunFolderError
             If the file is missing or is something else.
         """
-        return read_json(cls, path, *cls.FILE) if cls.KIND is None else read(cls, path, cls.KIND, *cls.FILE)
+        return (
+            read_json(cls, path, *cls.FILE)
+            if cls.KIND is None
+            else read(cls, path, cls.KIND, *cls.FILE)
+        )
 
 
 def read_arrays(path: PathLike) -> Arrays:
     """All arrays of an ``.npz`` file.
 
-    One that holds Python objects is refused, as is an array that declares more than its file has, before memory is
-    taken for it.
+    One that holds Python objects is refused, as is an array that declares more than its file has,
+    before memory is taken for it.
     """
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
@@ -320,11 +371,17 @@ def read_arrays(path: PathLike) -> Arrays:
 
 
 def _array(member: IO[bytes], size: int, name: str) -> Any:
-    """The array of a member of `size` bytes, whose header is believed only where it fits to them."""
+    """The array of a member of `size` bytes, whose header is believed only where it fits to
+    them.
+    """
     version = np.lib.format.read_magic(member)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"{name} is no array")
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    header = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, _, dtype = header(member)
     if dtype.hasobject:
         raise ValueError(f"{name} holds Python objects")

@@ -1,7 +1,8 @@
-"""What settings may be, numbers within limits or words of a list: said once, for Python and the command line.
+"""What settings may be, numbers within limits or words of a list: said once, for Python and the
+command line.
 
-A limit belongs to the name of a parameter, which has it wherever it occurs; `bounded` makes a function refuse what lies
-outside, before it does anything.
+A limit belongs to the name of a parameter, which has it wherever it occurs; `bounded` makes a
+function refuse what lies outside, before it does anything.
 """
 
 from __future__ import annotations
@@ -84,7 +85,9 @@ class Limit:
             return False
         if isinstance(value, tuple | list):
             return all(map(self.holds, value))
-        return not isinstance(value, Integral if self.whole else Real) or bool(self.low <= value <= self.high)  # type: ignore[operator]
+        return not isinstance(value, Integral if self.whole else Real) or bool(
+            self.low <= value <= self.high
+        )  # type: ignore[operator]
 
 
 def wanted(low: float, high: float, whole: bool, verb: str = "give") -> str:
@@ -138,7 +141,8 @@ LIMITS = {
 }
 
 
-# The same for keys of files and axes of studies that are no parameters of functions, or have limits of their own there.
+# The same for keys of files and axes of studies that are no parameters of functions, or have limits
+# of their own there.
 KEYS = {
     "width_px": Limit(1, 10**6),
     "height_px": Limit(1, 10**6),
@@ -189,7 +193,9 @@ def bounded(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def check_memory(setting: str, n_bytes: float) -> None:
-    """Refuse a setting, such as "n_steps=10", with which results alone take more memory than this machine has."""
+    """Refuse a setting, such as "n_steps=10", with which results alone take more memory than this
+    machine has.
+    """
     try:
         installed = float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -197,6 +203,7 @@ def check_memory(setting: str, n_bytes: float) -> None:
         return
     if n_bytes > installed:
         raise SettingError(
-            f"{setting}: the result needs {n_bytes / 1e9:.3g} GB of memory at the least, and this machine has "
+            f"{setting}: the result needs {n_bytes / 1e9:.3g} GB of memory at the least, and "
+            "this machine has "
             f"{installed / 1e9:.3g} GB: give less."
         )

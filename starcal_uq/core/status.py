@@ -19,23 +19,30 @@ class Status(Enum):
 
     CONVERGED = "converged"
     MAX_ITERATIONS = (
-        "the iteration limit was reached first: start closer to the optimum (--start) or raise max_iterations "
+        "the iteration limit was reached first: start closer to the optimum (--start) or raise "
+        "max_iterations "
         "(--max-iterations)"
     )
     SINGULAR = (
         "the data do not determine every parameter: add frames or stars spread over the field, "
         "or choose a distortion model with fewer coefficients"
     )
-    STALLED = "no step lowers the cost although the gradient is not zero: check the scale of the start values"
+    STALLED = (
+        "no step lowers the cost although the gradient is not zero: check the scale of the start "
+        "values"
+    )
     OUTSIDE_DETECTOR = (
         "the principal point left the detector: check the identifications and the nominal camera, "
         "or use solver='ipopt', which keeps it inside"
     )
     FOLDED = (
-        "the distortion folds over inside the field: choose a model with fewer coefficients or use solver='ipopt', "
+        "the distortion folds over inside the field: choose a model with fewer coefficients or "
+        "use solver='ipopt', "
         "which keeps the distortion monotonic"
     )
-    NOT_FINITE = "the model is not finite at the start: check the nominal camera against the observations"
+    NOT_FINITE = (
+        "the model is not finite at the start: check the nominal camera against the observations"
+    )
     INCONSISTENT = (
         "the fit is far worse than centroid noise can explain: check the star identifications, "
         "the parity of the axes and the nominal focal length"
@@ -66,12 +73,16 @@ class Level(Enum):
 
     @property
     def exit_status(self) -> int:
-        """Exit status of a command that ends with this outcome: 1 for a failed check, 0 otherwise."""
+        """Exit status of a command that ends with this outcome: 1 for a failed check, 0
+        otherwise.
+        """
         return int(self is Level.FAIL)
 
 
 class Question(Enum):
-    """What a check helps to answer: did it converge, can it be trusted, and is it enough for the mission?"""
+    """What a check helps to answer: did it converge, can it be trusted, and is it enough for the
+    mission?
+    """
 
     CONVERGED = "converged"
     TRUSTWORTHY = "trustworthy"
@@ -97,11 +108,12 @@ class Check:
     sentence : str
         Meaning, in plain words.
     remedy : str
-        Command or Python call that may mend it, several joined by " or "; empty where it passed or nothing of the kind
-        helps. OBS, CAMERA, SITE and RUN stand for the user's files, ``obs``, ``camera`` and ``cal`` for results.
+        Command or Python call that may mend it, several joined by " or "; empty where it passed or
+        nothing of the kind helps. OBS, CAMERA, SITE and RUN stand for the user's files, ``obs``,
+        ``camera`` and ``cal`` for results.
     advice : str
-        What to do with the instrument or the data, an order: before the command, or where none helps; else empty. Of a
-        check that did not pass, remedy and advice are never both empty.
+        What to do with the instrument or the data, an order: before the command, or where none
+        helps; else empty. Of a check that did not pass, remedy and advice are never both empty.
     """
 
     DOCUMENTED: ClassVar = ("key",)
@@ -117,7 +129,9 @@ class Check:
 
     @property
     def remedies(self) -> tuple[str, ...]:
-        """The commands and calls of the remedy, each by itself; a name of a file may hold any word."""
+        """The commands and calls of the remedy, each by itself; a name of a file may hold any
+        word.
+        """
         return tuple(filter(None, re.split(r" or (?=starcal-uq |sc\.)", self.remedy)))
 
     @property
@@ -127,7 +141,9 @@ class Check:
 
     @property
     def phrase(self) -> str:
-        """The name for use within a sentence: no capital, unless it starts with a symbol such as R-hat."""
+        """The name for use within a sentence: no capital, unless it starts with a symbol such as
+        R-hat.
+        """
         return self.name if self.name[1:2] == "-" else self.name[0].lower() + self.name[1:]
 
     def __str__(self) -> str:

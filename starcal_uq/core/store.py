@@ -1,4 +1,6 @@
-"""Results on disk while they are made: appended in parts, each written whole, found again by what they depend on."""
+"""Results on disk while they are made: appended in parts, each written whole, found again by what
+they depend on.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import UNFINISHED, PathLike, atomic_path, new_folder, read_parquet, reading, sweep_temporary
+from starcal_uq.core.files import (
+    UNFINISHED,
+    PathLike,
+    atomic_path,
+    new_folder,
+    read_parquet,
+    reading,
+    sweep_temporary,
+)
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.types import AnyDict
@@ -33,9 +43,15 @@ class Store:
     The `schema` has a column ``key``; `read` makes rows of the path of a part.
     """
 
-    def __init__(self, folder: PathLike | None, schema: pa.Schema, read: Callable[[Path], pa.Table]) -> None:
+    def __init__(
+        self, folder: PathLike | None, schema: pa.Schema, read: Callable[[Path], pa.Table]
+    ) -> None:
         self.folder, self.schema = None if folder is None else new_folder(folder), schema
-        self._tables = [read(path) for path in sorted(self.folder.glob(_PATTERN))] if self.folder is not None else []
+        self._tables = (
+            [read(path) for path in sorted(self.folder.glob(_PATTERN))]
+            if self.folder is not None
+            else []
+        )
 
     def keys(self) -> set[str]:
         """Keys of the rows that are there."""
@@ -54,12 +70,20 @@ class Store:
         """All rows, each once."""
         import pyarrow as pa
 
-        whole = pa.concat_tables(self._tables) if self._tables else pa.Table.from_pylist([], schema=self.schema)
-        _, first = np.unique(np.array(whole["key"].to_pylist(), dtype=object).astype(str), return_index=True)
+        whole = (
+            pa.concat_tables(self._tables)
+            if self._tables
+            else pa.Table.from_pylist([], schema=self.schema)
+        )
+        _, first = np.unique(
+            np.array(whole["key"].to_pylist(), dtype=object).astype(str), return_index=True
+        )
         return whole if len(first) == len(whole) else whole.take(np.sort(first))
 
     def consolidate(self) -> None:
-        """One file instead of many parts; until they are gone, rows that stand in both count once."""
+        """One file instead of many parts; until they are gone, rows that stand in both count
+        once.
+        """
         if self.folder is None or len(self._tables) < 2:
             return
         parts = held(self.folder)
@@ -76,7 +100,9 @@ def held(folder: PathLike) -> list[Path]:
 
 
 def take_over(old: PathLike, new: PathLike) -> None:
-    """Put the rows of a folder in the place of another's; stopped anywhere, the first has them still, or the other."""
+    """Put the rows of a folder in the place of another's; stopped anywhere, the first has them
+    still, or the other.
+    """
     for path in held(old):
         path.unlink()
     for path in held(new):
@@ -94,9 +120,9 @@ def write_part(table: pa.Table, path: Path) -> None:
 class Kept:
     """Results of numbered tasks in the folder of a command that is not finished.
 
-    Those that depend on something else than is wanted now are not found, and a part that cannot be read is passed over.
-    `identity` is all that the tasks depend on but their number: a record, or what a record may hold; `kinds` are the
-    named tuples and dataclasses that results are, or hold.
+    Those that depend on something else than is wanted now are not found, and a part that cannot be
+    read is passed over. `identity` is all that the tasks depend on but their number: a record, or
+    what a record may hold; `kinds` are the named tuples and dataclasses that results are, or hold.
     """
 
     def __init__(self, folder: PathLike, identity: object, kinds: Sequence[type] = ()) -> None:
@@ -129,7 +155,9 @@ class Kept:
 
     def keep(self, results: Sequence[tuple[int, Any]]) -> None:
         """Add results."""
-        self._store.append([{"key": self._key(n), "result": json.dumps(_plain(value))} for n, value in results])
+        self._store.append(
+            [{"key": self._key(n), "result": json.dumps(_plain(value))} for n, value in results]
+        )
 
     def _value(self, plain: Any) -> Any:
         if not isinstance(plain, dict):
@@ -137,13 +165,21 @@ class Kept:
         ((kind, content),) = plain.items()
         if kind == "array":
             dtype, shape, data = content
-            return np.frombuffer(base64.b64decode(data), dtype=np.dtype(dtype)).reshape(shape).copy()
+            return (
+                np.frombuffer(base64.b64decode(data), dtype=np.dtype(dtype)).reshape(shape).copy()
+            )
         if kind == "bytes":
             return base64.b64decode(content)
         if kind == "dict":
             return {self._value(key): self._value(value) for key, value in content}
         items = [self._value(item) for item in content]
-        return items if kind == "list" else tuple(items) if kind == "tuple" else self._kinds[kind](*items)
+        return (
+            items
+            if kind == "list"
+            else tuple(items)
+            if kind == "tuple"
+            else self._kinds[kind](*items)
+        )
 
 
 def _plain(value: Any) -> Any:
@@ -157,7 +193,11 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {"dict": [[_plain(key), _plain(item)] for key, item in value.items()]}
     if is_dataclass(value):
-        return {type(value).__name__: [_plain(getattr(value, field.name)) for field in fields(value) if field.init]}
+        return {
+            type(value).__name__: [
+                _plain(getattr(value, field.name)) for field in fields(value) if field.init
+            ]
+        }
     if isinstance(value, list | tuple):
         kind = type(value).__name__
         return {kind: [_plain(item) for item in value]}
@@ -165,6 +205,8 @@ def _plain(value: Any) -> Any:
 
 
 def finished(folder: PathLike) -> None:
-    """Remove what a command has kept, now that its results are written, and what killed ones have left."""
+    """Remove what a command has kept, now that its results are written, and what killed ones have
+    left.
+    """
     sweep_temporary(folder)
     shutil.rmtree(Path(folder) / UNFINISHED, ignore_errors=True)

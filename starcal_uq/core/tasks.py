@@ -1,4 +1,6 @@
-"""Independent tasks over processes: the same results for any number of them, and Ctrl-C keeps what is done."""
+"""Independent tasks over processes: the same results for any number of them, and Ctrl-C keeps what
+is done.
+"""
 
 from __future__ import annotations
 
@@ -50,14 +52,16 @@ def run_tasks(
     each: Callable[[T], None] | None = None,
     kept: Kept | None = None,
 ) -> tuple[list[T], bool]:
-    """Run task 0 .. n_tasks - 1; the results in order, and whether Ctrl-C was pressed before all were complete.
+    """Run task 0 .. n_tasks - 1; the results in order, and whether Ctrl-C was pressed before all
+    were complete.
 
-    `task`: from the number of a task to its result, which depends on the number alone; sent once to every process.
-    `caller`: function that users call, for messages.
-    `chunk`: tasks sent to a process at once: about a second's work, which is also what Ctrl-C waits for.
-    `workers`: processes; 0 stays in this one, None takes as many as there are processors.
-    `each`: called with every result as it arrives, in this process; what it keeps survives whatever comes later.
-    `kept`: results of an earlier call, which are not computed again, and to which each new one is added.
+    `task`: from the number of a task to its result, which depends on the number alone; sent once to
+    every process. `caller`: function that users call, for messages.
+    `chunk`: tasks sent to a process at once: about a second's work, which is also what Ctrl-C waits
+    for. `workers`: processes; 0 stays in this one, None takes as many as there are processors.
+    `each`: called with every result as it arrives, in this process; what it keeps survives whatever
+    comes later. `kept`: results of an earlier call, which are not computed again, and to which each
+    new one is added.
     """
     known: dict[int, T] = {} if kept is None else kept.results(n_tasks)
     results: Numbered[T] = list(known.items())
@@ -112,31 +116,42 @@ def processors() -> int:
 
 
 def _spread(
-    task: Callable[[int], T], n_tasks: int, workers: int, chunk: int, caller: str, keep: Callable[[Numbered[T]], None]
+    task: Callable[[int], T],
+    n_tasks: int,
+    workers: int,
+    chunk: int,
+    caller: str,
+    keep: Callable[[Numbered[T]], None],
 ) -> None:
     try:
         content = pickle.dumps(task)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise SamplingError(
-            f"the settings cannot be sent to other processes ({error}): give functions that a module defines at its "
+            f"the settings cannot be sent to other processes ({error}): give functions that a "
+            "module defines at its "
             "top level, or use workers=0."
         ) from error
     chunks = [range(first, min(first + chunk, n_tasks)) for first in range(0, n_tasks, chunk)]
     with TemporaryFolder() as folder:
-        # A file, because a process that dies while it starts would leave this one waiting at a pipe that is full.
+        # A file, because a process that dies while it starts would leave this one waiting at a pipe
+        # that is full.
         path = Path(folder) / "task.pickle"
         path.write_bytes(content)
         _submit(path, chunks, workers, caller, keep)
 
 
-def _submit(path: Path, chunks: list[range], workers: int, caller: str, keep: Callable[[Numbered[T]], None]) -> None:
+def _submit(
+    path: Path, chunks: list[range], workers: int, caller: str, keep: Callable[[Numbered[T]], None]
+) -> None:
     # Forked processes would inherit the locks of threads that they do not have.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start, initargs=(path,))
     try:
         with interrupt_between_steps() as check, one_thread():
             # Processes start while they are given work, and take along what is blocked.
             with _blocked():
-                pending: set[Future[Numbered[T]]] = {pool.submit(_run, numbers) for numbers in chunks}
+                pending: set[Future[Numbered[T]]] = {
+                    pool.submit(_run, numbers) for numbers in chunks
+                }
             try:
                 while pending:
                     check()
@@ -161,7 +176,9 @@ def _submit(path: Path, chunks: list[range], workers: int, caller: str, keep: Ca
 
 
 def _keep_running(
-    pool: ProcessPoolExecutor, pending: set[Future[Numbered[T]]], keep: Callable[[Numbered[T]], None]
+    pool: ProcessPoolExecutor,
+    pending: set[Future[Numbered[T]]],
+    keep: Callable[[Numbered[T]], None],
 ) -> None:
     """Drop what waits, and keep what was under way."""
     pool.shutdown(cancel_futures=True)
@@ -172,7 +189,9 @@ def _keep_running(
 
 @lru_cache(maxsize=1)
 def _pools(_n_loaded: int) -> Any:
-    """The libraries' pools of threads; looked up again when other modules were loaded, which may have brought one."""
+    """The libraries' pools of threads; looked up again when other modules were loaded, which may
+    have brought one.
+    """
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -180,10 +199,11 @@ def _pools(_n_loaded: int) -> Any:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One BLAS thread in this process and in those that it starts; also a decorator, ``@one_thread()``.
+    """One BLAS thread in this process and in those that it starts; also a decorator,
+    ``@one_thread()``.
 
-    Our matrices are small or thin: more threads take half as much processor time again and save none, fight for the
-    cores with other processes, and sum in another order.
+    Our matrices are small or thin: more threads take half as much processor time again and save
+    none, fight for the cores with other processes, and sum in another order.
     """
     if _limited[0] > 0:
         # A caller has done it.
@@ -240,13 +260,17 @@ def _run(numbers: range) -> Numbered[Any]:
 
 
 def interrupt(number: int, _frame: Any) -> None:
-    """Handler of a signal that ends a command: KeyboardInterrupt, and `caught_signal` knows which it was."""
+    """Handler of a signal that ends a command: KeyboardInterrupt, and `caught_signal` knows which
+    it was.
+    """
     _caught.append(number)
     raise KeyboardInterrupt
 
 
 def caught_signal() -> int | None:
-    """Number of the signal that has ended the work, which is then forgotten; None where there was none."""
+    """Number of the signal that has ended the work, which is then forgotten; None where there was
+    none.
+    """
     number = _caught[-1] if _caught else None
     _caught.clear()
     return number
@@ -254,10 +278,11 @@ def caught_signal() -> int | None:
 
 @contextmanager
 def interrupt_between_steps() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back until the function that this yields is called, which raises KeyboardInterrupt if it was pressed.
+    """Hold Ctrl-C back until the function that this yields is called, which raises
+    KeyboardInterrupt if it was pressed.
 
-    SIGTERM is held back as well where `interrupt` takes it. In a thread other than the main one, which receives no
-    signals, it does nothing.
+    SIGTERM is held back as well where `interrupt` takes it. In a thread other than the main one,
+    which receives no signals, it does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
@@ -276,7 +301,9 @@ def interrupt_between_steps() -> Iterator[Callable[[], None]]:
             raise KeyboardInterrupt
 
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    ours = {n for n, handler in handlers.items() if handler is interrupt or hasattr(handler, "of_steps")}
+    ours = {
+        n for n, handler in handlers.items() if handler is interrupt or hasattr(handler, "of_steps")
+    }
     taken = ours if handlers[signal.SIGINT] is signal.SIG_IGN else ours | {signal.SIGINT}
     previous = {number: signal.signal(number, note) for number in taken}
     try:

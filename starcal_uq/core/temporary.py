@@ -13,7 +13,9 @@ _NAME = re.compile(rf"{_PREFIX}[a-z0-9_]{{8}}")
 
 
 class TemporaryFolder(TemporaryDirectory[str]):
-    """A folder for files of this process; those that killed processes have left are removed first."""
+    """A folder for files of this process; those that killed processes have left are removed
+    first.
+    """
 
     def __init__(self) -> None:
         _sweep()
@@ -34,7 +36,8 @@ class TemporaryFolder(TemporaryDirectory[str]):
 def lock(path: str | os.PathLike[str], flags: int = os.O_RDONLY) -> int | None:
     """Lock a file or a folder as long as the handle is open and the process lives.
 
-    Returns the handle, None where another process has the lock or the path is gone, and -1 where there are no locks.
+    Returns the handle, None where another process has the lock or the path is gone, and -1 where
+    there are no locks.
     """
     try:
         import fcntl
@@ -63,7 +66,9 @@ def lock(path: str | os.PathLike[str], flags: int = os.O_RDONLY) -> int | None:
 
 
 def _sweep() -> None:
-    """Remove folders of this user whose process is gone; others have no lock of this kind in them."""
+    """Remove folders of this user whose process is gone; others have no lock of this kind in
+    them.
+    """
     for path in Path(gettempdir()).glob(f"{_PREFIX}*/{_LOCK}"):
         if not _NAME.fullmatch(path.parent.name) or path.parent.is_symlink() or path.is_symlink():
             continue

@@ -18,25 +18,40 @@ _EXAMPLE = "2026-11-21T03:04:05.6"
 # How images of several nights are given theirs.
 TIMES_IN_NAMES = "where they differ a time in each file's name (2026-11-21T030405_1.fits)"
 
-# Scales that are UTC within 0.9 s, and seconds by which others are ahead of TAI; barycentric time is TT within 2 ms.
+# Scales that are UTC within 0.9 s, and seconds by which others are ahead of TAI; barycentric time
+# is TT within 2 ms.
 _UTC_NAMES = ("UTC", "UT", "UT1", "GMT")
-_AHEAD_OF_TAI_S = {"TAI": 0.0, "IAT": 0.0, "GPS": -19.0, "TT": 32.184, "TDT": 32.184, "ET": 32.184, "TDB": 32.184}
+_AHEAD_OF_TAI_S = {
+    "TAI": 0.0,
+    "IAT": 0.0,
+    "GPS": -19.0,
+    "TT": 32.184,
+    "TDT": 32.184,
+    "ET": 32.184,
+    "TDB": 32.184,
+}
 
 _ISO = re.compile(
-    r"(\d{4})-(\d\d)-(\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d*)?))?)?\s*(Z|UTC|[+-]\d\d:?\d\d)?", re.ASCII
+    r"(\d{4})-(\d\d)-(\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d*)?))?)?\s*(Z|UTC|[+-]\d\d:?\d\d)?",
+    re.ASCII,
 )
 
 
-def julian_days(time_utc: Any, ut1_minus_utc_s: float = 0.0) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Two-part Julian dates TT and UT1 (m, 2) of the different times among n, and which of them each time is (n,).
+def julian_days(
+    time_utc: Any, ut1_minus_utc_s: float = 0.0
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Two-part Julian dates TT and UT1 (m, 2) of the different times among n, and which of them
+    each time is (n,).
 
-    A time is ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as "+02:00" is understood),
-    `datetime.datetime` or `numpy.datetime64`, UTC without an offset. CatalogueError quotes one that is not readable,
-    with its place among several, from 1.
+    A time is ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as "+02:00"
+    is understood), `datetime.datetime` or `numpy.datetime64`, UTC without an offset. CatalogueError
+    quotes one that is not readable, with its place among several, from 1.
     """
     times = np.atleast_1d(np.asarray(time_utc)).astype(str)
     unique, inverse = np.unique(times, return_inverse=True)
-    days = np.array([_days(str(text), times, ut1_minus_utc_s) for text in unique], dtype=np.float64).reshape(-1, 2, 2)
+    days = np.array(
+        [_days(str(text), times, ut1_minus_utc_s) for text in unique], dtype=np.float64
+    ).reshape(-1, 2, 2)
     return days[:, 0], days[:, 1], inverse.reshape(-1).astype(np.int64)
 
 
@@ -47,7 +62,8 @@ def julian_year(time_utc: Any) -> float:
 
 
 def utc_text(time: str) -> str:
-    """One UTC time as tables hold it, YYYY-MM-DDTHH:MM:SS[.f]; an offset such as "+02:00" is taken out.
+    """One UTC time as tables hold it, YYYY-MM-DDTHH:MM:SS[.f]; an offset such as "+02:00" is taken
+    out.
 
     CatalogueError quotes one that is not readable, or a date alone.
     """
@@ -55,7 +71,9 @@ def utc_text(time: str) -> str:
     if match is not None and match[4] is None and match[7] is None:
         # Dates that do not exist are named as such.
         julian_days(time)
-        raise CatalogueError(f"The time {shown(time)} is a date without a time of day; write it as {_EXAMPLE}.")
+        raise CatalogueError(
+            f"The time {shown(time)} is a date without a time of day; write it as {_EXAMPLE}."
+        )
     try:
         if match is None or match[4] is None:
             raise ValueError("not ISO 8601")
@@ -73,7 +91,9 @@ def utc_text(time: str) -> str:
 
 
 def utc_of_scale(time: datetime, scale: str) -> datetime:
-    """UTC of a time without zone in another scale, such as TAI or TT; ValueError for an unknown one."""
+    """UTC of a time without zone in another scale, such as TAI or TT; ValueError for an unknown
+    one.
+    """
     import erfa
 
     if scale in _UTC_NAMES:
@@ -92,10 +112,14 @@ def utc_of_scale(time: datetime, scale: str) -> datetime:
 
 def _unreadable(text: str, place: str = "") -> CatalogueError:
     years = f"between {FIRST_YEAR} and {LAST_YEAR}"
-    return CatalogueError(f"The time {shown(text)}{place} is not a UTC time {years}; write it as {_EXAMPLE}.")
+    return CatalogueError(
+        f"The time {shown(text)}{place} is not a UTC time {years}; write it as {_EXAMPLE}."
+    )
 
 
-def _days(text: str, times: Any, ut1_minus_utc_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def _days(
+    text: str, times: Any, ut1_minus_utc_s: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """Two-part Julian dates, TT and UT1, of one UTC time."""
     import erfa
 
@@ -108,8 +132,9 @@ def _days(text: str, times: Any, ut1_minus_utc_s: float) -> tuple[tuple[float, f
         year, month, day, hour, minute = (int(group or 0) for group in match.groups()[:5])
         second = float(match[6] or 0.0)
         with warnings.catch_warnings():
-            # "Dubious year": leap seconds of the future are not known; ten of them change the Earth's velocity by
-            # 6e-5 km/s. "Time is after end of day" and the like are errors of the input.
+            # "Dubious year": leap seconds of the future are not known; ten of them change the
+            # Earth's velocity by 6e-5 km/s. "Time is after end of day" and the like are errors of
+            # the input.
             warnings.simplefilter("error", erfa.ErfaWarning)
             warnings.filterwarnings("ignore", message=".*dubious year", category=erfa.ErfaWarning)
             utc = erfa.dtf2d("UTC", year, month, day, hour, minute, second)

@@ -1,4 +1,6 @@
-"""Tables of TOML files that people write: read and checked in one way, with one sentence for whatever is wrong."""
+"""Tables of TOML files that people write: read and checked in one way, with one sentence for
+whatever is wrong.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,13 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 
-def read_toml(path: PathLike, name: str, error: type[StarcalError], missing: str = "check the path") -> AnyDict:
+def read_toml(
+    path: PathLike, name: str, error: type[StarcalError], missing: str = "check the path"
+) -> AnyDict:
     """Content of a TOML file in UTF-8, with or without a byte order mark.
 
-    `name` is its subject in messages, such as "camera", and `missing` the remedy for a file that does not exist.
+    `name` is its subject in messages, such as "camera", and `missing` the remedy for a file that
+    does not exist.
     """
     path = Path(path)
     if os.path.isdir(path):
@@ -34,10 +39,14 @@ def read_toml(path: PathLike, name: str, error: type[StarcalError], missing: str
     except FileNotFoundError:
         raise error(f"{where} does not exist; {missing}.") from None
     except OSError as problem:
-        raise error(f"{where} cannot be read ({problem.strerror}); check its permissions.") from problem
+        raise error(
+            f"{where} cannot be read ({problem.strerror}); check its permissions."
+        ) from problem
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
         if path.suffix.lower() != ".toml":
-            raise error(f"{path}: is no TOML, as a {name} file is; check the order of the arguments.") from None
+            raise error(
+                f"{path}: is no TOML, as a {name} file is; check the order of the arguments."
+            ) from None
         if isinstance(problem, tomllib.TOMLDecodeError):
             raise error(f"{where} is not valid TOML: {problem}; correct that line.") from None
         raise error(f"{where} is not UTF-8 text; save it as TOML in UTF-8.") from None
@@ -47,13 +56,22 @@ def read_toml(path: PathLike, name: str, error: type[StarcalError], missing: str
         raise error(f"{where} nests its values too deeply; write plain tables and lists.") from None
 
 
-def read_section(path: PathLike, name: str, error: type[StarcalError], *, alone: bool = True) -> AnyDict:
+def read_section(
+    path: PathLike, name: str, error: type[StarcalError], *, alone: bool = True
+) -> AnyDict:
     """The table ``[name]`` of a TOML file; with `alone`, nothing may stand outside it."""
     content = read_toml(path, name, error)
     write = f"write [{name}] above its keys"
     if name not in content:
         empty = "" if content else f"the {name} file is empty: "
-        other = next((f", and [{key}] is there" for key, value in content.items() if isinstance(value, dict)), "")
+        other = next(
+            (
+                f", and [{key}] is there"
+                for key, value in content.items()
+                if isinstance(value, dict)
+            ),
+            "",
+        )
         remedy = f"give another file, or {write}" if other else write
         raise error(f"{path}: {empty}section [{name}] is missing{other}; {remedy}.")
     section = content.pop(name)
@@ -61,11 +79,15 @@ def read_section(path: PathLike, name: str, error: type[StarcalError], *, alone:
         raise error(f"{path}: {name} is no section; {write}.")
     if content and alone:
         first = next(iter(content))
-        raise error(f"{path}: {first} stands outside section [{name}]; remove it or move it below [{name}].")
+        raise error(
+            f"{path}: {first} stands outside section [{name}]; remove it or move it below [{name}]."
+        )
     return section
 
 
-def write_section(path: PathLike, name: str, table: Mapping[str, Any], header: str, force: bool) -> None:
+def write_section(
+    path: PathLike, name: str, table: Mapping[str, Any], header: str, force: bool
+) -> None:
     """Write a table ``[name]`` without loss of digits, below comments that explain its keys."""
     import tomli_w
 
@@ -81,10 +103,11 @@ def unknown_key(key: str, known: Collection[str]) -> str:
 
 
 class Key:
-    """What may stand under a key: its type, and the text of what to write, said wherever it is missing or wrong.
+    """What may stand under a key: its type, and the text of what to write, said wherever it is
+    missing or wrong.
 
-    A whole number may stand for a float, but neither text nor a truth value for a number. The bounds are limits as of
-    `pydantic.Field`, such as ``gt=0``.
+    A whole number may stand for a float, but neither text nor a truth value for a number. The
+    bounds are limits as of `pydantic.Field`, such as ``gt=0``.
     """
 
     words: tuple[str, ...] = ()

@@ -18,6 +18,8 @@ Shapes: TypeAlias = Mapping[str, tuple[int | str, ...]]
 
 
 def unaliased(hint: Any) -> Any:
-    """An annotation without the type statement by which NumPy 2.5 declares NDArray, where Python has one."""
+    """An annotation without the type statement by which NumPy 2.5 declares NDArray, where Python
+    has one.
+    """
     origin = get_origin(hint)
     return origin.__value__[get_args(hint)] if hasattr(origin, "__value__") else hint

@@ -1,15 +1,16 @@
 """Is refraction in the residuals, and where would the camera have stood?
 
-Air raises a star at zenith distance z by about A tan z: what the attitude and the focal length leave of that is a
-compression towards the zenith that grows with z. Where frames have times, a place on the Earth has one zenith for each;
-without times all frames are taken to be of one moment. For places all over the globe from which every star was
-above the horizon, the amplitude of refraction is fitted in units of the standard air's; the largest amplitude in its
-sigmas is compared with the largest of as many that noise gives, which are as correlated as their shapes. Frames without
-times that are not of one moment get a zenith each.
+Air raises a star at zenith distance z by about A tan z: what the attitude and the focal length
+leave of that is a compression towards the zenith that grows with z. Where frames have times, a
+place on the Earth has one zenith for each; without times all frames are taken to be of one moment.
+For places all over the globe from which every star was above the horizon, the amplitude of
+refraction is fitted in units of the standard air's; the largest amplitude in its sigmas is compared
+with the largest of as many that noise gives, which are as correlated as their shapes. Frames
+without times that are not of one moment get a zenith each.
 
-Noise is that of the calibration: its model of the images' noise, and the direction errors of stars that it fitted or,
-where it fitted none, that the stars which recur show. Terms that the lens may lack are fitted beside the air. What
-these explain as well as air does cannot be separated from it.
+Noise is that of the calibration: its model of the images' noise, and the direction errors of stars
+that it fitted or, where it fitted none, that the stars which recur show. Terms that the lens may
+lack are fitted beside the air. What these explain as well as air does cannot be separated from it.
 """
 
 from __future__ import annotations
@@ -44,10 +45,11 @@ if TYPE_CHECKING:
 
 # False alarms where there is no air.
 AIR_P = 1e-3
-# Density of the air in that of the standard air at sea level: its spread before any data, least (4 km) and most.
+# Density of the air in that of the standard air at sea level: its spread before any data, least (4
+# km) and most.
 _DENSITY_SPREAD, _THIN, _THICK = 0.2, 0.64, 1.06
-# What leaves all of these with less probability is another misfit: chi-square of the amplitude, or a share of what air
-# explains that refraction by two constants may leave.
+# What leaves all of these with less probability is another misfit: chi-square of the amplitude, or
+# a share of what air explains that refraction by two constants may leave.
 _AIR_CHI2, _INEXACT = 10.8, 0.01
 _PLACES, _DRAWS, _FRAMES, _STARS = 600, 4000, 200, 4000
 # Frames that get a zenith each.
@@ -56,8 +58,9 @@ _FRAMES_APIECE = 80
 _LOWEST = np.sin(np.radians(5.0))
 # Damped steps towards the best zeniths, until chi-square falls by less than a tenth.
 _STEPS, _STEP_RAD, _LONGEST_RAD, _SETTLED = 24, 1e-3, 0.2, 0.1
-# Zeniths that are tried for a frame by itself: distances from its boresight, degrees, and directions. Tangents of a
-# distance common to all frames from which the search starts, and its rounds.
+# Zeniths that are tried for a frame by itself: distances from its boresight, degrees, and
+# directions. Tangents of a distance common to all frames from which the search starts, and its
+# rounds.
 _DISTANCES_DEG, _AROUND, _TANGENTS, _ROUNDS = np.arange(5.0, 81.0, 7.5), 16, (0.4, 1.0, 2.0), 6
 # A share of a shape's square that is not there, where all of the rest is absorbed.
 _ABSORBED = 1e-8
@@ -72,26 +75,27 @@ class AirTest:
     Attributes
     ----------
     p_value : float
-        Probability of so large an amplitude anywhere, or of so much explained by a zenith for each frame, if there is
-        no refraction, whatever terms the lens lacks.
+        Probability of so large an amplitude anywhere, or of so much explained by a zenith for each
+        frame, if there is no refraction, whatever terms the lens lacks.
     amplitude, amplitude_std : float
-        Amplitude in units of standard air and its standard error: the density of the air found, or where there is
-        none the largest amplitude in its errors of the places tried.
+        Amplitude in units of standard air and its standard error: the density of the air found, or
+        where there is none the largest amplitude in its errors of the places tried.
     is_air : bool
-        Whether it is significant (`AIR_P`), the air of one place, as dense as from the sea to 4 km, explains as much,
-        and frames have no more scale and shape of their own than that gives them.
+        Whether it is significant (`AIR_P`), the air of one place, as dense as from the sea to 4 km,
+        explains as much, and frames have no more scale and shape of their own than that gives them.
     latitude_deg, longitude_deg : float
         That place, north and east positive; NaN where it is none, or frames have no times.
     latitude_std_deg, longitude_std_deg : float
         Standard errors.
     f_px, f_sigma : float
-        How much too short f is without refraction, px and in its standard deviations; NaN where there is none.
+        How much too short f is without refraction, px and in its standard deviations; NaN where
+        there is none.
     n_frames : int
         Frames that were looked at.
     like_others : bool
-        Whether air explains what is left, and terms that the lens may lack or a drift of f explain it as well: where
-        the horizon keeps its place in the camera, refraction is a scale and skew of the axes. Then `f_px` is what
-        would hold if it is air.
+        Whether air explains what is left, and terms that the lens may lack or a drift of f explain
+        it as well: where the horizon keeps its place in the camera, refraction is a scale and skew
+        of the axes. Then `f_px` is what would hold if it is air.
     """
 
     p_value: float
@@ -110,7 +114,9 @@ class AirTest:
 
 @bounded
 @one_thread()
-def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, stars: StarTest | None = None) -> AirTest | None:
+def air_test(
+    obs: Observations, cal: Calibration, *, seed: int = 0, stars: StarTest | None = None
+) -> AirTest | None:
     """Look for refraction in the residuals of a calibration.
 
     Parameters
@@ -125,8 +131,8 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, stars: StarT
     Returns
     -------
     AirTest or None
-        None where the camera was in space, or where from no place all stars were above the horizon and frames by
-        themselves hold no scale and shape.
+        None where the camera was in space, or where from no place all stars were above the horizon
+        and frames by themselves hold no scale and shape.
     """
     if obs.meta.get("observer") in _NO_AIR:
         return None
@@ -157,8 +163,12 @@ def _rms(sigma_px: FloatArray | None) -> float:
     return 1.0 if sigma_px is None else float(np.sqrt(np.mean(sigma_px**2)))
 
 
-def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> tuple[StarErrors, float] | None:
-    """Direction errors of the stars and the noise of their images: those fitted, or those that recurring stars show."""
+def _star_noise(
+    obs: Observations, cal: Calibration, found: StarTest
+) -> tuple[StarErrors, float] | None:
+    """Direction errors of the stars and the noise of their images: those fitted, or those that
+    recurring stars show.
+    """
     if cal.star_errors is not None:
         return cal.star_errors, cal.sigma
     if not found.tau_px > 0.0:
@@ -171,11 +181,12 @@ def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> tuple[S
 
 
 class Remainder:
-    """Residuals of some frames, and of what displaces stars that part which attitudes and parameters cannot take up.
+    """Residuals of some frames, and of what displaces stars that part which attitudes and
+    parameters cannot take up.
 
-    `obs` has the noise of its stars as the estimate weighs them. `residuals` (m,) are whitened, with `dof` degrees of
-    freedom and scatter `sigma`: m = 2 N, x of all stars before y, and where stars bring errors along, which `errors`
-    holds with the noise of images, two more for each star.
+    `obs` has the noise of its stars as the estimate weighs them. `residuals` (m,) are whitened,
+    with `dof` degrees of freedom and scatter `sigma`: m = 2 N, x of all stars before y, and where
+    stars bring errors along, which `errors` holds with the noise of images, two more for each star.
     """
 
     def __init__(
@@ -186,20 +197,26 @@ class Remainder:
         errors: tuple[StarErrors, float] | None = None,
         most: int = _FRAMES,
     ) -> None:
-        chosen = one_of_each(obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed)
+        chosen = one_of_each(
+            obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed
+        )
         self.obs = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
         model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
         self.likelihood = MarginalLikelihood(self.obs, model, axes=True)
         if errors is not None:
             self.likelihood = StarLikelihood(self.obs, model, cal.theta, rotations, *errors)
         self.state, _ = self.likelihood.profile(cal.theta, rotations)
-        slopes = self.likelihood.whitened(self.state, self.likelihood.derivatives(cal.theta, self.state))
+        slopes = self.likelihood.whitened(
+            self.state, self.likelihood.derivatives(cal.theta, self.state)
+        )
         self.basis, self._triangle = np.linalg.qr(slopes.T)
         e = self.likelihood.whitened(self.state, self.state.e[None])[0]
         self.residuals: FloatArray = e - self.basis @ (self.basis.T @ e)
         self.dof = max(self.likelihood.dof - len(cal.theta), 1)
         # Errors of few stars are known less well than the noise of their images.
-        self.least_dof = self.dof if errors is None else max(2 * errors[0].n_recurring - 3 - len(cal.theta), 1)
+        self.least_dof = (
+            self.dof if errors is None else max(2 * errors[0].n_recurring - 3 - len(cal.theta), 1)
+        )
 
     @property
     def sigma(self) -> float:
@@ -207,8 +224,12 @@ class Remainder:
         return float(np.sqrt(self.residuals @ self.residuals / self.dof))
 
     def shift(self, moved: FloatArray) -> FloatArray:
-        """Whitened shifts (2, N) of images by small moves (3, N) of the stars, camera frame, rad."""
-        shifts: FloatArray = np.einsum("ixn,in->xn", self.state.attitude, np.cross(self.state.b, moved, axis=0))
+        """Whitened shifts (2, N) of images by small moves (3, N) of the stars, camera frame,
+        rad.
+        """
+        shifts: FloatArray = np.einsum(
+            "ixn,in->xn", self.state.attitude, np.cross(self.state.b, moved, axis=0)
+        )
         return shifts
 
     def left(self, shifts: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -225,7 +246,9 @@ class Remainder:
 
     def beside(self, shifts: FloatArray) -> Remainder:
         """The same where shifts (g, 2, N) are fitted as well."""
-        flat = self.left(shifts)[0] / np.linalg.norm(shifts.reshape(len(shifts), -1), axis=1)[:, None]
+        flat = (
+            self.left(shifts)[0] / np.linalg.norm(shifts.reshape(len(shifts), -1), axis=1)[:, None]
+        )
         more = _orthonormal(flat)
         found = copy(self)
         found.basis = np.concatenate([self.basis, more.T], axis=1)
@@ -243,22 +266,32 @@ def _orthonormal(rows: FloatArray, least: float = 1e-6) -> FloatArray:
 
 
 class _Settled(NamedTuple):
-    """Zeniths (n, 3) whose air explains the most, its density, shifts (2, N) by it, what is left of these (m,)."""
+    """Zeniths (n, 3) whose air explains the most, its density, shifts (2, N) by it, what is left of
+    these (m,).
+    """
 
     zeniths: FloatArray
     density: float
     shift: FloatArray
     column: FloatArray
-    errors: FloatArray  # Standard errors: of moves of the zeniths along their tangents, rad, and of the density
+    # Standard errors: of moves of the zeniths along their tangents, rad, and of the density
+    errors: FloatArray
 
 
 class _Air:
     """Refraction of some frames from any place."""
 
-    def __init__(self, obs: Observations, cal: Calibration, seed: int, errors: tuple[StarErrors, float] | None) -> None:
+    def __init__(
+        self,
+        obs: Observations,
+        cal: Calibration,
+        seed: int,
+        errors: tuple[StarErrors, float] | None,
+    ) -> None:
         timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
         rest = Remainder(obs, cal, seed, errors, _FRAMES if timed else _FRAMES_APIECE)
-        # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is without these.
+        # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is
+        # without these.
         likelihood, state, camera = rest.likelihood, rest.state, cal.camera
         view = View.of(likelihood, state, camera.theta, slice(0, likelihood.frames.n_stars))
         others = (*lens_shapes(camera), *focal_drift(rest.obs))
@@ -284,7 +317,9 @@ class _Air:
         return found
 
     def _taken(self, shift_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened shifts (1, 2, N) of shifts (2, N) of images, px, and what parameters take up of them (p,)."""
+        """Whitened shifts (1, 2, N) of shifts (2, N) of images, px, and what parameters take up of
+        them (p,).
+        """
         shifts = np.array(shift_px)[None]
         self._alone.likelihood.frames.whiten(shifts)
         return shifts, self._alone.left(shifts)[1][0]
@@ -324,7 +359,9 @@ class _Air:
         return found
 
     def _shift(self, zeniths: FloatArray) -> FloatArray:
-        """Whitened shifts (2, N) by standard air below zeniths (K, 3) of the frames, camera frame."""
+        """Whitened shifts (2, N) by standard air below zeniths (K, 3) of the frames, camera
+        frame.
+        """
         return self._raised(self._rest.likelihood.frames.spread(np.ascontiguousarray(zeniths.T)))
 
     def _possible(self, places: FloatArray) -> FloatArray:
@@ -340,7 +377,9 @@ class _Air:
         places = self._possible(_sphere(_PLACES))
         if not len(places):
             return None
-        alone, _ = self._alone.left(np.stack([self._shift(self._above(place[None])) for place in places]))
+        alone, _ = self._alone.left(
+            np.stack([self._shift(self._above(place[None])) for place in places])
+        )
         rest, columns = self._rest, self._rest.cleared(alone)
         p_value, amplitude, std = _largest(rest, columns, seed)
         found = AirTest(p_value, amplitude, std, n_frames=rest.obs.n_frames)
@@ -351,7 +390,9 @@ class _Air:
         gain = 2.0 * columns @ rest.residuals - np.sum(columns**2, axis=1)
         settled = self._settled(rest, places[np.argmax(gain)][None], self._above)
         gained, most = _gained(rest, settled.column), _most(rest, columns)
-        good = most - gained < max(_AIR_CHI2, _INEXACT * most) and self._nothing_else(rest, settled.column)
+        good = most - gained < max(_AIR_CHI2, _INEXACT * most) and self._nothing_else(
+            rest, settled.column
+        )
         if not good:
             return found
         found = self._with(found, settled, rest)
@@ -368,9 +409,13 @@ class _Air:
         )
 
     def of_each_frame(self) -> AirTest | None:
-        """Air with a zenith for every frame; None where frames by themselves hold no scale and shape."""
+        """Air with a zenith for every frame; None where frames by themselves hold no scale and
+        shape.
+        """
         found = self._of_each_frame(self._rest)
-        return self._of_each_frame(self._alone) if found is None or found.p_value >= AIR_P else found
+        return (
+            self._of_each_frame(self._alone) if found is None or found.p_value >= AIR_P else found
+        )
 
     def _of_each_frame(self, rest: Remainder) -> AirTest | None:
         own, k = self._own_shapes(rest), rest.obs.n_frames
@@ -381,8 +426,9 @@ class _Air:
         p_value = _f_tail(gained * rest.sigma**2, len(own), rest)
         good = p_value < AIR_P and self._nothing_else(rest, settled.column, k)
         if rest is not self._alone:
-            # A focal length of each frame, or a shape without the scale of air, is not air: that has to explain more
-            # than either, even with all that noise gives to what that one leaves out.
+            # A focal length of each frame, or a shape without the scale of air, is not air: that
+            # has to explain more than either, even with all that noise gives to what that one
+            # leaves out.
             for first, last in ((0, 1), (1, 3)):
                 one = _explained(rest, self._own_shapes(rest, slice(first, last))) / rest.sigma**2
                 good = good and gained > one + (3 - last + first) * k + _AIR_CHI2
@@ -390,11 +436,19 @@ class _Air:
         return self._with(found, settled, rest) if good else found
 
     def _with(self, found: AirTest, settled: _Settled, rest: Remainder) -> AirTest:
-        """What was found, with the air that explains it, beside terms of the lens or only without these."""
+        """What was found, with the air that explains it, beside terms of the lens or only without
+        these.
+        """
         self.seen_px = rest.likelihood.frames.in_pixels(settled.shift)
         f_px = self.f_px(self.seen_px)
         alike, errors = rest is self._alone, float(settled.errors[-1])
-        found = replace(found, amplitude=settled.density, amplitude_std=errors, is_air=not alike, like_others=alike)
+        found = replace(
+            found,
+            amplitude=settled.density,
+            amplitude_std=errors,
+            is_air=not alike,
+            like_others=alike,
+        )
         return replace(found, f_px=f_px, f_sigma=f_px / float(self._cal.sigmas[2]))
 
     @cached_property
@@ -404,15 +458,20 @@ class _Air:
         return rows.reshape(*self._own.shape[:2], -1)
 
     def _own_shapes(self, rest: Remainder, which: slice = slice(None)) -> FloatArray:
-        """What is left of scale and shape of each frame by itself, as orthonormal rows; `which` of the three."""
+        """What is left of scale and shape of each frame by itself, as orthonormal rows; `which` of
+        the three.
+        """
         shifts = self._own[which].reshape(-1, *self._own.shape[2:])
         rows = self._own_left[which].reshape(len(shifts), -1)
         if rest is self._rest:
             rows = rest.cleared(rows)
-        return _orthonormal(rows / np.linalg.norm(shifts.reshape(len(rows), -1), axis=1)[:, None], _ABSORBED)
+        return _orthonormal(
+            rows / np.linalg.norm(shifts.reshape(len(rows), -1), axis=1)[:, None], _ABSORBED
+        )
 
     def _nothing_else(self, rest: Remainder, column: FloatArray, fitted: int = 0) -> bool:
-        """Whether frames by themselves, without that air, differ in scale and shape no more than by noise.
+        """Whether frames by themselves, without that air, differ in scale and shape no more than by
+        noise.
 
         `fitted` is how many numbers of the air the frames' own shapes have determined.
         """
@@ -421,10 +480,14 @@ class _Air:
         tail = _f_tail(explained, max(len(rows) - fitted, 1), rest, float(left @ left))
         return tail > AIR_P or explained < _INEXACT * float(column @ column)
 
-    def _settled(self, rest: Remainder, zeniths: FloatArray, above: Callable[[FloatArray], FloatArray]) -> _Settled:
-        """The zeniths (n, 3) near to these whose air explains the most; `above` makes the frames' (K, 3) of them.
+    def _settled(
+        self, rest: Remainder, zeniths: FloatArray, above: Callable[[FloatArray], FloatArray]
+    ) -> _Settled:
+        """The zeniths (n, 3) near to these whose air explains the most; `above` makes the frames'
+        (K, 3) of them.
 
-        Levenberg's damped steps; the density of the air is fitted as well, with what is known of it.
+        Levenberg's damped steps; the density of the air is fitted as well, with what is known of
+        it.
         """
         scale, damping, least = rest.sigma**2, 1e-3, np.inf
         known, density, trial, trial_density = zeniths, 1.0, zeniths, 1.0
@@ -437,7 +500,9 @@ class _Air:
                 gained, least, damping = least - cost, cost, 0.2 * damping
                 known, density, found = trial, trial_density, (shift, column)
                 tangents = _tangents(known)
-                moved = [self._shift(above(_unit(known + _STEP_RAD * way))) * density for way in tangents]
+                moved = [
+                    self._shift(above(_unit(known + _STEP_RAD * way))) * density for way in tangents
+                ]
                 slopes = (np.stack(moved) - shift) / _STEP_RAD
                 if len(known) > 1:
                     slopes = self._apart(slopes)
@@ -450,12 +515,16 @@ class _Air:
             else:
                 damping *= 10.0
             diagonal = np.diag(matrix)
-            step = np.linalg.solve(matrix + np.diag(damping * (diagonal + 1e-9 * diagonal.max())), pull)
+            step = np.linalg.solve(
+                matrix + np.diag(damping * (diagonal + 1e-9 * diagonal.max())), pull
+            )
             turn = step[:-1].reshape(2, -1)
             turn = turn * np.minimum(1.0, _LONGEST_RAD / np.maximum(np.hypot(*turn), 1e-12))
             trial = _unit(known + turn[0][:, None] * tangents[0] + turn[1][:, None] * tangents[1])
             trial_density = float(np.clip(density + step[-1], _THIN, _THICK))
-        return _Settled(known, density, *found, np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True))))
+        return _Settled(
+            known, density, *found, np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True)))
+        )
 
     def _zeniths_apiece(self) -> FloatArray:
         """Zeniths (K, 3), camera frame, that explain the most of each frame by itself, from a grid.
@@ -465,7 +534,9 @@ class _Air:
         likelihood, state = self._rest.likelihood, self._rest.state
         frames, n = likelihood.frames, likelihood.frames.n_stars
         grid = _around(_DISTANCES_DEG)
-        shifts = np.stack([self._raised(np.broadcast_to(zenith[:, None], (3, n))) for zenith in grid])
+        shifts = np.stack(
+            [self._raised(np.broadcast_to(zenith[:, None], (3, n))) for zenith in grid]
+        )
         lowest = np.minimum.reduceat(grid @ state.b, frames.starts[:-1], axis=1)
         columns = likelihood.project_out(state, shifts)
         size = np.where(lowest > _LOWEST, frames.sum(np.sum(columns**2, axis=1)), np.inf)
@@ -475,7 +546,9 @@ class _Air:
         number, star = np.repeat(np.arange(frames.n_frames), frames.sizes), np.arange(n)
         best, least = np.zeros(frames.n_frames, dtype=np.int64), np.inf
         for tangent in _TANGENTS:
-            left = e - h[2] * (self._cal.camera.focal_px * self._constants[0] * (1.0 + 0.5 * tangent**2))
+            left = e - h[2] * (
+                self._cal.camera.focal_px * self._constants[0] * (1.0 + 0.5 * tangent**2)
+            )
             for _ in range(_ROUNDS):
                 gain = 2.0 * frames.sum(np.sum(columns * left, axis=1)) - size
                 chosen = np.argmax(gain, axis=0)
@@ -488,14 +561,19 @@ class _Air:
 
 
 def _largest(rest: Remainder, columns: FloatArray, seed: int) -> tuple[float, float, float]:
-    """Probability that noise gives so large an amplitude of one of columns (g, m); that amplitude and its error."""
+    """Probability that noise gives so large an amplitude of one of columns (g, m); that amplitude
+    and its error.
+    """
     length = np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
     z = columns @ rest.residuals / length / rest.sigma
     best = int(np.argmax(z))
     rng = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(columns @ columns.T / np.outer(length, length))
     kept = values > 1e-10 * values[-1]
-    noise = rng.standard_normal((_DRAWS, int(np.count_nonzero(kept)))) @ (vectors[:, kept] * np.sqrt(values[kept])).T
+    noise = (
+        rng.standard_normal((_DRAWS, int(np.count_nonzero(kept))))
+        @ (vectors[:, kept] * np.sqrt(values[kept])).T
+    )
     dof = min(rest.dof, rest.least_dof)
     noise /= np.sqrt(rng.chisquare(dof, _DRAWS) / dof)[:, None]
     p_value = (1.0 + float(np.count_nonzero(noise.max(axis=1) >= z[best]))) / (_DRAWS + 1.0)
@@ -519,7 +597,9 @@ def _most(rest: Remainder, columns: FloatArray) -> float:
 
 
 def _f_tail(explained: float, rank: int, rest: Remainder, total: float | None = None) -> float:
-    """Probability that noise gives so much of a sum of squares `total`, that of the residuals, to `rank` numbers."""
+    """Probability that noise gives so much of a sum of squares `total`, that of the residuals, to
+    `rank` numbers.
+    """
     from scipy.special import fdtrc
 
     dof = rest.dof - rank
@@ -530,7 +610,8 @@ def _f_tail(explained: float, rank: int, rest: Remainder, total: float | None = 
 
 
 def _earth(obs: Observations) -> tuple[FloatArray, bool]:
-    """Axes of the Earth among the stars for each frame, (K, 3, 3) by rows, and whether they are known.
+    """Axes of the Earth among the stars for each frame, (K, 3, 3) by rows, and whether they are
+    known.
 
     Without times of all frames one moment's will do, whose Earth is turned as if it did not matter.
     """
@@ -539,7 +620,10 @@ def _earth(obs: Observations) -> tuple[FloatArray, bool]:
         return np.broadcast_to(np.eye(3), (obs.n_frames, 3, 3)), False
     ways = ((0.0, 0.0), (0.0, 90.0), (90.0, 0.0))
     try:
-        axes = [site_among_stars(Site(latitude, longitude), obs.time_utc[first])[0] for latitude, longitude in ways]
+        axes = [
+            site_among_stars(Site(latitude, longitude), obs.time_utc[first])[0]
+            for latitude, longitude in ways
+        ]
     except StarcalError:
         return np.broadcast_to(np.eye(3), (obs.n_frames, 3, 3)), False
     return np.stack(axes, axis=1), True
@@ -558,9 +642,13 @@ def _around(distances_deg: FloatArray) -> FloatArray:
     """Directions (g, 3) at some distances from +z, all around."""
     distance, angle = (
         grid.ravel()
-        for grid in np.meshgrid(np.radians(distances_deg), 2.0 * np.pi / _AROUND * np.arange(_AROUND), indexing="ij")
+        for grid in np.meshgrid(
+            np.radians(distances_deg), 2.0 * np.pi / _AROUND * np.arange(_AROUND), indexing="ij"
+        )
     )
-    return np.column_stack([np.sin(distance) * np.cos(angle), np.sin(distance) * np.sin(angle), np.cos(distance)])
+    return np.column_stack(
+        [np.sin(distance) * np.cos(angle), np.sin(distance) * np.sin(angle), np.cos(distance)]
+    )
 
 
 def _tangents(places: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,8 +1,8 @@
 """Everything that questions the model of a run, in one result that is stored with it.
 
-The tests for misfit and for errors of the stars, the jackknife, the comparison of distortion models, the posterior
-predictive check and fits from other starts take seconds; the report reads what is stored, and leaves out what was made
-from another calibration.
+The tests for misfit and for errors of the stars, the jackknife, the comparison of distortion
+models, the posterior predictive check and fits from other starts take seconds; the report reads
+what is stored, and leaves out what was made from another calibration.
 """
 
 from __future__ import annotations
@@ -39,10 +39,12 @@ if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 
-# How far the other starts are from the nominal camera: of its focal length, and of the detector's longer side.
+# How far the other starts are from the nominal camera: of its focal length, and of the detector's
+# longer side.
 _START_FOCAL, _START_CENTRE = 0.05, 0.1
 _SAME_SIGMA, _BETTER = 0.1, 1e-6
-# Stars and frames that fits from other starts need, and how far chance puts their optimum from that of all.
+# Stars and frames that fits from other starts need, and how far chance puts their optimum from that
+# of all.
 _START_STARS, _FEWEST_FRAMES, _NEAR_SIGMA = 3000, 200, 6.0
 
 
@@ -55,7 +57,8 @@ class MultiStart:
     n : int
         Starts.
     same : int
-        Starts that reached the same optimum, within a tenth of a standard deviation of every parameter.
+        Starts that reached the same optimum, within a tenth of a standard deviation of every
+        parameter.
     better : int
         Starts that reached a better one.
     failed : int
@@ -67,8 +70,8 @@ class MultiStart:
     of_frames : int
         Frames of the calibration.
     start : tuple of float
-        Start that reached the best optimum, where that is a better one: focal length, principal point (px); else
-        empty.
+        Start that reached the best optimum, where that is a better one: focal length, principal
+        point (px); else empty.
     focal_unit : str
         Unit of its focal length: "mm", or "px" where the pixel pitch is unknown.
     """
@@ -107,14 +110,15 @@ class Diagnosis(Shown, Saved):
     stars : StarTest or None
         Errors that stars bring along; None in a diagnosis of an earlier version.
     air : AirTest or None
-        Refraction in the residuals; None where there cannot be any, or in a diagnosis of an earlier version.
+        Refraction in the residuals; None where there cannot be any, or in a diagnosis of an earlier
+        version.
     cameras : MixedCameras or None
         Several cameras, where the frames' own focal lengths ask for them.
     times : TimeTest or None
         Another time or epoch, where the residuals ask for one.
     aberration : UnseenAberration or None
-        What aberration that is left out or applied twice would do to f unseen; None where it would be seen, or in a
-        diagnosis of an earlier version.
+        What aberration that is left out or applied twice would do to f unseen; None where it would
+        be seen, or in a diagnosis of an earlier version.
     """
 
     misfit: Misfit
@@ -140,7 +144,9 @@ class Diagnosis(Shown, Saved):
 
 @dataclass(frozen=True)
 class Apart:
-    """The part of a `Diagnosis` that takes data and estimate alone, and little to load: what can be found beside."""
+    """The part of a `Diagnosis` that takes data and estimate alone, and little to load: what can be
+    found beside.
+    """
 
     misfit: Misfit
     starts: MultiStart | None
@@ -153,11 +159,17 @@ class Apart:
 
 @one_thread()
 def diagnose_apart(
-    obs: Observations, cal: Calibration, *, n_starts: int = 5, seed: int = 0, whole: Calibration | None = None
+    obs: Observations,
+    cal: Calibration,
+    *,
+    n_starts: int = 5,
+    seed: int = 0,
+    whole: Calibration | None = None,
 ) -> Apart:
     """Half of what `diagnose` finds, of stars with the noise that the estimate gives them.
 
-    `whole` is the calibration that partitioned observations have, where `cal` is that of their sample.
+    `whole` is the calibration that partitioned observations have, where `cal` is that of their
+    sample.
     """
     stars = star_test(obs, cal)
     return Apart(
@@ -189,8 +201,9 @@ def diagnose(
     Parameters
     ----------
     obs, cal
-        The data and the estimate. Of partitioned observations the sample of frames that the calibration has kept is
-        questioned, and what compares estimates starts from that of the sample.
+        The data and the estimate. Of partitioned observations the sample of frames that the
+        calibration has kept is questioned, and what compares estimates starts from that of the
+        sample.
     post : Posterior, optional
         For the posterior predictive check; the calibration's normal approximation otherwise.
     models : sequence of str
@@ -202,7 +215,8 @@ def diagnose(
     progress : callable, optional
         Called with the number of steps done and their total.
     apart : callable, optional
-        What waits for `diagnose_apart` of the same arguments, which runs elsewhere; None of it is asked for here again.
+        What waits for `diagnose_apart` of the same arguments, which runs elsewhere; None of it is
+        asked for here again.
     """
     step = progress or (lambda done, total: None)
     obs, whole = weighed(obs, cal), cal
@@ -213,7 +227,9 @@ def diagnose(
     predictive = predictive_check(obs, whole, post, seed=seed)
     step(2, 4)
     # A single frame cannot be left out.
-    comparison = compare_models(obs, cal, models, seed=seed) if models and obs.n_frames > 1 else None
+    comparison = (
+        compare_models(obs, cal, models, seed=seed) if models and obs.n_frames > 1 else None
+    )
     if comparison is not None:
         comparison = of_all_stars(comparison, obs, whole)
     step(3, 4)
@@ -249,9 +265,9 @@ def _jackknife(obs: Observations, cal: Calibration) -> Jackknife | None:
 def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> MultiStart:
     """Calibrate from n starts scattered around the nominal camera, and count the optima.
 
-    One standard deviation of the starts is 5 % of the focal length and a tenth of the detector. Where there are many
-    frames, a few hundred of them have the same optima: the starts are then held against the optimum of these, if the
-    estimate is as near to it as chance has it.
+    One standard deviation of the starts is 5 % of the focal length and a tenth of the detector.
+    Where there are many frames, a few hundred of them have the same optima: the starts are then
+    held against the optimum of these, if the estimate is as near to it as chance has it.
     """
     rng = np.random.default_rng((seed, 11))
     nominal = cal.nominal
@@ -259,9 +275,12 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     same = better = failed = 0
     largest = 0.0
     best: tuple[float, tuple[float, ...]] = (np.inf, ())
-    # Errors of the stars weigh an estimate that was found without them: that is what a start leads to.
+    # Errors of the stars weigh an estimate that was found without them: that is what a start leads
+    # to.
     reached = None if cal.star_errors is None else cal.stages[-2]
-    reference, lowest = (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
+    reference, lowest = (
+        (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
+    )
     some, sigmas = _few(obs), cal.sigmas
     if some is not obs:
         sigmas = sigmas * np.sqrt(obs.n_stars / some.n_stars)
@@ -270,7 +289,8 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
         except StarcalError:
             some, sigmas = obs, cal.sigmas
         else:
-            # An estimate that is not the optimum of all is not near that of some, and every start finds a better one.
+            # An estimate that is not the optimum of all is not near that of some, and every start
+            # finds a better one.
             near = bool(np.max(np.abs(optimum - reference) / sigmas) < _NEAR_SIGMA)
             reference, lowest = (optimum, lowest) if near else (reference, np.inf)
     for _ in range(n):
@@ -307,11 +327,17 @@ def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatA
     likelihood = cal.provenance.get("settings", {}).get("likelihood", "marginal")
     if likelihood != "marginal" or method not in ("efficient", "three_stage"):
         options: AnyDict = {} if likelihood == "marginal" else {"likelihood": likelihood}
-        other = calibrate(obs, start, model=start.distortion, method=method, duplicates="keep", **options)
+        other = calibrate(
+            obs, start, model=start.distortion, method=method, duplicates="keep", **options
+        )
         return other.theta, other.chi2
     found = fit(obs, start, method=method)
     if cal.star_errors is not None:
         return found.theta, found.chi2
     # The last, small step of a calibration, which is the same for all that end in its optimum.
-    step = 0.5 * cal.compressed.whitening @ cal.compressed.log_determinant_slope if method == "efficient" else 0.0
+    step = (
+        0.5 * cal.compressed.whitening @ cal.compressed.log_determinant_slope
+        if method == "efficient"
+        else 0.0
+    )
     return found.theta - step, found.chi2

@@ -1,4 +1,6 @@
-"""What the tests of a model say about its attitude error: the second of the two figures that every error has."""
+"""What the tests of a model say about its attitude error: the second of the two figures that every
+error has.
+"""
 
 from __future__ import annotations
 
@@ -24,17 +26,20 @@ if TYPE_CHECKING:
 _ROUNDING = 1e-6
 
 
-def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs: Observations) -> AttitudeError:
+def with_misfit(
+    error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs: Observations
+) -> AttitudeError:
     """The attitude error with what the tests of the model found.
 
-    - The pattern that the misfit tests found goes through the geometry of the frames: what it does to their attitudes
-      counts, as common rotation and rest, the noise of its amplitudes taken off.
-    - A distortion model that the data prefer to the fitted one counts by how far it moves the attitudes, in squares
-      as far as they prefer it (`ModelScore.preferred`); every one that is not rejected does in full if the fitted
-      model is. Pattern and model are two views of one error, of which the larger counts. What is left of a move that
-      exceeds the standard deviation within the fitted model is the choice of the model: stated beside the error.
-    - Frames that disagree more than their formal errors allow multiply common rotation and rest by the jackknife ratio,
-      over what of it the draws hold already.
+    - The pattern that the misfit tests found goes through the geometry of the frames: what it does
+      to their attitudes counts, as common rotation and rest, the noise of its amplitudes taken off.
+    - A distortion model that the data prefer to the fitted one counts by how far it moves the
+      attitudes, in squares as far as they prefer it (`ModelScore.preferred`); every one that is not
+      rejected does in full if the fitted model is. Pattern and model are two views of one error, of
+      which the larger counts. What is left of a move that exceeds the standard deviation within the
+      fitted model is the choice of the model: stated beside the error.
+    - Frames that disagree more than their formal errors allow multiply common rotation and rest by
+      the jackknife ratio, over what of it the draws hold already.
 
     Parameters
     ----------
@@ -64,7 +69,8 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
     notes: tuple[str, ...] = ()
     if phase:
         notes = (
-            f"Part of the estimated noise is {join_words(phase)}: it counts as a pattern, and in the {CONTRIBUTORS[0]} "
+            f"Part of the estimated noise is {join_words(phase)}: it counts as a pattern, and in "
+            f"the {CONTRIBUTORS[0]} "
             "as well.",
         )
     found = MisfitFound(
@@ -84,7 +90,9 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
 def _pattern(
     error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs: Observations
 ) -> tuple[Response, tuple[tuple[str, ...], tuple[str, ...]]]:
-    """What the pattern that was found does to the attitudes of the frames, and how to say it of each part."""
+    """What the pattern that was found does to the attitudes of the frames, and how to say it of
+    each part.
+    """
     pattern = diagnosis.misfit.pattern
     if pattern is None or not pattern.families:
         nothing = np.zeros(3)
@@ -97,10 +105,20 @@ def _pattern(
         if not upper.any():
             return ()
         pairs = zip(value, upper, strict=True)
-        values = ", ".join(f"{significant(float(v))} (at most {significant(float(u))})" for v, u in pairs)
-        return (f"misfit, {names}, through the attitudes of these frames: {values} arcsec of {join_words(list(AXES))}",)
+        values = ", ".join(
+            f"{significant(float(v))} (at most {significant(float(u))})" for v, u in pairs
+        )
+        return (
+            (
+                f"misfit, {names}, through the attitudes of these frames: {values} arcsec of "
+                f"{join_words(list(AXES))}"
+            ),
+        )
 
-    reasons = said(found.common_arcsec, found.common_upper_arcsec), said(found.rest_arcsec, found.rest_upper_arcsec)
+    reasons = (
+        said(found.common_arcsec, found.common_upper_arcsec),
+        said(found.rest_arcsec, found.rest_upper_arcsec),
+    )
     return found, reasons
 
 
@@ -160,4 +178,9 @@ def _frames(diagnosis: Diagnosis, post: Posterior) -> tuple[float, tuple[str, ..
     factor = float(np.max(found.ratio[flagged] / held))
     if factor <= 1.0 + _ROUNDING:
         return 1.0, ()
-    return factor, (f"frames disagree {significant(factor, 3)} times as much as their formal errors allow (jackknife)",)
+    return factor, (
+        (
+            f"frames disagree {significant(factor, 3)} times as much as their formal errors allow "
+            "(jackknife)"
+        ),
+    )

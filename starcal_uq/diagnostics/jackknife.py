@@ -1,9 +1,9 @@
 """Leave-one-frame-out jackknife: uncertainties from how the frames disagree, whatever the cause.
 
-Formal uncertainties hold if noise is Gaussian and independent from star to star. Whatever makes stars of one frame err
-together, and differently from frame to frame, shows in the scatter of estimates that leave one frame out, and in that
-of the frames' slopes. The second is tested: with the leverage corrected (CR2 of Bell & McCaffrey 2002) it is unbiased
-for any number of frames.
+Formal uncertainties hold if noise is Gaussian and independent from star to star. Whatever makes
+stars of one frame err together, and differently from frame to frame, shows in the scatter of
+estimates that leave one frame out, and in that of the frames' slopes. The second is tested: with
+the leverage corrected (CR2 of Bell & McCaffrey 2002) it is unbiased for any number of frames.
 """
 
 from __future__ import annotations
@@ -44,18 +44,21 @@ class Jackknife(Shown):
     jackknife_covariance : (p, p) array
         ``(K - 1) / K`` times the scatter of the estimates that leave one of K frames out.
     sandwich_covariance : (p, p) array
-        ``H^-1 (sum_k g_k g_k^T) H^-1`` over frames: the cluster-robust one, with the leverage of each frame corrected.
+        ``H^-1 (sum_k g_k g_k^T) H^-1`` over frames: the cluster-robust one, with the leverage of
+        each frame corrected.
     left_out : (K, p) array
         Estimates without each frame, px units; none of partitioned observations.
     effective_frames : (p,) array
-        Frames of equal weight that would determine each parameter as unevenly as these K do: one more than
-        Satterthwaite's degrees of freedom of `sandwich_covariance`.
+        Frames of equal weight that would determine each parameter as unevenly as these K do: one
+        more than Satterthwaite's degrees of freedom of `sandwich_covariance`.
     n_frames : int
         K.
     residual_dof : int
-        Degrees of freedom of the noise in `formal_covariance`; 0 in files of before, which took it as known.
+        Degrees of freedom of the noise in `formal_covariance`; 0 in files of before, which took it
+        as known.
     tail_dof : (p,) array or None
-        Degrees of freedom of a chi-square as skew as `sandwich_covariance`; None in files of before.
+        Degrees of freedom of a chi-square as skew as `sandwich_covariance`; None in files of
+        before.
     """
 
     parameter_names: tuple[str, ...]
@@ -69,8 +72,15 @@ class Jackknife(Shown):
     tail_dof: FloatArray | None = None
 
     SHAPES: ClassVar[Shapes] = {
-        **{"parameter_names": ("p",), "left_out": ("k", "p"), "effective_frames": ("p",), "tail_dof": ("p",)},
-        **dict.fromkeys(("formal_covariance", "jackknife_covariance", "sandwich_covariance"), ("p", "p")),
+        **{
+            "parameter_names": ("p",),
+            "left_out": ("k", "p"),
+            "effective_frames": ("p",),
+            "tail_dof": ("p",),
+        },
+        **dict.fromkeys(
+            ("formal_covariance", "jackknife_covariance", "sandwich_covariance"), ("p", "p")
+        ),
     }
 
     @property
@@ -80,7 +90,9 @@ class Jackknife(Shown):
 
     @property
     def jackknife_ratio(self) -> FloatArray:
-        """Jackknife standard deviation over the formal one, (p,); too large on average where frames are few."""
+        """Jackknife standard deviation over the formal one, (p,); too large on average where frames
+        are few.
+        """
         return np.sqrt(np.diag(self.jackknife_covariance) / np.diag(self.formal_covariance))
 
     def expected(self, probability: float = 0.95) -> tuple[FloatArray, FloatArray]:
@@ -96,8 +108,9 @@ class Jackknife(Shown):
         """Degrees of freedom (p,) of the cluster-robust variances."""
         return np.maximum(self.effective_frames - 1.0, 1.0)
 
-    # A squared ratio has mean 1, variance 2 / dof and the skewness of tail_dof; shifted and scaled it is, to these
-    # three moments, a chi-square of tail_dof (Hall 1983, Buckley & Eagleson 1988), as a part of all squares a beta.
+    # A squared ratio has mean 1, variance 2 / dof and the skewness of tail_dof; shifted and scaled
+    # it is, to these three moments, a chi-square of tail_dof (Hall 1983, Buckley & Eagleson 1988),
+    # as a part of all squares a beta.
 
     @property
     def _tail(self) -> FloatArray:
@@ -109,7 +122,9 @@ class Jackknife(Shown):
         return 0.5 * self._tail, 0.5 * rest
 
     def _ratio(self, share: FloatArray) -> FloatArray:
-        excess = (share * (self.residual_dof or _MANY) - self._tail) / np.sqrt(self.dof * self._tail)
+        excess = (share * (self.residual_dof or _MANY) - self._tail) / np.sqrt(
+            self.dof * self._tail
+        )
         return np.sqrt(np.maximum(1.0 + excess, 0.0))
 
     @property
@@ -117,25 +132,34 @@ class Jackknife(Shown):
         """Probability (p,) of a ratio at least this large if the formal errors hold."""
         from scipy.special import betaincc
 
-        share = (self._tail + (self.ratio**2 - 1.0) * np.sqrt(self.dof * self._tail)) / (self.residual_dof or _MANY)
+        share = (self._tail + (self.ratio**2 - 1.0) * np.sqrt(self.dof * self._tail)) / (
+            self.residual_dof or _MANY
+        )
         return np.asarray(betaincc(*self._shape, np.clip(share, 0.0, 1.0)), dtype=np.float64)
 
     def detectable(self, alpha: float, power: float = 0.9) -> FloatArray:
-        """Ratios (p,) of true uncertainties that a test at this level finds with this probability."""
+        """Ratios (p,) of true uncertainties that a test at this level finds with this
+        probability.
+        """
         from scipy.special import betaincinv, gammaincinv
 
         found = self._ratio(betaincinv(*self._shape, 1.0 - alpha))
-        # Frames that err by more scatter as evenly as they weigh: Satterthwaite's approximation, which is never zero.
+        # Frames that err by more scatter as evenly as they weigh: Satterthwaite's approximation,
+        # which is never zero.
         missed = np.sqrt(2.0 / self.dof * gammaincinv(0.5 * self.dof, 1.0 - power))
         return np.asarray(found / missed, dtype=np.float64)
 
     @property
     def factors(self) -> FloatArray:
-        """Factors (p,) by which the formal standard deviations grow if the inflation is accepted; at least 1."""
+        """Factors (p,) by which the formal standard deviations grow if the inflation is accepted;
+        at least 1.
+        """
         return np.maximum(self.ratio, 1.0)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per parameter: formal, jackknife and cluster-robust sigma, their ratios, the factor."""
+        """One row per parameter: formal, jackknife and cluster-robust sigma, their ratios, the
+        factor.
+        """
         import pandas as pd
 
         low, high = self.expected()
@@ -155,7 +179,9 @@ class Jackknife(Shown):
         )
 
 
-def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals | None = None) -> Jackknife:
+def jackknife_frames(
+    obs: Observations, cal: Calibration, normals: FrameNormals | None = None
+) -> Jackknife:
     """Leave each frame out in turn, by one Gauss-Newton step from the estimate.
 
     Parameters
@@ -168,22 +194,27 @@ def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals 
     Raises
     ------
     CalibrationError
-        For fewer than three frames, or when the parameters are not determined without one of the frames.
+        For fewer than three frames, or when the parameters are not determined without one of the
+        frames.
     """
     if obs.n_frames < 3:
-        raise CalibrationError(f"a jackknife over {plural(obs.n_frames, 'frame')} says nothing: use three or more.")
+        raise CalibrationError(
+            f"a jackknife over {plural(obs.n_frames, 'frame')} says nothing: use three or more."
+        )
     found = FrameNormals.at(weighed(obs, cal), cal) if normals is None else normals
     z, _ = found.left_out()
     if not np.isfinite(z).all():
         frame = obs.frame_ids[int(np.argmin(np.isfinite(z).all(axis=1)))]
         raise CalibrationError(
-            f"without frame {frame} the parameters are not determined: a jackknife needs more frames like it."
+            f"without frame {frame} the parameters are not determined: a jackknife needs more "
+            "frames like it."
         )
     return _jackknife(found.scatter(), cal, found.theta + z * found.scale)
 
 
 def jackknife_of_all(cal: Calibration) -> Jackknife | None:
-    """The jackknife over all frames of partitioned observations, without the single estimates; None if it has no sums.
+    """The jackknife over all frames of partitioned observations, without the single estimates; None
+    if it has no sums.
 
     The sums are made with the calibration, file by file.
     """
@@ -210,7 +241,8 @@ def _jackknife(found: FrameScatter, cal: Calibration, left_out: FloatArray) -> J
 
 
 def accept_inflation(cal: Calibration, jackknife: Jackknife) -> Calibration:
-    """The calibration with the inflated covariance; provenance says so, and draws made from it are as wide.
+    """The calibration with the inflated covariance; provenance says so, and draws made from it are
+    as wide.
 
     Raises
     ------
@@ -218,15 +250,26 @@ def accept_inflation(cal: Calibration, jackknife: Jackknife) -> Calibration:
         When the jackknife is of another model, or the calibration is inflated already.
     """
     if cal.inflation is not None:
-        raise CalibrationError("the calibration's sigmas are inflated already: give the one that was estimated.")
+        raise CalibrationError(
+            "the calibration's sigmas are inflated already: give the one that was estimated."
+        )
     if jackknife.parameter_names != cal.parameter_names:
         raise CalibrationError(
-            f"the jackknife is of the parameters {', '.join(jackknife.parameter_names)}, the calibration of "
+            f"the jackknife is of the parameters {', '.join(jackknife.parameter_names)}, the "
+            "calibration of "
             f"{', '.join(cal.parameter_names)}: make both from the same run."
         )
     factors = dict(zip(jackknife.parameter_names, jackknife.factors.tolist(), strict=True))
     settings = {**cal.provenance.get("settings", {}), "inflation": factors}
     covariance = cal.covariance * np.outer(jackknife.factors, jackknife.factors)
     # A sigma that frames were asked for has only their degrees of freedom.
-    dof = {name: d for name, d in zip(factors, jackknife.dof.tolist(), strict=True) if factors[name] > 1.0}
-    return replace(cal, covariance=covariance, provenance={**cal.provenance, "settings": settings, "interval_dof": dof})
+    dof = {
+        name: d
+        for name, d in zip(factors, jackknife.dof.tolist(), strict=True)
+        if factors[name] > 1.0
+    }
+    return replace(
+        cal,
+        covariance=covariance,
+        provenance={**cal.provenance, "settings": settings, "interval_dof": dof},
+    )

@@ -1,13 +1,16 @@
-"""Calibrated tests for structure in the residuals: model error is in no posterior, so it must be looked for.
+"""Calibrated tests for structure in the residuals: model error is in no posterior, so it must be
+looked for.
 
-Residuals after the fit are ``e = (I - P) epsilon`` with P the projector on what the attitudes and the parameters can
-reproduce. A family of shapes C (pixel shifts that some model error would cause) is projected the same way; the part of
-the sum of squares that the remainder explains then follows an F distribution exactly, whatever the geometry:
+Residuals after the fit are ``e = (I - P) epsilon`` with P the projector on what the attitudes and
+the parameters can reproduce. A family of shapes C (pixel shifts that some model error would cause)
+is projected the same way; the part of the sum of squares that the remainder explains then follows
+an F distribution exactly, whatever the geometry:
 
     F = (e^T Q e / q) / (e^T (I - Q) e / (d - q)),   Q the projector on (I - P) C, of rank q.
 
-It is the Lagrange-multiplier (score) test of the model extended by these shapes: nothing is fitted again. Tests for
-unequal noise compare the residuals' weighted and unweighted sums of squares with their exact mean and variance.
+It is the Lagrange-multiplier (score) test of the model extended by these shapes: nothing is fitted
+again. Tests for unequal noise compare the residuals' weighted and unweighted sums of squares with
+their exact mean and variance.
 """
 
 from __future__ import annotations
@@ -106,21 +109,24 @@ class MisfitTest:
     p_holm : float
         p-value corrected for the number of tests (Holm 1979).
     size_px : float
-        Root mean square per axis of the pattern found, its noise taken off, px; NaN for unequal noise.
+        Root mean square per axis of the pattern found, its noise taken off, px; NaN for unequal
+        noise.
     visible : float
-        Share of the squared shapes that attitudes and parameters do not absorb; NaN for unequal noise.
+        Share of the squared shapes that attitudes and parameters do not absorb; NaN for unequal
+        noise.
     amplitudes : tuple of Amplitude
         Amplitudes, where they mean something by themselves.
     moved_sigma : float
-        Largest change of a parameter if the shapes were fitted too, in its standard deviations; NaN where nothing is
-        fitted.
+        Largest change of a parameter if the shapes were fitted too, in its standard deviations; NaN
+        where nothing is fitted.
     moved_name : str
         That parameter.
     moved_std : float
-        Standard error of that change, in the same unit: large where shapes can hardly be separated from the parameter.
+        Standard error of that change, in the same unit: large where shapes can hardly be separated
+        from the parameter.
     detectable_px : float
-        Root mean square per axis of a pattern that the test finds nine times in ten, at level ALPHA of all tests
-        together, px; NaN for unequal noise.
+        Root mean square per axis of a pattern that the test finds nine times in ten, at level ALPHA
+        of all tests together, px; NaN for unequal noise.
     """
 
     name: str
@@ -176,10 +182,11 @@ class Misfit(Shown):
     n_stars, n_frames : int
         Size of the data.
     uneven : UnevenNoise or None
-        How the noise varies, and what that does to the stated sigmas; None where no test found that it does, or where
-        the calibration knows it already.
+        How the noise varies, and what that does to the stated sigmas; None where no test found that
+        it does, or where the calibration knows it already.
     pattern : Pattern or None
-        What the tests found, fitted; of no shapes where they found nothing. None of an earlier version.
+        What the tests found, fitted; of no shapes where they found nothing. None of an earlier
+        version.
     """
 
     tests: tuple[MisfitTest, ...]
@@ -191,18 +198,26 @@ class Misfit(Shown):
 
     @property
     def p_value(self) -> float:
-        """Overall p-value: the smallest after Holm's correction. Overlap of the tests makes it err to the safe side."""
+        """Overall p-value: the smallest after Holm's correction. Overlap of the tests makes it err
+        to the safe side.
+        """
         return min((test.p_holm for test in self.tests), default=1.0)
 
     def found(self, alpha: float = ALPHA) -> tuple[MisfitTest, ...]:
         """Tests that reject at this level after correction, the strongest first."""
-        return tuple(sorted((t for t in self.tests if t.p_holm < alpha), key=lambda t: (t.p_holm, -t.size_px)))
+        return tuple(
+            sorted(
+                (t for t in self.tests if t.p_holm < alpha), key=lambda t: (t.p_holm, -t.size_px)
+            )
+        )
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per test; amplitudes as text."""
         import pandas as pd
 
-        rows = [{**asdict(t), "amplitudes": "; ".join(str(a) for a in t.amplitudes)} for t in self.tests]
+        rows = [
+            {**asdict(t), "amplitudes": "; ".join(str(a) for a in t.amplitudes)} for t in self.tests
+        ]
         return pd.DataFrame(rows).rename(columns={"name": "test"})
 
 
@@ -213,16 +228,16 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     Parameters
     ----------
     obs, cal
-        The data and the estimate made from them (by the marginal likelihood: the residuals of stage 3 alone are not
-        at its optimum, and the tests then include that).
+        The data and the estimate made from them (by the marginal likelihood: the residuals of stage
+        3 alone are not at its optimum, and the tests then include that).
     max_cells : int
         Largest number of field cells along the longer side.
 
     Returns
     -------
     Misfit
-        With a false-alarm rate that is the nominal one for each test, and at most that for all of them together. Of an
-        estimate with Student-t tails it is about the stars within 4.5 sigma.
+        With a false-alarm rate that is the nominal one for each test, and at most that for all of
+        them together. Of an estimate with Student-t tails it is about the stars within 4.5 sigma.
     """
     from scipy.special import ndtr
 
@@ -231,11 +246,14 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     obs, cal = of_heard(obs, cal)
     families = shapes(obs, cal.camera, max_cells=max_cells)
     sums = _Sums.over(obs, cal, families)
-    tests = [test for test in (sums.family(index) for index in range(len(families))) if test is not None]
+    tests = [
+        test for test in (sums.family(index) for index in range(len(families))) if test is not None
+    ]
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
     of_noise = [
-        (f"noise that changes with {name}", name, z, p) for name, z, p in sums.noise.tests(*sums.independent, sums.dof)
+        (f"noise that changes with {name}", name, z, p)
+        for name, z, p in sums.noise.tests(*sums.independent, sums.dof)
     ]
     if (frames := sums.noise_by_frame()) is not None:
         of_noise.append(("noise that differs from frame to frame", "frame", *frames))
@@ -244,18 +262,27 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     for name, z in zip(names, axes.z(noise_model_of(cal)), strict=True):
         of_noise.append((name, "axis", z, float(2.0 * ndtr(-abs(z)))))
     nothing = float("nan")
-    tests += [MisfitTest(name, against, z, 0, sums.dof, p, 1.0, nothing, nothing) for name, against, z, p in of_noise]
+    tests += [
+        MisfitTest(name, against, z, 0, sums.dof, p, 1.0, nothing, nothing)
+        for name, against, z, p in of_noise
+    ]
     corrected = holm([test.p_value for test in tests])
     unit = np.sqrt(sums.rss / sums.dof / (2.0 * obs.n_stars)) * sums.noise_px
     tests = [
-        replace(test, p_holm=float(p), detectable_px=float(unit * _detectable(test, ALPHA / len(tests))))
+        replace(
+            test, p_holm=float(p), detectable_px=float(unit * _detectable(test, ALPHA / len(tests)))
+        )
         for test, p in zip(tests, corrected, strict=True)
     ]
     uneven = None
     if any(test.is_of_noise and test.p_holm < ALPHA for test in tests) and cal.noise_model is None:
         model, _ = fit_noise(obs, cal.camera, rounds=_NOISE_ROUNDS)
-        uneven = UnevenNoise(model, cal.parameter_names, sigma_ratios(obs, cal.camera, model, cal.sigma))
-    pattern = sums.pattern([test.name for test in tests if test.dof > 0 and test.p_holm < ALPHA], len(tests))
+        uneven = UnevenNoise(
+            model, cal.parameter_names, sigma_ratios(obs, cal.camera, model, cal.sigma)
+        )
+    pattern = sums.pattern(
+        [test.name for test in tests if test.dof > 0 and test.p_holm < ALPHA], len(tests)
+    )
     pattern = replace(pattern, n_frames=obs.n_frames, max_cells=max_cells, left_out=left_out)
     if FRAME_BY_FRAME in pattern.families:
         pattern = replace(pattern, frame_covariance=frame_covariance(pattern, families, obs, cal))
@@ -264,7 +291,9 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
 
 
 def _detectable(test: MisfitTest, level: float) -> float:
-    """Root of the noncentrality at which an F test of this level has its power; NaN for a test for unequal noise."""
+    """Root of the noncentrality at which an F test of this level has its power; NaN for a test for
+    unequal noise.
+    """
     from scipy.special import fdtri, ncfdtrinc
 
     if test.dof == 0:
@@ -275,7 +304,8 @@ def _detectable(test: MisfitTest, level: float) -> float:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Columns of some stars, the last of them the two axes of cells of the field, which are sums and no columns.
+    """Columns of some stars, the last of them the two axes of cells of the field, which are sums
+    and no columns.
 
     `dense` (q, 2, n) are the others; `cell` (n,) is of `n_cells`.
     """
@@ -321,7 +351,9 @@ class _Columns:
         return found
 
     def _turned(self, sums: FloatArray) -> FloatArray:
-        """Sums (c, 2, m) of whitened columns over cells, along the axes of the cells' own shifts."""
+        """Sums (c, 2, m) of whitened columns over cells, along the axes of the cells' own
+        shifts.
+        """
         w = self.frames.whitening
         return sums if w is None else np.einsum("ba,cbm->cam", w, sums)
 
@@ -335,7 +367,9 @@ class _Columns:
         order = np.argsort(self.cell, kind="stable")
         present, first = np.unique(self.cell[order], return_index=True)
         sums = np.zeros((self.n_cells, 2, len(columns)))
-        sums[present] = np.add.reduceat(np.take(self._weight(columns), order, axis=-1), first, axis=-1).T
+        sums[present] = np.add.reduceat(
+            np.take(self._weight(columns), order, axis=-1), first, axis=-1
+        ).T
         return self._turned(sums).reshape(2 * self.n_cells, -1)
 
     def by_frame(self, few: FloatArray) -> FloatArray:
@@ -362,10 +396,12 @@ def _frame_products(frames: StarFrames, column: FloatArray, many: FloatArray) ->
 
 @dataclass
 class _Sums:
-    """Sums over all stars from which every test follows; the table is visited once, some frames at a time.
+    """Sums over all stars from which every test follows; the table is visited once, some frames at
+    a time.
 
-    Where stars bring errors along, `gram` is weighted by them. `plain` is of the parameters and the residuals that are
-    left after each star's offset, which are independent: frame by frame, and for unequal noise.
+    Where stars bring errors along, `gram` is weighted by them. `plain` is of the parameters and the
+    residuals that are left after each star's offset, which are independent: frame by frame, and for
+    unequal noise.
     """
 
     families: tuple[Shape, ...]
@@ -381,7 +417,8 @@ class _Sums:
     blocks: FloatArray
     own: Shape
     block_rank: int = 0
-    # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their normal matrices.
+    # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their normal
+    # matrices.
     frames: list[tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=list)
     names: tuple[str, ...] = ()
 
@@ -415,8 +452,15 @@ class _Sums:
             rows = slice(int(starts[first]), int(starts[last]))
             fitted, columns, view = found._add(part, state, theta, rows)
             if stars is not None:
-                stars.add(part, state, np.concatenate([fitted, part.project_out(state, columns.all())]), rows)
-                fitted[p] = cal.residuals_px[rows].T * (1.0 if part.frames.weight is None else part.frames.weight)
+                stars.add(
+                    part,
+                    state,
+                    np.concatenate([fitted, part.project_out(state, columns.all())]),
+                    rows,
+                )
+                fitted[p] = cal.residuals_px[rows].T * (
+                    1.0 if part.frames.weight is None else part.frames.weight
+                )
             flat = fitted.reshape(p + 1, -1)
             found.plain += flat @ flat.T
             found._add_blocks(part, state, view, fitted, columns)
@@ -426,16 +470,19 @@ class _Sums:
             squares = part.frames.sum(np.sum(e**2, axis=0))
             found.frames.append((squares, np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
         if model is not None and stars is not None and cal.star_errors is not None:
-            found.gram -= stars.solved(model.ratio(cal.star_errors.tau_px**2, cal.sigma)).correction()
+            found.gram -= stars.solved(
+                model.ratio(cal.star_errors.tau_px**2, cal.sigma)
+            ).correction()
         return found
 
     def _add(
         self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice
     ) -> tuple[FloatArray, _Columns, View]:
-        """Add some frames: parameters and residuals, attitudes projected out, and all columns, as they are.
+        """Add some frames: parameters and residuals, attitudes projected out, and all columns, as
+        they are.
 
-        A product of columns after projection is that before, less the products of what rotations of the frames make of
-        both: nothing of the size of the many columns is written for it.
+        A product of columns after projection is that before, less the products of what rotations of
+        the frames make of both: nothing of the size of the many columns is written for it.
         """
         view = View.of(part, state, theta, rows)
         columns = _Columns.of(self.families, view)
@@ -453,13 +500,17 @@ class _Sums:
         self.gram[:n, :n] += flat @ flat.T
         self.gram[n:, :n] += across
         self.gram[:n, n:] += across.T
-        self.gram[n:, n:] += inner - np.tensordot(np.moveaxis(turned, 0, 1), answer, ((1, 2), (1, 2)))
+        self.gram[n:, n:] += inner - np.tensordot(
+            np.moveaxis(turned, 0, 1), answer, ((1, 2), (1, 2))
+        )
         return fitted, columns, view
 
     def _add_blocks(
         self, part: MarginalLikelihood, state: Any, view: View, fitted: FloatArray, others: _Columns
     ) -> None:
-        """Scale and quadrupole of every frame by itself: three columns per frame, which no other frame sees."""
+        """Scale and quadrupole of every frame by itself: three columns per frame, which no other
+        frame sees.
+        """
         frames = part.frames
         columns = self.own.columns(view)
         frames.whiten(columns)
@@ -524,14 +575,25 @@ class _Sums:
         unit = np.sqrt(np.diag(self.projection) * self.rss / self.dof)
         moved = np.abs(self.projection @ cross.T @ fitted) / unit
         worst = int(np.argmax(moved))
-        turned = self.projection[worst] @ (cross / norm[:, None]).T @ (vectors[:, kept] / np.sqrt(values[kept]))
-        error = float(np.sqrt((self.rss - explained) / (self.dof - rank)) * np.linalg.norm(turned) / unit[worst])
+        turned = (
+            self.projection[worst]
+            @ (cross / norm[:, None]).T
+            @ (vectors[:, kept] / np.sqrt(values[kept]))
+        )
+        error = float(
+            np.sqrt((self.rss - explained) / (self.dof - rank))
+            * np.linalg.norm(turned)
+            / unit[worst]
+        )
         amplitudes: tuple[Amplitude, ...] = ()
         if family.labels and rank == family.size:
             inverse = (vectors / values) @ vectors.T
             variance = (self.rss - explained) / (self.dof - rank)
             unit = np.array(family.per_amplitude) / norm
-            best, errors = inverse @ (slope / norm) * unit, np.sqrt(variance * np.diag(inverse)) * unit
+            best, errors = (
+                inverse @ (slope / norm) * unit,
+                np.sqrt(variance * np.diag(inverse)) * unit,
+            )
             amplitudes = tuple(
                 Amplitude(name, u, float(value), float(sigma))
                 for (name, u), value, sigma in zip(family.labels, best, errors, strict=True)
@@ -566,26 +628,39 @@ class _Sums:
         return fit.pattern(families, FRAME_BY_FRAME in found, ALPHA / n_tests)
 
     def noise_by_frame(self) -> tuple[float, float] | None:
-        """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few frames.
+        """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few
+        frames.
 
-        With d_k degrees of freedom of the frames' sums of squares S_k, nu in all, the statistic is T = nu log(S / nu) -
-        sum d_k log(S_k / d_k). Shares of S are independent of S, so that mean and variance of T follow exactly from
-        those of logarithms of chi-squares; T is then taken as gamma-distributed.
+        With d_k degrees of freedom of the frames' sums of squares S_k, nu in all, the statistic is
+        T = nu log(S / nu) - sum d_k log(S_k / d_k). Shares of S are independent of S, so that mean
+        and variance of T follow exactly from those of logarithms of chi-squares; T is then taken as
+        gamma-distributed.
         """
         from scipy.special import digamma, gammaincc, ndtri, polygamma
 
-        squares, dof, matrices = (np.concatenate(column) for column in zip(*self.frames, strict=True))
+        squares, dof, matrices = (
+            np.concatenate(column) for column in zip(*self.frames, strict=True)
+        )
         dof = dof - np.einsum("kab,ba->k", matrices, self.independent[1])
         nu = float(dof.sum())
-        if len(dof) < _LEAST_FRAMES or nu < _LEAST_DOF or dof.min() < _LEAST_FRAME_DOF or squares.min() <= 0.0:
+        if (
+            len(dof) < _LEAST_FRAMES
+            or nu < _LEAST_DOF
+            or dof.min() < _LEAST_FRAME_DOF
+            or squares.min() <= 0.0
+        ):
             return None
         found = nu * np.log(squares.sum() / nu) - np.sum(dof * np.log(squares / dof))
-        mean = nu * (digamma(nu / 2) - np.log(nu / 2)) - np.sum(dof * (digamma(dof / 2) - np.log(dof / 2)))
+        mean = nu * (digamma(nu / 2) - np.log(nu / 2)) - np.sum(
+            dof * (digamma(dof / 2) - np.log(dof / 2))
+        )
         variance = np.sum(dof**2 * polygamma(1, dof / 2)) - nu**2 * float(polygamma(1, nu / 2))
         p = float(gammaincc(mean**2 / variance, found * mean / variance))
         return float(-ndtri(np.clip(p, 1e-300, 1.0 - 1e-16))), p
 
-    def _f_test(self, name: str, against: str, explained: float, rank: int, rss: float) -> MisfitTest:
+    def _f_test(
+        self, name: str, against: str, explained: float, rank: int, rss: float
+    ) -> MisfitTest:
         from scipy.special import fdtrc
 
         rest = self.dof - rank
@@ -594,7 +669,15 @@ class _Sums:
         excess = max(explained - rank * variance, 0.0) / (2.0 * self.n_stars)
         p = float(fdtrc(rank, rest, statistic))
         return MisfitTest(
-            name, against, statistic, rank, rest, p, 1.0, float(np.sqrt(excess)) * self.noise_px, float("nan")
+            name,
+            against,
+            statistic,
+            rank,
+            rest,
+            p,
+            1.0,
+            float(np.sqrt(excess)) * self.noise_px,
+            float("nan"),
         )
 
 
@@ -616,7 +699,9 @@ def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:
 
 
 class NoiseSums:
-    """Sums over stars that the moments need, for several weights (N,) by name, with p parameters."""
+    """Sums over stars that the moments need, for several weights (N,) by name, with p
+    parameters.
+    """
 
     def __init__(self, weights: dict[str, FloatArray], p: int) -> None:
         self.weights = weights
@@ -628,7 +713,9 @@ class NoiseSums:
         self.parameters2 = np.zeros((n, p, p))
         self.crossed = np.zeros((n, p, p))
 
-    def add(self, frames: StarFrames, state: Any, h: FloatArray, e: FloatArray, rows: slice) -> None:
+    def add(
+        self, frames: StarFrames, state: Any, h: FloatArray, e: FloatArray, rows: slice
+    ) -> None:
         """Add some frames: h (p, 2, n) and e (2, n) with the attitudes removed."""
         a, inverse = state.attitude, np.moveaxis(state.inverse, 2, 0)
         for i, values in enumerate(self.weights.values()):
@@ -643,10 +730,16 @@ class NoiseSums:
             awh = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", a * w, h)), 2, 0)
             self.trace[i] += 2.0 * np.sum(w) - np.einsum("kaa->", awa)
             # tr(W W) - 2 tr(P W W) + tr(P W P W) for the attitudes' part of P.
-            self.trace2[i] += 2.0 * np.sum(w**2) - 2.0 * np.einsum("kaa->", aw2a) + np.einsum("kab,kba->", awa, awa)
+            self.trace2[i] += (
+                2.0 * np.sum(w**2)
+                - 2.0 * np.einsum("kaa->", aw2a)
+                + np.einsum("kab,kba->", awa, awa)
+            )
             self.crossed[i] += np.einsum("kap,kab,kbq->pq", awh, inverse, awh)
 
-    def tests(self, matrix: FloatArray, inverse: FloatArray, rss: float, dof: int) -> list[tuple[str, float, float]]:
+    def tests(
+        self, matrix: FloatArray, inverse: FloatArray, rss: float, dof: int
+    ) -> list[tuple[str, float, float]]:
         """Name, z and two-sided p-value of every weight."""
         from scipy.special import erfc
 

@@ -1,12 +1,14 @@
-"""Which distortion model the data ask for: expected log predictive density, leaving one frame out at a time.
+"""Which distortion model the data ask for: expected log predictive density, leaving one frame out
+at a time.
 
-A frame is the unit, because its stars share an attitude. The log likelihood of a frame has its attitude integrated out;
-the posterior of the parameters and the noise is that of the linearised model under the reference prior (flat in the
-parameters, 1 / sigma): normal times scaled inverse chi-square. Two estimates of each frame's density without itself:
+A frame is the unit, because its stars share an attitude. The log likelihood of a frame has its
+attitude integrated out; the posterior of the parameters and the noise is that of the linearised
+model under the reference prior (flat in the parameters, 1 / sigma): normal times scaled inverse
+chi-square. Two estimates of each frame's density without itself:
 
 - the closed form, a multivariate t, exact for the linearised model, and
-- Pareto-smoothed importance sampling over posterior draws (Vehtari, Gelman & Gabry 2017), of some of the frames where
-  they are many; frames whose k-hat exceeds 0.7 keep the closed form.
+- Pareto-smoothed importance sampling over posterior draws (Vehtari, Gelman & Gabry 2017), of some
+  of the frames where they are many; frames whose k-hat exceeds 0.7 keep the closed form.
 """
 
 from __future__ import annotations
@@ -39,13 +41,15 @@ if TYPE_CHECKING:
 
 MODELS = ("none", "k1", "brown", "brown3", "brown_tangential")
 KHAT_BOUND = 0.7
-# A model is rejected when another one predicts better beyond the Student quantile for so many frames, and by more than
-# chance between equal models (Sivula et al. 2020: below four, a difference of elpd says nothing).
+# A model is rejected when another one predicts better beyond the Student quantile for so many
+# frames, and by more than chance between equal models (Sivula et al. 2020: below four, a difference
+# of elpd says nothing).
 REJECT_P, REJECT_ELPD = 0.005, 4.0
 # Up to the quantile of this probability a difference is no preference.
 _CHANCE_P = 0.05
 _DRAWS = 1000
-# Frames whose densities are sampled as well; the closed form, which is exact for the same model, costs nothing.
+# Frames whose densities are sampled as well; the closed form, which is exact for the same model,
+# costs nothing.
 _SAMPLED_FRAMES = 100
 
 
@@ -62,7 +66,8 @@ class ModelScore:
     sigma : float
         Estimated noise.
     elpd : float
-        Expected log predictive density of a left-out frame, summed over frames, nat; up to a common constant.
+        Expected log predictive density of a left-out frame, summed over frames, nat; up to a common
+        constant.
     difference, difference_se : float
         `elpd` minus that of the best model, and its standard error over frames.
     effective_parameters : float
@@ -74,15 +79,16 @@ class ModelScore:
     n_replaced : int
         Sampled frames whose importance weights could not be trusted, taken in closed form.
     common_arcsec : tuple of float
-        Mean rotation over frames from the calibration's attitudes to this model's: pitch, yaw, roll.
+        Mean rotation over frames from the calibration's attitudes to this model's: pitch, yaw,
+        roll.
     rest_arcsec : tuple of float
         Root mean square over frames of what is left of the rotation.
     rejected : bool
         True if another model predicts better beyond doubt.
     preferred : float
-        How far the data prefer this model to the fitted one: 0 up to a difference of their scores that its own error
-        gives in one case of twenty, 1 where the fitted one is rejected against it, linear between. 0 of an earlier
-        version.
+        How far the data prefer this model to the fitted one: 0 up to a difference of their scores
+        that its own error gives in one case of twenty, 1 where the fitted one is rejected against
+        it, linear between. 0 of an earlier version.
     """
 
     model: str
@@ -116,8 +122,8 @@ class ModelComparison(Shown):
     share : float
         Frames that were compared, of those that the calibration rests on.
     n_frames, n_sampled_frames : int
-        Frames, and those of them whose densities were sampled; the others are in closed form. 0 in a comparison of a
-        version that sampled all.
+        Frames, and those of them whose densities were sampled; the others are in closed form. 0 in
+        a comparison of a version that sampled all.
     """
 
     scores: tuple[ModelScore, ...]
@@ -139,7 +145,9 @@ class ModelComparison(Shown):
 
     @property
     def better(self) -> str:
-        """Of a fitted model that is rejected, the simplest accepted one that predicts better; else empty."""
+        """Of a fitted model that is rejected, the simplest accepted one that predicts better; else
+        empty.
+        """
         mine = self.of(self.fitted)
         if mine is None or not mine.rejected:
             return ""
@@ -178,7 +186,8 @@ def compare_models(
     Parameters
     ----------
     obs, cal
-        The data and the calibration whose model is in question; its own model is always among those compared.
+        The data and the calibration whose model is in question; its own model is always among those
+        compared.
     models : sequence of str
         Names of the registry.
     n_draws : int
@@ -202,7 +211,9 @@ def compare_models(
         except StarcalError as error:
             failed[name] = str(error)
     if not fits:
-        raise StarcalError(f"no distortion model could be calibrated: {next(iter(failed.values()))}")
+        raise StarcalError(
+            f"no distortion model could be calibrated: {next(iter(failed.values()))}"
+        )
     rng = np.random.default_rng(seed)
     found_scores = {name: _leave_out(normals, n_draws, rng) for name, normals in fits.items()}
     best = max(found_scores, key=lambda name: float(np.sum(found_scores[name].pointwise)))
@@ -218,7 +229,9 @@ def compare_models(
             ModelScore(
                 model=name,
                 n_parameters=len(normals.theta),
-                sigma=cal.sigma if name == cal.camera.distortion else float(np.sqrt(normals.variance)),
+                sigma=cal.sigma
+                if name == cal.camera.distortion
+                else float(np.sqrt(normals.variance)),
                 elpd=float(np.sum(loo.pointwise)),
                 difference=total,
                 difference_se=_spread(difference),
@@ -235,7 +248,11 @@ def compare_models(
     scores.sort(key=lambda score: -score.elpd)
     sampled = min(obs.n_frames, _SAMPLED_FRAMES)
     return ModelComparison(
-        tuple(scores), cal.camera.distortion, failed, n_frames=obs.n_frames, n_sampled_frames=sampled
+        tuple(scores),
+        cal.camera.distortion,
+        failed,
+        n_frames=obs.n_frames,
+        n_sampled_frames=sampled,
     )
 
 
@@ -245,18 +262,24 @@ def _spread(pointwise: FloatArray) -> float:
 
 
 def _beyond_doubt(pointwise: FloatArray) -> float:
-    return max(student_quantile(1.0 - 2.0 * REJECT_P, len(pointwise) - 1) * _spread(pointwise), REJECT_ELPD)
+    return max(
+        student_quantile(1.0 - 2.0 * REJECT_P, len(pointwise) - 1) * _spread(pointwise), REJECT_ELPD
+    )
 
 
 def _preference(pointwise: FloatArray) -> float:
-    """`ModelScore.preferred` of a model from its scores less those of the fitted one, frame by frame (K,)."""
+    """`ModelScore.preferred` of a model from its scores less those of the fitted one, frame by
+    frame (K,).
+    """
     chance = student_quantile(1.0 - 2.0 * _CHANCE_P, len(pointwise) - 1) * _spread(pointwise)
     share = (float(np.sum(pointwise)) - chance) / (_beyond_doubt(pointwise) - chance)
     return float(np.clip(share, 0.0, 1.0))
 
 
 def of_all_stars(found: ModelComparison, obs: Observations, cal: Calibration) -> ModelComparison:
-    """The comparison on a sample of partitioned observations, with the moves by richer models that all stars give."""
+    """The comparison on a sample of partitioned observations, with the moves by richer models that
+    all stars give.
+    """
     if cal.partitions is None or obs.n_frames == cal.n_frames:
         return found
     rotations = quaternion_to_rotation(cal.quaternions)
@@ -264,15 +287,23 @@ def of_all_stars(found: ModelComparison, obs: Observations, cal: Calibration) ->
     scores = []
     for score in found.scores:
         if score.model in richer:
-            common, rest = _moved(cal, FrameNormals.around(obs, score.model, richer[score.model], rotations))
+            common, rest = _moved(
+                cal, FrameNormals.around(obs, score.model, richer[score.model], rotations)
+            )
             score = replace(score, common_arcsec=common, rest_arcsec=rest)
         scores.append(score)
-    sampled = any(score.model not in richer and score.model != found.fitted for score in found.accepted)
-    return replace(found, scores=tuple(scores), share=obs.n_frames / cal.n_frames if sampled else 1.0)
+    sampled = any(
+        score.model not in richer and score.model != found.fitted for score in found.accepted
+    )
+    return replace(
+        found, scores=tuple(scores), share=obs.n_frames / cal.n_frames if sampled else 1.0
+    )
 
 
 def _without_star_errors(obs: Observations, cal: Calibration) -> Calibration:
-    """The estimate that knows of no errors of the stars, as those of the other models: moves are then the models'."""
+    """The estimate that knows of no errors of the stars, as those of the other models: moves are
+    then the models'.
+    """
     theta = cal.stages[-2].theta
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
     state, _ = likelihood.profile(theta, quaternion_to_rotation(cal.quaternions))
@@ -287,7 +318,9 @@ def _normals(obs: Observations, cal: Calibration, name: str) -> FrameNormals:
     return FrameNormals.around(obs, name, found.theta, found.rotations)
 
 
-def _moved(cal: Calibration, normals: FrameNormals) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+def _moved(
+    cal: Calibration, normals: FrameNormals
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     phi = left_error(rotation_to_quaternion(normals.rotations), cal.quaternions) * ARCSEC
     common = phi.mean(axis=0)
     rest = np.sqrt(np.mean((phi - common) ** 2, axis=0))
@@ -314,8 +347,16 @@ def _leave_out(normals: FrameNormals, n_draws: int, rng: np.random.Generator) ->
     sigma = np.sqrt(np.sum(normals.squares) / rng.chisquare(dof, n_draws))
     centre = np.linalg.solve(normals.matrix, normals.slopes.sum(axis=0))
     z = centre + sigma[:, None] * (rng.standard_normal((n_draws, len(factor))) @ factor.T)
-    slopes, matrices, own_dof = normals.slopes[chosen], normals.matrices[chosen], normals.dof[chosen]
-    squares = normals.squares[chosen] - 2.0 * z @ slopes.T + np.einsum("sa,kab,sb->sk", z, matrices, z, optimize=True)
+    slopes, matrices, own_dof = (
+        normals.slopes[chosen],
+        normals.matrices[chosen],
+        normals.dof[chosen],
+    )
+    squares = (
+        normals.squares[chosen]
+        - 2.0 * z @ slopes.T
+        + np.einsum("sa,kab,sb->sk", z, matrices, z, optimize=True)
+    )
     log_density = -0.5 * squares / sigma[:, None] ** 2 - np.outer(np.log(sigma), own_dof)
     log_density += -0.5 * normals.log_determinant[chosen] - 0.5 * own_dof * np.log(2.0 * np.pi)
     by_frame = np.ascontiguousarray(log_density.T)
@@ -324,15 +365,19 @@ def _leave_out(normals: FrameNormals, n_draws: int, rng: np.random.Generator) ->
     pointwise, in_sample = closed.copy(), closed_form(normals, left_out=False)
     pointwise[chosen[good]] = _log_mean_exp(weights + by_frame)[good] + np.log(n_draws)
     in_sample[chosen] = _log_mean_exp(by_frame)
-    return _LeftOut(pointwise, closed, in_sample, float(np.max(khats)), int(np.count_nonzero(~good)))
+    return _LeftOut(
+        pointwise, closed, in_sample, float(np.max(khats)), int(np.count_nonzero(~good))
+    )
 
 
 def closed_form(normals: FrameNormals, *, left_out: bool = True) -> FloatArray:
-    """Log predictive density (K,) of every frame given the others, or given all, for the linearised model.
+    """Log predictive density (K,) of every frame given the others, or given all, for the linearised
+    model.
 
-    A frame's projected residuals, given the others, are multivariate t with ``nu = d - d_k - p`` degrees of freedom,
-    location ``h_k z_(k)`` and scale ``s_(k)^2 (I + h_k H_(k)^-1 h_k^T)``; determinant and inverse need matrices of
-    size p only. Given all, H, z and s are those of all frames.
+    A frame's projected residuals, given the others, are multivariate t with ``nu = d - d_k - p``
+    degrees of freedom, location ``h_k z_(k)`` and scale ``s_(k)^2 (I + h_k H_(k)^-1 h_k^T)``;
+    determinant and inverse need matrices of size p only. Given all, H, z and s are those of all
+    frames.
     """
     from scipy.special import gammaln
 

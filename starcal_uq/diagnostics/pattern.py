@@ -1,18 +1,20 @@
 """The pattern that the misfit tests found, fitted, and what it does to attitudes.
 
-A test says that residuals hold structure; it does not say what that does to a mission. So the shapes that the tests
-found are fitted together, the strongest first and each further one only as far as it explains what those before leave.
-The attitude of a frame then errs by its least-squares response
+A test says that residuals hold structure; it does not say what that does to a mission. So the
+shapes that the tests found are fitted together, the strongest first and each further one only as
+far as it explains what those before leave. The attitude of a frame then errs by its least-squares
+response
 
     phi = (A^T W A)^-1 A^T W (C - B G) a,
 
-with A the attitude Jacobian of that frame, C the shapes at its own stars, a their amplitudes, B the derivatives by the
-camera's parameters and G what the calibration's parameters took up of each shape. Amplitudes have an error, so that the
-square of what they give is too large by its own variance on average: that is taken off, and what is left has a bound.
+with A the attitude Jacobian of that frame, C the shapes at its own stars, a their amplitudes, B the
+derivatives by the camera's parameters and G what the calibration's parameters took up of each
+shape. Amplitudes have an error, so that the square of what they give is too large by its own
+variance on average: that is taken off, and what is left has a bound.
 
-Shapes that are a basis for any smooth misfit hold combinations that attitudes or parameters imitate, and by which even
-a small leak of another misfit would be divided. Their amplitudes have a prior, as large in every combination, px over
-the stars, as those are that the residuals show well.
+Shapes that are a basis for any smooth misfit hold combinations that attitudes or parameters
+imitate, and by which even a small leak of another misfit would be divided. Their amplitudes have a
+prior, as large in every combination, px over the stars, as those are that the residuals show well.
 """
 
 from __future__ import annotations
@@ -26,7 +28,15 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, OVER_FIELD, Shape, View, frame_shapes, shapes
+from starcal_uq.diagnostics.shapes import (
+    FRAME_BY_FRAME,
+    MAX_CELLS,
+    OVER_FIELD,
+    Shape,
+    View,
+    frame_shapes,
+    shapes,
+)
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.propagation.alignment import alignment_weights
@@ -41,10 +51,12 @@ if TYPE_CHECKING:
 _STARS_AT_ONCE = 10_000
 # One-sided 95 % quantile of the normal distribution.
 _UPPER = 1.645
-# Directions of which attitudes and parameters absorb all but this share of the square are not there.
+# Directions of which attitudes and parameters absorb all but this share of the square are not
+# there.
 _ABSORBED = 1e-8
 _DIRECTION_P = 0.05
-# Share of the square of a shape that attitudes and parameters must leave in sight for its amplitude to set a prior.
+# Share of the square of a shape that attitudes and parameters must leave in sight for its amplitude
+# to set a prior.
 _SEEN = 0.1
 # Standard errors that a variance over frames has to exceed.
 _SAID = 3.0
@@ -55,22 +67,32 @@ class Pattern:
     """Shapes of displacement that the residuals ask for, fitted together."""
 
     families: tuple[str, ...]  # Names of the tests whose shapes are in it, the strongest first
-    # (q, J): combinations of the families' columns, px, that the residuals determine, but for frames by themselves.
+    # (q, J): combinations of the families' columns, px, that the residuals determine, but for
+    # frames by themselves.
     directions: FloatArray
     amplitudes: FloatArray  # (J,): amplitude of every direction
     covariance: FloatArray  # (J, J): covariance of the amplitudes
-    parameters: FloatArray  # (J, p): what the calibrated parameters took up of every direction, px units
-    # (3, 3): covariance over frames of scale and of two components of shape, px at the corner; zero where frames
-    # agree.
+    parameters: (
+        FloatArray  # (J, p): what the calibrated parameters took up of every direction, px units
+    )
+    # (3, 3): covariance over frames of scale and of two components of shape, px at the corner; zero
+    # where frames agree.
     frame_covariance: FloatArray
     variance: float  # Variance of the noise that is left, px^2, or relative to what stars state
     n_frames: int = 0  # Number of frames behind it
     max_cells: int = MAX_CELLS  # Largest number of field cells along the longer side
     n_with_prior: int = 0  # Number of directions, the last ones, whose amplitudes have a prior
-    left_out: tuple[int, ...] = ()  # Rows of the table that had no say in the fit, and in the families' columns
+    left_out: tuple[
+        int, ...
+    ] = ()  # Rows of the table that had no say in the fit, and in the families' columns
 
     SHAPES: ClassVar[Shapes] = {
-        **{"directions": ("q", "j"), "amplitudes": ("j",), "covariance": ("j", "j"), "parameters": ("j", "p")},
+        **{
+            "directions": ("q", "j"),
+            "amplitudes": ("j",),
+            "covariance": ("j", "j"),
+            "parameters": ("j", "p"),
+        },
         "frame_covariance": (3, 3),
     }
 
@@ -78,7 +100,8 @@ class Pattern:
     def products(self) -> FloatArray:
         """Expected products (J, J) of the true amplitudes.
 
-        What has a prior is as large as that leaves it, what has none by its noise smaller than it is estimated.
+        What has a prior is as large as that leaves it, what has none by its noise smaller than it
+        is estimated.
         """
         first = len(self.amplitudes) - self.n_with_prior
         made = np.outer(self.amplitudes, self.amplitudes) - self.covariance
@@ -86,7 +109,9 @@ class Pattern:
         return made
 
     def among(self, families: Sequence[Shape]) -> list[Shape]:
-        """Its own families, in the order of the rows of `directions`; LookupError where one is not among these."""
+        """Its own families, in the order of the rows of `directions`; LookupError where one is not
+        among these.
+        """
         known = {family.name: family for family in families}
         return [known[name] for name in self.families if name != FRAME_BY_FRAME]
 
@@ -95,8 +120,8 @@ class Pattern:
 class Response:
     """What a pattern does to the attitudes of some frames."""
 
-    # `common_arcsec`, `rest_arcsec`, (3,): common rotation, and root mean square over frames of the rest, about
-    # pitch, yaw and roll; the noise of the amplitudes is taken off their squares.
+    # `common_arcsec`, `rest_arcsec`, (3,): common rotation, and root mean square over frames of the
+    # rest, about pitch, yaw and roll; the noise of the amplitudes is taken off their squares.
     common_arcsec: FloatArray
     rest_arcsec: FloatArray
     # `common_upper_arcsec`, `rest_upper_arcsec`, (3,): bounds of both at 95 %.
@@ -104,7 +129,9 @@ class Response:
     rest_upper_arcsec: FloatArray
 
     SHAPES: ClassVar[Shapes] = {
-        **dict.fromkeys(("common_arcsec", "rest_arcsec", "common_upper_arcsec", "rest_upper_arcsec"), (3,))
+        **dict.fromkeys(
+            ("common_arcsec", "rest_arcsec", "common_upper_arcsec", "rest_upper_arcsec"), (3,)
+        )
     }
 
 
@@ -119,20 +146,29 @@ def response(
     """What a pattern does to attitudes.
 
     `pattern`: the pattern, at least of one family.
-    `theta`: estimate of the camera that it was found beside, px units.
-    `post`, `obs`: posterior and data of the calibration.
-    `seen`, `aligned`: frames of the mission, and those of its alignment, which decide what is common; `seen` if they
-        are not given. Where frames have no time, temperature or magnitudes, they get those of the calibration's frames
-        and stars.
+    `theta`: estimate of the camera that it was found beside, px units. `post`, `obs`: posterior and
+    data of the calibration.
+    `seen`, `aligned`: frames of the mission, and those of its alignment, which decide what is
+    common; `seen` if they
+        are not given. Where frames have no time, temperature or magnitudes, they get those of the
+        calibration's frames and stars.
     LookupError if the data do not offer a shape of the pattern, which then is not of them.
     """
     if pattern.left_out:
         # Which shapes there are, and their scales, follow from the stars that they were fitted to.
         fitted = obs.select(~np.isin(np.arange(obs.n_stars), pattern.left_out))
-        seen, aligned, obs = fitted if seen is obs else seen, fitted if aligned is obs else aligned, fitted
+        seen, aligned, obs = (
+            fitted if seen is obs else seen,
+            fitted if aligned is obs else aligned,
+            fitted,
+        )
     camera = post.camera.with_theta(np.asarray(theta, dtype=np.float64))
     here = _Turned.of(pattern, camera, post, obs, seen)
-    there = here if aligned is None or aligned is seen else _Turned.of(pattern, camera, post, obs, aligned)
+    there = (
+        here
+        if aligned is None or aligned is seen
+        else _Turned.of(pattern, camera, post, obs, aligned)
+    )
     weights, _ = alignment_weights(there.noise_covariance)
     together = np.einsum("nij,njk->ik", weights, there.direct)
     apart = here.direct - together
@@ -140,7 +176,9 @@ def response(
     if len(pattern.amplitudes):
         common, common_error = _square(np.einsum("ij,ik->ijk", together, together), pattern)
         rest, rest_error = _square(np.einsum("kij,kil->ijl", apart, apart) / len(apart), pattern)
-    own = np.mean(np.einsum("kia,ab,kib->ki", here.moving, pattern.frame_covariance, here.moving), axis=0)
+    own = np.mean(
+        np.einsum("kia,ab,kib->ki", here.moving, pattern.frame_covariance, here.moving), axis=0
+    )
     rest = rest + own
     # A variance over this many frames is known to this share of itself.
     rest_error = np.hypot(rest_error, own * np.sqrt(2.0 / max(pattern.n_frames - 1, 1)))
@@ -159,14 +197,23 @@ def response(
 
 @dataclass(frozen=True, eq=False)
 class _Turned:
-    """Turns of frames by directions (K, 3, J) and by scale and shape of their own (K, 3, 3), rad; their noise."""
+    """Turns of frames by directions (K, 3, J) and by scale and shape of their own (K, 3, 3), rad;
+    their noise.
+    """
 
     direct: FloatArray
     moving: FloatArray
     noise_covariance: FloatArray
 
     @classmethod
-    def of(cls, pattern: Pattern, camera: Camera, post: Posterior, obs: Observations, frames: Observations) -> _Turned:
+    def of(
+        cls,
+        pattern: Pattern,
+        camera: Camera,
+        post: Posterior,
+        obs: Observations,
+        frames: Observations,
+    ) -> _Turned:
         chosen = pattern.among(shapes(obs, camera, max_cells=pattern.max_cells, seen=frames))
         geometry = FrameGeometry.of(post, frames)
         turns = geometry.noise_response / geometry.noise_px[:, None]
@@ -180,9 +227,13 @@ class _Turned:
             columns = frame_shapes(camera).columns(view)
             if chosen:
                 found = np.concatenate([family.columns(view) for family in chosen])
-                columns = np.concatenate([columns, np.einsum("qj,qan->jan", pattern.directions, found)])
+                columns = np.concatenate(
+                    [columns, np.einsum("qj,qan->jan", pattern.directions, found)]
+                )
             edges = starts[first:last] - starts[first]
-            turned.append(np.add.reduceat(np.einsum("jan,ani->nij", columns, turns[:, rows]), edges, axis=0))
+            turned.append(
+                np.add.reduceat(np.einsum("jan,ani->nij", columns, turns[:, rows]), edges, axis=0)
+            )
         moving, direct = np.split(np.concatenate(turned), [3], axis=2)
         if chosen:
             direct = direct + geometry.response @ pattern.parameters.T
@@ -194,8 +245,12 @@ def _square(matrices: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatAr
     a, C = pattern.amplitudes, pattern.covariance
     noisy = matrices @ C
     value = np.einsum("ijk,jk->i", matrices, pattern.products)
-    linear, quadratic = np.einsum("j,ijk,k->i", a, noisy @ matrices, a), np.einsum("ijk,ikj->i", noisy, noisy)
-    # At the estimate the first term counts the noise once too often; it can then not fall below the second.
+    linear, quadratic = (
+        np.einsum("j,ijk,k->i", a, noisy @ matrices, a),
+        np.einsum("ijk,ikj->i", noisy, noisy),
+    )
+    # At the estimate the first term counts the noise once too often; it can then not fall below the
+    # second.
     return value, np.sqrt(np.maximum(4.0 * linear - 2.0 * quadratic, 2.0 * quadratic))
 
 
@@ -203,25 +258,32 @@ def _square(matrices: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatAr
 class Fit:
     """Sums over all stars from which shapes are fitted."""
 
-    # `gram`, `blocks`, (p + 1 + q, p + 1 + q): products of parameters, residuals and columns of all families,
-    # attitudes removed; and the part of them that scale and shape of every frame by itself explain.
+    # `gram`, `blocks`, (p + 1 + q, p + 1 + q): products of parameters, residuals and columns of all
+    # families, attitudes removed; and the part of them that scale and shape of every frame by
+    # itself explain.
     gram: FloatArray
     blocks: FloatArray
     raw: FloatArray  # (p + 1 + q,): squares of the same before attitudes were removed
-    inner: FloatArray  # (q, q): products of the columns among themselves before attitudes were removed
-    # `p`, `dof`, `block_rank`: parameters, degrees of freedom of the residuals, and those that frames by themselves
-    # take.
+    inner: (
+        FloatArray  # (q, q): products of the columns among themselves before attitudes were removed
+    )
+    # `p`, `dof`, `block_rank`: parameters, degrees of freedom of the residuals, and those that
+    # frames by themselves take.
     p: int
     dof: int
     block_rank: int
 
-    def pattern(self, families: dict[str, tuple[Shape, slice]], frame_by_frame: bool, alpha: float) -> Pattern:
-        """Fit these families, which have these places, and frames by themselves, the strongest first.
+    def pattern(
+        self, families: dict[str, tuple[Shape, slice]], frame_by_frame: bool, alpha: float
+    ) -> Pattern:
+        """Fit these families, which have these places, and frames by themselves, the strongest
+        first.
 
-        `alpha` is the level of a single test; what does not reach it beside those before is left out. A family without
-        labels is a basis for any smooth misfit: amplitudes of the first one, and of all that come after it, have a
-        prior. One over the field counts with all of its shapes, as a misfit has no reason to be only where attitudes
-        and parameters leave it in sight; terms of a known form are then no longer separated from it.
+        `alpha` is the level of a single test; what does not reach it beside those before is left
+        out. A family without labels is a basis for any smooth misfit: amplitudes of the first one,
+        and of all that come after it, have a prior. One over the field counts with all of its
+        shapes, as a misfit has no reason to be only where attitudes and parameters leave it in
+        sight; terms of a known form are then no longer separated from it.
         """
         size = len(self.gram) - self.p - 1
         left, places = dict(families), {name: place for name, (_, place) in families.items()}
@@ -239,7 +301,11 @@ class Fit:
             if frame_by_frame and not own:
                 with_frames = _without(self._system(True), directions)[0, 0]
                 gain = _gain(
-                    rest[0, 0], rest[0, 0] - with_frames, dof, dof - self._dof(True) + directions.shape[1], alpha
+                    rest[0, 0],
+                    rest[0, 0] - with_frames,
+                    dof,
+                    dof - self._dof(True) + directions.shape[1],
+                    alpha,
                 )
                 gains |= {} if gain is None else {FRAME_BY_FRAME: gain}
             if not gains:
@@ -257,14 +323,20 @@ class Fit:
             if not shape.labels and shape.against in OVER_FIELD:
                 norm = np.sqrt(self.raw[at])
                 found = np.diag(1.0 / np.where(norm > 0.0, norm, 1.0))[:, norm > 0.0]
-                left = {name: (s, p) for name, (s, p) in left.items() if not s.labels or s.against not in OVER_FIELD}
+                left = {
+                    name: (s, p)
+                    for name, (s, p) in left.items()
+                    if not s.labels or s.against not in OVER_FIELD
+                }
             directions = np.column_stack((directions, _placed(found, at.start - self.p - 1, size)))
         if certain is None:
             certain = directions.shape[1]
         return self._fitted(tuple(chosen), places, directions, own, certain)
 
     def _system(self, own: bool) -> FloatArray:
-        """Residuals and columns (1 + q, 1 + q) with the parameters removed, and frames by themselves if `own`."""
+        """Residuals and columns (1 + q, 1 + q) with the parameters removed, and frames by
+        themselves if `own`.
+        """
         gram = self.gram - self.blocks if own else self.gram
         scale = 1.0 / np.sqrt(np.diag(self.gram)[: self.p])
         values, vectors = np.linalg.eigh(gram[: self.p, : self.p] * np.outer(scale, scale))
@@ -279,10 +351,19 @@ class Fit:
             return self.dof
         scale = 1.0 / np.sqrt(np.diag(self.gram)[: self.p])
         left = (self.gram - self.blocks)[: self.p, : self.p] * np.outer(scale, scale)
-        return self.dof - self.block_rank + self.p - int(np.count_nonzero(np.linalg.eigvalsh(left) > _ABSORBED))
+        return (
+            self.dof
+            - self.block_rank
+            + self.p
+            - int(np.count_nonzero(np.linalg.eigvalsh(left) > _ABSORBED))
+        )
 
-    def _step(self, rest: FloatArray, dof: int, at: slice, alpha: float) -> tuple[float, FloatArray] | None:
-        """Gain and directions (columns, j) of one family beside what was removed; None if it is not significant."""
+    def _step(
+        self, rest: FloatArray, dof: int, at: slice, alpha: float
+    ) -> tuple[float, FloatArray] | None:
+        """Gain and directions (columns, j) of one family beside what was removed; None if it is not
+        significant.
+        """
         from scipy.special import fdtrc
 
         norm = np.sqrt(self.raw[at.start + self.p : at.stop + self.p])
@@ -298,13 +379,19 @@ class Fit:
         gain = _gain(rest[0, 0], explained, dof, rank, alpha)
         if gain is None:
             return None
-        # What is found is what the test found: directions that say nothing by themselves would add their noise only.
+        # What is found is what the test found: directions that say nothing by themselves would add
+        # their noise only.
         variance = (rest[0, 0] - explained) / (dof - rank)
         said = fdtrc(1.0, dof - rank, squares / variance) * rank < _DIRECTION_P
         return gain, vectors[:, said if said.any() else slice(None)] / norm[:, None]
 
     def _fitted(
-        self, chosen: tuple[str, ...], places: dict[str, slice], directions: FloatArray, own: bool, certain: int
+        self,
+        chosen: tuple[str, ...],
+        places: dict[str, slice],
+        directions: FloatArray,
+        own: bool,
+        certain: int,
     ) -> Pattern:
         """The pattern of all directions, of which the first `certain` have no prior."""
         system = self._system(own)
@@ -319,17 +406,25 @@ class Fit:
             # Columns of two families may make the same shape.
             raw = lengths + _ABSORBED * np.diag(np.diag(lengths))
             precision = np.zeros_like(matrix)
-            size = _prior_variance(free.T @ loose[1:, 1:] @ free, raw, free.T @ loose[1:, 0], variance)
+            size = _prior_variance(
+                free.T @ loose[1:, 1:] @ free, raw, free.T @ loose[1:, 0], variance
+            )
             precision[certain:, certain:] = raw / size
             covariance = np.asarray(np.linalg.inv(matrix / variance + precision), dtype=np.float64)
         amplitudes = covariance @ slope / variance
-        absorbed = scaled_inverse(self.gram[: self.p, : self.p]) @ self.gram[: self.p, self.p + 1 :] @ directions
+        absorbed = (
+            scaled_inverse(self.gram[: self.p, : self.p])
+            @ self.gram[: self.p, self.p + 1 :]
+            @ directions
+        )
         rows = [np.arange(self.p, len(self.gram) - 1)[:0]]
         names = [name for name in chosen if name != FRAME_BY_FRAME]
         rows += [np.arange(places[name].start, places[name].stop) - self.p - 1 for name in names]
         arrays = (directions[np.concatenate(rows)], amplitudes, covariance, absorbed.T)
         # Nothing is nothing, also when it is read from a file.
-        directions, amplitudes, covariance, parameters = (a if a.size else np.zeros(0) for a in arrays)
+        directions, amplitudes, covariance, parameters = (
+            a if a.size else np.zeros(0) for a in arrays
+        )
         return Pattern(
             families=chosen,
             directions=directions,
@@ -342,12 +437,15 @@ class Fit:
         )
 
 
-def _prior_variance(matrix: FloatArray, raw: FloatArray, slope: FloatArray, variance: float) -> float:
+def _prior_variance(
+    matrix: FloatArray, raw: FloatArray, slope: FloatArray, variance: float
+) -> float:
     """Variance of every amplitude of a pattern that is as large in any direction of its shapes.
 
-    `matrix`, `slope`: normal equations of the amplitudes, attitudes and parameters removed. `raw`: products of the
-    shapes before that; in combinations that are orthonormal in it the amplitudes are independent. Those set the size
-    that are in sight: a leak of another misfit into what attitudes imitate is divided by nearly nothing.
+    `matrix`, `slope`: normal equations of the amplitudes, attitudes and parameters removed. `raw`:
+    products of the shapes before that; in combinations that are orthonormal in it the amplitudes
+    are independent. Those set the size that are in sight: a leak of another misfit into what
+    attitudes imitate is divided by nearly nothing.
     """
     from scipy.linalg import eigh
 
@@ -375,7 +473,9 @@ def _without(system: FloatArray, directions: FloatArray) -> FloatArray:
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of products of directions, whose length was 1; what frames by themselves absorb of them is left out."""
+    """Inverse of products of directions, whose length was 1; what frames by themselves absorb of
+    them is left out.
+    """
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
     kept = values > _ABSORBED
     inverse: FloatArray = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
@@ -383,7 +483,9 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 def _gain(rss: float, explained: float, dof: int, rank: int, alpha: float) -> float | None:
-    """How much likelier the data become, less the price of the columns (Akaike); None if that may be chance."""
+    """How much likelier the data become, less the price of the columns (Akaike); None if that may
+    be chance.
+    """
     from scipy.special import fdtrc
 
     if rank <= 0 or dof - rank < 1 or not 0.0 < explained < rss:
@@ -394,10 +496,14 @@ def _gain(rss: float, explained: float, dof: int, rank: int, alpha: float) -> fl
     return dof * float(np.log(rss / (rss - explained))) - 2.0 * rank
 
 
-def frame_covariance(pattern: Pattern, families: Sequence[Shape], obs: Observations, cal: Calibration) -> FloatArray:
-    """Covariance (3, 3) over frames of their own scale and shape, beside the rest of a pattern, px at the corner.
+def frame_covariance(
+    pattern: Pattern, families: Sequence[Shape], obs: Observations, cal: Calibration
+) -> FloatArray:
+    """Covariance (3, 3) over frames of their own scale and shape, beside the rest of a pattern, px
+    at the corner.
 
-    By moments: with w = C^T e of a frame and L = C^T C, both without its attitude, E[w w^T] = L S L + variance L.
+    By moments: with w = C^T e of a frame and L = C^T C, both without its attitude, E[w w^T] = L S L
+    + variance L.
     """
     chosen = pattern.among(families)
     own = frame_shapes(cal.camera)
@@ -413,10 +519,14 @@ def frame_covariance(pattern: Pattern, families: Sequence[Shape], obs: Observati
         if chosen:
             columns = np.concatenate([family.columns(view) for family in chosen])
             shift = np.einsum("q,qan->an", pattern.directions @ pattern.amplitudes, columns)
-            shift -= np.einsum("p,pan->an", pattern.amplitudes @ pattern.parameters, view.parameter_columns)
+            shift -= np.einsum(
+                "p,pan->an", pattern.amplitudes @ pattern.parameters, view.parameter_columns
+            )
             e -= weight * shift
         projected = part.project_out(state, np.concatenate([own.columns(view) * weight, e[None]]))
-        products = np.stack([part.frames.sum(np.sum(column * projected, axis=1)) for column in projected[:3]])
+        products = np.stack(
+            [part.frames.sum(np.sum(column * projected, axis=1)) for column in projected[:3]]
+        )
         grams.append(np.moveaxis(products[:, :3], 2, 0))
         slopes.append(products[:, 3].T)
     # The mean over frames went into the parameters, and with it one frame's worth of the spread.
@@ -425,7 +535,9 @@ def frame_covariance(pattern: Pattern, families: Sequence[Shape], obs: Observati
 
 
 def _moments(grams: FloatArray, slopes: FloatArray, variance: float) -> FloatArray:
-    """The covariance (3, 3) from L (K, 3, 3) and w (K, 3), without components whose variance is within its error."""
+    """The covariance (3, 3) from L (K, 3, 3) and w (K, 3), without components whose variance is
+    within its error.
+    """
     covariance, error = _solved(grams, slopes, variance)
     kept = np.flatnonzero(np.diag(covariance) > _SAID * np.diag(error))
     if not len(kept):
@@ -437,8 +549,12 @@ def _moments(grams: FloatArray, slopes: FloatArray, variance: float) -> FloatArr
     return found
 
 
-def _solved(grams: FloatArray, slopes: FloatArray, variance: float) -> tuple[FloatArray, FloatArray]:
-    """Solution of the equations of moments, and its standard errors by their scatter over frames."""
+def _solved(
+    grams: FloatArray, slopes: FloatArray, variance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Solution of the equations of moments, and its standard errors by their scatter over
+    frames.
+    """
     size = slopes.shape[1]
     pairs = np.einsum("kab,kcd->kacbd", grams, grams).reshape(len(grams), size**2, size**2)
     moments = (slopes[:, :, None] * slopes[:, None, :] - variance * grams).reshape(len(grams), -1)

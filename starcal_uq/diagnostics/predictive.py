@@ -1,7 +1,8 @@
 """Posterior predictive check: would data that the model makes look like those that were measured?
 
-Each draw of camera and noise makes replicated residuals on the observed frames, with their attitudes fitted again. The
-same statistics of the measured residuals at the same draw are set against them.
+Each draw of camera and noise makes replicated residuals on the observed frames, with their
+attitudes fitted again. The same statistics of the measured residuals at the same draw are set
+against them.
 """
 
 from __future__ import annotations
@@ -93,7 +94,12 @@ class PredictiveCheck(Shown):
 @bounded
 @one_thread()
 def predictive_check(
-    obs: Observations, cal: Calibration, post: Posterior | None = None, *, n_draws: int = 500, seed: int = 0
+    obs: Observations,
+    cal: Calibration,
+    post: Posterior | None = None,
+    *,
+    n_draws: int = 500,
+    seed: int = 0,
 ) -> PredictiveCheck:
     """Compare statistics of the residuals with those of data that the posterior predicts.
 
@@ -118,8 +124,11 @@ def predictive_check(
     e, h = state.e, part.project_out(state, part.derivatives(cal.theta, state))
     stars = None
     if cal.star_errors is not None:
-        # Residuals after each star's offset, as they follow the parameters; replicates go the same way.
-        stars = StarLikelihood(some, part.model_name, cal.theta, state.rotations, cal.star_errors, cal.sigma)
+        # Residuals after each star's offset, as they follow the parameters; replicates go the same
+        # way.
+        stars = StarLikelihood(
+            some, part.model_name, cal.theta, state.rotations, cal.star_errors, cal.sigma
+        )
         columns, _ = stars.conditioned(state, np.concatenate([h, e[None]]))
         h, e = columns[:-1], columns[-1]
     theta, sigma = _draws(cal, post, n_draws, rng)
@@ -134,12 +143,16 @@ def predictive_check(
             fresh -= turns @ (turns.T @ fresh)
             replicated.append(summary(fresh.reshape(e.shape)))
         else:
-            replicated.append(summary(stars.conditioned(state, fresh + stars.random_shifts(state, rng))[0][0]))
+            replicated.append(
+                summary(stars.conditioned(state, fresh + stars.random_shifts(state, rng))[0][0])
+            )
     data, fake = np.array(measured), np.array(replicated)
     low, middle, high = np.quantile(fake, (0.025, 0.5, 0.975), axis=0)
     p = np.mean(fake >= data, axis=0)
     rows = zip(_NAMES, data.mean(axis=0), low, middle, high, p, strict=True)
-    statistics = tuple(PredictiveStatistic(name, *(float(v) for v in values)) for name, *values in rows)
+    statistics = tuple(
+        PredictiveStatistic(name, *(float(v) for v in values)) for name, *values in rows
+    )
     if cal.noise_model is not None and cal.noise_model.frame_dof is not None:
         # Every frame's sum of squares went into the factor of its own noise.
         statistics = tuple(s for s in statistics if not s.name.startswith("worst frame"))
@@ -147,18 +160,24 @@ def predictive_check(
 
 
 def _turns(part: MarginalLikelihood, state: Profile) -> Any:
-    """Orthonormal columns (2 N, 3 K) that span what rotations of the frames make of residuals (2, N), sparse."""
+    """Orthonormal columns (2 N, 3 K) that span what rotations of the frames make of residuals (2,
+    N), sparse.
+    """
     from scipy.sparse import csr_array
 
     frames = part.frames
-    factor: FloatArray = np.asarray(np.linalg.cholesky(np.moveaxis(state.inverse, 2, 0)), dtype=np.float64)
+    factor: FloatArray = np.asarray(
+        np.linalg.cholesky(np.moveaxis(state.inverse, 2, 0)), dtype=np.float64
+    )
     root = frames.spread(np.moveaxis(factor, 0, 2))
     # Star by star and axis by axis: A times the root of (A^T A)^-1.
     values = np.einsum("axn,abn->xnb", state.attitude, root, optimize=True)
     columns = 3 * np.repeat(np.arange(frames.n_frames), frames.sizes)[:, None] + np.arange(3)
     n = frames.n_stars
     place = np.broadcast_to(columns, (2, n, 3)).ravel()
-    return csr_array((values.ravel(), place, 3 * np.arange(2 * n + 1)), shape=(2 * n, 3 * frames.n_frames))
+    return csr_array(
+        (values.ravel(), place, 3 * np.arange(2 * n + 1)), shape=(2 * n, 3 * frames.n_frames)
+    )
 
 
 def _draws(
@@ -203,7 +222,8 @@ class _Summary:
         radial = z[0] * self.out[0] + z[1] * self.out[1]
         across = self.out[0] * z[1] - self.out[1] * z[0]
         patterns = [
-            float(np.mean(np.bincount(self.ring, values, _RINGS) ** 2 / self.counts)) for values in (radial, across)
+            float(np.mean(np.bincount(self.ring, values, _RINGS) ** 2 / self.counts))
+            for values in (radial, across)
         ]
         total = float(squares.sum())
         return [

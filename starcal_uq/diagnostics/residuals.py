@@ -1,4 +1,6 @@
-"""What the model leaves over: residuals in cells of the detector, and whether their pattern is more than noise."""
+"""What the model leaves over: residuals in cells of the detector, and whether their pattern is more
+than noise.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ class BinnedResiduals:
     centres: FloatArray  # (n, 2): cell centres, px
     means: FloatArray  # (n, 2): mean residuals, px
     counts: FloatArray  # (n,): stars in the cell
-    # (n,): |mean|^2 over its variance per axis if residuals are noise alone; two degrees of freedom each.
+    # (n,): |mean|^2 over its variance per axis if residuals are noise alone; two degrees of freedom
+    # each.
     chi2: FloatArray
     noise_px: FloatArray  # (n,): standard deviation per axis of a mean that is noise alone, px
     cell_px: float  # Side of a cell
@@ -38,8 +41,8 @@ class BinnedResiduals:
     def p_value(self) -> float:
         """Probability of cell means at least this large from noise alone.
 
-        A little too large in general, which is the safe side for an alarm: the attitude of each frame takes up part of
-        a pattern, and of the noise in the means.
+        A little too large in general, which is the safe side for an alarm: the attitude of each
+        frame takes up part of a pattern, and of the noise in the means.
         """
         from scipy.special import gammaincc
 
@@ -49,7 +52,9 @@ class BinnedResiduals:
 
     @property
     def pattern_px(self) -> float:
-        """Root mean square per axis of the pattern over the field, the noise of the cell means taken off; px."""
+        """Root mean square per axis of the pattern over the field, the noise of the cell means
+        taken off; px.
+        """
         if len(self.counts) == 0:
             return 0.0
         excess = np.mean(np.sum(self.means**2, axis=1) / 2.0 - self.noise_px**2)
@@ -57,10 +62,11 @@ class BinnedResiduals:
 
 
 def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
-    """Mean residual vectors in cells that hold about 25 stars each (4 to 12 cells along the longer side).
+    """Mean residual vectors in cells that hold about 25 stars each (4 to 12 cells along the longer
+    side).
 
-    Of partitioned observations they are those of all stars, of which `obs` is a sample; of an estimate with Student-t
-    tails those of stars within 4.5 sigma.
+    Of partitioned observations they are those of all stars, of which `obs` is a sample; of an
+    estimate with Student-t tails those of stars within 4.5 sigma.
     """
     if cal.partitions is not None:
         found, scale2 = cal.partitions.residuals, _unit_scale(cal, cal.n_stars) ** 2
@@ -72,7 +78,9 @@ def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
         if not use.all():
             # The scale of the t is not the scatter of those that it hears.
             scale2 = float(np.mean((residuals / stated[:, None])[use] ** 2))
-        found = ResidualMap.of(cal.camera, obs.n_stars, obs.xy[use].T, residuals[use].T, stated[use])
+        found = ResidualMap.of(
+            cal.camera, obs.n_stars, obs.xy[use].T, residuals[use].T, stated[use]
+        )
     cell, nx = found.cell_px, int(found.shape[1])
     keep = found.counts >= _MIN_STARS
     counts, sums, variance = found.counts[keep], found.sums[keep], found.stated2[keep] * scale2
@@ -90,7 +98,8 @@ def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
 
 
 def heard(obs: Observations, cal: Calibration) -> BoolArray:
-    """Stars (N,) that had a say in an estimate: of one with Student-t tails those within 4.5 sigma, else all.
+    """Stars (N,) that had a say in an estimate: of one with Student-t tails those within 4.5 sigma,
+    else all.
 
     Frames keep at least three of them, or none.
     """
@@ -111,15 +120,17 @@ def of_heard(obs: Observations, cal: Calibration) -> tuple[Observations, Calibra
         return obs, cal
     left = np.isin(cal.frame_ids, obs.frame[use])
     frames, quaternions = cal.frame_ids[left], cal.quaternions[left]
-    kept = replace(cal, residuals_px=cal.residuals_px[use], frame_ids=frames, quaternions=quaternions)
+    kept = replace(
+        cal, residuals_px=cal.residuals_px[use], frame_ids=frames, quaternions=quaternions
+    )
     return obs.select(use), kept
 
 
 def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
     """Expected standard deviation of each residual per axis, px, shape (N,).
 
-    The fit takes up part of the noise: with d degrees of freedom in 2N numbers, residuals are smaller than the noise by
-    sqrt(d / 2N) on average.
+    The fit takes up part of the noise: with d degrees of freedom in 2N numbers, residuals are
+    smaller than the noise by sqrt(d / 2N) on average.
     """
     obs = weighed(obs, cal)
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
@@ -128,12 +139,16 @@ def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
 
 
 def _unit_scale(cal: Calibration, n_stars: int) -> float:
-    """Expected standard deviation of the residuals of `n_stars` stars with a stated noise of one."""
+    """Expected standard deviation of the residuals of `n_stars` stars with a stated noise of
+    one.
+    """
     return float(cal.sigma * np.sqrt(max(cal.dof, 1) / (2.0 * n_stars)))
 
 
 def normalised_residuals(cal: Calibration, obs: Observations) -> FloatArray:
-    """Residuals in units of their expected standard deviation, shape (N, 2); of fitted axes, the independent parts."""
+    """Residuals in units of their expected standard deviation, shape (N, 2); of fitted axes, the
+    independent parts.
+    """
     scaled: FloatArray = cal.residuals_px / residual_scale(cal, obs)[:, None]
     axes = weighed(obs, cal).noise_axes
     return scaled if axes is None else scaled @ np.linalg.inv(np.linalg.cholesky(axes)).T
@@ -156,21 +171,30 @@ _XY, _POLAR = ("x", "y"), ("radial", "tangential")
 
 
 def residual_profiles(cal: Calibration, obs: Observations) -> tuple[Profile1D, ...]:
-    """Residuals against azimuth, pixel phase in x and y, order of frames, magnitude and temperature, in bins.
+    """Residuals against azimuth, pixel phase in x and y, order of frames, magnitude and
+    temperature, in bins.
 
-    The phase is that of the predicted position, from -0.5 to 0.5 px around the centre of a pixel. Quantities that the
-    table lacks, or that do not vary, are left out.
+    The phase is that of the predicted position, from -0.5 to 0.5 px around the centre of a pixel.
+    Quantities that the table lacks, or that do not vary, are left out.
     """
     obs = weighed(obs, cal)
     residuals = np.asarray(cal.residuals_px).T
     predicted = obs.xy.T - residuals
     offset = predicted - cal.theta[:2, None]
     unit = offset / np.maximum(np.hypot(*offset), 1e-9)
-    polar = np.stack([np.sum(residuals * unit, axis=0), unit[0] * residuals[1] - unit[1] * residuals[0]])
+    polar = np.stack(
+        [np.sum(residuals * unit, axis=0), unit[0] * residuals[1] - unit[1] * residuals[0]]
+    )
     phase = predicted - np.round(predicted)
     order = np.searchsorted(obs.frame_ids, obs.frame).astype(np.float64)
     wanted: list[tuple[str, str, tuple[str, str], FloatArray | None, FloatArray]] = [
-        ("Azimuth", "azimuth in the field [°]", _POLAR, np.degrees(np.arctan2(offset[1], offset[0])), polar),
+        (
+            "Azimuth",
+            "azimuth in the field [°]",
+            _POLAR,
+            np.degrees(np.arctan2(offset[1], offset[0])),
+            polar,
+        ),
         ("Pixel phase in x", "phase in x [px]", _XY, phase[0], residuals),
         ("Pixel phase in y", "phase in y [px]", _XY, phase[1], residuals),
         ("Order of frames", "frame, in order", _POLAR, order, polar),
@@ -186,7 +210,12 @@ def residual_profiles(cal: Calibration, obs: Observations) -> tuple[Profile1D, .
 
 
 def _profile(
-    title: str, label: str, names: tuple[str, str], values: FloatArray, parts: FloatArray, scale2: FloatArray
+    title: str,
+    label: str,
+    names: tuple[str, str],
+    values: FloatArray,
+    parts: FloatArray,
+    scale2: FloatArray,
 ) -> Profile1D:
     known = np.isfinite(values)
     values, parts, scale2 = values[known], parts[:, known], scale2[known]

@@ -1,8 +1,9 @@
 """Shapes that residuals take when the model is wrong, as columns of pixel shifts.
 
-Every column is a displacement (observed minus predicted) for every star and both axes. Positions are predicted ones:
-with measured ones, the noise of a star would enter its own shape. What the attitudes and the fitted parameters absorb
-of a shape is removed where the shapes are used, so their scale and their overlap do not matter here.
+Every column is a displacement (observed minus predicted) for every star and both axes. Positions
+are predicted ones: with measured ones, the noise of a star would enter its own shape. What the
+attitudes and the fitted parameters absorb of a shape is removed where the shapes are used, so their
+scale and their overlap do not matter here.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _RADIAL_DEGREE, _TWIST_DEGREE = 6, 3
 _TIME_DEGREE = 3
 _STARS_PER_CELL = 25.0
 MAX_CELLS = 8
-# Coordinates of shapes that keep their place in the field, and those of the directions of one frame.
+# Coordinates of shapes that keep their place in the field, and those of the directions of one
+# frame.
 IN_FIELD = ("radius", "azimuth", "field", "field cells")
 OVER_FIELD = (*IN_FIELD, "direction")
 FRAME_BY_FRAME = "scale and shape that change from frame to frame"
@@ -43,7 +45,9 @@ class View:
     rows: slice  # Rows of the stars in the table
     part: MarginalLikelihood  # Likelihood of the stars
     state: Profile  # The model at the best attitudes
-    parameter_columns: FloatArray  # (p, 2, n): derivatives by the fitted parameters, not divided by the noise
+    parameter_columns: (
+        FloatArray  # (p, 2, n): derivatives by the fitted parameters, not divided by the noise
+    )
     uv: FloatArray  # (2, n): predicted positions relative to the principal point, px
 
     @classmethod
@@ -51,7 +55,13 @@ class View:
         """The stars of `part`, which are these rows of the table."""
         frames = part.frames
         predicted = frames.pixel - frames.in_pixels(state.e)
-        return cls(rows, part, state, frames.in_pixels(part.derivatives(theta, state)), predicted - theta[:2, None])
+        return cls(
+            rows,
+            part,
+            state,
+            frames.in_pixels(part.derivatives(theta, state)),
+            predicted - theta[:2, None],
+        )
 
 
 @dataclass(frozen=True)
@@ -66,17 +76,23 @@ class Shape:
     # Name and unit of each column's amplitude, where amplitudes mean something by themselves.
     labels: tuple[tuple[str, str], ...] = ()
     per_amplitude: tuple[float, ...] = ()  # Amplitude in that unit of a column as it stands
-    # ``View -> (n,)`` cell of every star, where the columns are shifts of those in one cell along each axis.
+    # ``View -> (n,)`` cell of every star, where the columns are shifts of those in one cell along
+    # each axis.
     cell: Callable[[View], IntArray] | None = None
 
 
 def shapes(
-    obs: Observations, camera: Camera, *, max_cells: int = MAX_CELLS, seen: Observations | None = None
+    obs: Observations,
+    camera: Camera,
+    *,
+    max_cells: int = MAX_CELLS,
+    seen: Observations | None = None,
 ) -> tuple[Shape, ...]:
-    """Every family of shapes that the table allows; magnitude, time and temperature are used where they vary.
+    """Every family of shapes that the table allows; magnitude, time and temperature are used where
+    they vary.
 
-    `max_cells`: largest number of field cells along the longer side.
-    `seen`: other frames that the same shapes are wanted on. What these do not state is drawn from the table: the time
+    `max_cells`: largest number of field cells along the longer side. `seen`: other frames that the
+    same shapes are wanted on. What these do not state is drawn from the table: the time
         of a frame and its temperature together, the magnitude of a star by itself.
     """
     seen = obs if seen is None else seen
@@ -97,7 +113,11 @@ def shapes(
         found.append(_drift(clock, called))
     if warmth is not None and obs.temperature_c is not None:
         spread = float(np.nanstd(obs.temperature_c))
-        found.append(_focal_against(warmth, "focal length with temperature", "temperature", ("df/dT", "px/K"), spread))
+        found.append(
+            _focal_against(
+                warmth, "focal length with temperature", "temperature", ("df/dT", "px/K"), spread
+            )
+        )
     found += [_radius(camera), _azimuth(camera), _phase(0), _phase(1)]
     if magnitude is not None:
         found.append(_magnitude(magnitude, camera))
@@ -107,7 +127,9 @@ def shapes(
 
 
 def lens_shapes(camera: Camera) -> tuple[Shape, ...]:
-    """Terms that the lens of the fitted model lacks: of the other models, and scale and skew of the axes."""
+    """Terms that the lens of the fitted model lacks: of the other models, and scale and skew of the
+    axes.
+    """
     return *_missing_terms(camera), _axes(camera)
 
 
@@ -119,11 +141,15 @@ def focal_drift(obs: Observations) -> tuple[Shape, ...]:
 
 def _drift(clock: FloatArray, called: str) -> Shape:
     # The clock runs from -1 to 1: twice the amplitude is the change over the run.
-    return _focal_against(clock, "linear drift of f", called, ("change of f over the run", "px"), 0.5)
+    return _focal_against(
+        clock, "linear drift of f", called, ("change of f over the run", "px"), 0.5
+    )
 
 
 def run_clock(obs: Observations) -> tuple[FloatArray | None, str]:
-    """Time of every star from -1 to 1 over the run, or the order of frames where there is no time; and its name."""
+    """Time of every star from -1 to 1 over the run, or the order of frames where there is no time;
+    and its name.
+    """
     seconds = None if obs.time_utc is None else _seconds(obs.time_utc)
     called = "time"
     if seconds is None or np.ptp(seconds) <= 0.0:
@@ -163,8 +189,11 @@ def _drawn(rng: np.random.Generator, n: int, size: int) -> IntArray:
     return found
 
 
-def _standardised(table: FloatArray | None, seen: FloatArray | None, rows: Any) -> FloatArray | None:
-    """A quantity of the stars seen by mean and spread of the table's, and within its range; zero where unknown.
+def _standardised(
+    table: FloatArray | None, seen: FloatArray | None, rows: Any
+) -> FloatArray | None:
+    """A quantity of the stars seen by mean and spread of the table's, and within its range; zero
+    where unknown.
 
     Where it is not stated, it is taken from these rows of the table. None where nothing varies.
     """
@@ -187,7 +216,10 @@ def _missing_terms(camera: Camera) -> list[Shape]:
                     lacking.setdefault(coefficient.name, (name, index))
     orders = {c.name: c.order for name in model_names() for c in get_model(name).coefficients}
     found = []
-    for title, radial in (("radial distortion beyond the model", True), ("decentring distortion", False)):
+    for title, radial in (
+        ("radial distortion beyond the model", True),
+        ("decentring distortion", False),
+    ):
         names = [name for name in lacking if name.startswith("k") is radial]
         if names:
             found.append(
@@ -236,7 +268,8 @@ def _axes(camera: Camera) -> Shape:
 
 def _aberration() -> Shape:
     def columns(view: View) -> FloatArray:
-        # A velocity V/c moves b by the rotation b x V/c, whose effect on pixels is that of an attitude error.
+        # A velocity V/c moves b by the rotation b x V/c, whose effect on pixels is that of an
+        # attitude error.
         frames, state = view.part.frames, view.state
         b = state.b
         found = np.empty((3, 2, frames.n_stars))
@@ -246,10 +279,19 @@ def _aberration() -> Shape:
         return frames.in_pixels(found)
 
     labels = tuple((f"velocity along {axis}", "km/s") for axis in ("ICRS x", "ICRS y", "ICRS z"))
-    return Shape("aberration of a constant velocity", "direction", 3, columns, labels, (LIGHT_SPEED_KM_S,) * 3)
+    return Shape(
+        "aberration of a constant velocity",
+        "direction",
+        3,
+        columns,
+        labels,
+        (LIGHT_SPEED_KM_S,) * 3,
+    )
 
 
-def _focal_against(clock: FloatArray, name: str, against: str, label: tuple[str, str], spread: float) -> Shape:
+def _focal_against(
+    clock: FloatArray, name: str, against: str, label: tuple[str, str], spread: float
+) -> Shape:
     def columns(view: View) -> FloatArray:
         return view.parameter_columns[2:3] * clock[view.rows]
 
@@ -288,17 +330,26 @@ def _phase(axis: int) -> Shape:
     name = "xy"[axis]
 
     def columns(view: View) -> FloatArray:
-        # Whole pixels drop out of the waves, so the position on the detector stands for its fraction.
+        # Whole pixels drop out of the waves, so the position on the detector stands for its
+        # fraction.
         centre = view.part.frames.pixel[axis] - view.part.frames.in_pixels(view.state.e)[axis]
-        waves = [f(2.0 * np.pi * h * centre) for h in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)]
+        waves = [
+            f(2.0 * np.pi * h * centre) for h in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)
+        ]
         found = np.zeros((len(waves), 2, len(centre)))
         found[:, axis] = waves
         return found
 
-    labels = tuple((f"{wave}({2 * h}π{name})", "px") for h in range(1, _HARMONICS + 1) for wave in ("sin", "cos"))
+    labels = tuple(
+        (f"{wave}({2 * h}π{name})", "px")
+        for h in range(1, _HARMONICS + 1)
+        for wave in ("sin", "cos")
+    )
     size = 2 * _HARMONICS
     against = f"pixel phase in {name}"
-    return Shape(f"error with the pixel phase in {name}", against, size, columns, labels, (1.0,) * size)
+    return Shape(
+        f"error with the pixel phase in {name}", against, size, columns, labels, (1.0,) * size
+    )
 
 
 def _magnitude(z: FloatArray, camera: Camera) -> Shape:
@@ -321,11 +372,15 @@ def _over_time(clock: FloatArray, called: str) -> Shape:
         moving = view.parameter_columns[:3]
         return np.concatenate([moving[i] * powers[:, None] for i in range(3)])
 
-    return Shape(f"smooth change of x0, y0 and f over the {called}", called, 3 * _TIME_DEGREE, columns)
+    return Shape(
+        f"smooth change of x0, y0 and f over the {called}", called, 3 * _TIME_DEGREE, columns
+    )
 
 
 def cell_columns(cell: IntArray, n_cells: int) -> FloatArray:
-    """Shifts (2 c, 2, n) of the stars in each cell along each axis; `cell` (n,) tells where a star is."""
+    """Shifts (2 c, 2, n) of the stars in each cell along each axis; `cell` (n,) tells where a star
+    is.
+    """
     star = np.arange(len(cell))
     found = np.zeros((n_cells, 2, 2, len(cell)))
     found[cell, 0, 0, star] = found[cell, 1, 1, star] = 1.0
@@ -345,4 +400,10 @@ def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
         return np.asarray(row * nx + column)
 
     name = f"mean shift in {nx} × {ny} cells of the field"
-    return Shape(name, "field cells", 2 * nx * ny, lambda view: cell_columns(cell_of(view), nx * ny), cell=cell_of)
+    return Shape(
+        name,
+        "field cells",
+        2 * nx * ny,
+        lambda view: cell_columns(cell_of(view), nx * ny),
+        cell=cell_of,
+    )

@@ -1,14 +1,16 @@
-"""Does a star bring an error along? A test of the variance that images of one star share, and what it does to sigma.
+"""Does a star bring an error along? A test of the variance that images of one star share, and what
+it does to sigma.
 
-Catalogue errors, blends and colours move a star's images together, however the camera is turned. Residuals e, brought
-to the star's own axes on the sky (Q, a turn for every image), are then alike within a star:
+Catalogue errors, blends and colours move a star's images together, however the camera is turned.
+Residuals e, brought to the star's own axes on the sky (Q, a turn for every image), are then alike
+within a star:
 
     R = e^T (Q Q^T - I) e / e^T e,
 
-over the images of stars that recur, attitudes and parameters projected out. It is the score test of a variance
-component that is common to a star; pairs of images alone count, so that noise that differs from star to star does not
-raise it. Moments of R under independent noise are exact; its tail is that of the gamma distribution with the first
-three.
+over the images of stars that recur, attitudes and parameters projected out. It is the score test of
+a variance component that is common to a star; pairs of images alone count, so that noise that
+differs from star to star does not raise it. Moments of R under independent noise are exact; its
+tail is that of the gamma distribution with the first three.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ if TYPE_CHECKING:
 
 _LEAST_DOF = 10
 _ABSORBED = 1e-10
-# More stars than this, and what the parameters absorb of them is too little to be worth a dense matrix.
+# More stars than this, and what the parameters absorb of them is too little to be worth a dense
+# matrix.
 _DENSE = 1500
 # Normal quantiles: of a test of 5 %, and of a power of 90 %.
 _SEEN = 1.645 + 1.282
@@ -44,7 +47,8 @@ _SEEN = 1.645 + 1.282
 
 @dataclass(frozen=True, eq=False)
 class StarTest(Shown):
-    """Errors that stars bring along: their size, the test for them, and uncertainties clustered on the star.
+    """Errors that stars bring along: their size, the test for them, and uncertainties clustered on
+    the star.
 
     Attributes
     ----------
@@ -63,7 +67,8 @@ class StarTest(Shown):
     arcsec_per_px : float
         Scale at the boresight.
     included_px, included_px_std : float
-        Error that the calibration has estimated and marginalised, and its standard error; zero where it has none.
+        Error that the calibration has estimated and marginalised, and its standard error; zero
+        where it has none.
     formal_covariance : (p, p) array
         Covariance if all images err independently.
     model_covariance : (p, p) array
@@ -71,7 +76,8 @@ class StarTest(Shown):
     sandwich_covariance : (p, p) array
         Cluster-robust covariance, clustered on the star.
     jackknife_covariance : (p, p) array
-        ``(S - 1) / S`` times the scatter of the estimates that leave one of S stars out; NaN where one is needed.
+        ``(S - 1) / S`` times the scatter of the estimates that leave one of S stars out; NaN where
+        one is needed.
     """
 
     parameter_names: tuple[str, ...]
@@ -107,7 +113,9 @@ class StarTest(Shown):
         return np.sqrt(np.diag(self.model_covariance) / np.diag(self.formal_covariance))
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per parameter: formal sigma, with star errors, cluster-robust, jackknife over stars."""
+        """One row per parameter: formal sigma, with star errors, cluster-robust, jackknife over
+        stars.
+        """
         import pandas as pd
 
         names = {
@@ -117,7 +125,9 @@ class StarTest(Shown):
             "jackknife_sigma": self.jackknife_covariance,
         }
         columns = {name: np.sqrt(np.diag(covariance)) for name, covariance in names.items()}
-        return pd.DataFrame({"parameter": list(self.parameter_names), **columns, "widening": self.widening})
+        return pd.DataFrame(
+            {"parameter": list(self.parameter_names), **columns, "widening": self.widening}
+        )
 
 
 # Random signs, of which the small parts of traces are means.
@@ -125,13 +135,14 @@ _PROBES = 16
 
 
 def star_test(obs: Observations, cal: Calibration) -> StarTest:
-    """Test whether stars bring errors of their own along, and how much that widens the uncertainties.
+    """Test whether stars bring errors of their own along, and how much that widens the
+    uncertainties.
 
     Parameters
     ----------
     obs, cal
-        The data and the estimate made from them. Stars are told apart by `star_id` where all have one, else by
-        direction.
+        The data and the estimate made from them. Stars are told apart by `star_id` where all have
+        one, else by direction.
     """
     obs, focal = weighed(obs, cal), float(cal.theta[2])
     numbers = star_numbers(obs, focal)
@@ -144,7 +155,10 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
     pulled = pull.T @ pull * found.tau2
     # The images' own noise is what is left when the stars' errors are taken off.
     noise = normals.squares / normals.dof
-    own = max(noise - found.tau2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0)), 0.1 * noise)
+    own = max(
+        noise - found.tau2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0)),
+        0.1 * noise,
+    )
     steps = normals.left_out()
     spread = steps - steps.mean(axis=0)
     scores = normals.scores @ inverse
@@ -159,7 +173,9 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
         visible_px=found.visible,
         arcsec_per_px=ARCSEC / focal,
         formal_covariance=inverse * noise * unit,
-        model_covariance=(inverse * own + pulled) * unit if found.tau2 > 0.0 else inverse * noise * unit,
+        model_covariance=(inverse * own + pulled) * unit
+        if found.tau2 > 0.0
+        else inverse * noise * unit,
         sandwich_covariance=scores.T @ scores * s / (s - 1.0) * unit,
         jackknife_covariance=spread.T @ spread * (s - 1.0) / s * unit,
         included_px=0.0 if cal.star_errors is None else cal.star_errors.tau_px,
@@ -191,7 +207,9 @@ def _recurring(obs: Observations, numbers: IntArray) -> BoolArray:
 
 
 def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likeness:
-    """The test, on images of recurring stars alone: others say nothing about likeness within a star."""
+    """The test, on images of recurring stars alone: others say nothing about likeness within a
+    star.
+    """
     used = _recurring(obs, numbers)
     if not used.any():
         return _Likeness(0, 0)
@@ -215,7 +233,8 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     if dof < _LEAST_DOF:
         return nothing
     g1, g2, g3, g4 = _traces(sums.matrix, absorbed)
-    # Of A = M - (g1 / dof) I on the residuals, M having the traces g: sums of powers of its eigenvalues.
+    # Of A = M - (g1 / dof) I on the residuals, M having the traces g: sums of powers of its
+    # eigenvalues.
     m = g1 / dof
     a2, a3 = g2 - m * g1, g3 - 3.0 * m * g2 + 3.0 * m**2 * g1 - m**3 * dof
     if a2 <= _ABSORBED * g2:
@@ -229,7 +248,9 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
 
     def spread(share: float) -> float:
         middle, last = g3 - 2.0 * m * g2 + m**2 * g1, g4 - 2.0 * m * g3 + m**2 * g2
-        return float(np.sqrt(2.0 * (noise**2 * a2 + 2.0 * noise * share * middle + share**2 * last)) / a2)
+        return float(
+            np.sqrt(2.0 * (noise**2 * a2 + 2.0 * noise * share * middle + share**2 * last)) / a2
+        )
 
     sd = spread(max(tau2, 0.0))
     unit = 1.0 if frames.weight is None else float(1.0 / np.sqrt(np.mean(frames.weight**2)))
@@ -249,15 +270,20 @@ def _traces(matrix: Any, absorbed: FloatArray) -> tuple[float, float, float, flo
     if matrix.shape[0] <= _DENSE:
         g = matrix.toarray() - absorbed @ absorbed.T
         square = g @ g
-        return float(np.trace(g)), float(np.trace(square)), float(np.sum(square * g)), float(np.sum(square**2))
+        return (
+            float(np.trace(g)),
+            float(np.trace(square)),
+            float(np.sum(square * g)),
+            float(np.sum(square**2)),
+        )
     return _sparse_traces(matrix)
 
 
 def _sparse_traces(matrix: Any) -> tuple[float, float, float, float]:
     """The same of a sparse matrix whose products would fill up.
 
-    The diagonal D and its products with the rest O are exact; tr(O^3), tr(D O^3) and tr(O^4), which are small, are
-    means of x^T O^3 x and the like over random signs x (Hutchinson 1989).
+    The diagonal D and its products with the rest O are exact; tr(O^3), tr(D O^3) and tr(O^4), which
+    are small, are means of x^T O^3 x and the like over random signs x (Hutchinson 1989).
     """
     d = matrix.diagonal()
     rest = matrix.copy()
@@ -269,8 +295,19 @@ def _sparse_traces(matrix: Any) -> tuple[float, float, float, float]:
     one = rest @ x
     two = rest @ one
     cube, mixed = np.sum(one * two) / _PROBES, np.sum((rest @ (d[:, None] * x)) * two) / _PROBES
-    fourth = np.sum(d**4) + 4.0 * (d**2 @ row) + 2.0 * (d @ (squares @ d)) + 4.0 * mixed + np.sum(two**2) / _PROBES
-    return float(d.sum()), float(d @ d + row.sum()), float(np.sum(d**3) + 3.0 * (d @ row) + cube), float(fourth)
+    fourth = (
+        np.sum(d**4)
+        + 4.0 * (d**2 @ row)
+        + 2.0 * (d @ (squares @ d))
+        + 4.0 * mixed
+        + np.sum(two**2) / _PROBES
+    )
+    return (
+        float(d.sum()),
+        float(d @ d + row.sum()),
+        float(np.sum(d**3) + 3.0 * (d @ row) + cube),
+        float(fourth),
+    )
 
 
 def _gamma_tail(z: float, skewness: float) -> float:

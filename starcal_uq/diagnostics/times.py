@@ -1,10 +1,11 @@
 """Do the residuals ask for another time, or for an epoch other than that of the directions?
 
-A wrong time moves the stars of a table in ways that are known. Proper motion: by years. Annual aberration: by the
-Earth's velocity of another day, or by all of it where it is missing or was applied twice. Refraction at a site: towards
-the zenith of another hour. Each is tried; what attitudes and parameters cannot take up of it is fitted to the residuals
-with a factor that has to be one, and whose scatter from star to star and from frame to frame, and not only the noise,
-says how well it is known.
+A wrong time moves the stars of a table in ways that are known. Proper motion: by years. Annual
+aberration: by the Earth's velocity of another day, or by all of it where it is missing or was
+applied twice. Refraction at a site: towards the zenith of another hour. Each is tried; what
+attitudes and parameters cannot take up of it is fitted to the residuals with a factor that has to
+be one, and whose scatter from star to star and from frame to frame, and not only the noise, says
+how well it is known.
 """
 
 from __future__ import annotations
@@ -52,13 +53,14 @@ class TimeTest:
     Attributes
     ----------
     cause : {"epoch", "no aberration", "aberration twice", "date", "hour"}
-        Proper motion to another epoch, annual aberration that is missing, applied twice or of another date, or
-        refraction of another hour.
+        Proper motion to another epoch, annual aberration that is missing, applied twice or of
+        another date, or refraction of another hour.
     later, later_std : float
-        How much later the stars were seen than the directions are for, and its standard error: years of an epoch, days
-        of a date, hours of an hour; NaN for the others.
+        How much later the stars were seen than the directions are for, and its standard error:
+        years of an epoch, days of a date, hours of an hour; NaN for the others.
     factor, factor_std : float
-        The effect of that, fitted, in units of itself (of an epoch: of one year), and its standard error.
+        The effect of that, fitted, in units of itself (of an epoch: of one year), and its standard
+        error.
     moves : str
         The parameter that it moves most.
     moves_sigma : float
@@ -76,14 +78,16 @@ class TimeTest:
 
 @dataclass(frozen=True)
 class UnseenAberration:
-    """What annual aberration does to f if it was left out of the directions or applied twice, and nothing shows it.
+    """What annual aberration does to f if it was left out of the directions or applied twice, and
+    nothing shows it.
 
     Frames near one direction and date stretch by it alike, which is what a focal length does.
 
     Attributes
     ----------
     f_px, f_sigma : float
-        How far f would move, px and in its standard deviations; of frames without times at the worst date.
+        How far f would move, px and in its standard deviations; of frames without times at the
+        worst date.
     visible : float
         How many of its standard errors the residuals would be off by.
     dated : bool
@@ -98,7 +102,9 @@ class UnseenAberration:
 
 @dataclass(frozen=True)
 class _Moved:
-    """A cause with the moves of the stars for each offset: shifts (g, 2, N) of images, offsets (g,)."""
+    """A cause with the moves of the stars for each offset: shifts (g, 2, N) of images, offsets
+    (g,).
+    """
 
     cause: Cause
     shifts: FloatArray
@@ -144,7 +150,9 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
             if moved.cause in ("date", "hour"):
                 a, b = max(i - 1, 0), min(i + 1, len(size) - 1)
                 slope = (columns[b] - columns[a]) / (moved.later[b] - moved.later[a])
-                step, later_std, _ = _fitted(slope, rest, (numbers, frames), rest.residuals - columns[i])
+                step, later_std, _ = _fitted(
+                    slope, rest, (numbers, frames), rest.residuals - columns[i]
+                )
                 later += step
         if good and sure > _SIGNIFICANT:
             shift = np.abs(absorbed[i] * (factor if moved.cause == "epoch" else 1.0)) / cal.sigmas
@@ -156,8 +164,11 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
 
 
 @bounded
-def unseen_aberration(obs: Observations, cal: Calibration, *, seed: int = 0) -> UnseenAberration | None:
-    """Ask how far annual aberration would move f without being seen in the residuals of a calibration.
+def unseen_aberration(
+    obs: Observations, cal: Calibration, *, seed: int = 0
+) -> UnseenAberration | None:
+    """Ask how far annual aberration would move f without being seen in the residuals of a
+    calibration.
 
     Parameters
     ----------
@@ -185,13 +196,16 @@ def unseen_aberration(obs: Observations, cal: Calibration, *, seed: int = 0) -> 
 
 
 def _fitted(
-    column: FloatArray, rest: Remainder, groups: tuple[IntArray, ...], residuals: FloatArray | None = None
+    column: FloatArray,
+    rest: Remainder,
+    groups: tuple[IntArray, ...],
+    residuals: FloatArray | None = None,
 ) -> tuple[float, float, float]:
     """The factor of a column, its error and how many errors it is.
 
-    The error is the largest of that by noise and those by leaving out star by star, frame by frame; that of few groups
-    counts as what Student's t of as many makes of it, far out. No star has more than a twentieth of the say, as one of
-    large proper motion would have.
+    The error is the largest of that by noise and those by leaving out star by star, frame by frame;
+    that of few groups counts as what Student's t of as many makes of it, far out. No star has more
+    than a twentieth of the say, as one of large proper motion would have.
     """
     from scipy.special import stdtrit
 
@@ -212,7 +226,9 @@ def _fitted(
     for group in groups:
         share = np.minimum(np.bincount(group, weight * own) / size, 1.0 - 1e-12)
         errors.append(float(np.linalg.norm(np.bincount(group, left) / (1.0 - share))) / size)
-        few.append(stdtrit(max(1.0 / float(share @ share) - 1.0, 0.1), _FAR) / stdtrit(np.inf, _FAR))
+        few.append(
+            stdtrit(max(1.0 / float(share @ share) - 1.0, 0.1), _FAR) / stdtrit(np.inf, _FAR)
+        )
     return factor, max(errors), abs(factor) / float(np.max(np.multiply(errors, few)))
 
 
@@ -225,8 +241,11 @@ def _causes(rest: Remainder) -> Iterator[_Moved]:
         turned = rest.state.rotations[np.repeat(np.arange(frames.n_frames), frames.sizes)]
         return rest.shift(np.einsum("nij,jn->in", turned, moves))
 
-    # One and the same for all stars of a frame, so that three columns hold the velocities of all candidates.
-    basis = np.stack([seen(np.repeat(np.eye(3)[:, i : i + 1], frames.n_stars, axis=1)) for i in range(3)])
+    # One and the same for all stars of a frame, so that three columns hold the velocities of all
+    # candidates.
+    basis = np.stack(
+        [seen(np.repeat(np.eye(3)[:, i : i + 1], frames.n_stars, axis=1)) for i in range(3)]
+    )
 
     def aberrated(cause: Cause, velocities: FloatArray, later: FloatArray) -> _Moved:
         """By velocities (g, K, 3), km/s."""
@@ -265,7 +284,10 @@ def _proper_motion(obs: Observations) -> FloatArray:
 
 def _velocities(times: np.ndarray, days: FloatArray) -> FloatArray:
     """Velocity of the Earth (g, K, 3), km/s, so many days after some times."""
-    day, first, last = np.timedelta64(1, "D"), *(np.datetime64(f"{year}-01-01") for year in (FIRST_YEAR, LAST_YEAR))
+    day, first, last = (
+        np.timedelta64(1, "D"),
+        *(np.datetime64(f"{year}-01-01") for year in (FIRST_YEAR, LAST_YEAR)),
+    )
     start = max(times.min() - 200 * day, first)
     known = np.arange(0.0, (min(times.max() + 200 * day, last) - start) / day)
     table = earth_velocity_km_s(start + known.astype("timedelta64[D]"))
@@ -288,6 +310,10 @@ def _other_hours(rest: Remainder, site: Site, times: StrArray) -> Iterator[_Move
         return rest.shift(up * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
 
     stated = raised(0.0)
-    found = [] if stated is None else [(h, s - stated) for h in _HOURS if (s := raised(h)) is not None]
+    found = (
+        [] if stated is None else [(h, s - stated) for h in _HOURS if (s := raised(h)) is not None]
+    )
     if found:
-        yield _Moved("hour", np.stack([shift for _, shift in found]), np.array([hours for hours, _ in found]))
+        yield _Moved(
+            "hour", np.stack([shift for _, shift in found]), np.array([hours for hours, _ in found])
+        )

@@ -1,4 +1,6 @@
-"""From an estimate to a `Calibration`: residuals, attitudes, information and the compressed likelihood at it."""
+"""From an estimate to a `Calibration`: residuals, attitudes, information and the compressed
+likelihood at it.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation, rotation_to_quaternion
+from starcal_uq.attitude.rotations import (
+    exp_rotation,
+    quaternion_to_rotation,
+    rotation_to_quaternion,
+)
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px
@@ -38,7 +44,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.frames import StarFrames
     from starcal_uq.observations.table import Observations
 
-# Noise above this fraction of the detector's width means that the stars are not the ones they are said to be.
+# Noise above this fraction of the detector's width means that the stars are not the ones they are
+# said to be.
 IMPLAUSIBLE_NOISE = 0.01
 # Attitudes this near to the best ones tell such a noise.
 _NEARLY_RAD = 1e-4
@@ -63,9 +70,10 @@ def assemble(
 ) -> Calibration:
     """Everything that a calibration tells about the end of its last stage.
 
-    The last of `stages` ends in the estimate; one named ``refinement`` is the maximum of `likelihood`. Without it, the
-    covariance of the result is `pair_covariance`, that of the estimate from interstar angles. CalibrationError when
-    there is no estimate that residuals could be taken at.
+    The last of `stages` ends in the estimate; one named ``refinement`` is the maximum of
+    `likelihood`. Without it, the covariance of the result is `pair_covariance`, that of the
+    estimate from interstar angles. CalibrationError when there is no estimate that residuals could
+    be taken at.
     """
     theta = stages[-1].theta
     refined = stages[-1].name == "refinement"
@@ -74,7 +82,13 @@ def assemble(
         raise failed(likelihood, nominal.theta, nominal, status)
     normal = likelihood.sums(theta, tolerance=TURN_RAD)[0].normal
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
-        reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
+        reason = (
+            status
+            if not status.ok
+            else Status.SINGULAR
+            if np.isfinite(normal.cost)
+            else Status.NOT_FINITE
+        )
         raise failed(likelihood, theta, nominal, reason)
     dof = likelihood.dof - p
     sigma = float(np.sqrt(normal.cost / dof))
@@ -98,7 +112,8 @@ def assemble(
         )
         stages = [*stages[:-1], ended]
     if refined:
-        # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma: one Newton step.
+        # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma: one
+        # Newton step.
         theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     e = np.empty((2, likelihood.frames.n_stars))
     sums, attitudes = likelihood.sums(theta, e)
@@ -136,8 +151,12 @@ def assemble(
     )
 
 
-def failed(likelihood: MarginalLikelihood, theta: FloatArray, nominal: Camera, status: Status) -> CalibrationError:
-    """The error of a calibration without an estimate: what its stars hardly determine at theta, or else its status."""
+def failed(
+    likelihood: MarginalLikelihood, theta: FloatArray, nominal: Camera, status: Status
+) -> CalibrationError:
+    """The error of a calibration without an estimate: what its stars hardly determine at theta, or
+    else its status.
+    """
     noise = _USUAL_NOISE_PX if likelihood.frames.weight is None else 1.0
     # Where coefficients ended that nothing holds, others may seem to be open as well.
     plain = np.concatenate([theta[:3], np.zeros(len(theta) - 3)])
@@ -147,14 +166,17 @@ def failed(likelihood: MarginalLikelihood, theta: FloatArray, nominal: Camera, s
         found.append(open_parameters(own.evaluate(at).matrix, noise, nominal, WEAK))
     names = min(filter(None, found), key=len, default=())
     status = Status.SINGULAR if names else status
-    return CalibrationError(f"the calibration failed ({status.name}): {remedy_of(status, names)}.", status, names)
+    return CalibrationError(
+        f"the calibration failed ({status.name}): {remedy_of(status, names)}.", status, names
+    )
 
 
 def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
-    """The calibration with errors that stars bring along estimated and marginalised, and the estimate that they weight.
+    """The calibration with errors that stars bring along estimated and marginalised, and the
+    estimate that they weight.
 
-    CalibrationError when no star is seen twice and none states its error, or for more stars and frames than fit into
-    memory.
+    CalibrationError when no star is seen twice and none states its error, or for more stars and
+    frames than fit into memory.
     """
     began = perf_counter()
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
@@ -162,8 +184,10 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
     model = StarModel(obs, float(cal.theta[2]))
     if model.n_recurring < _FEWEST_STARS and not np.any(model.stated2 > 0.0):
         raise CalibrationError(
-            f"errors of the stars cannot be told from noise: {plural(model.n_recurring, 'star')} of "
-            f"{len(model.images)} seen in more than one frame, and the table states no direction_mas; leave "
+            f"errors of the stars cannot be told from noise: {plural(model.n_recurring, 'star')} "
+            "of "
+            f"{len(model.images)} seen in more than one frame, and the table states no "
+            "direction_mas; leave "
             "star_errors out."
         )
     errors, sigma, spread = model.estimate(likelihood, cal.theta, cal.sigmas, cal.sigma)
@@ -180,7 +204,9 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
         rotations = likelihood.rotations_at(theta)
         trajectory.append(theta)
     cost.append(found.sum_of_squares)
-    stage = Stage("stars", np.array(trajectory), np.array(cost), Status.CONVERGED, 2, perf_counter() - began)
+    stage = Stage(
+        "stars", np.array(trajectory), np.array(cost), Status.CONVERGED, 2, perf_counter() - began
+    )
     compressed = found.compressed
     theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     exact = StarLikelihood(obs, likelihood.model_name, theta, rotations, errors, sigma)
@@ -189,7 +215,8 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
     shifts = state.e[None] - exact.offset_shifts(state, offsets)
     turned = exact.attitude_response(state, shifts)[0].T
     weight = likelihood.frames.weight
-    # The stars of a frame err each by themselves: to its attitude that is more noise, which a stare does not average.
+    # The stars of a frame err each by themselves: to its attitude that is more noise, which a stare
+    # does not average.
     own = errors.total_px**2 * (1.0 if weight is None else float(np.mean(weight**2)))
     settings = cal.provenance.get("settings", {}) | {"star_errors": True}
     camera = cal.nominal.with_theta(theta)
@@ -216,7 +243,8 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
 
 
 def noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
-    """Root mean square of the residuals per axis, px, stars weighted by what they state; infinite without a model.
+    """Root mean square of the residuals per axis, px, stars weighted by what they state; infinite
+    without a model.
 
     `likelihood` starts its later attitude searches from those found here.
     """
@@ -231,20 +259,33 @@ def noise_of(cost: float, frames: StarFrames) -> float:
     """As `noise_px`, from the sum of squares over these frames."""
     if not np.isfinite(cost):
         return float("inf")
-    return float(np.sqrt(cost / (2.0 * (frames.n_stars if frames.weight is None else np.sum(frames.weight**2)))))
+    return float(
+        np.sqrt(
+            cost / (2.0 * (frames.n_stars if frames.weight is None else np.sum(frames.weight**2)))
+        )
+    )
 
 
 def check_noise(noise: float, camera: Camera, status: Status) -> Status:
-    """`status`, unless residuals of this size, px, say that the stars are not the ones they are said to be."""
-    return Status.INCONSISTENT if status.ok and noise > IMPLAUSIBLE_NOISE * camera.width_px else status
+    """`status`, unless residuals of this size, px, say that the stars are not the ones they are
+    said to be.
+    """
+    return (
+        Status.INCONSISTENT if status.ok and noise > IMPLAUSIBLE_NOISE * camera.width_px else status
+    )
 
 
 def check_camera(camera: Camera, status: Status) -> Status:
-    """`status`, unless the principal point left the detector or the distortion folds over inside the field."""
+    """`status`, unless the principal point left the detector or the distortion folds over inside
+    the field.
+    """
     if not status.ok:
         return status
     if not camera.contains(camera.theta[:2]):
         return Status.OUTSIDE_DETECTOR
-    if fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px) <= camera.corner_radius_px:
+    if (
+        fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px)
+        <= camera.corner_radius_px
+    ):
         return Status.FOLDED
     return status

@@ -1,4 +1,6 @@
-"""The methods that Ye & Yang 2017 compare theirs with, at full strength: least squares, Samaan's and Griffith's."""
+"""The methods that Ye & Yang 2017 compare theirs with, at full strength: least squares, Samaan's
+and Griffith's.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,11 @@ from starcal_uq.core.status import Status
 from starcal_uq.estimation.assemble import assemble, check_noise, noise_px
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.recursive.result import distortion_after, joint_estimate, sums_at_estimate
+from starcal_uq.estimation.recursive.result import (
+    distortion_after,
+    joint_estimate,
+    sums_at_estimate,
+)
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.estimation.stages import optics_stage
@@ -28,11 +34,14 @@ _CHUNK = 64
 _PART_STARS = 4096
 
 
-def least_squares(obs: Observations, camera: Camera, solver: str, max_iterations: int) -> Calibration:
+def least_squares(
+    obs: Observations, camera: Camera, solver: str, max_iterations: int
+) -> Calibration:
     """Least squares over interstar angles for x0, y0 and f, the distortion ignored.
 
-    The estimate is that of stage 1. The covariance is the sandwich over frames, which holds although the model is
-    wrong and pairs are dependent: the spread over repeated data sets, not the distance from the truth.
+    The estimate is that of stage 1. The covariance is the sandwich over frames, which holds
+    although the model is wrong and pairs are dependent: the spread over repeated data sets, not the
+    distance from the truth.
     """
     plain = camera.replace(distortion="none", coefficients=())
     likelihood = MarginalLikelihood(obs, "none")
@@ -41,21 +50,38 @@ def least_squares(obs: Observations, camera: Camera, solver: str, max_iterations
     stage = optics_stage(frames, plain, solver, max_iterations)
     covariance = PairObjective(frames, "none").godambe(stage.theta)
     # A mirror or wrong stars, which interstar angles do not see.
-    status = check_noise(noise_px(likelihood, stage.theta), plain, stage.status) if stage.status.ok else stage.status
+    status = (
+        check_noise(noise_px(likelihood, stage.theta), plain, stage.status)
+        if stage.status.ok
+        else stage.status
+    )
     settings = {"ignored_distortion": camera.distortion} if camera.distortion != "none" else {}
     return assemble(
-        obs, plain, "least_squares", solver, likelihood, [stage], status, stage.theta, covariance, settings=settings
+        obs,
+        plain,
+        "least_squares",
+        solver,
+        likelihood,
+        [stage],
+        status,
+        stage.theta,
+        covariance,
+        settings=settings,
     )
 
 
 def recursive(
-    obs: Observations | Iterable[Observations], camera: Camera, method: str, options: RecursionOptions | None
+    obs: Observations | Iterable[Observations],
+    camera: Camera,
+    method: str,
+    options: RecursionOptions | None,
 ) -> Calibration:
     """Samaan's or Griffith's method on a table, or on a stream of frames.
 
-    From a table the distortion of ``samaan`` is found in a second pass at the final optics, and the result has
-    residuals and attitudes. From a stream it has none; the second pass takes place where the source can be read twice
-    (a list, `stream_frames`), and an iterator has its running sums, brought to the final optics to first order.
+    From a table the distortion of ``samaan`` is found in a second pass at the final optics, and the
+    result has residuals and attitudes. From a stream it has none; the second pass takes place where
+    the source can be read twice (a list, `stream_frames`), and an iterator has its running sums,
+    brought to the final optics to first order.
     """
     filtering = RecursiveCalibration(camera, method, options)
     if not isinstance(obs, Observations):
@@ -67,11 +93,15 @@ def recursive(
     recursion, stages, status = filtering.finish()
     sums = None
     if len(recursion.offset) < len(recursion.origin):
-        sums = sums_at_estimate(recursion, (frames.part(*ends) for ends in frames.parts(_PART_STARS)))
+        sums = sums_at_estimate(
+            recursion, (frames.part(*ends) for ends in frames.parts(_PART_STARS))
+        )
     estimate = joint_estimate(recursion, sums)
     if sums is not None:
         stages.append(distortion_after(recursion, estimate, sums))
-    status = check_noise(noise_px(likelihood, estimate.theta), camera, status) if status.ok else status
+    status = (
+        check_noise(noise_px(likelihood, estimate.theta), camera, status) if status.ok else status
+    )
     return assemble(
         obs,
         filtering.nominal,
@@ -103,7 +133,8 @@ def _chunks(source: Iterable[Observations]) -> Iterator[StarFrames]:
         for piece in chunk:
             if not isinstance(piece, Observations):
                 raise CalibrationError(
-                    f"the stream of frames holds a {type(piece).__name__}: give Observations, or stream_frames(path)."
+                    f"the stream of frames holds a {type(piece).__name__}: give Observations, or "
+                    "stream_frames(path)."
                 )
         yield StarFrames.joined([StarFrames.from_observations(piece) for piece in chunk])
 
@@ -113,7 +144,9 @@ def check_count(likelihood: MarginalLikelihood, camera: Camera) -> None:
     p, frames = len(camera.theta), likelihood.frames
     if likelihood.dof <= p:
         raise CalibrationError(
-            f"{frames.n_stars} stars in {frames.n_frames} frames give {likelihood.dof} independent numbers for {p} "
-            "parameters and the noise: add stars or frames, or choose a distortion model with fewer coefficients.",
+            f"{frames.n_stars} stars in {frames.n_frames} frames give {likelihood.dof} "
+            f"independent numbers for {p} "
+            "parameters and the noise: add stars or frames, or choose a distortion model with "
+            "fewer coefficients.",
             Status.SINGULAR,
         )

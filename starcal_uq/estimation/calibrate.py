@@ -1,4 +1,6 @@
-"""From observations to a calibration: three stages, then refinement on the attitude-marginalised likelihood."""
+"""From observations to a calibration: three stages, then refinement on the attitude-marginalised
+likelihood.
+"""
 
 from __future__ import annotations
 
@@ -69,17 +71,20 @@ from starcal_uq.observations.table import Observations
 METHODS = get_args(Method)
 LIKELIHOODS = ("marginal", "student_t")
 SOLVERS = get_args(Solver)
-# Stage 1 that moves the principal point by more than this fraction of the width has met strong distortion.
+# Stage 1 that moves the principal point by more than this fraction of the width has met strong
+# distortion.
 _FAR = 0.05
 _ITERATIONS = 200
 # From the nominal optics positions take some fifteen.
 _DIRECT_ITERATIONS = 60
 # Starting processes takes two seconds.
 _STARS_WORTH_PROCESSES = 1_000_000
-# Frames and stars of a sample that is near enough to the minimum of all, and the relative gain of its last steps.
+# Frames and stars of a sample that is near enough to the minimum of all, and the relative gain of
+# its last steps.
 _SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-4
-# Standard deviations of the last step: of the estimate from interstar angles of all frames, which is then known to a
-# thousandth of that, and of the refinement, which is left to Newton's method on the expansion: a few 1e-9 of them.
+# Standard deviations of the last step: of the estimate from interstar angles of all frames, which
+# is then known to a thousandth of that, and of the refinement, which is left to Newton's method on
+# the expansion: a few 1e-9 of them.
 _LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.006
 
 
@@ -110,63 +115,73 @@ def calibrate(
     Parameters
     ----------
     obs : Observations, PartitionedObservations or iterable of Observations
-        Stars with pixel positions and catalogue directions; at least three per frame. Partitioned ones may exceed
-        memory: a sample of their frames goes through the stages, then all of them are refined on, pass by pass; the
-        result has residuals and attitudes of that sample. The recursive methods also take
-        a stream: any iterable of Observations of one or several frames, such as `stream_frames`. They keep none of
-        them, so that the result has no residuals and attitudes.
+        Stars with pixel positions and catalogue directions; at least three per frame. Partitioned
+        ones may exceed memory: a sample of their frames goes through the stages, then all of them
+        are refined on, pass by pass; the result has residuals and attitudes of that sample. The
+        recursive methods also take a stream: any iterable of Observations of one or several frames,
+        such as `stream_frames`. They keep none of them, so that the result has no residuals and
+        attitudes.
     camera : Camera
-        Start values; its `distortion` names the model. The coefficients start from zero, as in the paper.
+        Start values; its `distortion` names the model. The coefficients start from zero, as in the
+        paper.
     model : str, optional
-        Distortion model in place of the camera's. A model asked for here is fitted or refused. By default it is that of
-        `camera`, and where the data do not determine it (methods ``efficient`` and ``three_stage`` on a table), the
-        richest simpler one that they do: ``provenance["fallback"]`` then says which, and why. Where the distortion may
-        be none, sigmas leave out what its coma tells of the principal point (`Calibration.coma_factors`).
+        Distortion model in place of the camera's. A model asked for here is fitted or refused. By
+        default it is that of `camera`, and where the data do not determine it (methods
+        ``efficient`` and ``three_stage`` on a table), the richest simpler one that they do:
+        ``provenance["fallback"]`` then says which, and why. Where the distortion may be none,
+        sigmas leave out what its coma tells of the principal point (`Calibration.coma_factors`).
     method : {"efficient", "three_stage", "least_squares", "samaan", "griffith"}
-        ``three_stage`` is Ye & Yang 2017: interstar angles without distortion, linear distortion, interstar angles with
-        both; its covariance is the sandwich of composite likelihood, from the scatter of frames if there are 50 for
-        each parameter, else from Gaussian noise. ``efficient`` goes on to the attitude-marginalised likelihood, whose
-        covariance is the Cramer-Rao bound. The others are what the paper
-        compares itself with: ``least_squares`` fits the optics to interstar angles as if there were no distortion, and
-        its result's model is ``none``; ``samaan`` filters the optics frame by frame from the least-squares solution of
-        the first frames, and fits the distortion linearly afterwards; ``griffith`` is recursive least squares from the
-        start values, for the optics alone (model ``none``) unless `recursion` says otherwise. Their covariances are the
-        spread over repeated data sets; the bias from the distortion that they ignore is not in them.
+        ``three_stage`` is Ye & Yang 2017: interstar angles without distortion, linear distortion,
+        interstar angles with both; its covariance is the sandwich of composite likelihood, from the
+        scatter of frames if there are 50 for each parameter, else from Gaussian noise.
+        ``efficient`` goes on to the attitude-marginalised likelihood, whose covariance is the
+        Cramer-Rao bound. The others are what the paper compares itself with: ``least_squares`` fits
+        the optics to interstar angles as if there were no distortion, and its result's model is
+        ``none``; ``samaan`` filters the optics frame by frame from the least-squares solution of
+        the first frames, and fits the distortion linearly afterwards; ``griffith`` is recursive
+        least squares from the start values, for the optics alone (model ``none``) unless
+        `recursion` says otherwise. Their covariances are the spread over repeated data sets; the
+        bias from the distortion that they ignore is not in them.
     solver : {"lm", "minpack", "ipopt"}
-        Levenberg-Marquardt on normal equations, MINPACK on explicit pairs (where there are at most 500,000 of them), or
-        IPOPT with the principal point kept on the detector, f > 0 and the distortion monotonic. The refinement always
-        uses the first; the recursive methods use none.
+        Levenberg-Marquardt on normal equations, MINPACK on explicit pairs (where there are at most
+        500,000 of them), or IPOPT with the principal point kept on the detector, f > 0 and the
+        distortion monotonic. The refinement always uses the first; the recursive methods use none.
     max_iterations : int
         Limit for each stage.
     throw : bool
-        Raise when the estimate is not good; otherwise `Calibration.status` says so, as long as there is an estimate.
+        Raise when the estimate is not good; otherwise `Calibration.status` says so, as long as
+        there is an estimate.
     likelihood : {"marginal", "student_t"}
-        Likelihood that the refinement maximises: Gaussian noise, or a Student t per star for tables with wrong
-        identifications. With ``student_t`` the stages see only stars whose angles agree with those of their frame, the
-        refinement sees all that can be in the field, `covariance` is the sandwich one, `information` the observed one,
-        `sigma` the scale of the t, `chi2` is summed with the stars' weights, and `compressed` is the Gaussian
-        likelihood of the reweighted stars.
+        Likelihood that the refinement maximises: Gaussian noise, or a Student t per star for tables
+        with wrong identifications. With ``student_t`` the stages see only stars whose angles agree
+        with those of their frame, the refinement sees all that can be in the field, `covariance` is
+        the sandwich one, `information` the observed one, `sigma` the scale of the t, `chi2` is
+        summed with the stars' weights, and `compressed` is the Gaussian likelihood of the
+        reweighted stars.
     dof : float or "free", optional
-        Degrees of freedom of ``student_t``, 2 to 200, by default 4; "free" estimates them, with the gamma prior of
-        Juarez & Steel (2010) on what exceeds 2.
+        Degrees of freedom of ``student_t``, 2 to 200, by default 4; "free" estimates them, with the
+        gamma prior of Juarez & Steel (2010) on what exceeds 2.
     recursion : RecursionOptions, optional
         Options of ``samaan`` and ``griffith``.
     noise : {"common", "model"}
-        One noise for all stars (or one factor on what they state), or a variance that is fitted as a function of
-        radius, magnitude, frame and axis, as far as the residuals ask for it: `Calibration.noise_model`. Everything
-        that takes the result then weighs the stars by it, and `sigma` is a factor on it. It needs the ``efficient``
-        method and the ``marginal`` likelihood.
+        One noise for all stars (or one factor on what they state), or a variance that is fitted as
+        a function of radius, magnitude, frame and axis, as far as the residuals ask for it:
+        `Calibration.noise_model`. Everything that takes the result then weighs the stars by it, and
+        `sigma` is a factor on it. It needs the ``efficient`` method and the ``marginal``
+        likelihood.
     duplicates : {"refuse", "drop", "keep"}
-        What to do with frames that hold the same measurement as an earlier one, whatever their numbers, order and
-        stars (`starcal_uq.estimation.repeated_frames`): they would count twice. ``drop`` leaves them out, there and in
-        all that takes the table with the result (`frame_ids` are those that stay); ``keep`` does not ask, nor are
-        streams asked.
+        What to do with frames that hold the same measurement as an earlier one, whatever their
+        numbers, order and stars (`starcal_uq.estimation.repeated_frames`): they would count twice.
+        ``drop`` leaves them out, there and in all that takes the table with the result (`frame_ids`
+        are those that stay); ``keep`` does not ask, nor are streams asked.
     star_errors : bool
-        Take into account that a star's direction errs alike in every frame (catalogue, blend, colour): the size of such
-        errors is estimated, beyond what the column ``direction_mas`` of the table states, and they are marginalised in
-        estimate, covariance and `compressed`. For ``efficient`` with ``marginal``.
+        Take into account that a star's direction errs alike in every frame (catalogue, blend,
+        colour): the size of such errors is estimated, beyond what the column ``direction_mas`` of
+        the table states, and they are marginalised in estimate, covariance and `compressed`. For
+        ``efficient`` with ``marginal``.
     scheduler : str or distributed.Client, optional
-        Dask scheduler, whose workers read partitioned observations; processes of this machine otherwise.
+        Dask scheduler, whose workers read partitioned observations; processes of this machine
+        otherwise.
     workers : int, optional
         Number of these processes: as many as processors by default; 0 stays in this one.
     progress : callable, optional
@@ -192,7 +207,9 @@ def calibrate(
     if solver not in SOLVERS:
         raise CalibrationError(f"solver {solver!r} is unknown: use one of {', '.join(SOLVERS)}.")
     if likelihood not in LIKELIHOODS:
-        raise CalibrationError(f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}.")
+        raise CalibrationError(
+            f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}."
+        )
     nu = parse_dof(dof, CalibrationError)
     if noise not in NOISES:
         raise CalibrationError(f"noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
@@ -234,13 +251,18 @@ def calibrate(
         calibration = recursive(obs, camera, method, recursion)
     elif not isinstance(obs, Observations):
         raise CalibrationError(
-            f"method {method!r} needs all frames at once, as Observations: load them, or use samaan or griffith."
+            f"method {method!r} needs all frames at once, as Observations: load them, or use "
+            "samaan or griffith."
         )
     elif method == "least_squares":
         calibration = least_squares(obs, camera, solver, max_iterations)
     else:
         # Weights of another calibration's noise model are what this table states.
-        obs = replace(obs, stated_px=None, noise_axes=None) if obs.stated_px is not None and noise == "common" else obs
+        obs = (
+            replace(obs, stated_px=None, noise_axes=None)
+            if obs.stated_px is not None and noise == "common"
+            else obs
+        )
         frames = StarFrames.from_observations(obs)
 
         def fitted(start: Camera) -> Calibration:
@@ -253,7 +275,9 @@ def calibrate(
             return _gaussian(obs, start, gaussian, method, solver, max_iterations)
 
         sheet = nominal.distortion
-        calibration = fit_determined(obs, camera, fitted, sheet=sheet, asked=model is not None, throw=throw)
+        calibration = fit_determined(
+            obs, camera, fitted, sheet=sheet, asked=model is not None, throw=throw
+        )
         if star_errors and calibration.status.ok:
             calibration = with_star_errors(weighed(obs, calibration), calibration)
     if throw:
@@ -287,19 +311,30 @@ def _enough(workers: int | None, obs: PartitionedObservations) -> int | None:
 
 
 def _gaussian(
-    obs: Observations, camera: Camera, likelihood: MarginalLikelihood, method: str, solver: str, max_iterations: int
+    obs: Observations,
+    camera: Camera,
+    likelihood: MarginalLikelihood,
+    method: str,
+    solver: str,
+    max_iterations: int,
 ) -> Calibration:
     pairs = PairObjective(likelihood.frames, camera.distortion)
     last = _gain(likelihood, _LAST_STEP)
-    stages, status = _stages(pairs, camera, likelihood, method, solver, max_iterations, last, "left")
+    stages, status = _stages(
+        pairs, camera, likelihood, method, solver, max_iterations, last, "left"
+    )
     pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
     covariance = _pair_covariance(pairs, likelihood, pair_theta)
     return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance)
 
 
-def _pair_covariance(pairs: PairObjective, likelihood: MarginalLikelihood, pair_theta: FloatArray) -> FloatArray:
+def _pair_covariance(
+    pairs: PairObjective, likelihood: MarginalLikelihood, pair_theta: FloatArray
+) -> FloatArray:
     # The scatter of many frames needs no noise.
-    chi2 = np.nan if enough_frames(pairs) else likelihood.profile(pair_theta, likelihood.rotations)[1]
+    chi2 = (
+        np.nan if enough_frames(pairs) else likelihood.profile(pair_theta, likelihood.rotations)[1]
+    )
     # The last step was not followed by an evaluation.
     near = _gain(likelihood, _LAST_PAIR_STEP)
     return pair_covariance(pairs, pair_theta, chi2, likelihood.dof - len(pair_theta), near)
@@ -316,14 +351,17 @@ class Fit:
 
 @one_thread()
 def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
-    """Go through the stages of `calibrate` without covariances, compression and whatever else a result holds.
+    """Go through the stages of `calibrate` without covariances, compression and whatever else a
+    result holds.
 
     CalibrationError as for `calibrate`, whose ``efficient`` and ``three_stage`` are the methods.
     """
     likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
-    stages, status = _stages(pairs, camera, likelihood, method, "lm", _ITERATIONS, pairs_read=method != "efficient")
+    stages, status = _stages(
+        pairs, camera, likelihood, method, "lm", _ITERATIONS, pairs_read=method != "efficient"
+    )
     return _fitted(likelihood, camera, stages[-1].theta, status)
 
 
@@ -334,24 +372,32 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
     CalibrationError when neither they nor the nominal camera lead to an estimate.
     """
     likelihood = MarginalLikelihood(obs, model, axes=True)
-    start = cal.nominal.replace(distortion=model, coefficients=(0.0,) * len(get_model(model).coefficients))
+    start = cal.nominal.replace(
+        distortion=model, coefficients=(0.0,) * len(get_model(model).coefficients)
+    )
     check_count(likelihood, start)
     known = dict(zip(cal.parameter_names, cal.theta, strict=True))
     if get_model(model).direction != get_model(cal.camera.distortion).direction:
         known = dict(list(known.items())[:3])
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     theta = np.array([known.get(name, 0.0) for name in start.parameter_names])
-    stage = refinement_stage(likelihood, theta, _ITERATIONS, _gain(likelihood, _LAST_STEP), "unseen")
+    stage = refinement_stage(
+        likelihood, theta, _ITERATIONS, _gain(likelihood, _LAST_STEP), "unseen"
+    )
     try:
         return _fitted(likelihood, start, stage.theta, stage.status)
     except CalibrationError:
         return fit(obs, start)
 
 
-def _fitted(likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, status: Status) -> Fit:
+def _fitted(
+    likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, status: Status
+) -> Fit:
     raise_unless_good(check_camera(camera.with_theta(theta), status))
     sums, attitudes = likelihood.sums(theta)
-    raise_unless_good(check_noise(noise_of(sums.normal.cost, likelihood.frames), camera, Status.CONVERGED))
+    raise_unless_good(
+        check_noise(noise_of(sums.normal.cost, likelihood.frames), camera, Status.CONVERGED)
+    )
     return Fit(theta, sums.normal.cost, attitudes.rotations)
 
 
@@ -371,19 +417,27 @@ def _stages(
     last: Last = "seen",
     pairs_read: bool = True,
 ) -> tuple[list[Stage], Status]:
-    """All stages of a Gaussian fit, and how they ended; `tolerance` and `last` are those of the refinement.
+    """All stages of a Gaussian fit, and how they ended; `tolerance` and `last` are those of the
+    refinement.
 
     Where nobody reads the estimate from interstar angles, it need only lead to the refinement.
     """
     sampled = method == "efficient" and solver == "lm"
-    stages = _sampled_stages(pairs, camera, max_iterations, _gain(likelihood, _LAST_PAIR_STEP)) if sampled else []
-    ending: tuple[float, Last] = (PAIR_TOLERANCE, "seen") if pairs_read else (_SAMPLE_TOLERANCE, "unseen")
+    stages = (
+        _sampled_stages(pairs, camera, max_iterations, _gain(likelihood, _LAST_PAIR_STEP))
+        if sampled
+        else []
+    )
+    ending: tuple[float, Last] = (
+        (PAIR_TOLERANCE, "seen") if pairs_read else (_SAMPLE_TOLERANCE, "unseen")
+    )
     stages = stages or _pair_stages(pairs, camera, solver, max_iterations, *ending)
     most = IMPLAUSIBLE_NOISE * camera.width_px
     noise = _noise_at(pairs, likelihood, stages[-1].theta)
     if _strayed(stages[-1], camera) or noise > most:
-        # In a field of few degrees interstar angles hardly see the principal point, and where stars state very unequal
-        # noise they go by the worst ones; positions lead to the estimate from the nominal optics in a few steps.
+        # In a field of few degrees interstar angles hardly see the principal point, and where stars
+        # state very unequal noise they go by the worst ones; positions lead to the estimate from
+        # the nominal optics in a few steps.
         own = MarginalLikelihood(likelihood.frames, camera.distortion)
         direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
         if direct.status.ok:
@@ -394,10 +448,13 @@ def _stages(
             if method == "efficient" and noise_px(own, direct.theta) <= min(noise, most):
                 likelihood.use_sums(*own.sums(direct.theta))
                 return [*stages, direct], direct.status
-    # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
+    # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions
+    # do.
     status = check_noise(noise, camera, stages[-1].status)
     if status.ok and method == "efficient":
-        stages.append(refinement_stage(likelihood, stages[-1].theta, max_iterations, tolerance, last))
+        stages.append(
+            refinement_stage(likelihood, stages[-1].theta, max_iterations, tolerance, last)
+        )
         status = stages[-1].status
     return stages, status
 
@@ -417,21 +474,32 @@ def _far(stage: Stage, camera: Camera) -> bool:
     return float(np.max(np.abs(stage.theta[:2] - camera.theta[:2]))) > _FAR * camera.width_px
 
 
-def _with_noise_model(obs: Observations, camera: Camera, method: str, solver: str, max_iterations: int) -> Calibration:
-    """Calibrate, fit how the noise varies, and refine with the weights that follow; even noise changes nothing."""
-    calibration = _gaussian(obs, camera, MarginalLikelihood(obs, camera.distortion), method, solver, max_iterations)
+def _with_noise_model(
+    obs: Observations, camera: Camera, method: str, solver: str, max_iterations: int
+) -> Calibration:
+    """Calibrate, fit how the noise varies, and refine with the weights that follow; even noise
+    changes nothing.
+    """
+    calibration = _gaussian(
+        obs, camera, MarginalLikelihood(obs, camera.distortion), method, solver, max_iterations
+    )
     if calibration.status.ok:
         model, theta = fit_noise(obs, calibration.camera, max_iterations=max_iterations)
         if model.varies:
             obs = obs.weighted(model.sigma_px(obs), model.axes)
             likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
             likelihood.use_rotations(likelihood.start_rotations(theta))
-            # The estimate from interstar angles has no weights; its covariance and the refinement do.
+            # The estimate from interstar angles has no weights; its covariance and the refinement
+            # do.
             stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]
             pair_theta = calibration.pair_theta
-            covariance = _pair_covariance(PairObjective(likelihood.frames, camera.distortion), likelihood, pair_theta)
+            covariance = _pair_covariance(
+                PairObjective(likelihood.frames, camera.distortion), likelihood, pair_theta
+            )
             status = stages[-1].status
-            calibration = assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance)
+            calibration = assemble(
+                obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance
+            )
         settings = {**calibration.provenance["settings"], "noise": "model"}
         record = {**calibration.provenance, "settings": settings, "noise_model": model.record()}
         calibration = replace(calibration, provenance=record)
@@ -439,7 +507,12 @@ def _with_noise_model(obs: Observations, camera: Camera, method: str, solver: st
 
 
 def _robust(
-    obs: Observations, camera: Camera, frames: StarFrames, solver: str, max_iterations: int, nu: float | None
+    obs: Observations,
+    camera: Camera,
+    frames: StarFrames,
+    solver: str,
+    max_iterations: int,
+    nu: float | None,
 ) -> Calibration:
     model = camera.distortion
 
@@ -453,7 +526,9 @@ def _robust(
             own = MarginalLikelihood(trusted, model)
             direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
             noise = _noise_at(pairs, MarginalLikelihood(trusted, model), stages[-1].theta)
-            if direct.status.ok and not (stages[-1].status.ok and noise < noise_px(own, direct.theta)):
+            if direct.status.ok and not (
+                stages[-1].status.ok and noise < noise_px(own, direct.theta)
+            ):
                 stages[-1] = replace(direct, name=stages[-1].name)
         return stages
 
@@ -462,17 +537,31 @@ def _robust(
     except CalibrationError as error:
         if error.status is None or error.status not in EXPLAINED:
             raise
-        raise failed(MarginalLikelihood(frames, model), camera.theta, camera, error.status) from None
+        raise failed(
+            MarginalLikelihood(frames, model), camera.theta, camera, error.status
+        ) from None
     pair_theta = start.stages[-1].theta
     found = refine(frames, model, pair_theta, start.rotations, nu, max_iterations)
-    theta, sigma, state, information = found.stage.theta, found.sigma, found.state, found.information
+    theta, sigma, state, information = (
+        found.stage.theta,
+        found.sigma,
+        found.state,
+        found.information,
+    )
     status = found.stage.status
-    if not np.isfinite(state.value) or is_singular(information.matrix) or is_singular(found.covariance):
+    if (
+        not np.isfinite(state.value)
+        or is_singular(information.matrix)
+        or is_singular(found.covariance)
+    ):
         reason = status if not status.ok else Status.SINGULAR
         raise failed(MarginalLikelihood(start.frames, model), theta, camera, reason)
     result = camera.with_theta(theta)
     status = check_camera(result, status)
-    gaussian, matrix = MarginalLikelihood(start.frames, model), scaled_inverse(found.covariance) * sigma**2
+    gaussian, matrix = (
+        MarginalLikelihood(start.frames, model),
+        scaled_inverse(found.covariance) * sigma**2,
+    )
     names, factors = undetermined(gaussian, theta, matrix, sigma, camera, status)
     if names:
         status = Status.SINGULAR
@@ -480,7 +569,11 @@ def _robust(
     settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
     record = provenance(None, settings, obs.data_hash) | coma_record(camera, factors)
     residuals = frames.in_pixels(state.e).T
-    record["student_t"] = {"dof": found.nu, "dof_std": found.nu_std, "stars_out_of_field": int(np.sum(~state.seen))}
+    record["student_t"] = {
+        "dof": found.nu,
+        "dof_std": found.nu_std,
+        "stars_out_of_field": int(np.sum(~state.seen)),
+    }
     return Calibration(
         camera=result,
         nominal=camera,
@@ -510,11 +603,15 @@ def _robust(
     )
 
 
-def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int, tolerance: float) -> list[Stage]:
-    """The stages on interstar angles, from their start values near to the minimum on a sample of the frames alone.
+def _sampled_stages(
+    pairs: PairObjective, camera: Camera, max_iterations: int, tolerance: float
+) -> list[Stage]:
+    """The stages on interstar angles, from their start values near to the minimum on a sample of
+    the frames alone.
 
-    The last stage ends on all frames, so that the estimate is theirs. Empty where there are not so many frames that it
-    saves time, or where the sample or all frames from its estimate do not converge.
+    The last stage ends on all frames, so that the estimate is theirs. Empty where there are not so
+    many frames that it saves time, or where the sample or all frames from its estimate do not
+    converge.
     """
     frames = pairs.frames
     wanted = max(_SAMPLE_FRAMES, -(-_SAMPLE_STARS * frames.n_frames // frames.n_stars))
@@ -531,7 +628,9 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int, t
         return []
     scales = {"distortion": frames.n_stars / sample.frames.n_stars}
     by_pair = pairs.n_pairs / sample.n_pairs
-    first = [replace(stage, cost=stage.cost * scales.get(stage.name, by_pair)) for stage in stages[:-1]]
+    first = [
+        replace(stage, cost=stage.cost * scales.get(stage.name, by_pair)) for stage in stages[:-1]
+    ]
     return [*first, begun_on_sample(stages[-1], last, by_pair)]
 
 
@@ -545,13 +644,17 @@ def _pair_stages(
 ) -> list[Stage]:
     frames = pairs.frames
     stages = [optics_stage(frames, camera, solver, max_iterations, tolerance, last)]
-    # Without an optical axis there is nothing to attach the distortion to; later stages would only hide it.
+    # Without an optical axis there is nothing to attach the distortion to; later stages would only
+    # hide it.
     if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
-        stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations, tolerance, last))
+        stages.append(
+            joint_stage(pairs, camera, stages[1].theta, solver, max_iterations, tolerance, last)
+        )
         if not stages[-1].status.ok or _far(stages[0], camera):
-            # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the linear stage may then
-            # lead to another minimum or into a fold; the nominal optics without distortion are the safer start.
+            # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the
+            # linear stage may then lead to another minimum or into a fold; the nominal optics
+            # without distortion are the safer start.
             start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
             again = joint_stage(pairs, camera, start, solver, max_iterations, tolerance, last)
             stages[-1] = min(stages[-1], again, key=_badness)

@@ -1,4 +1,6 @@
-"""The result of a calibration: estimate, uncertainty and how it was reached; saves itself without loss."""
+"""The result of a calibration: estimate, uncertainty and how it was reached; saves itself without
+loss.
+"""
 
 from __future__ import annotations
 
@@ -33,13 +35,52 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.noise_model import NoiseModel
     from starcal_uq.observations.table import Observations
 
-# Fields whose arrays grow with the data or the iterations: they stand in an archive beside the document.
-_APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sigmas", "sizes", "xy_px", "error_px")
+# Fields whose arrays grow with the data or the iterations: they stand in an archive beside the
+# document.
+_APART = (
+    "frame_ids",
+    "quaternions",
+    "residuals_px",
+    "trajectory",
+    "cost",
+    "sigmas",
+    "sizes",
+    "xy_px",
+    "error_px",
+)
 # Fields of the document, in the order in which it is read.
 _DOCUMENT = (
-    *("status", "parameter_names", "method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof", "provenance"),
-    *("theta", "covariance", "information", "rotation_per_theta", "attitude_noise", "pair_theta", "pair_covariance"),
-    *("camera", "nominal", "stages", "compressed", "fingerprints", "star_errors", "partitions", "undetermined"),
+    *(
+        "status",
+        "parameter_names",
+        "method",
+        "solver",
+        "sigma",
+        "sigma_std",
+        "sigma_name",
+        "chi2",
+        "dof",
+        "provenance",
+    ),
+    *(
+        "theta",
+        "covariance",
+        "information",
+        "rotation_per_theta",
+        "attitude_noise",
+        "pair_theta",
+        "pair_covariance",
+    ),
+    *(
+        "camera",
+        "nominal",
+        "stages",
+        "compressed",
+        "fingerprints",
+        "star_errors",
+        "partitions",
+        "undetermined",
+    ),
 )
 # Hash of the archive that belongs to the document.
 _ARCHIVE = "archive_sha256"
@@ -51,9 +92,10 @@ _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
 class Calibration(Shown):
     """Optics and distortion estimated from star observations.
 
-    p is the number of parameters, K of frames, N of stars. A recursive method that was given a stream of frames has
-    kept none of them: its `frame_ids`, `quaternions` and `residuals_px` are empty, `chi2` and `compressed` are those of
-    the linearised frames, and `n_stars` and `n_frames` count what went by.
+    p is the number of parameters, K of frames, N of stars. A recursive method that was given a
+    stream of frames has kept none of them: its `frame_ids`, `quaternions` and `residuals_px` are
+    empty, `chi2` and `compressed` are those of the linearised frames, and `n_stars` and `n_frames`
+    count what went by.
 
     Attributes
     ----------
@@ -92,27 +134,30 @@ class Calibration(Shown):
     information : (p, p) array
         Fisher information of the likelihood with the attitudes eliminated, at `sigma`.
     rotation_per_theta : (3, p) array
-        Mean over frames of d(attitude, rad)/d(theta): the common rotation that a wrong parameter causes.
+        Mean over frames of d(attitude, rad)/d(theta): the common rotation that a wrong parameter
+        causes.
     attitude_noise : (3, 3) array
         Mean over frames of the attitude covariance due to centroid noise, rad^2.
     pair_theta : (p,) array
-        Estimate from interstar angles: that of stage 3, the paper's, or of the method itself where it has no other.
+        Estimate from interstar angles: that of stage 3, the paper's, or of the method itself where
+        it has no other.
     pair_covariance : (p, p) array
-        Sandwich (Godambe) covariance of `pair_theta`, px units; with fewer than 50 frames per parameter that which
-        Gaussian noise gives.
+        Sandwich (Godambe) covariance of `pair_theta`, px units; with fewer than 50 frames per
+        parameter that which Gaussian noise gives.
     compressed : CompressedLikelihood
         The whole data set's likelihood around the estimate.
     provenance : dict
         Versions, settings, time and the hash of the data.
     fingerprints : Fingerprints or None
-        What identifies the frames, so that a measurement is not counted twice; None for a stream, and for a calibration
-        by a version before this one.
+        What identifies the frames, so that a measurement is not counted twice; None for a stream,
+        and for a calibration by a version before this one.
     star_errors : StarErrors or None
-        Direction errors of the stars, where they were asked for: `covariance`, `information` and `compressed` hold
-        them, and residuals and attitudes are those after each star's own offset.
+        Direction errors of the stars, where they were asked for: `covariance`, `information` and
+        `compressed` hold them, and residuals and attitudes are those after each star's own offset.
     partitions : PartitionSums or None
-        Of a calibration of partitioned observations, sums over all of their residuals: `frame_ids`, `quaternions`,
-        `residuals_px`, `pair_theta` and `pair_covariance` are those of a sample of frames, everything else of all.
+        Of a calibration of partitioned observations, sums over all of their residuals: `frame_ids`,
+        `quaternions`, `residuals_px`, `pair_theta` and `pair_covariance` are those of a sample of
+        frames, everything else of all.
     undetermined : tuple of str
         Names of parameters that the data leave open; `status` is then SINGULAR.
     """
@@ -146,7 +191,12 @@ class Calibration(Shown):
     undetermined: tuple[str, ...] = ()
 
     SHAPES: ClassVar[Shapes] = {
-        **{"parameter_names": ("p",), "theta": ("p",), "covariance": ("p", "p"), "information": ("p", "p")},
+        **{
+            "parameter_names": ("p",),
+            "theta": ("p",),
+            "covariance": ("p", "p"),
+            "information": ("p", "p"),
+        },
         **{"frame_ids": ("k",), "quaternions": ("k", 4), "residuals_px": ("n", 2)},
         **{"rotation_per_theta": (3, "p"), "attitude_noise": (3, 3)},
         **{"pair_theta": ("p",), "pair_covariance": ("p", "p")},
@@ -174,20 +224,27 @@ class Calibration(Shown):
         return correlation_of(self.covariance)[0]
 
     def interval(self, probability: float = 0.95) -> FloatArray:
-        """Interval of each parameter without sampling, (p, 2), px units: Student's with `dof` degrees of freedom.
+        """Interval of each parameter without sampling, (p, 2), px units: Student's with `dof`
+        degrees of freedom.
 
         A sigma from the scatter of frames has its own degrees of freedom, which provenance states.
         """
         own = self.provenance.get("interval_dof", {})
-        half = self.sigmas * [student_quantile(probability, own.get(n, self.dof)) for n in self.parameter_names]
+        half = self.sigmas * [
+            student_quantile(probability, own.get(n, self.dof)) for n in self.parameter_names
+        ]
         return np.stack([self.theta - half, self.theta + half], axis=1)
 
     def sigma_interval(self, probability: float = 0.95) -> FloatArray:
-        """Interval of the noise without sampling, (2,), in the unit of `sigma`: of chi-square with `dof`."""
+        """Interval of the noise without sampling, (2,), in the unit of `sigma`: of chi-square with
+        `dof`.
+        """
         from scipy.special import chdtri
 
         tail = 0.5 * (1.0 - probability)
-        return self.sigma * np.sqrt([self.dof / float(chdtri(self.dof, q)) for q in (tail, 1.0 - tail)])
+        return self.sigma * np.sqrt(
+            [self.dof / float(chdtri(self.dof, q)) for q in (tail, 1.0 - tail)]
+        )
 
     @property
     def noise_model(self) -> NoiseModel | None:
@@ -198,34 +255,54 @@ class Calibration(Shown):
 
     @property
     def fitted_noise(self) -> NoiseModel | None:
-        """The noise model where it found that the noise varies; otherwise stars have what they state, or one noise."""
+        """The noise model where it found that the noise varies; otherwise stars have what they
+        state, or one noise.
+        """
         model = self.noise_model
         return model if model is not None and model.varies else None
 
     @property
     def inflation(self) -> FloatArray | None:
-        """Factors (p,) that `covariance` was accepted to be wider by, per sigma; None for that of the likelihood."""
+        """Factors (p,) that `covariance` was accepted to be wider by, per sigma; None for that of
+        the likelihood.
+        """
         factors = self.provenance.get("settings", {}).get("inflation")
-        return None if factors is None else np.array([factors[name] for name in self.parameter_names])
+        return (
+            None if factors is None else np.array([factors[name] for name in self.parameter_names])
+        )
 
     @property
     def coma_factors(self) -> FloatArray | None:
-        """Factors (p,) on the sigmas of the likelihood that leave out the coma of a distortion that may be none."""
+        """Factors (p,) on the sigmas of the likelihood that leave out the coma of a distortion that
+        may be none.
+        """
         factors = self.provenance.get("without_coma")
-        return None if factors is None else np.array([factors[name] for name in self.parameter_names])
+        return (
+            None if factors is None else np.array([factors[name] for name in self.parameter_names])
+        )
 
     @property
     def n_stars(self) -> int:
         """Number of stars."""
-        return self.compressed.n_stars if self.partitions else len(self.residuals_px) or self.compressed.n_stars
+        return (
+            self.compressed.n_stars
+            if self.partitions
+            else len(self.residuals_px) or self.compressed.n_stars
+        )
 
     @property
     def n_frames(self) -> int:
         """Number of frames."""
-        return self.compressed.n_frames if self.partitions else len(self.frame_ids) or self.compressed.n_frames
+        return (
+            self.compressed.n_frames
+            if self.partitions
+            else len(self.frame_ids) or self.compressed.n_frames
+        )
 
     def data_hash_of(self, obs: Observations) -> str:
-        """Hash of the data that a table stands for: that of all partitions for the sample that was kept of them."""
+        """Hash of the data that a table stands for: that of all partitions for the sample that was
+        kept of them.
+        """
         record = self.provenance.get("partitions", {})
         if record.get("sample_sha256") == obs.data_hash:
             return str(self.provenance["data_sha256"])
@@ -237,14 +314,29 @@ class Calibration(Shown):
         return len(self.residuals_px) > 0
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per parameter: start, estimate, sigma, 95 % interval and unit; the noise is the last row."""
+        """One row per parameter: start, estimate, sigma, 95 % interval and unit; the noise is the
+        last row.
+        """
         import pandas as pd
 
         rows = [
-            {"parameter": p.name, "start": start, "estimate": value, "sigma": sigma, "low": low, "high": high}
+            {
+                "parameter": p.name,
+                "start": start,
+                "estimate": value,
+                "sigma": sigma,
+                "low": low,
+                "high": high,
+            }
             | {"unit": p.unit}
             for p, start, value, sigma, (low, high) in zip(
-                *(parameters(self.camera.distortion), self.nominal.theta, self.theta, self.sigmas, self.interval()),
+                *(
+                    parameters(self.camera.distortion),
+                    self.nominal.theta,
+                    self.theta,
+                    self.sigmas,
+                    self.interval(),
+                ),
                 strict=True,
             )
         ]
@@ -265,7 +357,9 @@ class Calibration(Shown):
     def __repr__(self) -> str:
         values = ", ".join(
             f"{name}={value:.8g}+-{sigma:.2g}"
-            for name, value, sigma in zip(self.parameter_names, self.theta, self.sigmas, strict=True)
+            for name, value, sigma in zip(
+                self.parameter_names, self.theta, self.sigmas, strict=True
+            )
         )
         return f"Calibration({values}, {self.sigma_name}={self.sigma:.4g}, {self.status.name})"
 
@@ -287,7 +381,9 @@ class Calibration(Shown):
             with temporary.open("wb") as stream:
                 np.savez_compressed(stream, allow_pickle=False, **arrays)
             archive = digest(temporary)
-        kept = {name: plain[name] for name in _DOCUMENT if plain[name] is not None and plain[name] != []}
+        kept = {
+            name: plain[name] for name in _DOCUMENT if plain[name] is not None and plain[name] != []
+        }
         write_json(kept | {_ARCHIVE: archive}, path)
 
     @classmethod
@@ -297,8 +393,8 @@ class Calibration(Shown):
         Raises
         ------
         RunFolderError
-            When a file is missing or not a calibration, when the two are not of one calibration, or when the
-            information matrix is not positive definite.
+            When a file is missing or not a calibration, when the two are not of one calibration, or
+            when the information matrix is not positive definite.
         """
         path, remedy = Path(path), "run `starcal-uq calibrate` again"
         beside = path.with_suffix(".npz")
@@ -311,7 +407,8 @@ class Calibration(Shown):
             # Files of versions before this one do not name their archive.
             if document.pop(_ARCHIVE, archive) != archive:
                 raise RunFolderError(
-                    f"{path}: is not of the same calibration as {beside.name} beside it; read it again if it is being "
+                    f"{path}: is not of the same calibration as {beside.name} beside it; read it "
+                    "again if it is being "
                     f"written, or {remedy}."
                 )
             found = from_plain(cls, document, arrays)

@@ -1,8 +1,9 @@
 """Are all frames of one camera? Each frame's own focal length, and whether these fall into groups.
 
-A frame tells its focal length by itself, through the angles between its stars. Frames of one camera scatter around one
-value, by noise and by what the model leaves over; those of two, around two. The split of the sorted values that leaves
-the least scatter within is held against the same of as many values of one camera.
+A frame tells its focal length by itself, through the angles between its stars. Frames of one camera
+scatter around one value, by noise and by what the model leaves over; those of two, around two. The
+split of the sorted values that leaves the least scatter within is held against the same of as many
+values of one camera.
 """
 
 from __future__ import annotations
@@ -39,11 +40,12 @@ class FrameFocals:
     """Focal length of each frame by itself."""
 
     frame_ids: IntArray  # (K,): frames with at least four stars; of more than 300, a sample
-    # `focal_px`, `sigma_px`, (K,): estimate at the given distortion, and its standard error from the scatter of the
-    # frame's stars, px.
+    # `focal_px`, `sigma_px`, (K,): estimate at the given distortion, and its standard error from
+    # the scatter of the frame's stars, px.
     focal_px: FloatArray
     sigma_px: FloatArray
-    # (K,): number of the group that a frame is of, from 0, by focal length; all 0 where there is one camera.
+    # (K,): number of the group that a frame is of, from 0, by focal length; all 0 where there is
+    # one camera.
     group: IntArray
     p_value: float  # Probability that frames of one camera fall apart so
 
@@ -58,7 +60,9 @@ class FrameFocals:
         return frame_ranges(self.frame_ids[self.group == np.bincount(self.group).argmax()])
 
     def words(self, camera: Camera) -> str:
-        """Each group's focal length and frames, in one clause, with the option that selects a group."""
+        """Each group's focal length and frames, in one clause, with the option that selects a
+        group.
+        """
         told = []
         for number in range(self.n_groups):
             mine = self.group == number
@@ -66,7 +70,8 @@ class FrameFocals:
             told.append(f"{focal} in {_listed(self.frame_ids[mine])}")
         chosen = self.largest if self.largest.count(",") < _WORDS else "LIST"
         return (
-            f"the frames are of {plural(self.n_groups, 'camera')}, or some are wrong: focal length {join_words(told)}; "
+            f"the frames are of {plural(self.n_groups, 'camera')}, or some are wrong: focal "
+            f"length {join_words(told)}; "
             f"calibrate each by itself (--only-frames {chosen})"
         )
 
@@ -99,7 +104,9 @@ def frame_ranges(frames: IntArray) -> str:
     """Frame numbers as ``--only-frames`` takes them, such as 0-4,7."""
     ends = np.flatnonzero(np.diff(frames) != 1)
     first, last = frames[np.concatenate([[0], ends + 1])], frames[np.append(ends, len(frames) - 1)]
-    return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in zip(first.tolist(), last.tolist(), strict=True))
+    return ",".join(
+        str(a) if a == b else f"{a}-{b}" for a, b in zip(first.tolist(), last.tolist(), strict=True)
+    )
 
 
 def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFocals:
@@ -110,7 +117,9 @@ def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFo
     """
     enough = np.flatnonzero(obs.stars_per_frame >= _LEAST_STARS)
     chosen = enough[one_of_each(len(enough), _FRAMES, seed)]
-    none = FrameFocals(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), 1.0)
+    none = FrameFocals(
+        np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), 1.0
+    )
     if not len(chosen):
         return none
     some = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
@@ -124,12 +133,17 @@ def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFo
     log_scale = -np.log(frame_focal_ratios(tangent, frames))
     for _ in range(_STEPS):
         pixel = np.ascontiguousarray(camera.focal_px * tangent * frames.spread(np.exp(log_scale)))
-        likelihood = MarginalLikelihood(StarFrames(pixel, frames.r, frames.weight, frames.starts), "none")
+        likelihood = MarginalLikelihood(
+            StarFrames(pixel, frames.r, frames.weight, frames.starts), "none"
+        )
         state, cost = likelihood.profile(theta)
         if not np.isfinite(cost):
             return none
         # A focal length that is longer by one per cent is a pattern that is larger by as much.
-        slope = likelihood.project_out(state, likelihood.derivatives(theta, state)[2:3])[0] * camera.focal_px
+        slope = (
+            likelihood.project_out(state, likelihood.derivatives(theta, state)[2:3])[0]
+            * camera.focal_px
+        )
         curvature = frames.sum(np.sum(slope**2, axis=0))
         step = frames.sum(np.sum(slope * state.e, axis=0)) / curvature
         log_scale -= np.clip(step, -0.2, 0.2)
@@ -158,8 +172,12 @@ def _grouped(value: FloatArray, sigma: FloatArray, seed: int) -> tuple[IntArray,
     return group, first
 
 
-def _split(value: FloatArray, sigma: FloatArray, rng: np.random.Generator) -> tuple[list[slice], float]:
-    """Groups of sorted values, one where they are no more, and the probability of so clear ones among one camera's."""
+def _split(
+    value: FloatArray, sigma: FloatArray, rng: np.random.Generator
+) -> tuple[list[slice], float]:
+    """Groups of sorted values, one where they are no more, and the probability of so clear ones
+    among one camera's.
+    """
     n, whole = len(value), [slice(0, len(value))]
     if n < _LEAST_FRAMES:
         return whole, 1.0
@@ -177,18 +195,23 @@ def _split(value: FloatArray, sigma: FloatArray, rng: np.random.Generator) -> tu
         edges = [0, *cuts[0].tolist(), n]
         parts = [slice(low, high) for low, high in pairwise(edges)]
         apart = np.diff([np.median(value[part]) for part in parts])
-        if p_value < GROUPS_P and np.min(apart) > max(_LEAST_APART, _SIGMAS_APART / np.sqrt(np.median(weight))):
+        if p_value < GROUPS_P and np.min(apart) > max(
+            _LEAST_APART, _SIGMAS_APART / np.sqrt(np.median(weight))
+        ):
             return parts, smallest
     return whole, smallest
 
 
 def _within(value: FloatArray, cuts: IntArray) -> float:
     """Mean square of sorted values around the medians of their groups."""
-    return float(np.mean(np.concatenate([part - np.median(part) for part in np.split(value, cuts)]) ** 2))
+    return float(
+        np.mean(np.concatenate([part - np.median(part) for part in np.split(value, cuts)]) ** 2)
+    )
 
 
 def _cut(value: FloatArray, weight: FloatArray, number: int) -> tuple[IntArray, FloatArray]:
-    """Where rows of sorted values (d, n) fall into groups, (d, number - 1), and scatter between over within, (d,).
+    """Where rows of sorted values (d, n) fall into groups, (d, number - 1), and scatter between
+    over within, (d,).
 
     Two groups are those with the least scatter within, more are cut at the widest gaps.
     """
@@ -197,11 +220,23 @@ def _cut(value: FloatArray, weight: FloatArray, number: int) -> tuple[IntArray, 
     middle = running[:, -1:] / mass[-1]
     if number == 2:
         part = mass[1:-1]
-        cuts = 1 + np.argmax((running[:, 1:-1] - part * middle) ** 2 / (part * (mass[-1] - part)), axis=1)[:, None]
+        cuts = (
+            1
+            + np.argmax(
+                (running[:, 1:-1] - part * middle) ** 2 / (part * (mass[-1] - part)), axis=1
+            )[:, None]
+        )
     else:
-        cuts = np.sort(np.argpartition(-np.diff(value, axis=1), number - 2, axis=1)[:, : number - 1], axis=1) + 1
+        cuts = (
+            np.sort(
+                np.argpartition(-np.diff(value, axis=1), number - 2, axis=1)[:, : number - 1],
+                axis=1,
+            )
+            + 1
+        )
     edges = np.concatenate(
-        [np.zeros((len(value), 1), dtype=int), cuts, np.full((len(value), 1), value.shape[1])], axis=1
+        [np.zeros((len(value), 1), dtype=int), cuts, np.full((len(value), 1), value.shape[1])],
+        axis=1,
     )
     sums = np.diff(np.take_along_axis(running, edges, axis=1), axis=1)
     between = np.sum(sums**2 / np.diff(mass[edges], axis=1), axis=1) - middle[:, 0] ** 2 * mass[-1]

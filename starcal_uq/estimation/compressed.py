@@ -1,9 +1,10 @@
 """The compressed likelihood: all stars of all frames in one small Gram matrix.
 
-In whitened parameters ``theta = theta_hat + L z`` the residuals, with each frame's attitude following its best value,
-are quadratic in z to high accuracy: ``e(z) = M [1, z, z z^T]``. After the attitudes are projected out, the sum of
-squares of the whole data set is ``m(z)^T G m(z)`` with one Gram matrix G = M^T M (21 x 21 for five parameters), which
-adds up over frames. An evaluation then costs the same for any number of stars.
+In whitened parameters ``theta = theta_hat + L z`` the residuals, with each frame's attitude
+following its best value, are quadratic in z to high accuracy: ``e(z) = M [1, z, z z^T]``. After the
+attitudes are projected out, the sum of squares of the whole data set is ``m(z)^T G m(z)`` with one
+Gram matrix G = M^T M (21 x 21 for five parameters), which adds up over frames. An evaluation then
+costs the same for any number of stars.
 """
 
 from __future__ import annotations
@@ -24,8 +25,20 @@ from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.loops import gram_loop, kernels
 from starcal_uq.estimation.marginal import TURN_RAD, MarginalLikelihood
 from starcal_uq.estimation.star_errors import StarSums
-from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, Attitudes, NormalSums, settled_sums
-from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric, scaled_cholesky, symmetric_inverse
+from starcal_uq.estimation.sums import (
+    ATTITUDE_STEPS,
+    ATTITUDE_TOLERANCE_RAD,
+    Attitudes,
+    NormalSums,
+    settled_sums,
+)
+from starcal_uq.maths.linear import (
+    COLUMNS,
+    ROWS,
+    inverse_symmetric,
+    scaled_cholesky,
+    symmetric_inverse,
+)
 from starcal_uq.observations.frames import StarFrames
 
 # Stars whose columns stay in the second-level cache.
@@ -35,12 +48,16 @@ _pairs = cache(np.triu_indices)
 
 @dataclass(frozen=True)
 class CompressedLikelihood:
-    """Attitude-marginalised log likelihood around an estimate, at a cost independent of the number of stars."""
+    """Attitude-marginalised log likelihood around an estimate, at a cost independent of the number
+    of stars.
+    """
 
     theta_hat: FloatArray  # (p,): point of expansion, px units
-    # (p, p): L in ``theta = theta_hat + L z``; lower triangular, ``L L^T`` is the covariance at the estimate.
+    # (p, p): L in ``theta = theta_hat + L z``; lower triangular, ``L L^T`` is the covariance at the
+    # estimate.
     whitening: FloatArray
-    gram: FloatArray  # (q, q): G over the monomials 1, z_a, z_a z_b (a <= b, row-major), q = (p + 1)(p + 2) / 2
+    # (q, q): G over the monomials 1, z_a, z_a z_b (a <= b, row-major), q = (p + 1)(p + 2) / 2
+    gram: FloatArray
     log_determinant: float  # ``sum_k log |A_k^T A_k|`` at theta_hat
     log_determinant_slope: FloatArray  # (p,): derivative of `log_determinant` with respect to z
     dof: int  # ``sum_k (2 m_k - 3)``
@@ -49,7 +66,12 @@ class CompressedLikelihood:
     n_frames: int
 
     SHAPES: ClassVar[Shapes] = {
-        **{"theta_hat": ("p",), "whitening": ("p", "p"), "gram": ("q", "q"), "log_determinant_slope": ("p",)}
+        **{
+            "theta_hat": ("p",),
+            "whitening": ("p", "p"),
+            "gram": ("q", "q"),
+            "log_determinant_slope": ("p",),
+        }
     }
     FINITE: ClassVar[tuple[str, ...]] = ("theta_hat", "whitening", "gram", "log_determinant_slope")
 
@@ -99,7 +121,9 @@ class CompressedLikelihood:
 
 @dataclass(frozen=True)
 class GramSums:
-    """What a part of the frames adds to a compressed likelihood around a given point; they add up."""
+    """What a part of the frames adds to a compressed likelihood around a given point; they add
+    up.
+    """
 
     gram: FloatArray  # (q, q): as in `CompressedLikelihood`
     log_determinant: float  # ``sum_k log |A_k^T A_k|``
@@ -118,7 +142,9 @@ class GramSums:
         )
 
     def likelihood(self, theta_hat: FloatArray, whitening: FloatArray) -> CompressedLikelihood:
-        """The compressed likelihood of all that was summed around theta_hat (p,) with the whitening (p, p)."""
+        """The compressed likelihood of all that was summed around theta_hat (p,) with the whitening
+        (p, p).
+        """
         return CompressedLikelihood(
             theta_hat=np.array(theta_hat),
             whitening=whitening,
@@ -134,8 +160,9 @@ class GramSums:
 class _Expansion:
     """The residuals of frames expanded around one point, block by block.
 
-    Second derivatives Q over (theta, phi) are contracted with the directions (L z, phi(z)), in which the attitudes
-    phi(z) = K z follow the parameters; most entries of Q that belong to theta alone vanish and are not formed.
+    Second derivatives Q over (theta, phi) are contracted with the directions (L z, phi(z)), in
+    which the attitudes phi(z) = K z follow the parameters; most entries of Q that belong to theta
+    alone vanish and are not formed.
     """
 
     def __init__(self, model_name: str, theta: FloatArray, whitening: FloatArray) -> None:
@@ -146,9 +173,12 @@ class _Expansion:
         rows, columns = bent_index(model_name)
         own, mixed, turned = columns < p, (rows < p) & (columns >= p), rows >= p
         self._own, self._mixed = np.flatnonzero(own), np.flatnonzero(mixed)
-        self._turned = {(int(rows[n]) - p, int(columns[n]) - p): int(n) for n in np.flatnonzero(turned)}
+        self._turned = {
+            (int(rows[n]) - p, int(columns[n]) - p): int(n) for n in np.flatnonzero(turned)
+        }
         i, j = np.triu_indices(p)
-        # A diagonal entry of z z^T stands once in the expansion, halved; the others stand for both orders.
+        # A diagonal entry of z z^T stands once in the expansion, halved; the others stand for both
+        # orders.
         self._halved = np.where(i == j, 0.5, 1.0)
         r, c = rows[own], columns[own]
         both = whitening[r][:, i] * whitening[c][:, j] + np.where(r == c, 0.0, 1.0)[:, None] * (
@@ -168,12 +198,16 @@ class _Expansion:
         for _ in range(ATTITUDE_STEPS):
             b = part.rotated(rotations)
             outputs = (xy, h.reshape(-1, n), a.reshape(-1, n), bent.reshape(-1, n))
-            self._kernel.into((self.theta, b, forward_root(self.model_name, self.theta, b)), outputs)
+            self._kernel.into(
+                (self.theta, b, forward_root(self.model_name, self.theta, b)), outputs
+            )
             e = part.pixel - xy
             for array in (e, h, a, bent):
                 part.whiten(array)
             d = (self.whitening.T @ h.reshape(p, -1)).reshape(p, 2, n)
-            packed = np.stack([np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)])
+            packed = np.stack(
+                [np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)]
+            )
             inverse, determinant = inverse_symmetric(part.sum(packed))
             slopes = np.stack([part.sum(np.sum(column * d, axis=1)) for column in a])
             slope = part.sum(np.sum(a * e, axis=1))
@@ -195,7 +229,9 @@ class _Expansion:
         return _Block(columns, a, inverse, float(np.sum(np.log(determinant))), log_slope, rotations)
 
     def _curves(self, bent: FloatArray, path: FloatArray, second: FloatArray) -> FloatArray:
-        """Second derivatives along z into `second`; the derivatives (p, 3, 2, n) of the attitude columns come back."""
+        """Second derivatives along z into `second`; the derivatives (p, 3, 2, n) of the attitude
+        columns come back.
+        """
         p, n = self.p, bent.shape[2]
         flat = bent.reshape(len(bent), -1)
         bend = (self._to_mixed.reshape(3 * p, -1) @ flat[self._mixed]).reshape(p, 3, 2, n)
@@ -223,8 +259,9 @@ class _Expansion:
 class _Block:
     """One block of an expansion.
 
-    `columns` (q, 2, n) are derivatives of the residuals along the attitudes' first-order path: value and first
-    derivatives are free of what attitudes can reproduce, second derivatives are not.
+    `columns` (q, 2, n) are derivatives of the residuals along the attitudes' first-order path:
+    value and first derivatives are free of what attitudes can reproduce, second derivatives are
+    not.
     """
 
     columns: FloatArray
@@ -255,10 +292,11 @@ def gram_sums(
 ) -> GramSums:
     """What a part of the frames adds to the compressed likelihood around theta (p,), in one pass.
 
-    `theta` (p,): point of expansion, px units; the same for all parts.
-    `whitening` (p, p): L in ``theta = theta_hat + L z``, lower triangular; the same for all parts.
-    `rotations` (K, 3, 3): attitudes to start from.
-    `known`: sums at theta with settled attitudes, where there are any; the compiled path need not make them again.
+    `theta` (p,): point of expansion, px units; the same for all parts. `whitening` (p, p): L in
+    ``theta = theta_hat + L z``, lower triangular; the same for all parts. `rotations` (K, 3, 3):
+    attitudes to start from.
+    `known`: sums at theta with settled attitudes, where there are any; the compiled path need not
+    make them again.
     """
     theta = np.asarray(theta, dtype=np.float64)
     if frames.axes is None and kernels(model_name, frames.n_stars) == "numba":
@@ -267,7 +305,9 @@ def gram_sums(
         moved = (np.zeros_like(at.shift), at.response, at.inverse)
         gram, slope = gram_loop(frames, model_name, theta, whitening, at.at(theta), moved)
         return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)
-    return _expanded(frames, model_name, theta, whitening, rotations, lambda part, block, stars: None)
+    return _expanded(
+        frames, model_name, theta, whitening, rotations, lambda part, block, stars: None
+    )
 
 
 def _expanded(
@@ -304,8 +344,8 @@ def compress(
 
     `likelihood`: exact likelihood of the data.
     `theta_hat` (p,): point of expansion, px units.
-    `covariance` (p, p): covariance there; sets the whitened coordinates.
-    `rotations` (K, 3, 3): attitudes to start from; otherwise those where the likelihood's own searches start, or
+    `covariance` (p, p): covariance there; sets the whitened coordinates. `rotations` (K, 3, 3):
+    attitudes to start from; otherwise those where the likelihood's own searches start, or
         QUEST's.
     `stars`: stars that bring errors along, nothing added yet.
     `ratio` (2 S,): variances of their errors, in units of sigma^2.
@@ -313,7 +353,9 @@ def compress(
     whitening, theta = scaled_cholesky(covariance), np.asarray(theta_hat, dtype=np.float64)
     frames, model_name = likelihood.frames, likelihood.model_name
     known = likelihood.last_sums
-    if known is not None and not (np.array_equal(known[1].theta, theta) and known[0].turn < TURN_RAD):
+    if known is not None and not (
+        np.array_equal(known[1].theta, theta) and known[0].turn < TURN_RAD
+    ):
         known = None
     if rotations is None:
         # Of use to the NumPy path alone, where sums are known.
@@ -331,18 +373,25 @@ def compress(
             bringing.add(own, state, own.project_out(state, block.columns), rows)
 
         sums = _expanded(frames, model_name, theta, whitening, rotations, add)
-        return dataclasses.replace(sums, gram=sums.gram - stars.solved(ratio).correction()).likelihood(theta, whitening)
-    return gram_sums(frames, model_name, theta, whitening, rotations, known).likelihood(theta, whitening)
+        return dataclasses.replace(
+            sums, gram=sums.gram - stars.solved(ratio).correction()
+        ).likelihood(theta, whitening)
+    return gram_sums(frames, model_name, theta, whitening, rotations, known).likelihood(
+        theta, whitening
+    )
 
 
 _STEPS = 50
 _HALVINGS = 20
-# A further Newton step would gain less than this, nat: the optimum is then known to a millionth of a sigma.
+# A further Newton step would gain less than this, nat: the optimum is then known to a millionth of
+# a sigma.
 _GAIN = 1e-12
 
 
 def monomial_map(offset: FloatArray, matrix: FloatArray) -> FloatArray:
-    """T (q, q) with ``m(c + A z) = T m(z)`` for the monomials 1, z_a, z_a z_b (a <= b); `offset` is c, `matrix` A."""
+    """T (q, q) with ``m(c + A z) = T m(z)`` for the monomials 1, z_a, z_a z_b (a <= b); `offset` is
+    c, `matrix` A.
+    """
     p = len(offset)
     rows, columns = _pairs(p)
     q = 1 + p + len(rows)
@@ -357,7 +406,9 @@ def monomial_map(offset: FloatArray, matrix: FloatArray) -> FloatArray:
     return t
 
 
-def moved(compressed: CompressedLikelihood, theta_hat: FloatArray, whitening: FloatArray) -> CompressedLikelihood:
+def moved(
+    compressed: CompressedLikelihood, theta_hat: FloatArray, whitening: FloatArray
+) -> CompressedLikelihood:
     """The same function of theta, expanded around another point in other whitened coordinates.
 
     `theta_hat` (p,): new point of expansion, px units.
@@ -366,7 +417,9 @@ def moved(compressed: CompressedLikelihood, theta_hat: FloatArray, whitening: Fl
     offset = compressed.whiten(theta_hat)[0]
     # Rows of the factors differ by twenty powers of ten.
     scale = np.diag(compressed.whitening)[:, None]
-    matrix: FloatArray = np.asarray(np.linalg.solve(compressed.whitening / scale, whitening / scale), dtype=np.float64)
+    matrix: FloatArray = np.asarray(
+        np.linalg.solve(compressed.whitening / scale, whitening / scale), dtype=np.float64
+    )
     t = monomial_map(offset, matrix)
     gram = t.T @ compressed.gram @ t
     slope = compressed.log_determinant_slope
@@ -381,21 +434,26 @@ def moved(compressed: CompressedLikelihood, theta_hat: FloatArray, whitening: Fl
 
 
 def scaled(compressed: CompressedLikelihood, unit: float) -> CompressedLikelihood:
-    """The likelihood of the same stars if each had stated the noise `unit` (px, or a factor on what it states).
+    """The likelihood of the same stars if each had stated the noise `unit` (px, or a factor on what
+    it states).
 
-    Sigma is then a common factor on it; the value at ``sigma / unit`` differs from the one at `sigma` before by
-    ``dof log unit`` and by the frames' volumes, as it does for `starcal_uq.estimation.marginal.MarginalLikelihood`.
+    Sigma is then a common factor on it; the value at ``sigma / unit`` differs from the one at
+    `sigma` before by ``dof log unit`` and by the frames' volumes, as it does for
+    `starcal_uq.estimation.marginal.MarginalLikelihood`.
     """
     return dataclasses.replace(
         compressed,
         gram=compressed.gram / unit**2,
-        log_determinant=compressed.log_determinant - 6.0 * compressed.n_frames * float(np.log(unit)),
+        log_determinant=compressed.log_determinant
+        - 6.0 * compressed.n_frames * float(np.log(unit)),
     )
 
 
 def total(parts: Sequence[CompressedLikelihood]) -> CompressedLikelihood:
     """Sum of likelihoods of different frames, expanded around their precision-weighted mean."""
-    theta, covariance = combined([part.theta_hat for part in parts], [_covariance(part) for part in parts])
+    theta, covariance = combined(
+        [part.theta_hat for part in parts], [_covariance(part) for part in parts]
+    )
     whitening = scaled_cholesky(covariance)
     at = [moved(part, theta, whitening) for part in parts]
     return CompressedLikelihood(
@@ -410,14 +468,18 @@ def total(parts: Sequence[CompressedLikelihood]) -> CompressedLikelihood:
     )
 
 
-def combined(theta: Sequence[FloatArray], covariance: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+def combined(
+    theta: Sequence[FloatArray], covariance: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
     """Precision-weighted mean (p,) of independent estimates, and its covariance (p, p)."""
     scale = np.sqrt(np.diag(covariance[0]))
     outer = np.outer(scale, scale)
     precision = [np.linalg.inv(c / outer) for c in covariance]
     reduced = np.linalg.inv(np.sum(precision, axis=0))
     # Differences from the first: 5852 px with a sigma of 0.01 px would lose digits.
-    shift = np.sum([w @ ((t - theta[0]) / scale) for w, t in zip(precision, theta, strict=True)], axis=0)
+    shift = np.sum(
+        [w @ ((t - theta[0]) / scale) for w, t in zip(precision, theta, strict=True)], axis=0
+    )
     mean = theta[0] + scale * (reduced @ shift)
     return np.asarray(mean), np.asarray(0.5 * (reduced + reduced.T) * outer)
 
@@ -430,7 +492,9 @@ def _covariance(compressed: CompressedLikelihood) -> FloatArray:
 class Optimum:
     """Least squares of a compressed likelihood."""
 
-    compressed: CompressedLikelihood  # Expanded around the optimum, whitened by the covariance there
+    compressed: (
+        CompressedLikelihood  # Expanded around the optimum, whitened by the covariance there
+    )
     information: FloatArray  # (p, p): Gauss-Newton information at the estimated noise, px units
     covariance: FloatArray  # (p, p): inverse of the information
     sigma: float  # ``sqrt(S / (dof - p))``
@@ -462,10 +526,13 @@ def optimum(compressed: CompressedLikelihood) -> Optimum:
         try:
             factor = np.linalg.cholesky(hessian)
         except np.linalg.LinAlgError:
-            # Far from the optimum the full Hessian may not be positive definite; Gauss and Newton's is.
+            # Far from the optimum the full Hessian may not be positive definite; Gauss and Newton's
+            # is.
             factor = np.linalg.cholesky(2.0 * here.gram[1 : p + 1, 1 : p + 1])
         step = -np.linalg.solve(factor.T, np.linalg.solve(factor, slope))
-        gain = -0.5 * float(slope @ step) * dof / max(2.0 * here.gram[0, 0], np.finfo(np.float64).tiny)
+        gain = (
+            -0.5 * float(slope @ step) * dof / max(2.0 * here.gram[0, 0], np.finfo(np.float64).tiny)
+        )
         if gain < _GAIN:
             break
         here = _shorter(here, step)
@@ -473,7 +540,8 @@ def optimum(compressed: CompressedLikelihood) -> Optimum:
         cost.append(float(here.gram[0, 0]))
     else:
         raise CalibrationError(
-            "the merged likelihood has no optimum near the runs' own: they do not describe one camera; calibrate "
+            "the merged likelihood has no optimum near the runs' own: they do not describe one "
+            "camera; calibrate "
             "their observations together.",
             Status.STALLED,
         )
@@ -491,7 +559,9 @@ def optimum(compressed: CompressedLikelihood) -> Optimum:
 
 
 def unit_covariance(compressed: CompressedLikelihood) -> FloatArray:
-    """Covariance (p, p) at the point of expansion for a noise of one: the inverse of the Gauss-Newton matrix."""
+    """Covariance (p, p) at the point of expansion for a noise of one: the inverse of the
+    Gauss-Newton matrix.
+    """
     p = len(compressed.theta_hat)
     unit = np.linalg.inv(compressed.gram[1 : p + 1, 1 : p + 1])
     root = compressed.whitening @ np.linalg.cholesky(0.5 * (unit + unit.T))
@@ -522,4 +592,6 @@ def _shorter(compressed: CompressedLikelihood, step: FloatArray) -> CompressedLi
     trials = 0.5 ** np.arange(_HALVINGS)[:, None] * step
     good = np.flatnonzero(compressed.sum_of_squares(trials) <= compressed.gram[0, 0])
     step = trials[good[0] if len(good) else -1]
-    return moved(compressed, compressed.theta_hat + compressed.whitening @ step, compressed.whitening)
+    return moved(
+        compressed, compressed.theta_hat + compressed.whitening @ step, compressed.whitening
+    )

@@ -18,9 +18,17 @@ if TYPE_CHECKING:
 DUPLICATES = get_args(Duplicates)
 
 
-def fingerprints_of(calibration: Calibration, obs: Observations | None = None) -> Fingerprints | None:
-    """Those of a calibration; where a version before this one made it, from its observations, if there are any."""
-    if calibration.fingerprints is not None or obs is None or len(obs) != len(calibration.residuals_px):
+def fingerprints_of(
+    calibration: Calibration, obs: Observations | None = None
+) -> Fingerprints | None:
+    """Those of a calibration; where a version before this one made it, from its observations, if
+    there are any.
+    """
+    if (
+        calibration.fingerprints is not None
+        or obs is None
+        or len(obs) != len(calibration.residuals_px)
+    ):
         return calibration.fingerprints
     return Fingerprints.of(obs, calibration.residuals_px, calibration.camera.centre_px)
 
@@ -33,7 +41,8 @@ def repeated_frames(a: Calibration, b: Calibration | None = None) -> IntArray:
     a : Calibration
         A calibration with fingerprints.
     b : Calibration, optional
-        Another, whose frames are compared with those of `a`; otherwise those of `a` are compared with each other.
+        Another, whose frames are compared with those of `a`; otherwise those of `a` are compared
+        with each other.
 
     Returns
     -------
@@ -43,7 +52,8 @@ def repeated_frames(a: Calibration, b: Calibration | None = None) -> IntArray:
     Raises
     ------
     RepeatedFramesError
-        If a calibration has no fingerprints: it was made from a stream or by a version without them.
+        If a calibration has no fingerprints: it was made from a stream or by a version without
+        them.
     """
     given = [a] if b is None else [a, b]
     marks = [calibration.fingerprints for calibration in given]
@@ -61,18 +71,30 @@ def repeated_frames(a: Calibration, b: Calibration | None = None) -> IntArray:
 def check_duplicates(duplicates: str) -> None:
     """Refuse a word that says nothing about repeated frames."""
     if duplicates not in DUPLICATES:
-        raise CalibrationError(f"duplicates {duplicates!r} is unknown: use one of {', '.join(DUPLICATES)}.")
+        raise CalibrationError(
+            f"duplicates {duplicates!r} is unknown: use one of {', '.join(DUPLICATES)}."
+        )
 
 
 def repeated(what: str, pairs: IntArray, n_frames: int) -> str:
-    """First part of a sentence about so many frames that hold the same as others; pairs (n, 2) of frame numbers."""
+    """First part of a sentence about so many frames that hold the same as others; pairs (n, 2) of
+    frame numbers.
+    """
     more = n_frames - 1
-    others = f", and {more} more repeat others" if more > 1 else ", and one more repeats another" if more else ""
+    others = (
+        f", and {more} more repeat others"
+        if more > 1
+        else ", and one more repeats another"
+        if more
+        else ""
+    )
     return f"frame {pairs[0, 1]} holds the same {what} as frame {pairs[0, 0]}{others}"
 
 
 def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:
-    """Numbers of the frames to leave out: none where they are kept, and an error where they are refused."""
+    """Numbers of the frames to leave out: none where they are kept, and an error where they are
+    refused.
+    """
     if duplicates == "keep" or calibration.fingerprints is None:
         return np.empty(0, dtype=np.int64)
     pairs = repeated_frames(calibration)
@@ -81,7 +103,8 @@ def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:
         raise RepeatedFramesError(
             f"{repeated('measurement', pairs, len(later))}: their stars differ by far less than "
             "their noise, and would count twice; leave the later ones out (duplicates='drop', "
-            "--duplicates drop), or, if you know them to be exposures of their own, keep them (duplicates='keep', "
+            "--duplicates drop), or, if you know them to be exposures of their own, keep them "
+            "(duplicates='keep', "
             "--duplicates keep).",
             pairs=pairs.tolist(),
         )

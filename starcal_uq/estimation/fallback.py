@@ -1,8 +1,10 @@
-"""The richest distortion model that the data determine, where they do not determine the one of the camera.
+"""The richest distortion model that the data determine, where they do not determine the one of the
+camera.
 
-One rule: what is asked for by name (``model="brown"``, ``--model brown``) is fitted or refused, and the refusal names
-the model that would converge; the model of a camera's sheet is a start, and a simpler one is taken where it fails.
-Where the simpler model is asked for, it leaves out as much: its record is the same.
+One rule: what is asked for by name (``model="brown"``, ``--model brown``) is fitted or refused, and
+the refusal names the model that would converge; the model of a camera's sheet is a start, and a
+simpler one is taken where it fails. Where the simpler model is asked for, it leaves out as much:
+its record is the same.
 """
 
 from __future__ import annotations
@@ -23,7 +25,13 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.plausibility import find_reason
-from starcal_uq.estimation.undetermined import COMA_MATTERS, EXPLAINED, open_parameters, remedy_of, what_is_open
+from starcal_uq.estimation.undetermined import (
+    COMA_MATTERS,
+    EXPLAINED,
+    open_parameters,
+    remedy_of,
+    what_is_open,
+)
 from starcal_uq.observations.table import Observations
 
 # Ends that a better start may mend.
@@ -42,12 +50,14 @@ def fit_determined(
     asked: bool,
     throw: bool = True,
 ) -> Calibration:
-    """The calibration by `fit` with the model of a camera, or with the richest simpler one that the data determine.
+    """The calibration by `fit` with the model of a camera, or with the richest simpler one that the
+    data determine.
 
     `camera`: nominal, with the model wanted.
-    `fit`: nominal camera to calibration; it may raise `CalibrationError`.
-    `sheet`: model of the camera's sheet.
-    `asked`: whether the model was asked for by name: then it is that or, with `throw`, an error naming one that
+    `fit`: nominal camera to calibration; it may raise `CalibrationError`. `sheet`: model of the
+    camera's sheet.
+    `asked`: whether the model was asked for by name: then it is that or, with `throw`, an error
+    naming one that
         converges.
     `throw`: whether a calibration that did not end well is of no use.
     CalibrationError as `fit`, where no simpler model is to be had.
@@ -68,7 +78,8 @@ def fit_determined(
             used = simpler.camera.distortion
             if asked:
                 raise CalibrationError(
-                    f"the calibration failed ({status.name}): {remedy_of(status, names)}; {used!r} converges "
+                    f"the calibration failed ({status.name}): {remedy_of(status, names)}; "
+                    f"{used!r} converges "
                     f"(--model {used}, or model={used!r} in Python).",
                     status,
                     names,
@@ -85,9 +96,15 @@ def fit_determined(
     return found
 
 
-def _conditional(cal: Calibration, model: str, status: Status, names: tuple[str, ...]) -> Calibration:
-    """The calibration with the record of the richer model that the data do not determine, and why."""
-    because = "the stars are too few" if status is Status.SINGULAR else f"the fit ended in {status.name}"
+def _conditional(
+    cal: Calibration, model: str, status: Status, names: tuple[str, ...]
+) -> Calibration:
+    """The calibration with the record of the richer model that the data do not determine, and
+    why.
+    """
+    because = (
+        "the stars are too few" if status is Status.SINGULAR else f"the fit ended in {status.name}"
+    )
     because = f"{what_is_open(names) if names else because} with the latter"
     record: AnyDict = {"model": model, "used": cal.camera.distortion, "status": status.name}
     record |= {"undetermined": list(names), "because": because}
@@ -95,7 +112,9 @@ def _conditional(cal: Calibration, model: str, status: Status, names: tuple[str,
 
 
 def _left_open(obs: Observations, cal: Calibration, richer: str) -> tuple[str, ...] | None:
-    """What the data leave open of a richer model around a calibration; None where they determine all of it."""
+    """What the data leave open of a richer model around a calibration; None where they determine
+    all of it.
+    """
     likelihood, theta = _as_richer(obs, cal, richer)
     if likelihood.dof < len(theta):
         return ()
@@ -103,8 +122,12 @@ def _left_open(obs: Observations, cal: Calibration, richer: str) -> tuple[str, .
     return open_parameters(likelihood.evaluate(theta).matrix, cal.sigma, camera) or None
 
 
-def _as_richer(obs: Observations, cal: Calibration, richer: str) -> tuple[MarginalLikelihood, FloatArray]:
-    """The likelihood of a richer model, and the estimate of a calibration in it: what it lacks is zero."""
+def _as_richer(
+    obs: Observations, cal: Calibration, richer: str
+) -> tuple[MarginalLikelihood, FloatArray]:
+    """The likelihood of a richer model, and the estimate of a calibration in it: what it lacks is
+    zero.
+    """
     likelihood = MarginalLikelihood(weighed(obs, cal), richer)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     extra = len(get_model(richer).coefficients) - len(get_model(cal.camera.distortion).coefficients)
@@ -114,11 +137,15 @@ def _as_richer(obs: Observations, cal: Calibration, richer: str) -> tuple[Margin
 def _simpler(
     obs: Observations, camera: Camera, fit: Callable[[Camera], Calibration], status: Status
 ) -> Calibration | None:
-    """The calibration with the richest simpler model that converges, or with the model itself from a better start.
+    """The calibration with the richest simpler model that converges, or with the model itself from
+    a better start.
 
-    None where the stars do not agree, so that no model is to blame, or where they ask for the terms left out.
+    None where the stars do not agree, so that no model is to blame, or where they ask for the terms
+    left out.
     """
-    names = sorted(simpler_models(camera.distortion), key=lambda name: -len(get_model(name).coefficients))
+    names = sorted(
+        simpler_models(camera.distortion), key=lambda name: -len(get_model(name).coefficients)
+    )
     if not names or find_reason(obs, camera, status) is not None:
         return None
     for name in names:
@@ -141,7 +168,9 @@ def _simpler(
 
 
 def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:
-    """Whether the residuals of a calibration ask for the terms of a richer model: the score test, an F statistic."""
+    """Whether the residuals of a calibration ask for the terms of a richer model: the score test,
+    an F statistic.
+    """
     from scipy.special import fdtrc
 
     if cal.provenance["settings"].get("likelihood") == "student_t":
@@ -153,14 +182,19 @@ def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:
     values, vectors = np.linalg.eigh(normal.matrix * np.outer(scale, scale))
     kept = values > _ABSORBED
     gain = float(np.sum((vectors[:, kept].T @ (scale * normal.gradient)) ** 2 / values[kept]))
-    terms, dof = int(np.count_nonzero(kept)) - len(cal.theta), likelihood.dof - int(np.count_nonzero(kept))
+    terms, dof = (
+        int(np.count_nonzero(kept)) - len(cal.theta),
+        likelihood.dof - int(np.count_nonzero(kept)),
+    )
     if terms < 1 or dof < 1 or not 0.0 < gain < normal.cost:
         return False
     return bool(fdtrc(terms, dof, gain / terms / ((normal.cost - gain) / dof)) < _WANTED_P)
 
 
 def fallback_words(cal: Calibration) -> str:
-    """What the data do not determine of the camera's model, and what the sigmas rest on; empty where they do."""
+    """What the data do not determine of the camera's model, and what the sigmas rest on; empty
+    where they do.
+    """
     record = cal.provenance.get("fallback")
     if not record:
         return _coma_words(cal)
@@ -168,7 +202,8 @@ def fallback_words(cal: Calibration) -> str:
     left_out = [name for name in left_out if name not in cal.parameter_names]
     verb = "is" if len(left_out) == 1 else "are"
     return (
-        f"Distortion model {record['used']!r} in place of {record['model']!r}: {record['because']}. The sigmas hold if "
+        f"Distortion model {record['used']!r} in place of {record['model']!r}: "
+        f"{record['because']}. The sigmas hold if "
         f"{join_words(left_out)} {verb} zero."
     )
 
@@ -179,6 +214,8 @@ def _coma_words(cal: Calibration) -> str:
         return ""
     x0, y0 = (significant(float(sigma)) for sigma in cal.sigmas[:2])
     return (
-        f"The distortion may be none, and without its coma the stars tell the principal point to {x0} and {y0} px "
-        f"only: sigmas hold that, and are up to {significant(float(np.max(factors)))} times as large as with it."
+        "The distortion may be none, and without its coma the stars tell the principal point to "
+        f"{x0} and {y0} px "
+        f"only: sigmas hold that, and are up to {significant(float(np.max(factors)))} times as "
+        "large as with it."
     )

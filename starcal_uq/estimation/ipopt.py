@@ -15,7 +15,9 @@ from starcal_uq.estimation.solvers import Constraints, Evaluate, Normal, Solutio
 class _Cache:
     """The model at the last point, shared by value, gradient and Hessian callbacks."""
 
-    def __init__(self, evaluate: Evaluate, origin: FloatArray, scale: FloatArray, unit: float) -> None:
+    def __init__(
+        self, evaluate: Evaluate, origin: FloatArray, scale: FloatArray, unit: float
+    ) -> None:
         self.evaluate, self.origin, self.scale, self.unit = evaluate, origin, scale, unit
         self.point: FloatArray | None = None
         self.normal: Normal | None = None
@@ -83,7 +85,8 @@ class _Hessian(ca.Callback):
         return 4
 
     def get_sparsity_in(self, i: int) -> Any:
-        # Order of IPOPT's Hessian: x, parameters, multiplier of the objective, multipliers of the constraints.
+        # Order of IPOPT's Hessian: x, parameters, multiplier of the objective, multipliers of the
+        # constraints.
         return [
             ca.Sparsity.dense(self.p, 1),
             ca.Sparsity(0, 0),
@@ -95,7 +98,11 @@ class _Hessian(ca.Callback):
         return ca.Sparsity.upper(self.p)
 
     def eval(self, arg: Any) -> list[Any]:
-        matrix = self.model.at(arg[0]).matrix * np.outer(self.model.scale, self.model.scale) / self.model.unit
+        matrix = (
+            self.model.at(arg[0]).matrix
+            * np.outer(self.model.scale, self.model.scale)
+            / self.model.unit
+        )
         return [ca.triu(ca.DM(float(arg[2]) * matrix))]
 
 
@@ -115,7 +122,13 @@ class _Recorder(ca.Callback):
         return str(ca.nlpsol_out(i))
 
     def get_sparsity_in(self, i: int) -> Any:
-        size = {"f": 1, "x": self.p, "lam_x": self.p, "g": self.n_constraints, "lam_g": self.n_constraints}
+        size = {
+            "f": 1,
+            "x": self.p,
+            "lam_x": self.p,
+            "g": self.n_constraints,
+            "lam_g": self.n_constraints,
+        }
         return ca.Sparsity.dense(size.get(str(ca.nlpsol_out(i)), 0), 1)
 
     def eval(self, arg: Any) -> list[Any]:
@@ -123,11 +136,14 @@ class _Recorder(ca.Callback):
         return [0]
 
 
-def ipopt(evaluate: Evaluate, start: FloatArray, constraints: Constraints, *, max_iterations: int = 200) -> Solution:
-    """Minimise a sum of squares under constraints with IPOPT, through CasADi; the start is moved inside the bounds.
+def ipopt(
+    evaluate: Evaluate, start: FloatArray, constraints: Constraints, *, max_iterations: int = 200
+) -> Solution:
+    """Minimise a sum of squares under constraints with IPOPT, through CasADi; the start is moved
+    inside the bounds.
 
-    The objective enters as callbacks (value, gradient, Gauss-Newton Hessian), in variables scaled by the curvature at
-    the start so that IPOPT sees numbers of order one.
+    The objective enters as callbacks (value, gradient, Gauss-Newton Hessian), in variables scaled
+    by the curvature at the start so that IPOPT sees numbers of order one.
     """
     theta = np.clip(np.array(start, dtype=np.float64), constraints.lower, constraints.upper)
     normal = evaluate(theta)
@@ -137,7 +153,11 @@ def ipopt(evaluate: Evaluate, start: FloatArray, constraints: Constraints, *, ma
 
 
 def _solve(
-    evaluate: Evaluate, start: FloatArray, normal: Normal, constraints: Constraints, max_iterations: int
+    evaluate: Evaluate,
+    start: FloatArray,
+    normal: Normal,
+    constraints: Constraints,
+    max_iterations: int,
 ) -> Solution:
     """Run IPOPT from a point at which the model is finite."""
     p = len(start)
@@ -188,8 +208,11 @@ def _solve(
     elif not np.isfinite(final.matrix).all():
         status = Status.NOT_FINITE
     else:
-        # IPOPT also stops with a search direction too small once rounding is reached; the gradient decides.
-        gain = float(final.gradient @ np.linalg.pinv(final.matrix) @ final.gradient) / max(final.cost, 1e-300)
+        # IPOPT also stops with a search direction too small once rounding is reached; the gradient
+        # decides.
+        gain = float(final.gradient @ np.linalg.pinv(final.matrix) @ final.gradient) / max(
+            final.cost, 1e-300
+        )
         status = Status.CONVERGED if gain < 1e-10 else Status.STALLED
     trajectory = np.array([start + scale * point for point in recorder.points] or [start])
     costs = np.array([evaluate(point).cost for point in trajectory])

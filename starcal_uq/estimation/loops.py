@@ -1,8 +1,10 @@
-"""The sums over frames as loops for Numba: the same numbers as the NumPy path, several times faster.
+"""The sums over frames as loops for Numba: the same numbers as the NumPy path, several times
+faster.
 
-The source is generated for one distortion model: its kernels come from the instructions of CasADi, and what has a fixed
-number of terms is written out, so that accumulators stay in registers. Stars are visited in chunks whose columns stay
-in the first cache; a column is a row of `STRIDE` numbers in one buffer, at a distance that the compiler knows.
+The source is generated for one distortion model: its kernels come from the instructions of CasADi,
+and what has a fixed number of terms is written out, so that accumulators stay in registers. Stars
+are visited in chunks whose columns stay in the first cache; a column is a row of `STRIDE` numbers
+in one buffer, at a distance that the compiler knows.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ from starcal_uq.camera.projection import backward_kernel, bent_index, forward_ke
 from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.frames import StarFrames
 
-# Columns of a buffer: more than a chunk, and no multiple of what makes rows compete for places in the cache.
+# Columns of a buffer: more than a chunk, and no multiple of what makes rows compete for places in
+# the cache.
 _STRIDE, _CHUNK = 136, 128
 _NONE = np.empty(0)
 
@@ -472,15 +475,25 @@ def gram_sums(theta, l, x0, y0, r0, r1, r2, weight, starts, rotations, shift, pa
 
 
 def _star_source(
-    kernel: Kernel, name: str, into: Callable[[int, int], object], inputs: str = "x, y", given: str = ""
+    kernel: Kernel,
+    name: str,
+    into: Callable[[int, int], object],
+    inputs: str = "x, y",
+    given: str = "",
 ) -> str:
-    """A kernel for one star: `into` tells the row of the buffer of an element of an output, in column i.
+    """A kernel for one star: `into` tells the row of the buffer of an element of an output, in
+    column i.
 
-    Its inputs are the parameters t, those of the star and the root u, v; `given` are further names that `into` uses.
+    Its inputs are the parameters t, those of the star and the root u, v; `given` are further names
+    that `into` uses.
     """
 
     def read(source: int, element: int) -> str:
-        return f"t[{element}]" if source == 0 else (inputs.split(", "), ("u", "v"))[source - 1][element]
+        return (
+            f"t[{element}]"
+            if source == 0
+            else (inputs.split(", "), ("u", "v"))[source - 1][element]
+        )
 
     def write(output: int, element: int) -> str:
         return f"out[({into(output, element)}) * STRIDE + i]"
@@ -506,14 +519,21 @@ def _sums_source(name: str, arguments: str, begin: str, end: str, sums: _Sums) -
 
 
 def _normal_sources(rows: int) -> list[str]:
-    """Products of A with A, e and H of a frame, and those of e and H among themselves of a chunk."""
+    """Products of A with A, e and H of a frame, and those of e and H among themselves of a
+    chunk.
+    """
 
     def products(name: str, pairs: list[tuple[int, int]], offset: int) -> _Sums:
-        return [(f"{name}[{a - offset}, {b - offset}]", [(2 * a + x, 2 * b + x) for x in range(2)]) for a, b in pairs]
+        return [
+            (f"{name}[{a - offset}, {b - offset}]", [(2 * a + x, 2 * b + x) for x in range(2)])
+            for a, b in pairs
+        ]
 
     with_attitude = [(c, q) for c in range(3) for q in range(c, rows)]
     among = [(a, b) for a in range(3, rows) for b in range(a, rows)]
-    frame = _sums_source("frame_products", "buf, j, end, acc", "j", "end", products("acc", with_attitude, 0))
+    frame = _sums_source(
+        "frame_products", "buf, j, end, acc", "j", "end", products("acc", with_attitude, 0)
+    )
     chunk = _sums_source("chunk_products", "buf, m, gram", "0", "m", products("gram", among, 3))
     return ["@njit(**ORDERED, **HELPER)\n" + frame, "@njit(**FAST, **HELPER)\n" + chunk]
 
@@ -523,9 +543,11 @@ def _pair_sources(p: int) -> list[str]:
     db, r, e, d, bb, eb = 3, 3 + 3 * p, 6 + 3 * p, 9 + 3 * p, 12 + 3 * p, 18 + 3 * p
     profile: _Sums = [(f"profile[{i}, {k}]", [(i, 3 + k)]) for i in range(3) for k in range(3)]
     sources = [
-        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_profile", "buf, j, end, profile", "j", "end", profile)
+        "@njit(**ORDERED, **HELPER)\n"
+        + _sums_source("pair_profile", "buf, j, end, profile", "j", "end", profile)
     ]
-    # B^T [dB], R'^T [R' E] and E^T [E] of a frame, of the symmetric ones half: one sum more costs what it adds.
+    # B^T [dB], R'^T [R' E] and E^T [E] of a frame, of the symmetric ones half: one sum more costs
+    # what it adds.
     for x in range(3):
         sums = [(f"acc[{x}, {q}]", [(x, db + q)]) for q in range(3 * p)]
         sums += [(f"acc[{x}, {3 * p + c}]", [(r + x, r + c)]) for c in range(x, 3)]
@@ -539,21 +561,28 @@ def _pair_sources(p: int) -> list[str]:
         *(f"    s{n} = 0.0" for n in range(len(pairs))),
         "    for i in range(m):",
     ]
-    lines += [f"        v{row} = buf[{row} * STRIDE + i]" for row in (*range(db, d), *range(bb, eb + 9))]
+    lines += [
+        f"        v{row} = buf[{row} * STRIDE + i]" for row in (*range(db, d), *range(bb, eb + 9))
+    ]
     for c in range(3):
-        terms_of = [f"v{eb + 3 * a + c} * v{r + a} + v{bb + _packed(a, c)} * v{e + a}" for a in range(3)]
+        terms_of = [
+            f"v{eb + 3 * a + c} * v{r + a} + v{bb + _packed(a, c)} * v{e + a}" for a in range(3)
+        ]
         lines.append(f"        buf[{d + c} * STRIDE + i] = " + " + ".join(terms_of))
     for a in range(p):
         for c in range(3):
             weighed = " + ".join(f"v{bb + _packed(c, x)} * v{db + 3 * a + x}" for x in range(3))
             lines.append(f"        w{a}_{c} = {weighed}")
     for n, (a, c) in enumerate(pairs):
-        lines.append(f"        s{n} += " + " + ".join(f"w{a}_{x} * v{db + 3 * c + x}" for x in range(3)))
+        lines.append(
+            f"        s{n} += " + " + ".join(f"w{a}_{x} * v{db + 3 * c + x}" for x in range(3))
+        )
     lines += [f"    matrix[{a}, {c}] += s{n}" for n, (a, c) in enumerate(pairs)]
     sources.append("@njit(**FAST, **HELPER)\n" + "\n".join(lines) + "\n")
     scores: _Sums = [(f"score[{a}]", [(db + 3 * a + i, d + i) for i in range(3)]) for a in range(p)]
     sources.append(
-        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_scores", "buf, j, end, score", "j", "end", scores)
+        "@njit(**ORDERED, **HELPER)\n"
+        + _sums_source("pair_scores", "buf, j, end, score", "j", "end", scores)
     )
     return sources
 
@@ -572,11 +601,13 @@ def _sum_of(terms: list[str]) -> str:
 
 
 def _expansion_sources(model_name: str, p: int) -> list[str]:
-    """Columns of the compressed likelihood of a chunk, as `compressed._Expansion` forms them, one axis each.
+    """Columns of the compressed likelihood of a chunk, as `compressed._Expansion` forms them, one
+    axis each.
 
-    Rows of the buffer: e, H, A and the second derivatives that do not vanish, two axes each; of each star's frame the
-    path (3, p), the shift (3) and the inverse (6); then the columns, two axes each, and what one axis needs meanwhile.
-    A loop holds no more values than there are registers for. The whitening l is lower triangular.
+    Rows of the buffer: e, H, A and the second derivatives that do not vanish, two axes each; of
+    each star's frame the path (3, p), the shift (3) and the inverse (6); then the columns, two axes
+    each, and what one axis needs meanwhile. A loop holds no more values than there are registers
+    for. The whitening l is lower triangular.
     """
     rows, columns = (index.tolist() for index in bent_index(model_name))
     h, a, bent = 2, 2 + 2 * p, 8 + 2 * p
@@ -587,14 +618,18 @@ def _expansion_sources(model_name: str, p: int) -> list[str]:
     turned, pseudo = out + 2 * q + 8, out + 2 * q + 8 + 3 * p
     at = {(0, 0): 0, (0, 1): 1, (0, 2): 2, (1, 1): 3, (1, 2): 4, (2, 2): 5}
     own = [(n, t, d) for n, (t, d) in enumerate(zip(rows, columns, strict=True)) if d < p]
-    sources = [f"PATH, COLUMNS, Q, SECOND, GRAM_ROWS = {path}, {out}, {q}, {q - p - 1}, {pseudo + 3}"]
+    sources = [
+        f"PATH, COLUMNS, Q, SECOND, GRAM_ROWS = {path}, {out}, {q}, {q - p - 1}, {pseudo + 3}"
+    ]
     for x in range(2):
         lines = [f"def expand_{x}(l, buf, m, slope):"]
 
         def loop(body: list[str], lines: list[str] = lines) -> None:
             lines += ["    for i in range(m):", *(f"        {line}" for line in body)]
 
-        body = [f"a{c} = {_row(a + 2 * c + x)}" for c in range(3)] + [f"h{t} = {_row(h + 2 * t + x)}" for t in range(p)]
+        body = [f"a{c} = {_row(a + 2 * c + x)}" for c in range(3)] + [
+            f"h{t} = {_row(h + 2 * t + x)}" for t in range(p)
+        ]
         taken = _sum_of([f"{_row(shift + c)} * a{c}" for c in range(3)])
         body.append(f"{_row(out + x)} = {_row(x)} - ({taken})")
         for c in range(3):
@@ -623,24 +658,35 @@ def _expansion_sources(model_name: str, p: int) -> list[str]:
                 ]
                 body += [f"m{c}, r{c} = {_sum_of(mixed)}, {_sum_of(along)}"]
                 body += [f"{_row(turned + 3 * z + c)} = m{c} + 0.5 * r{c}"]
-            body.append("t += " + _sum_of([f"{_row(pseudo + c)} * (m{c} + r{c})" for c in range(3)]))
+            body.append(
+                "t += " + _sum_of([f"{_row(pseudo + c)} * (m{c} + r{c})" for c in range(3)])
+            )
             lines.append("    t = 0.0")
             loop(body)
             lines.append(f"    slope[{z}] += 2.0 * t")
         column = 1 + p
         for z in range(p):
             body = [f"q{n} = {_row(bent + 2 * n + x)}" for n, _, _ in own]
-            body += [f"u{c}, k{c} = {_row(turned + 3 * z + c)}, {_row(path + p * c + z)}" for c in range(3)]
+            body += [
+                f"u{c}, k{c} = {_row(turned + 3 * z + c)}, {_row(path + p * c + z)}"
+                for c in range(3)
+            ]
             for y in range(z, p):
-                # A diagonal entry of z z^T stands once in the expansion, halved; the others stand for both orders.
+                # A diagonal entry of z z^T stands once in the expansion, halved; the others stand
+                # for both orders.
                 weights = {
                     n: [
-                        f"l[{one * p + z}] * l[{two * p + y}]" for one, two in {(t, d), (d, t)} if z <= one and y <= two
+                        f"l[{one * p + z}] * l[{two * p + y}]"
+                        for one, two in {(t, d), (d, t)}
+                        if z <= one and y <= two
                     ]
                     for n, t, d in own
                 }
                 used = [n for n, terms in weights.items() if terms]
-                lines += [f"    c{y}_{n} = {-0.5 if z == y else -1.0} * ({_sum_of(weights[n])})" for n in used]
+                lines += [
+                    f"    c{y}_{n} = {-0.5 if z == y else -1.0} * ({_sum_of(weights[n])})"
+                    for n in used
+                ]
                 bends = [
                     f"u{c} * k{c}"
                     if z == y
@@ -659,7 +705,8 @@ def _expansion_sources(model_name: str, p: int) -> list[str]:
             for c in range(3)
         ]
         sources.append(
-            "@njit(**ORDERED, **HELPER)\n" + _sums_source(f"second_{part}", "buf, j, end, acc", "j", "end", sums)
+            "@njit(**ORDERED, **HELPER)\n"
+            + _sums_source(f"second_{part}", "buf, j, end, acc", "j", "end", sums)
         )
     return sources
 
@@ -672,14 +719,25 @@ def source(model_name: str) -> str:
     explicit = get_model(model_name).direction == "forward"
     first, bent = (6, 8, 0), (0, 2, 2 + 2 * p, 8 + 2 * p)
     functions = [
-        _star_source(forward_kernel(model_name, "first"), "first_kernel", lambda o, n: first[o] + n, "x, y, z"),
-        _star_source(newton_kernel(model_name), "newton", lambda o, n: f"row + {2 * o + n}", given="row, "),
+        _star_source(
+            forward_kernel(model_name, "first"),
+            "first_kernel",
+            lambda o, n: first[o] + n,
+            "x, y, z",
+        ),
+        _star_source(
+            newton_kernel(model_name), "newton", lambda o, n: f"row + {2 * o + n}", given="row, "
+        ),
         _star_source(backward_kernel(model_name, False), "direction_kernel", lambda o, n: n),
         # Derivatives come as rows of (p, 3).
         _star_source(backward_kernel(model_name, True), "backward_kernel", lambda o, n: 3 * o + n),
-        _star_source(forward_kernel(model_name, "bent"), "bent_kernel", lambda o, n: bent[o] + n, "x, y, z"),
+        _star_source(
+            forward_kernel(model_name, "bent"), "bent_kernel", lambda o, n: bent[o] + n, "x, y, z"
+        ),
     ]
-    head = _HEAD.format(p=p, stride=_STRIDE, chunk=_CHUNK, rows=rows, explicit=explicit, degenerate=DEGENERATE)
+    head = _HEAD.format(
+        p=p, stride=_STRIDE, chunk=_CHUNK, rows=rows, explicit=explicit, degenerate=DEGENERATE
+    )
     inlined = ["@njit(**INLINE)\n" + kernel for kernel in functions]
     parts = [head, *inlined, *_normal_sources(rows), *_pair_sources(p), _LOOPS, _PAIRS]
     parts += [*_expansion_sources(model_name, p), _GRAM]
@@ -704,23 +762,41 @@ def _both(upper: FloatArray) -> FloatArray:
 
 
 def frame_loop(
-    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, residuals: FloatArray | None
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    residuals: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Gram matrix (p + 1, p + 1) of e and H with the attitudes eliminated, and what `Attitudes` holds of every frame.
+    """Gram matrix (p + 1, p + 1) of e and H with the attitudes eliminated, and what `Attitudes`
+    holds of every frame.
 
-    Shift (3, K), response (3, p, K), inverse (3, 3, K) and log determinant (K,): see `starcal_uq.estimation.sums`.
+    Shift (3, K), response (3, p, K), inverse (3, 3, K) and log determinant (K,): see
+    `starcal_uq.estimation.sums`.
     """
     p, k = len(theta), frames.n_frames
     gram, shift, response = np.zeros((p + 1, p + 1)), np.empty((3, k)), np.empty((3, p, k))
     inverse, volume = np.empty((3, 3, k)), np.empty(k)
     into = np.empty((2, 0)) if residuals is None else residuals
     loops = compiled.load(model_name, source(model_name))
-    loops.frame_sums(tuple(theta.tolist()), *_stars(frames, rotations), into, gram, shift, response, inverse, volume)
+    loops.frame_sums(
+        tuple(theta.tolist()),
+        *_stars(frames, rotations),
+        into,
+        gram,
+        shift,
+        response,
+        inverse,
+        volume,
+    )
     return _both(gram), shift, response, inverse, volume
 
 
-def attitude_loop(frames: StarFrames, model_name: str, theta: FloatArray) -> tuple[FloatArray, bool] | None:
-    """Attitudes (K, 3, 3) by QUEST at theta, without weights, NaN where stars determine none; whether they all do.
+def attitude_loop(
+    frames: StarFrames, model_name: str, theta: FloatArray
+) -> tuple[FloatArray, bool] | None:
+    """Attitudes (K, 3, 3) by QUEST at theta, without weights, NaN where stars determine none;
+    whether they all do.
 
     None where a frame has more stars than the loops take.
     """
@@ -728,7 +804,9 @@ def attitude_loop(frames: StarFrames, model_name: str, theta: FloatArray) -> tup
         return None
     rotations = np.empty((frames.n_frames, 3, 3))
     loops = compiled.load(model_name, source(model_name))
-    sound = loops.attitudes(tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, rotations)
+    sound = loops.attitudes(
+        tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, rotations
+    )
     return rotations, sound == frames.n_frames
 
 
@@ -745,7 +823,8 @@ def pair_loop(
 ) -> tuple[float, FloatArray, FloatArray] | None:
     """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of frames over interstar angles.
 
-    `rotations` (K, 3, 3) turn the catalogue nearly into the camera frame. None as in `attitude_loop`.
+    `rotations` (K, 3, 3) turn the catalogue nearly into the camera frame. None as in
+    `attitude_loop`.
     """
     if int(frames.sizes.max()) > _CHUNK:
         return None
@@ -753,7 +832,9 @@ def pair_loop(
     scores, matrix = np.empty((p, frames.n_frames)), np.zeros((p, p))
     loops = compiled.load(model_name, source(model_name))
     at = np.ascontiguousarray(rotations)
-    cost = loops.pair_sums(tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, at, scores, matrix)
+    cost = loops.pair_sums(
+        tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, at, scores, matrix
+    )
     return cost, _both(matrix), scores
 
 
@@ -767,7 +848,8 @@ def gram_loop(
 ) -> tuple[FloatArray, FloatArray]:
     """Gram matrix (q, q) of `compressed.GramSums` and the slope (p,) of the log determinant.
 
-    `moved` are shift, response and inverse of the frames at `rotations`, as `frame_loop` gives them.
+    `moved` are shift, response and inverse of the frames at `rotations`, as `frame_loop` gives
+    them.
     """
     p = len(theta)
     q = (p + 1) * (p + 2) // 2
@@ -776,5 +858,6 @@ def gram_loop(
     loops = compiled.load(model_name, source(model_name))
     given = (tuple(theta.tolist()), tuple(whitening.ravel().tolist()), *_stars(frames, rotations))
     loops.gram_sums(*given, np.ascontiguousarray(moved[0]), path, moved[2], gram, slope)
-    # Rows are summed by fours: what stands below the diagonal and beyond the last column is of no use.
+    # Rows are summed by fours: what stands below the diagonal and beyond the last column is of no
+    # use.
     return _both(np.triu(gram[:, :q])), slope

@@ -1,8 +1,9 @@
 """Several calibrations of one camera as one: their compressed likelihoods added up.
 
-The likelihood of all stars is the product over runs, and each run stores its own as a small Gram matrix. Moved to a
-common point (`compressed`), the matrices add: no star is looked at again, and the result is what a calibration on all
-stars gives. Whether the runs show the same camera is tested on the way.
+The likelihood of all stars is the product over runs, and each run stores its own as a small Gram
+matrix. Moved to a common point (`compressed`), the matrices add: no star is looked at again, and
+the result is what a calibration on all stars gives. Whether the runs show the same camera is tested
+on the way.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NOISES = get_args(MergedNoise)
-# Up to this many sigmas of a run, its quadratic expansion was never wrong by more than 0.15 nat, even with five frames.
-# Runs of one camera stay within five.
+# Up to this many sigmas of a run, its quadratic expansion was never wrong by more than 0.15 nat,
+# even with five frames. Runs of one camera stay within five.
 MAX_DISTANCE = 8.0
 
 
@@ -59,22 +60,23 @@ def merge(
     Parameters
     ----------
     calibrations : sequence of Calibration
-        At least two, with the same detector and distortion model. The start values (`nominal`) of the first become
-        those of the result, and with them the centre of the default priors.
+        At least two, with the same detector and distortion model. The start values (`nominal`) of
+        the first become those of the result, and with them the centre of the default priors.
     observations : Observations, optional
-        All stars, from `join_observations`. With them, residuals and attitudes are those at the merged
-        estimate; without, they are the runs' own.
+        All stars, from `join_observations`. With them, residuals and attitudes are those at the
+        merged estimate; without, they are the runs' own.
     names : sequence of str, optional
         Names of the runs in messages; ``run 1``... otherwise.
     noise : {"auto", "common", "own"}
-        ``common``: one noise for all runs, estimated anew. ``own``: each run keeps its own estimate as stated noise,
-        and the result has a common factor on it (`sigma_scale`), which also allows runs with and without stated noises.
-        ``auto``: ``own`` where the runs' noises differ (Bartlett's test at 0.1 %) or are of different kinds.
+        ``common``: one noise for all runs, estimated anew. ``own``: each run keeps its own estimate
+        as stated noise, and the result has a common factor on it (`sigma_scale`), which also allows
+        runs with and without stated noises. ``auto``: ``own`` where the runs' noises differ
+        (Bartlett's test at 0.1 %) or are of different kinds.
     allow_inconsistent : bool
         Merge runs that do not show the same camera; the result says so.
     duplicates : {"refuse", "keep"}
-        What to do with frames that hold the same measurement in two runs: they would count twice. `merge_runs` can
-        also drop them.
+        What to do with frames that hold the same measurement in two runs: they would count twice.
+        `merge_runs` can also drop them.
 
     Returns
     -------
@@ -85,8 +87,9 @@ def merge(
     Raises
     ------
     CalibrationError
-        For runs that cannot be merged: other camera, other kind of noise, shared data, unsound estimates, a shift of
-        more than `MAX_DISTANCE` sigmas, or, unless allowed, significantly different cameras.
+        For runs that cannot be merged: other camera, other kind of noise, shared data, unsound
+        estimates, a shift of more than `MAX_DISTANCE` sigmas, or, unless allowed, significantly
+        different cameras.
     RepeatedFramesError
         For runs with the same measurements, unless they are kept.
     """
@@ -94,8 +97,12 @@ def merge(
     names = [f"run {i}" for i in range(1, len(calibrations) + 1)] if names is None else list(names)
     check_mergeable(calibrations, names, noise, duplicates)
     if any(cal.partitions is not None for cal in calibrations):
-        # What a run of partitions holds is a sample of its frames, which does not add up with the frames of others.
-        nothing: AnyDict = {"frame_ids": np.zeros(0, dtype=np.int64), "quaternions": np.zeros((0, 4))}
+        # What a run of partitions holds is a sample of its frames, which does not add up with the
+        # frames of others.
+        nothing: AnyDict = {
+            "frame_ids": np.zeros(0, dtype=np.int64),
+            "quaternions": np.zeros((0, 4)),
+        }
         nothing |= {"residuals_px": np.zeros((0, 2)), "fingerprints": None, "partitions": None}
         calibrations, observations = [replace(cal, **nothing) for cal in calibrations], None
     marks = _fingerprints(calibrations, observations)
@@ -108,19 +115,31 @@ def merge(
     parts = [scaled(cal.compressed, unit) for cal, unit in zip(calibrations, units, strict=True)]
     best = optimum(total(parts))
     sigma_name = sigma_parameter(True).name if noise == "own" else calibrations[0].sigma_name
-    found = consistency_between(names, calibrations[0].parameter_names, runs, best, noise, unchecked)
+    found = consistency_between(
+        names, calibrations[0].parameter_names, runs, best, noise, unchecked
+    )
     if len({cal.sigma_name for cal in calibrations}) > 1:
         found = replace(found, noise_p_value=float("nan"))
     _check_consistent(found, allow_inconsistent)
     theta = best.theta - 0.5 * best.compressed.whitening @ best.compressed.log_determinant_slope
-    stage = Stage("merging", best.trajectory, best.cost, Status.CONVERGED, len(best.cost), perf_counter() - began)
+    stage = Stage(
+        "merging",
+        best.trajectory,
+        best.cost,
+        Status.CONVERGED,
+        len(best.cost),
+        perf_counter() - began,
+    )
     frame_ids, shifts = renumbered([cal.frame_ids for cal in calibrations])
     quaternions, residuals = _frames(calibrations, observations, theta)
     frames = np.array([cal.n_frames for cal in calibrations], dtype=np.float64)
     pair_theta, pair_covariance = combined(
         [cal.pair_theta for cal in calibrations], [cal.pair_covariance for cal in calibrations]
     )
-    unit_noise = [cal.attitude_noise * (u / cal.sigma) ** 2 for cal, u in zip(calibrations, units, strict=True)]
+    unit_noise = [
+        cal.attitude_noise * (u / cal.sigma) ** 2
+        for cal, u in zip(calibrations, units, strict=True)
+    ]
     return Calibration(
         camera=calibrations[0].nominal.with_theta(theta),
         nominal=calibrations[0].nominal,
@@ -139,13 +158,17 @@ def merge(
         chi2=float(best.compressed.sum_of_squares(best.compressed.whiten(theta))[0]),
         dof=best.dof,
         information=best.information,
-        rotation_per_theta=np.average([cal.rotation_per_theta for cal in calibrations], axis=0, weights=frames),
+        rotation_per_theta=np.average(
+            [cal.rotation_per_theta for cal in calibrations], axis=0, weights=frames
+        ),
         attitude_noise=np.average(unit_noise, axis=0, weights=frames) * best.sigma**2,
         pair_theta=pair_theta,
         pair_covariance=pair_covariance,
         compressed=best.compressed,
         provenance=_provenance(calibrations, observations, names, noise, found, shifts, runs),
-        fingerprints=Fingerprints.joined([mark for mark in marks if mark is not None]) if not unchecked else None,
+        fingerprints=Fingerprints.joined([mark for mark in marks if mark is not None])
+        if not unchecked
+        else None,
     )
 
 
@@ -154,20 +177,28 @@ def merging_noise(calibrations: Sequence[Calibration], noise: str) -> str:
     if noise != "auto":
         return noise
     one_kind = len({cal.sigma_name for cal in calibrations}) == 1
-    # Where noises differ unnoticed, the common one costs weight, not coverage: the covariance from the mean square of
-    # all residuals is right where runs have their share of the information by their share of the stars.
+    # Where noises differ unnoticed, the common one costs weight, not coverage: the covariance from
+    # the mean square of all residuals is right where runs have their share of the information by
+    # their share of the stars.
     equal = one_kind and _bartlett([optimum(cal.compressed) for cal in calibrations]) >= ALPHA
     return "common" if equal else "own"
 
 
-def _fingerprints(calibrations: Sequence[Calibration], observations: Observations | None) -> list[Fingerprints | None]:
-    """Those of each run; of runs that lack them, from the rows of all runs, which stand one after the other."""
-    if observations is None or len(observations) != sum(len(cal.residuals_px) for cal in calibrations):
+def _fingerprints(
+    calibrations: Sequence[Calibration], observations: Observations | None
+) -> list[Fingerprints | None]:
+    """Those of each run; of runs that lack them, from the rows of all runs, which stand one after
+    the other.
+    """
+    if observations is None or len(observations) != sum(
+        len(cal.residuals_px) for cal in calibrations
+    ):
         return [cal.fingerprints for cal in calibrations]
     ends = np.cumsum([0, *(len(cal.residuals_px) for cal in calibrations)])
     place = np.arange(len(observations))
     return [
-        cal.fingerprints or fingerprints_of(cal, observations.select((place >= first) & (place < last)))
+        cal.fingerprints
+        or fingerprints_of(cal, observations.select((place >= first) & (place < last)))
         for cal, first, last in zip(calibrations, ends[:-1], ends[1:], strict=True)
     ]
 
@@ -179,13 +210,20 @@ def refuse_shared(
     for (i, first), (j, later) in combinations(enumerate(marks), 2):
         pairs = np.empty((0, 2)) if first is None or later is None else shared(first, later)
         if len(pairs):
-            ids = np.column_stack([calibrations[i].frame_ids[pairs[:, 0]], calibrations[j].frame_ids[pairs[:, 1]]])
+            ids = np.column_stack(
+                [calibrations[i].frame_ids[pairs[:, 0]], calibrations[j].frame_ids[pairs[:, 1]]]
+            )
             n = len(np.unique(pairs[:, 1]))
             one = f"frame {ids[0, 1]} holds the same measurement as frame {ids[0, 0]} of {names[i]}"
-            more = f", and {n - 1} more of its {calibrations[j].n_frames} frames repeat others" if n > 1 else ""
+            more = (
+                f", and {n - 1} more of its {calibrations[j].n_frames} frames repeat others"
+                if n > 1
+                else ""
+            )
             raise RepeatedFramesError(
                 f"{names[j]}: {one}{more}, which would count twice: leave the shared frames out "
-                "(duplicates='drop', --duplicates drop, where the runs hold their observations), or, if you know them "
+                "(duplicates='drop', --duplicates drop, where the runs hold their observations), "
+                "or, if you know them "
                 "to be exposures of their own, keep them (duplicates='keep').",
                 pairs=ids.tolist(),
             )
@@ -194,7 +232,8 @@ def refuse_shared(
 def renumbered(frame_ids: Sequence[IntArray]) -> tuple[IntArray, list[int]]:
     """Frame numbers of all runs in a row, and what was added to those of each run.
 
-    The numbers of the first run stay; those of each further run are shifted to follow the ones before.
+    The numbers of the first run stay; those of each further run are shifted to follow the ones
+    before.
     """
     shifts, following = [], None
     for ids in frame_ids:
@@ -204,11 +243,16 @@ def renumbered(frame_ids: Sequence[IntArray]) -> tuple[IntArray, list[int]]:
             continue
         shifts.append(0 if following is None else following - int(ids.min()))
         following = int(ids.max()) + shifts[-1] + 1
-    return np.concatenate([ids + shift for ids, shift in zip(frame_ids, shifts, strict=True)]), shifts
+    return np.concatenate(
+        [ids + shift for ids, shift in zip(frame_ids, shifts, strict=True)]
+    ), shifts
 
 
 def check_mergeable(
-    calibrations: Sequence[Calibration], names: Sequence[str], noise: str, duplicates: str = "refuse"
+    calibrations: Sequence[Calibration],
+    names: Sequence[str],
+    noise: str,
+    duplicates: str = "refuse",
 ) -> None:
     """Refuse runs that cannot be merged, whatever their estimates."""
     check_duplicates(duplicates)
@@ -217,39 +261,49 @@ def check_mergeable(
     if len(calibrations) < 2:
         raise CalibrationError("merging needs at least two runs: name another.")
     if len(names) != len(calibrations):
-        raise CalibrationError(f"{len(names)} names were given for {len(calibrations)} runs: give one for each.")
+        raise CalibrationError(
+            f"{len(names)} names were given for {len(calibrations)} runs: give one for each."
+        )
     first = calibrations[0]
     seen: dict[str, str] = {}
     for cal, name in zip(calibrations, names, strict=True):
         if not cal.status.ok:
-            raise CalibrationError(f"{name}: the calibration did not converge ({cal.status.name}): {cal.remedy}.")
+            raise CalibrationError(
+                f"{name}: the calibration did not converge ({cal.status.name}): {cal.remedy}."
+            )
         for what in ("width_px", "height_px", "pixel_um", "distortion"):
             ours, theirs = getattr(first.camera, what), getattr(cal.camera, what)
             if ours != theirs:
                 raise CalibrationError(
-                    f"{name}: {what} is {theirs}, but {ours} in {names[0]}: only runs of the same detector and "
+                    f"{name}: {what} is {theirs}, but {ours} in {names[0]}: only runs of the "
+                    "same detector and "
                     "distortion model can be merged; calibrate again with the same camera file."
                 )
         if noise == "common" and cal.sigma_name != first.sigma_name:
             raise CalibrationError(
-                f"{name}: the noise is {cal.sigma_name!r}, but {first.sigma_name!r} in {names[0]}: merge with noise "
+                f"{name}: the noise is {cal.sigma_name!r}, but {first.sigma_name!r} in "
+                f"{names[0]}: merge with noise "
                 "'own', which states each run's noise."
             )
         likelihood = cal.provenance.get("settings", {}).get("likelihood", "marginal")
         if likelihood != "marginal":
             raise CalibrationError(
-                f"{name}: was calibrated with the likelihood {likelihood!r}, which does not add up in compressed "
-                "form: calibrate it with the marginal likelihood, or calibrate all observations together."
+                f"{name}: was calibrated with the likelihood {likelihood!r}, which does not add "
+                "up in compressed "
+                "form: calibrate it with the marginal likelihood, or calibrate all observations "
+                "together."
             )
         if cal.star_errors is not None:
             raise CalibrationError(
-                f"{name}: holds errors of its stars, which other runs of the same stars share: calibrate all "
+                f"{name}: holds errors of its stars, which other runs of the same stars share: "
+                "calibrate all "
                 "observations together, or calibrate it without star errors."
             )
         for value in data_hashes(cal.provenance) if duplicates == "refuse" else ():
             if value in seen:
                 raise CalibrationError(
-                    f"{name}: holds the same observations as {seen[value]}, which would count twice: leave one out."
+                    f"{name}: holds the same observations as {seen[value]}, which would count "
+                    "twice: leave one out."
                 )
             seen[value] = name
 
@@ -258,16 +312,21 @@ def _check_consistent(consistency: Consistency, allow_inconsistent: bool) -> Non
     worst = int(np.argmax(consistency.distance_sigma))
     if consistency.distance_sigma[worst] > MAX_DISTANCE:
         raise CalibrationError(
-            f"{consistency.names[worst]}: its optimum is {consistency.distance_sigma[worst]:.1f} of its own sigmas "
-            f"from the merged one, beyond the {MAX_DISTANCE:g} within which its compressed likelihood holds (p = "
-            f"{consistency.p_value:.2g} that the runs show the same camera): leave it out, or calibrate all "
+            f"{consistency.names[worst]}: its optimum is {consistency.distance_sigma[worst]:.1f} "
+            "of its own sigmas "
+            f"from the merged one, beyond the {MAX_DISTANCE:g} within which its compressed "
+            "likelihood holds (p = "
+            f"{consistency.p_value:.2g} that the runs show the same camera): leave it out, or "
+            "calibrate all "
             "observations together.",
             Status.INCONSISTENT,
         )
     if consistency.p_value < ALPHA and not allow_inconsistent:
         raise CalibrationError(
-            f"the runs do not show the same camera (p = {consistency.p_value:.2g}; {consistency.odd_one_out}): merge "
-            "only runs between which nothing has moved, or allow inconsistent runs, whose sigmas are then too small.",
+            f"the runs do not show the same camera (p = {consistency.p_value:.2g}; "
+            f"{consistency.odd_one_out}): merge "
+            "only runs between which nothing has moved, or allow inconsistent runs, whose sigmas "
+            "are then too small.",
             Status.INCONSISTENT,
         )
 
@@ -275,7 +334,9 @@ def _check_consistent(consistency: Consistency, allow_inconsistent: bool) -> Non
 def _frames(
     calibrations: Sequence[Calibration], observations: Observations | None, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Quaternions (K, 4) and residuals (N, 2): at theta where the stars are known, else those of the runs."""
+    """Quaternions (K, 4) and residuals (N, 2): at theta where the stars are known, else those of
+    the runs.
+    """
     if observations is None:
         return (
             np.concatenate([cal.quaternions for cal in calibrations]),
@@ -337,7 +398,8 @@ class Consistency(Shown):
     statistic : float
         F.
     dof : (int, float)
-        Degrees of freedom of the statistic: (R - 1) p, and those that the runs' noise estimates leave it.
+        Degrees of freedom of the statistic: (R - 1) p, and those that the runs' noise estimates
+        leave it.
     p_value : float
         Probability of a larger F if all runs show the same camera.
     distance_sigma : array (R,)
@@ -345,11 +407,13 @@ class Consistency(Shown):
     run_p_value : array (R,)
         Probability of a larger deviation of the run from all others, if it shows the same camera.
     z : array (R, p)
-        Deviation of each parameter of the run from the merged one, in units of the deviation's standard deviation.
+        Deviation of each parameter of the run from the merged one, in units of the deviation's
+        standard deviation.
     sigma : array (R,)
         Noise of each run.
     noise_p_value : float
-        Probability of noises that differ as much, if they are the same; NaN where they are of different kinds.
+        Probability of noises that differ as much, if they are the same; NaN where they are of
+        different kinds.
     messages : tuple of str
         Sentences on what deserves attention.
     """
@@ -368,18 +432,26 @@ class Consistency(Shown):
 
     @property
     def ok(self) -> bool:
-        """True if nothing deserves attention: neither cameras nor noises differ, and all frames could be compared."""
+        """True if nothing deserves attention: neither cameras nor noises differ, and all frames
+        could be compared.
+        """
         return not self.messages
 
     @property
     def odd_one_out(self) -> str:
         """The run that deviates most, in words."""
         run = int(np.argmin(self.run_p_value))
-        # Jointly: strongly coupled parameters can each stay within their sigma while their combination does not.
-        return f"{self.names[run]} deviates most, by {self.distance_sigma[run]:.1f} of its own sigmas jointly"
+        # Jointly: strongly coupled parameters can each stay within their sigma while their
+        # combination does not.
+        return (
+            f"{self.names[run]} deviates most, by {self.distance_sigma[run]:.1f} of its own "
+            "sigmas jointly"
+        )
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per run: noise, distance, probability, and the deviation of every parameter in sigmas."""
+        """One row per run: noise, distance, probability, and the deviation of every parameter in
+        sigmas.
+        """
         import pandas as pd
 
         table = pd.DataFrame(
@@ -411,8 +483,9 @@ def consistency_between(
 ) -> Consistency:
     """Compare the optima of runs with each other and with the merged one.
 
-    Every run is weighed by its own noise, however they are merged: what differs by noise is then no sign of another
-    camera. `noise` is how they are merged, and `unchecked` names runs that may share frames with others.
+    Every run is weighed by its own noise, however they are merged: what differs by noise is then no
+    sign of another camera. `noise` is how they are merged, and `unchecked` names runs that may
+    share frames with others.
     """
     p = len(merged.theta)
     weighed = optimum(total([scaled(run.compressed, run.sigma) for run in runs]))
@@ -452,15 +525,18 @@ def consistency_between(
     return _with_messages(found, noise, unchecked)
 
 
-def welch_james(square: float, information: FloatArray, dof: FloatArray) -> tuple[float, float, float]:
+def welch_james(
+    square: float, information: FloatArray, dof: FloatArray
+) -> tuple[float, float, float]:
     """F, its second degrees of freedom, and p of R estimates weighed by their own estimated noises.
 
-    The statistic ``sum (theta_i - mean)^T I_i (theta_i - mean)`` is a chi-square with q = (R - 1) p degrees of freedom
-    where the noises are known. Of noises with nu_i degrees of freedom its mean is q + 2 A and its variance
-    2 q + 12 A + 2 B to first order in 1 / nu, with A = sum tr((1 - G_i)^2) / nu_i, B = sum tr(1 - G_i)^2 / nu_i and
-    G_i the share of run i in the whole information. c F with q and q (q + 2) / (2 A + B) degrees of freedom has the
-    same mean and variance; for one parameter this is the test of Welch (1951), and for p > 1 it is to unknown scalars
-    what James (1954) and Johansen (1980) are to unknown matrices.
+    The statistic ``sum (theta_i - mean)^T I_i (theta_i - mean)`` is a chi-square with q = (R - 1) p
+    degrees of freedom where the noises are known. Of noises with nu_i degrees of freedom its mean
+    is q + 2 A and its variance 2 q + 12 A + 2 B to first order in 1 / nu, with A = sum tr((1 -
+    G_i)^2) / nu_i, B = sum tr(1 - G_i)^2 / nu_i and G_i the share of run i in the whole
+    information. c F with q and q (q + 2) / (2 A + B) degrees of freedom has the same mean and
+    variance; for one parameter this is the test of Welch (1951), and for p > 1 it is to unknown
+    scalars what James (1954) and Johansen (1980) are to unknown matrices.
 
     `information` (R, p, p): information of each estimate at its own noise.
     `dof` (R,): degrees of freedom of each noise.
@@ -481,20 +557,25 @@ def _with_messages(consistency: Consistency, noise: str, unchecked: Sequence[str
     messages = []
     if consistency.p_value < ALPHA:
         messages.append(
-            f"The runs do not show the same camera (p = {consistency.p_value:.2g}): {consistency.odd_one_out}; the "
-            f"merged sigmas are too small by a factor of about {np.sqrt(consistency.statistic):.2g}."
+            f"The runs do not show the same camera (p = {consistency.p_value:.2g}): "
+            f"{consistency.odd_one_out}; the "
+            "merged sigmas are too small by a factor of about "
+            f"{np.sqrt(consistency.statistic):.2g}."
         )
     if noise == "common" and consistency.noise_p_value < ALPHA:
         values = ", ".join(
-            f"{name} {sigma:.3g}" for name, sigma in zip(consistency.names, consistency.sigma, strict=True)
+            f"{name} {sigma:.3g}"
+            for name, sigma in zip(consistency.names, consistency.sigma, strict=True)
         )
         messages.append(
-            f"The runs differ in noise (p = {consistency.noise_p_value:.2g}; {values}): merge with noise 'own', which "
+            f"The runs differ in noise (p = {consistency.noise_p_value:.2g}; {values}): merge "
+            "with noise 'own', which "
             "weights each run by its own."
         )
     if unchecked:
         messages.append(
-            f"Whether frames are shared cannot be checked for {', '.join(unchecked)}, whose calibration holds no "
+            f"Whether frames are shared cannot be checked for {', '.join(unchecked)}, whose "
+            "calibration holds no "
             "fingerprints of its frames: calibrate again to have it checked."
         )
     return replace(consistency, messages=tuple(messages))

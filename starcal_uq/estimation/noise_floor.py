@@ -1,11 +1,12 @@
 """What every star's noise has beyond what it states: a floor that bright stars show.
 
-Centroiding states the noise of the pixels. Air, the shape of the star images and faint neighbours displace stars by
-amounts that do not shrink with their brightness. With v_i = s^2 sigma_i^2 + F^2 the variance per axis of star i, the
-residuals of a calibration say whether F is needed: bright stars then scatter by F, whatever they state. s and F follow
-from the likelihood of the residuals: t_i = e^T (I - H)^-1 e of a star (`outliers`), times its variance in the fit, is
-v_i times a chi-square with two degrees of freedom where the weights of the fit are right. Stars beyond 4.5 sigma are
-left out.
+Centroiding states the noise of the pixels. Air, the shape of the star images and faint neighbours
+displace stars by amounts that do not shrink with their brightness. With v_i = s^2 sigma_i^2 + F^2
+the variance per axis of star i, the residuals of a calibration say whether F is needed: bright
+stars then scatter by F, whatever they state. s and F follow from the likelihood of the residuals:
+t_i = e^T (I - H)^-1 e of a star (`outliers`), times its variance in the fit, is v_i times a
+chi-square with two degrees of freedom where the weights of the fit are right. Stars beyond 4.5
+sigma are left out.
 """
 
 from __future__ import annotations
@@ -50,16 +51,20 @@ class NoiseFloor:
         if not self.needed:
             return "The residuals ask for no noise beyond what the stars state."
         return (
-            f"Bright stars scatter by {significant(self.floor_px)} px per axis however well they are measured; this "
+            f"Bright stars scatter by {significant(self.floor_px)} px per axis however well they "
+            "are measured; this "
             "was added to the noise of every star."
         )
 
 
-def noise_floor(cal: Calibration, obs: Observations, stated_px: FloatArray | None = None) -> NoiseFloor:
+def noise_floor(
+    cal: Calibration, obs: Observations, stated_px: FloatArray | None = None
+) -> NoiseFloor:
     """The noise that the residuals of a calibration have beyond what its observations state.
 
-    `sigma_px` in every row are the weights of the calibration; `stated_px` (N,) is what the stars state, px, where a
-    floor is in `sigma_px` already. CalibrationError when the observations state no noise.
+    `sigma_px` in every row are the weights of the calibration; `stated_px` (N,) is what the stars
+    state, px, where a floor is in `sigma_px` already. CalibrationError when the observations state
+    no noise.
     """
     from scipy.special import erfc
 
@@ -68,7 +73,9 @@ def noise_floor(cal: Calibration, obs: Observations, stated_px: FloatArray | Non
     if obs.n_stars < _MIN_STARS:
         return NoiseFloor(0.0, float(cal.sigma), 1.0)
     frames = StarFrames.from_observations(obs)
-    found = star_residuals(frames, cal.camera.distortion, cal.theta, np.ones(obs.n_stars, dtype=np.bool_))
+    found = star_residuals(
+        frames, cal.camera.distortion, cal.theta, np.ones(obs.n_stars, dtype=np.bool_)
+    )
     known = np.isfinite(found.t)
     squares = found.t[known] * obs.sigma_px[known] ** 2
     stated = (obs.sigma_px if stated_px is None else stated_px)[known] ** 2
@@ -79,7 +86,9 @@ def noise_floor(cal: Calibration, obs: Observations, stated_px: FloatArray | Non
         if np.array_equal(now, kept) or now.sum() < _MIN_STARS:
             break
         kept = now
-    without = _cost(squares[kept], stated[kept] * float(np.mean(squares[kept] / stated[kept]) / 2.0))
+    without = _cost(
+        squares[kept], stated[kept] * float(np.mean(squares[kept] / stated[kept]) / 2.0)
+    )
     ratio = max(0.0, without - _cost(squares[kept], scale * stated[kept] + floor))
     # The floor cannot be negative: half of the chi-square with one degree of freedom.
     p_value = 0.5 * float(erfc(np.sqrt(0.5 * ratio))) if floor > 0.0 else 1.0
@@ -87,10 +96,11 @@ def noise_floor(cal: Calibration, obs: Observations, stated_px: FloatArray | Non
 
 
 def settle_noise(obs: Observations, cal: Calibration) -> Observations:
-    """The observations (with `sigma_px` in every row) with a floor in their noise, if their residuals need one.
+    """The observations (with `sigma_px` in every row) with a floor in their noise, if their
+    residuals need one.
 
-    Without a floor bright stars have too much weight and hence too small residuals: it is found from a first
-    calibration, and again from ones that know it.
+    Without a floor bright stars have too much weight and hence too small residuals: it is found
+    from a first calibration, and again from ones that know it.
     """
     from starcal_uq.estimation.calibrate import calibrate
 
@@ -114,14 +124,18 @@ def settle_noise(obs: Observations, cal: Calibration) -> Observations:
 
 
 def with_noise_floor(obs: Observations, floor: NoiseFloor) -> Observations:
-    """The observations with the floor in every star's noise, where it is needed; ``meta["noise_floor_px"]`` says it.
+    """The observations with the floor in every star's noise, where it is needed;
+    ``meta["noise_floor_px"]`` says it.
 
-    A factor on the stated noise that is more than one is left to the calibration; a smaller one, which a floor above
-    all noise stated leaves unknown, is taken up here, so that the noise is the scatter seen.
+    A factor on the stated noise that is more than one is left to the calibration; a smaller one,
+    which a floor above all noise stated leaves unknown, is taken up here, so that the noise is the
+    scatter seen.
     """
     if not floor.needed or obs.sigma_px is None:
         return obs
-    raised: FloatArray = np.hypot(obs.sigma_px, floor.floor_px / floor.scale) * min(floor.scale, 1.0)
+    raised: FloatArray = np.hypot(obs.sigma_px, floor.floor_px / floor.scale) * min(
+        floor.scale, 1.0
+    )
     found = {"noise_floor_px": floor.floor_px, "noise_scale": floor.scale}
     return replace(obs, sigma_px=raised, meta={**obs.meta, **found})
 
@@ -138,7 +152,9 @@ def _fitted(squares: FloatArray, stated: FloatArray) -> tuple[float, float]:
     typical = float(np.median(stated))
 
     def profile(share: float) -> tuple[float, float]:
-        """Cost and common factor, for F^2 = factor * share * typical and s^2 = factor * (1 - share)."""
+        """Cost and common factor, for F^2 = factor * share * typical and s^2 = factor * (1 -
+        share).
+        """
         shape = (1.0 - share) * stated + share * typical
         factor = float(np.mean(squares / shape) / 2.0)
         return _cost(squares, factor * shape), factor

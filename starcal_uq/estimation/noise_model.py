@@ -1,17 +1,19 @@
-"""Centroid noise that varies: its variance as a smooth function of radius and magnitude, times a factor per frame.
+"""Centroid noise that varies: its variance as a smooth function of radius and magnitude, times a
+factor per frame.
 
 Its axes may differ, and correlate, alike for all stars: smear, or time delay and integration.
 
-The squared residuals of a fit tell the variances. With H the hat matrix of attitudes and parameters (weights as
-fitted), the two residuals of star i have the expected square ``v_i (2 - h_i)``, h_i the trace of its block of H.
-Setting ``sum_i z_i (d_i / v_i - (2 - h_i)) = 0`` for every column z of a log-linear model is restricted maximum
-likelihood (Smyth 2002, J. Comput. Graph. Stat. 11, 836): a gamma regression of d_i / (2 - h_i). The factors of frames
-follow a scaled inverse chi-square distribution whose degrees of freedom are estimated (Smyth 2004, Stat. Appl. Genet.
-Mol. Biol. 3, 3): each frame's own variance is shrunk towards that of the others. Weights and estimate are repeated
-until they settle.
+The squared residuals of a fit tell the variances. With H the hat matrix of attitudes and parameters
+(weights as fitted), the two residuals of star i have the expected square ``v_i (2 - h_i)``, h_i the
+trace of its block of H. Setting ``sum_i z_i (d_i / v_i - (2 - h_i)) = 0`` for every column z of a
+log-linear model is restricted maximum likelihood (Smyth 2002, J. Comput. Graph. Stat. 11, 836): a
+gamma regression of d_i / (2 - h_i). The factors of frames follow a scaled inverse chi-square
+distribution whose degrees of freedom are estimated (Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3,
+3): each frame's own variance is shrunk towards that of the others. Weights and estimate are
+repeated until they settle.
 
-A term stays only if it raises twice the log likelihood by more than the logarithm of the number of stars (Schwarz's
-criterion), so that even noise is left as it is.
+A term stays only if it raises twice the log likelihood by more than the logarithm of the number of
+stars (Schwarz's criterion), so that even noise is left as it is.
 """
 
 from __future__ import annotations
@@ -52,17 +54,19 @@ _MOST_CORRELATED = 0.99
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Variance per axis of a star: ``level_px^2 exp(terms)``, times the factor of its frame, times its stated variance.
+    """Variance per axis of a star: ``level_px^2 exp(terms)``, times the factor of its frame, times
+    its stated variance.
 
     Attributes
     ----------
     terms : tuple of str
-        Powers of ``radius`` (distance from the principal point over the half diagonal) and of ``magnitude`` (less the
-        reference) in the log variance, such as ``radius`` and ``radius^2``.
+        Powers of ``radius`` (distance from the principal point over the half diagonal) and of
+        ``magnitude`` (less the reference) in the log variance, such as ``radius`` and ``radius^2``.
     coefficients, errors : (q,) array
         Coefficients of the terms, and their standard errors.
     level_px : float
-        Noise at radius zero and the reference magnitude, px per axis; a factor where the stars state their noise.
+        Noise at radius zero and the reference magnitude, px per axis; a factor where the stars
+        state their noise.
     multiplies : bool
         Whether the model multiplies a noise that the stars state.
     centre_px : (2,) array
@@ -74,13 +78,16 @@ class NoiseModel:
     mag_reference : float
         Mean magnitude, which stands for a magnitude that is not known.
     frame_dof : float or None
-        Degrees of freedom of the inverse chi-square distribution of the frames' variances; None where frames are alike.
+        Degrees of freedom of the inverse chi-square distribution of the frames' variances; None
+        where frames are alike.
     frame_ids, frame_factors : (K,) array
-        Frames, and the factor of each on the variance; empty where frames are alike, and in a posterior.
+        Frames, and the factor of each on the variance; empty where frames are alike, and in a
+        posterior.
     frame_mean : float
         Mean of the factors, which stands for frames that were not observed.
     axis_ratio : float
-        Noise along x over that along y; 1 where they are alike. The variance above is their geometric mean.
+        Noise along x over that along y; 1 where they are alike. The variance above is their
+        geometric mean.
     axis_correlation : float
         Correlation of the errors of x and y.
     """
@@ -109,10 +116,17 @@ class NoiseModel:
 
     @property
     def axes(self) -> FloatArray | None:
-        """Covariance (2, 2) of the noise of x and y, of determinant one; None where the axes are alike."""
+        """Covariance (2, 2) of the noise of x and y, of determinant one; None where the axes are
+        alike.
+        """
         if self.axis_ratio == 1.0 and self.axis_correlation == 0.0:
             return None
-        matrix = np.array([[self.axis_ratio, self.axis_correlation], [self.axis_correlation, 1.0 / self.axis_ratio]])
+        matrix = np.array(
+            [
+                [self.axis_ratio, self.axis_correlation],
+                [self.axis_correlation, 1.0 / self.axis_ratio],
+            ]
+        )
         return np.asarray(matrix / np.sqrt(1.0 - self.axis_correlation**2))
 
     def __str__(self) -> str:
@@ -122,15 +136,22 @@ class NoiseModel:
         middle, edge = (self._noise(r) for r in (0.0, self.radius_range[1]))
         parts = []
         if "radius" in self.terms:
-            parts.append(f"{significant(middle)}{unit} in the centre of the field and {significant(edge)} at its edge")
+            parts.append(
+                f"{significant(middle)}{unit} in the centre of the field and {significant(edge)} "
+                "at its edge"
+            )
         if "magnitude" in self.terms:
             low, high = (float(mag) for mag in self.mag_range)
             bright, faint = (self._noise(0.0, mag) for mag in (low, high))
             least, most = sorted(((bright, fixed(low, 1)), (faint, fixed(high, 1))))
             parts.append(
-                f"{significant(most[0] / least[0])} times as much at magnitude {most[1]} as at {least[1]}"
+                (
+                    f"{significant(most[0] / least[0])} times as much at magnitude {most[1]} as at "
+                    f"{least[1]}"
+                )
                 if parts
-                else f"{significant(bright)}{unit} at magnitude {fixed(low, 1)} and {significant(faint)} at "
+                else f"{significant(bright)}{unit} at magnitude {fixed(low, 1)} and "
+                f"{significant(faint)} at "
                 f"{fixed(high, 1)}"
             )
         if self.frame_dof is not None:
@@ -159,28 +180,40 @@ class NoiseModel:
         return pd.DataFrame(columns)
 
     def at(self, x_px: FloatArray, y_px: FloatArray, mag: FloatArray | None = None) -> FloatArray:
-        """Noise of stars at pixels (n,) with magnitudes (n,), px per axis or a factor; frames apart, their mean."""
+        """Noise of stars at pixels (n,) with magnitudes (n,), px per axis or a factor; frames
+        apart, their mean.
+        """
         radius = np.hypot(x_px - self.centre_px[0], y_px - self.centre_px[1]) / self.corner_px
         centred = np.zeros_like(radius)
         if mag is not None:
             centred = np.nan_to_num(np.clip(mag, *self.mag_range) - self.mag_reference)
         columns = _columns(self.terms, np.clip(radius, *self.radius_range), centred)
-        sigma: FloatArray = self.level_px * np.sqrt(self.frame_mean) * np.exp(0.5 * (columns @ self.coefficients))
+        sigma: FloatArray = (
+            self.level_px * np.sqrt(self.frame_mean) * np.exp(0.5 * (columns @ self.coefficients))
+        )
         return sigma
 
     def sigma_px(self, obs: Observations) -> FloatArray:
-        """Noise of every star, (N,) px per axis; frames of a mission get the mean variance of those observed."""
+        """Noise of every star, (N,) px per axis; frames of a mission get the mean variance of those
+        observed.
+        """
         stated = obs.unweighted.sigma_px
         sigma = self.at(obs.x_px, obs.y_px, obs.mag)
         if len(self.frame_ids) and "frames" not in obs.meta:
             place = np.clip(np.searchsorted(self.frame_ids, obs.frame), 0, len(self.frame_ids) - 1)
-            own = np.where(self.frame_ids[place] == obs.frame, self.frame_factors[place], self.frame_mean)
+            own = np.where(
+                self.frame_ids[place] == obs.frame, self.frame_factors[place], self.frame_mean
+            )
             sigma = sigma * np.sqrt(own / self.frame_mean)
         return sigma if stated is None or not self.multiplies else np.asarray(sigma * stated)
 
     def record(self, frames: bool = True) -> AnyDict:
         """The model as plain values, for a provenance, with or without the factors of frames."""
-        kept = self if frames else replace(self, frame_ids=self.frame_ids[:0], frame_factors=self.frame_factors[:0])
+        kept = (
+            self
+            if frames
+            else replace(self, frame_ids=self.frame_ids[:0], frame_factors=self.frame_factors[:0])
+        )
         plain: AnyDict = to_plain(kept)
         return plain
 
@@ -192,11 +225,13 @@ def noise_model_of(result: Any) -> NoiseModel | None:
 
 
 def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observations:
-    """Observations as a calibration or posterior weighs them: with the noise of its model, if it has one that varies.
+    """Observations as a calibration or posterior weighs them: with the noise of its model, if it
+    has one that varies.
 
-    The data and their hash stay what they are, but for repeated frames that a calibration left out. Without a model,
-    weights of another result's are what the table states. Of partitioned observations it is the sample of frames that
-    their calibration has kept. CalibrationError when partitioned observations are not those of the result.
+    The data and their hash stay what they are, but for repeated frames that a calibration left out.
+    Without a model, weights of another result's are what the table states. Of partitioned
+    observations it is the sample of frames that their calibration has kept. CalibrationError when
+    partitioned observations are not those of the result.
     """
     if isinstance(obs, PartitionedObservations):
         return _sample_of(obs, result)
@@ -219,7 +254,8 @@ def _sample_of(obs: PartitionedObservations, result: Any) -> Observations:
     sample = obs.sample()
     if result.provenance.get("partitions", {}).get("sample_sha256") != sample.data_hash:
         raise CalibrationError(
-            f"the calibration was made from other observations than those in {obs.folder}: calibrate these first."
+            f"the calibration was made from other observations than those in {obs.folder}: "
+            "calibrate these first."
         )
     return sample
 
@@ -227,12 +263,18 @@ def _sample_of(obs: PartitionedObservations, result: Any) -> Observations:
 def _columns(terms: tuple[str, ...], radius: FloatArray, mag: FloatArray) -> FloatArray:
     """Columns (n, q) of the log variance."""
     values = dict(zip(_QUANTITIES, (radius, mag), strict=True))
-    found = [values[name] ** int(power or 1) for name, _, power in (term.partition("^") for term in terms)]
+    found = [
+        values[name] ** int(power or 1)
+        for name, _, power in (term.partition("^") for term in terms)
+    ]
     return np.stack(found, axis=-1) if found else np.zeros((len(radius), 0))
 
 
-def star_squares(likelihood: MarginalLikelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared whitened residuals (N,) of the stars, two axes, and their expectation 2 - h (N,) where weights are right.
+def star_squares(
+    likelihood: MarginalLikelihood, theta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Squared whitened residuals (N,) of the stars, two axes, and their expectation 2 - h (N,)
+    where weights are right.
 
     `theta` (p,): estimate, px units.
     """
@@ -256,20 +298,26 @@ class AxisNoise(NamedTuple):
 
     def z(self, model: NoiseModel | None = None) -> tuple[float, float]:
         """Standard normal statistics of ratio and correlation, of what a model leaves."""
-        ratio, correlation = (1.0, 0.0) if model is None else (model.axis_ratio, model.axis_correlation)
+        ratio, correlation = (
+            (1.0, 0.0) if model is None else (model.axis_ratio, model.axis_correlation)
+        )
         by_ratio = (self.log_ratio - np.log(ratio)) / self.log_ratio_std
         limited = np.clip([self.correlation, correlation], -_MOST_CORRELATED, _MOST_CORRELATED)
-        by_correlation = float(np.arctanh(limited[0]) - np.arctanh(limited[1])) / self.correlation_std
+        by_correlation = (
+            float(np.arctanh(limited[0]) - np.arctanh(limited[1])) / self.correlation_std
+        )
         return float(by_ratio), by_correlation
 
 
 def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
-    """Noise of x and y and their correlation, free of what attitudes and parameters take from the residuals.
+    """Noise of x and y and their correlation, free of what attitudes and parameters take from the
+    residuals.
 
-    With U the orthonormal columns that attitudes and parameters span, residuals are ``(I - U U^T)`` times the errors,
-    and the sums of squares and products of their axes expect linear combinations of the variances and the covariance
-    with traces of products of ``U_x^T U_x``, ``U_y^T U_y`` and ``U_x^T U_y``. Standard errors are those of the scatter
-    of the stars' products, which know the tails of the noise.
+    With U the orthonormal columns that attitudes and parameters span, residuals are ``(I - U U^T)``
+    times the errors, and the sums of squares and products of their axes expect linear combinations
+    of the variances and the covariance with traces of products of ``U_x^T U_x``, ``U_y^T U_y`` and
+    ``U_x^T U_y``. Standard errors are those of the scatter of the stars' products, which know the
+    tails of the noise.
 
     `likelihood`: of weights whose axes are alike.
     `theta` (p,): estimate, px units.
@@ -279,11 +327,15 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     h = likelihood.project_out(state, likelihood.derivatives(theta, state))
     flat = h.reshape(len(h), -1)
     camera = np.tensordot(scaled_cholesky(scaled_inverse(flat @ flat.T)).T, h, axes=1)
-    root = np.asarray(np.moveaxis(np.linalg.cholesky(np.moveaxis(state.inverse, 2, 0)), 0, 2), dtype=np.float64)
+    root = np.asarray(
+        np.moveaxis(np.linalg.cholesky(np.moveaxis(state.inverse, 2, 0)), 0, 2), dtype=np.float64
+    )
     attitude = np.einsum("ijn,ixn->jxn", frames.spread(root), state.attitude)
 
     def products(one: int, other: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """U^T U over the stars of the axes: attitudes of each frame, both ways of attitudes with camera, camera."""
+        """U^T U over the stars of the axes: attitudes of each frame, both ways of attitudes with
+        camera, camera.
+        """
         a, b, c, d = attitude[:, one], attitude[:, other], camera[:, one], camera[:, other]
         inner = frames.sum(np.einsum("in,jn->ijn", a, b))
         mixed = frames.sum(np.einsum("in,jn->ijn", a, d))
@@ -294,14 +346,25 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     taken = [float(np.einsum("iik->", part[0]) + np.trace(part[3])) for part in (xx, yy, xy)]
 
     def squared(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> float:
-        return float(np.sum(one[0] * other[0]) + 2.0 * np.sum(one[1] * other[1]) + np.sum(one[3] * other[3]))
+        return float(
+            np.sum(one[0] * other[0]) + 2.0 * np.sum(one[1] * other[1]) + np.sum(one[3] * other[3])
+        )
 
     across = squared(xx, yy)
-    free = np.array([[n - 2.0 * taken[0] + squared(xx, xx), across], [across, n - 2.0 * taken[1] + squared(yy, yy)]])
+    free = np.array(
+        [
+            [n - 2.0 * taken[0] + squared(xx, xx), across],
+            [across, n - 2.0 * taken[1] + squared(yy, yy)],
+        ]
+    )
     e = state.e
     variances = np.linalg.solve(free, np.sum(e**2, axis=1))
-    both_ways = float(np.sum(xy[0] ** 2) + np.sum(xy[1] ** 2) + np.sum(xy[2] ** 2) + np.sum(xy[3] ** 2))
-    transposed = float(np.sum(xy[0] * xy[0].swapaxes(0, 1)) + 2.0 * np.sum(xy[1] * xy[2]) + np.sum(xy[3] * xy[3].T))
+    both_ways = float(
+        np.sum(xy[0] ** 2) + np.sum(xy[1] ** 2) + np.sum(xy[2] ** 2) + np.sum(xy[3] ** 2)
+    )
+    transposed = float(
+        np.sum(xy[0] * xy[0].swapaxes(0, 1)) + 2.0 * np.sum(xy[1] * xy[2]) + np.sum(xy[3] * xy[3].T)
+    )
     dof = n - taken[0] - taken[1] + both_ways + transposed
     if not (np.all(variances > 0.0) and dof > 0.0):
         return AxisNoise(0.0, np.inf, 0.0, np.inf)
@@ -311,12 +374,15 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     by_star = np.linalg.solve(free, e**2) / variances[:, None]
     scatter = by_star[0] - by_star[1]
     scatter = scatter - np.mean(scatter)
-    # Residuals are smaller than errors: the scatter of their products grows by the square of the share that is left.
+    # Residuals are smaller than errors: the scatter of their products grows by the square of the
+    # share that is left.
     grown = 2.0 * n / likelihood.dof
     log_ratio_std = 0.5 * float(np.sqrt(grown * np.sum(scatter**2)))
     mixed = e[0] * e[1] / (sigma[0] * sigma[1])
     correlation_std = float(np.sqrt(grown * np.sum((mixed - np.mean(mixed)) ** 2))) / dof
-    return AxisNoise(float(np.log(sigma[0] / sigma[1])), log_ratio_std, float(correlation), correlation_std)
+    return AxisNoise(
+        float(np.log(sigma[0] / sigma[1])), log_ratio_std, float(correlation), correlation_std
+    )
 
 
 def fit_noise(
@@ -346,9 +412,15 @@ def fit_noise(
         squares, share = star_squares(likelihood, theta)
         stars = _Stars.of(obs, camera.with_theta(theta), squares * variance, share)
         # The first residuals come from wrong weights: terms are chosen again.
-        fit = _chosen(stars) if turn < _CHOOSING_ROUNDS else _fitted(stars, fit.terms, fit.frame_dof is not None)
+        fit = (
+            _chosen(stars)
+            if turn < _CHOOSING_ROUNDS
+            else _fitted(stars, fit.terms, fit.frame_dof is not None)
+        )
         variance = fit.variance(stars)
-        alike = MarginalLikelihood(replace(plain, weight=1.0 / (stated * np.sqrt(variance))), camera.distortion)
+        alike = MarginalLikelihood(
+            replace(plain, weight=1.0 / (stated * np.sqrt(variance))), camera.distortion
+        )
         found = _model(obs, camera.with_theta(theta), stars, fit, axis_noise(alike, theta))
         settled = model is not None and abs(found.axis_ratio / model.axis_ratio - 1.0) < _SETTLED
         model = found
@@ -360,7 +432,8 @@ def fit_noise(
 
 
 def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: float) -> FloatArray:
-    """Real over stated standard deviations (p,) of an estimate with one noise, if the noise is that of a model.
+    """Real over stated standard deviations (p,) of an estimate with one noise, if the noise is that
+    of a model.
 
     `obs`: identified stars, with the weights of the estimate.
     `sigma`: noise of the estimate, px or a factor on what the stars state.
@@ -368,8 +441,12 @@ def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: fl
     likelihood = MarginalLikelihood(obs, camera.distortion)
     state, _ = likelihood.profile(camera.theta)
     h = likelihood.project_out(state, likelihood.derivatives(camera.theta, state))
-    whitened = model.sigma_px(obs) * (1.0 if likelihood.frames.weight is None else likelihood.frames.weight)
-    turned = h if model.axes is None else np.einsum("pxn,xy->pyn", h, np.linalg.cholesky(model.axes))
+    whitened = model.sigma_px(obs) * (
+        1.0 if likelihood.frames.weight is None else likelihood.frames.weight
+    )
+    turned = (
+        h if model.axes is None else np.einsum("pxn,xy->pyn", h, np.linalg.cholesky(model.axes))
+    )
     flat, noisy = h.reshape(len(h), -1), (turned * whitened).reshape(len(h), -1)
     inverse = scaled_inverse(flat @ flat.T)
     real = inverse @ (noisy @ noisy.T) @ inverse
@@ -377,7 +454,9 @@ def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: fl
 
 
 class _Stars(NamedTuple):
-    """What the regression needs of the stars: squared residuals and their degrees of freedom, and the quantities."""
+    """What the regression needs of the stars: squared residuals and their degrees of freedom, and
+    the quantities.
+    """
 
     squares: FloatArray
     share: FloatArray
@@ -387,11 +466,19 @@ class _Stars(NamedTuple):
     n_frames: int
 
     @classmethod
-    def of(cls, obs: Observations, camera: Camera, squares: FloatArray, share: FloatArray) -> _Stars:
+    def of(
+        cls, obs: Observations, camera: Camera, squares: FloatArray, share: FloatArray
+    ) -> _Stars:
         x0, y0 = camera.theta[:2]
         radius = np.hypot(obs.x_px - x0, obs.y_px - y0) / camera.half_diagonal_px
-        mag = np.zeros(obs.n_stars) if obs.mag is None else np.nan_to_num(obs.mag - np.nanmean(obs.mag))
-        return cls(squares, share, radius, mag, np.searchsorted(obs.frame_ids, obs.frame), obs.n_frames)
+        mag = (
+            np.zeros(obs.n_stars)
+            if obs.mag is None
+            else np.nan_to_num(obs.mag - np.nanmean(obs.mag))
+        )
+        return cls(
+            squares, share, radius, mag, np.searchsorted(obs.frame_ids, obs.frame), obs.n_frames
+        )
 
     def per_frame(self, values: FloatArray) -> FloatArray:
         """Sums over the stars of each frame."""
@@ -405,7 +492,9 @@ class _Stars(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Terms with their coefficients (the first is that of the level), and the frames' distribution and factors."""
+    """Terms with their coefficients (the first is that of the level), and the frames' distribution
+    and factors.
+    """
 
     terms: tuple[str, ...]
     beta: FloatArray
@@ -438,14 +527,19 @@ def _chosen(stars: _Stars) -> _Fit:
     powers, frames = dict.fromkeys(_QUANTITIES, 0), False
     best, n_stars = _fitted(stars, (), False), len(stars.radius)
     while True:
-        trials = [(_fitted(stars, _terms(more), apart), more, apart) for more, apart in _near(stars, powers, frames)]
+        trials = [
+            (_fitted(stars, _terms(more), apart), more, apart)
+            for more, apart in _near(stars, powers, frames)
+        ]
         found = max(trials, key=lambda trial: trial[0].score(n_stars))
         if found[0].score(n_stars) <= best.score(n_stars):
             return best
         best, powers, frames = found
 
 
-def _near(stars: _Stars, powers: dict[str, int], frames: bool) -> Iterator[tuple[dict[str, int], bool]]:
+def _near(
+    stars: _Stars, powers: dict[str, int], frames: bool
+) -> Iterator[tuple[dict[str, int], bool]]:
     """Choices of terms that differ in one quantity."""
     for name, power in powers.items():
         for other in range(stars.highest(name) + 1):
@@ -455,36 +549,50 @@ def _near(stars: _Stars, powers: dict[str, int], frames: bool) -> Iterator[tuple
 
 
 def _terms(powers: dict[str, int]) -> tuple[str, ...]:
-    return tuple(f"{name}^{i}" if i > 1 else name for name, power in powers.items() for i in range(1, power + 1))
+    return tuple(
+        f"{name}^{i}" if i > 1 else name
+        for name, power in powers.items()
+        for i in range(1, power + 1)
+    )
 
 
 def _fitted(stars: _Stars, terms: tuple[str, ...], with_frames: bool) -> _Fit:
-    """Restricted maximum likelihood of the coefficients, and of the frames' distribution where frames differ."""
+    """Restricted maximum likelihood of the coefficients, and of the frames' distribution where
+    frames differ.
+    """
     design = _design(stars, terms)
     information = 0.5 * (design.T * stars.share) @ design
     beta = _scored(design, stars.squares, stars.share, information)
     errors = np.sqrt(np.diag(np.linalg.inv(information)))
     if not with_frames:
         eta = design @ beta
-        log_likelihood = -0.5 * float(np.sum(stars.squares * np.exp(-eta) + stars.share * (eta + np.log(2.0))))
+        log_likelihood = -0.5 * float(
+            np.sum(stars.squares * np.exp(-eta) + stars.share * (eta + np.log(2.0)))
+        )
         return _Fit(terms, beta, errors, None, np.ones(stars.n_frames), log_likelihood)
     from scipy.optimize import minimize
 
     dof = stars.per_frame(stars.share)
     bounds = [*[(None, None)] * len(beta), _FRAME_LOG_DOF]
     start = np.append(beta, _FRAME_LOG_DOF_START)
-    found = minimize(_frames_cost, start, (stars, design, dof), jac=True, method="L-BFGS-B", bounds=bounds)
+    found = minimize(
+        _frames_cost, start, (stars, design, dof), jac=True, method="L-BFGS-B", bounds=bounds
+    )
     beta, nu = found.x[:-1], float(np.exp(found.x[-1]))
     sums = stars.per_frame(stars.squares * np.exp(-design @ beta))
     return _Fit(terms, beta, errors, nu, (nu + sums) / (nu + dof), -float(found.fun))
 
 
-def _scored(design: FloatArray, squares: FloatArray, share: FloatArray, information: FloatArray) -> FloatArray:
+def _scored(
+    design: FloatArray, squares: FloatArray, share: FloatArray, information: FloatArray
+) -> FloatArray:
     """Fisher's scoring from one noise for all."""
     beta = np.zeros(design.shape[1])
     beta[0] = np.log(np.sum(squares) / np.sum(share))
     for _ in range(_NEWTON_STEPS):
-        step = np.linalg.solve(information, 0.5 * design.T @ (squares * np.exp(-design @ beta) - share))
+        step = np.linalg.solve(
+            information, 0.5 * design.T @ (squares * np.exp(-design @ beta) - share)
+        )
         longest = float(np.max(np.abs(design @ step)))
         beta = beta + step * min(1.0, _LONGEST_STEP / max(longest, 1e-300))
         if longest < _STEP_SETTLED:
@@ -492,10 +600,14 @@ def _scored(design: FloatArray, squares: FloatArray, share: FloatArray, informat
     return beta
 
 
-def _frames_cost(x: FloatArray, stars: _Stars, design: FloatArray, dof: FloatArray) -> tuple[float, FloatArray]:
-    """Minus the log likelihood of coefficients and log degrees of freedom of the frames, and its gradient.
+def _frames_cost(
+    x: FloatArray, stars: _Stars, design: FloatArray, dof: FloatArray
+) -> tuple[float, FloatArray]:
+    """Minus the log likelihood of coefficients and log degrees of freedom of the frames, and its
+    gradient.
 
-    Whitened sums of squares of frames are chi-squares times nu over a chi-square of nu degrees of freedom.
+    Whitened sums of squares of frames are chi-squares times nu over a chi-square of nu degrees of
+    freedom.
     """
     from scipy.special import digamma, gammaln
 
@@ -506,12 +618,20 @@ def _frames_cost(x: FloatArray, stars: _Stars, design: FloatArray, dof: FloatArr
     value -= 0.5 * (dof + nu) * np.log1p(sums / nu)
     precision = (nu + dof) / (nu + sums)
     by_beta = 0.5 * design.T @ (precision[stars.frame] * whitened - stars.share)
-    by_nu = digamma(0.5 * (dof + nu)) - digamma(0.5 * nu) - dof / nu - np.log1p(sums / nu) + precision * sums / nu
+    by_nu = (
+        digamma(0.5 * (dof + nu))
+        - digamma(0.5 * nu)
+        - dof / nu
+        - np.log1p(sums / nu)
+        + precision * sums / nu
+    )
     slope = np.append(by_beta, 0.5 * nu * np.sum(by_nu))
     return -float(np.sum(value) - 0.5 * stars.share @ eta), -slope
 
 
-def _model(obs: Observations, camera: Camera, stars: _Stars, fit: _Fit, axes: AxisNoise) -> NoiseModel:
+def _model(
+    obs: Observations, camera: Camera, stars: _Stars, fit: _Fit, axes: AxisNoise
+) -> NoiseModel:
     known = np.zeros(1) if obs.mag is None else obs.mag[np.isfinite(obs.mag)]
     apart = fit.frame_dof is not None
     # Schwarz's criterion, as for the terms.
@@ -532,5 +652,7 @@ def _model(obs: Observations, camera: Camera, stars: _Stars, fit: _Fit, axes: Ax
         frame_factors=fit.factors if apart else np.zeros(0),
         frame_mean=float(np.mean(fit.factors)),
         axis_ratio=float(np.exp(axes.log_ratio)) if ratio else 1.0,
-        axis_correlation=float(np.clip(axes.correlation, -_MOST_CORRELATED, _MOST_CORRELATED)) if correlation else 0.0,
+        axis_correlation=float(np.clip(axes.correlation, -_MOST_CORRELATED, _MOST_CORRELATED))
+        if correlation
+        else 0.0,
     )

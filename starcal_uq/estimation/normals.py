@@ -1,7 +1,8 @@
-"""What each frame, or each star, says about the parameters: normal equations with the attitudes eliminated.
+"""What each frame, or each star, says about the parameters: normal equations with the attitudes
+eliminated.
 
-Everything that leaves one of them out, or adds one, follows from these small matrices to first order, without another
-fit.
+Everything that leaves one of them out, or adds one, follows from these small matrices to first
+order, without another fit.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ class FrameNormals:
     """
 
     theta: FloatArray  # (p,): point of expansion, px units
-    scale: FloatArray  # (p,): unit of each parameter: its standard deviation with the others known, per unit of noise
+    # (p,): unit of each parameter: its standard deviation with the others known, per unit of noise
+    scale: FloatArray
     matrices: FloatArray  # (K, p, p): Gauss-Newton matrix
     slopes: FloatArray  # (K, p): minus half the gradient
     squares: FloatArray  # (K,): sum of squared whitened residuals
@@ -55,7 +57,9 @@ class FrameNormals:
     @classmethod
     def at(cls, obs: Observations, cal: Calibration) -> FrameNormals:
         """Normal equations at the estimate of a calibration."""
-        return cls.around(obs, cal.camera.distortion, cal.theta, quaternion_to_rotation(cal.quaternions))
+        return cls.around(
+            obs, cal.camera.distortion, cal.theta, quaternion_to_rotation(cal.quaternions)
+        )
 
     @classmethod
     def around(
@@ -66,8 +70,12 @@ class FrameNormals:
         start: FloatArray,
         scale: FloatArray | None = None,
     ) -> FrameNormals:
-        """Normal equations of a distortion model at theta (p,), attitudes searched from `start` (K, 3, 3)."""
-        frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes=True)
+        """Normal equations of a distortion model at theta (p,), attitudes searched from `start` (K,
+        3, 3).
+        """
+        frames = (
+            obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes=True)
+        )
         for _ in range(ATTITUDE_STEPS):
             gram, shift, log_determinant = frame_normals(frames, model, theta, start)
             if not np.max(np.abs(shift)) >= ATTITUDE_TOLERANCE_RAD:
@@ -87,9 +95,11 @@ class FrameNormals:
         )
 
     def scatter(self, whole: tuple[FloatArray, FloatArray] | None = None) -> FrameScatter:
-        """How these frames scatter about the estimate; `whole` are matrix and slope of all, where they are a part.
+        """How these frames scatter about the estimate; `whole` are matrix and slope of all, where
+        they are a part.
 
-        All of it needs only H_k, H and the slopes. Not finite where a frame alone determines a parameter.
+        All of it needs only H_k, H and the slopes. Not finite where a frame alone determines a
+        parameter.
         """
         matrix, slope = (self.matrix, self.slopes.sum(axis=0)) if whole is None else whole
         root = np.linalg.inv(np.linalg.cholesky(matrix))
@@ -99,14 +109,20 @@ class FrameNormals:
         free = np.where(free > 1e-10, free, np.nan)
         adjust = np.einsum("kab,kb,kcb->kac", vectors, free**-0.5, vectors)
         left = (self.slopes - self.matrices @ np.linalg.solve(matrix, slope)) @ root.T
-        # Columns of `root` are the whitened parameters; their pull on frame k, adjusted, before and after its share.
+        # Columns of `root` are the whitened parameters; their pull on frame k, adjusted, before and
+        # after its share.
         pull = np.einsum("kab,bj->kja", adjust, root)
         own = np.einsum("kab,kjb->kja", shares, pull)
         scores = np.einsum("kja,ka->kj", pull, left)
         # Covariance of the scores between frames: a diagonal less `own own^T`, for each parameter.
         diagonal, size = np.sum(pull * own, axis=2), np.sum(own**2, axis=2)
         # Steps to the estimates without a frame, and ones.
-        steps = np.einsum("kab,kb,kcb,kc->ka", vectors, 1.0 / free, vectors, (slope - self.slopes) @ root.T) @ root
+        steps = (
+            np.einsum(
+                "kab,kb,kcb,kc->ka", vectors, 1.0 / free, vectors, (slope - self.slopes) @ root.T
+            )
+            @ root
+        )
         steps = np.concatenate([np.ones((len(steps), 1)), steps], axis=1)
         return FrameScatter(
             theta=self.theta,
@@ -117,7 +133,9 @@ class FrameNormals:
             dof=int(np.sum(self.dof)),
             steps=steps.T @ steps,
             scores=scores.T @ scores,
-            powers=np.array([np.sum(diagonal**n - n * diagonal ** (n - 1) * size, axis=0) for n in (1, 2, 3)]),
+            powers=np.array(
+                [np.sum(diagonal**n - n * diagonal ** (n - 1) * size, axis=0) for n in (1, 2, 3)]
+            ),
             inner=np.einsum("kja,kjb->jab", own, own),
             middle=np.einsum("kj,kja,kjb->jab", diagonal, own, own),
         )
@@ -137,17 +155,20 @@ class FrameNormals:
 
 @dataclass(frozen=True)
 class StarNormals:
-    """What each of S stars says about the parameters through all of its images, in scaled parameters z."""
+    """What each of S stars says about the parameters through all of its images, in scaled
+    parameters z.
+    """
 
     scale: FloatArray  # (p,): unit of each parameter, as in `FrameNormals`
     matrix: FloatArray  # (p, p): Gauss-Newton matrix of all stars
     squares: float  # Sum of squared whitened residuals after the fit
     scores: FloatArray  # (S, p): share of the slope at the estimate; they sum to nothing
-    # `matrices`, `slopes`, (S, p, p) and (S, p): what the normal equations lose without a star, the attitudes of its
-    # frames fitted anew.
+    # `matrices`, `slopes`, (S, p, p) and (S, p): what the normal equations lose without a star, the
+    # attitudes of its frames fitted anew.
     matrices: FloatArray
     slopes: FloatArray
-    response: FloatArray  # (S, 2, p): change of the slope by one px of offset of the star along each of its axes
+    # (S, 2, p): change of the slope by one px of offset of the star along each of its axes
+    response: FloatArray
     dof: int  # Degrees of freedom after the fit
 
     @classmethod
@@ -159,7 +180,9 @@ class StarNormals:
         start = quaternion_to_rotation(cal.quaternions)
         matrix, slope, squares = np.zeros((p, p)), np.zeros(p), 0.0
         s = sums.n_stars
-        scores, slopes, matrices, response = (np.zeros((s, *shape)) for shape in ((p,), (p,), (p, p), (2, p)))
+        scores, slopes, matrices, response = (
+            np.zeros((s, *shape)) for shape in ((p,), (p,), (p, p), (2, p))
+        )
         for first, last in frames.parts(_STARS_AT_ONCE):
             part = MarginalLikelihood(frames.part(first, last), likelihood.model_name)
             rows = slice(int(frames.starts[first]), int(frames.starts[last]))
@@ -167,9 +190,12 @@ class StarNormals:
             h = part.project_out(state, part.derivatives(cal.theta, state))
             h = h * cal.sigmas[:, None, None]
             stars = numbers[rows]
-            # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has hidden.
+            # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has
+            # hidden.
             a = state.attitude
-            pulled = np.einsum("axn,abn,byn->xyn", a, part.frames.spread(state.inverse), a, optimize=True)
+            pulled = np.einsum(
+                "axn,abn,byn->xyn", a, part.frames.spread(state.inverse), a, optimize=True
+            )
             free = np.linalg.inv(np.eye(2) - np.moveaxis(pulled, 2, 0))
             raised = np.einsum("nxy,pyn->pxn", free, h, optimize=True)
             matrix += np.einsum("axn,bxn->ab", h, h, optimize=True)
@@ -178,7 +204,9 @@ class StarNormals:
             add_by_star(scores, np.sum(h * state.e, axis=1), stars)
             add_by_star(slopes, np.sum(raised * state.e, axis=1), stars)
             add_by_star(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
-            add_by_star(response, np.einsum("ixn,pxn->ipn", sums.columns(part, state, rows), h), stars)
+            add_by_star(
+                response, np.einsum("ixn,pxn->ipn", sums.columns(part, state, rows), h), stars
+            )
         unit = 1.0 / np.sqrt(np.diag(matrix))
         return cls(
             scale=cal.sigmas * unit,
@@ -192,9 +220,13 @@ class StarNormals:
         )
 
     def left_out(self) -> FloatArray:
-        """Changes z (S, p) of the estimate without each star, not finite where the parameters hang on it."""
+        """Changes z (S, p) of the estimate without each star, not finite where the parameters hang
+        on it.
+        """
         rest = self.matrix - self.matrices
         determined = np.linalg.cond(rest) < 1e14
         steps = np.full(self.slopes.shape, np.nan)
-        steps[determined] = np.linalg.solve(rest[determined], -self.slopes[determined][..., None])[..., 0]
+        steps[determined] = np.linalg.solve(rest[determined], -self.slopes[determined][..., None])[
+            ..., 0
+        ]
         return steps

@@ -1,8 +1,9 @@
 """The paper's interstar-angle objective in a time proportional to the number of stars.
 
-``S(theta) = sum_k sum_{i<j} (b_i . b_j - r_i . r_j)^2`` (Ye & Yang 2017, eqs. 5 and 13) is evaluated per frame from
-3 x 3 Gram matrices. With B the measured and R' the catalogue unit vectors rotated to the camera frame, E = B - R' is
-small, and every term below is formed from E, so that nothing cancels:
+``S(theta) = sum_k sum_{i<j} (b_i . b_j - r_i . r_j)^2`` (Ye & Yang 2017, eqs. 5 and 13) is
+evaluated per frame from 3 x 3 Gram matrices. With B the measured and R' the catalogue unit vectors
+rotated to the camera frame, E = B - R' is small, and every term below is formed from E, so that
+nothing cancels:
 
     B B^T - R' R'^T = R' E^T + E R'^T + E E^T.
 """
@@ -26,8 +27,8 @@ from starcal_uq.observations.frames import StarFrames
 
 # Stars per block: small enough that its arrays stay in cache, large enough to hide the interpreter.
 _BLOCK_STARS = 4096
-# The objective does not depend on how the catalogue is turned; a turn that is right to within this many pixels keeps E
-# small enough for eleven digits of the cost.
+# The objective does not depend on how the catalogue is turned; a turn that is right to within this
+# many pixels keeps E small enough for eleven digits of the cost.
 _TURN_AGAIN_PX = 30.0
 
 
@@ -57,21 +58,31 @@ def _dot(stars: FloatArray, vector: FloatArray) -> FloatArray:
     return product
 
 
-def _block_terms(frames: StarFrames, catalogue: FloatArray, b: FloatArray) -> tuple[float, FloatArray]:
-    """Cost and D B (3, N) of one block; `catalogue` are the directions (3, N), turned nearly into the camera frame."""
+def _block_terms(
+    frames: StarFrames, catalogue: FloatArray, b: FloatArray
+) -> tuple[float, FloatArray]:
+    """Cost and D B (3, N) of one block; `catalogue` are the directions (3, N), turned nearly into
+    the camera frame.
+    """
     e = b - catalogue
-    ee, rr, re = _gram(frames, e, e), _gram(frames, catalogue, catalogue), _gram(frames, catalogue, e)
+    ee, rr, re = (
+        _gram(frames, e, e),
+        _gram(frames, catalogue, catalogue),
+        _gram(frames, catalogue, e),
+    )
     er = re.transpose(1, 0, 2)
     cost = float(np.sum(ee * rr + re * er + 2.0 * ee * re + 0.5 * ee * ee))
     # D B = R' (E^T B) + E (R'^T B) + E (E^T B), with B = R' + E.
-    return cost, _apply(catalogue, frames.spread(er + ee)) + _apply(e, frames.spread(rr + re + er + ee))
+    return cost, _apply(catalogue, frames.spread(er + ee)) + _apply(
+        e, frames.spread(rr + re + er + ee)
+    )
 
 
 class PairObjective:
     """Sum of squared differences of interstar cosines over all pairs of a frame and all frames.
 
-    `model_name`: distortion model; ``none`` for the paper's first stage. Per-star weights are not used: the paper's
-    objective has none.
+    `model_name`: distortion model; ``none`` for the paper's first stage. Per-star weights are not
+    used: the paper's objective has none.
     """
 
     def __init__(self, frames: StarFrames, model_name: str) -> None:
@@ -99,7 +110,9 @@ class PairObjective:
         return None if self._turned_at is None else self._rotations
 
     def rotations_at(self, theta: FloatArray) -> FloatArray | None:
-        """As `rotations`, near enough to theta for a refinement to begin: all of them follow the principal point."""
+        """As `rotations`, near enough to theta for a refinement to begin: all of them follow the
+        principal point.
+        """
         with np.errstate(all="ignore"):
             self._turn(theta)
         if self._turned_at is None:
@@ -114,8 +127,13 @@ class PairObjective:
         return b, db
 
     def _turn(self, theta: FloatArray) -> FloatArray:
-        """Attitudes (K, 3, 3) that turn the catalogue nearly into the camera frame; new ones if these are too far."""
-        if self._turned_at is not None and np.max(np.abs(theta[:3] - self._turned_at)) <= _TURN_AGAIN_PX:
+        """Attitudes (K, 3, 3) that turn the catalogue nearly into the camera frame; new ones if
+        these are too far.
+        """
+        if (
+            self._turned_at is not None
+            and np.max(np.abs(theta[:3] - self._turned_at)) <= _TURN_AGAIN_PX
+        ):
             return self._rotations
         frames = self.frames
         found = attitude_loop(frames, self.model_name, theta) if self._compiled else None
@@ -139,12 +157,15 @@ class PairObjective:
     def _evaluate(self, theta: FloatArray, tolerance: float = 0.0) -> tuple[Normal, FloatArray]:
         """As `evaluate`, with the gradient of every frame (p, K).
 
-        The last point is remembered; it serves where a step from there changes the cost by a share of `tolerance`.
+        The last point is remembered; it serves where a step from there changes the cost by a share
+        of `tolerance`.
         """
         theta = np.array(theta, dtype=np.float64)
         if not np.isfinite(theta).all():
             p = self.n_parameters
-            return Normal(float("inf"), np.full(p, np.nan), np.full((p, p), np.nan)), np.full((p, 1), np.nan)
+            return Normal(float("inf"), np.full(p, np.nan), np.full((p, p), np.nan)), np.full(
+                (p, 1), np.nan
+            )
         if self._last is not None:
             at, normal, _ = self._last
             step = theta - at
@@ -159,7 +180,11 @@ class PairObjective:
         cost, matrix, scores = 0.0, np.zeros((p, p)), []
         with np.errstate(all="ignore"):
             rotations = self._turn(theta)
-            whole = pair_loop(self.frames, self.model_name, theta, rotations) if self._compiled else None
+            whole = (
+                pair_loop(self.frames, self.model_name, theta, rotations)
+                if self._compiled
+                else None
+            )
             for part in self._parts(theta) if whole is None else [whole]:
                 cost += part[0]
                 matrix += part[1]
@@ -192,12 +217,13 @@ class PairObjective:
         return cost, matrix, scores
 
     def godambe(self, theta: FloatArray, tolerance: float = 0.0) -> FloatArray:
-        """Sandwich covariance ``H^-1 V H^-1`` of the estimator that minimises the objective, (p, p).
+        """Sandwich covariance ``H^-1 V H^-1`` of the estimator that minimises the objective, (p,
+        p).
 
-        H is the Gauss-Newton matrix and V the sum over frames of the outer products of their gradients (Godambe
-        information): the pairs of a frame are dependent, so that ``H^-1`` alone would claim far too little. Not
-        finite where H is singular. The last point that was evaluated serves for theta where the cost differs by a share
-        of `tolerance`.
+        H is the Gauss-Newton matrix and V the sum over frames of the outer products of their
+        gradients (Godambe information): the pairs of a frame are dependent, so that ``H^-1`` alone
+        would claim far too little. Not finite where H is singular. The last point that was
+        evaluated serves for theta where the cost differs by a share of `tolerance`.
         """
         normal, scores = self._evaluate(theta, tolerance)
         p, k = self.n_parameters, self.frames.n_frames

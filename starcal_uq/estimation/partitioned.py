@@ -1,9 +1,11 @@
-"""A calibration of observations in partitions, which need not fit into memory or stand on one machine.
+"""A calibration of observations in partitions, which need not fit into memory or stand on one
+machine.
 
-Each step is one pass: every partition is read where it is worked on, becomes a few small matrices, and these are added
-up in a fixed tree. The refinement solves the sums of the partitions' normal equations, whose attitudes are eliminated
-frame by frame; the partitions' Gram matrices at the estimate add up to the compressed likelihood. Only a stated sample
-of frames is kept, for what looks at stars one by one.
+Each step is one pass: every partition is read where it is worked on, becomes a few small matrices,
+and these are added up in a fixed tree. The refinement solves the sums of the partitions' normal
+equations, whose attitudes are eliminated frame by frame; the partitions' Gram matrices at the
+estimate add up to the compressed likelihood. Only a stated sample of frames is kept, for what looks
+at stars one by one.
 """
 
 from __future__ import annotations
@@ -34,24 +36,37 @@ from starcal_uq.estimation.compressed import GramSums, gram_sums, optimum, settl
 from starcal_uq.estimation.duplicates import repeated
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.normals import FrameNormals
-from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, FrameScatter, PartitionSums, ResidualMap, RicherModel
+from starcal_uq.estimation.residual_map import (
+    OUTLIER_SIGMA,
+    FrameScatter,
+    PartitionSums,
+    ResidualMap,
+    RicherModel,
+)
 from starcal_uq.estimation.solvers import Normal, is_singular, levenberg_marquardt
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.sums import NormalSums, frame_sums, settled_sums, sum_of
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.checks import mixed_bits
-from starcal_uq.observations.partitions import Partition, PartitionedObservations, PartitionReader, joined_hash
+from starcal_uq.observations.partitions import (
+    Partition,
+    PartitionedObservations,
+    PartitionReader,
+    joined_hash,
+)
 from starcal_uq.observations.table import Observations
 
 T = TypeVar("T")
-# Standard deviations of the estimate: last step of the solver, from where one of Newton's on the expansion finds the
-# optimum, and its length that needs no new expansion.
+# Standard deviations of the estimate: last step of the solver, from where one of Newton's on the
+# expansion finds the optimum, and its length that needs no new expansion.
 _LAST_STEP, _NEAR = 0.5, 1e-5
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the first pass has seen: normal equations, data hashes; number and content of every frame if asked for."""
+    """What the first pass has seen: normal equations, data hashes; number and content of every
+    frame if asked for.
+    """
 
     sums: NormalSums
     hashes: tuple[str, ...]
@@ -64,7 +79,9 @@ def _with_kernels(kernels: str, one: Callable[[Partition], T], part: Partition) 
         return one(part)
 
 
-def _look(reader: PartitionReader, model: str, theta: FloatArray, by_content: bool, part: Partition) -> _Seen:
+def _look(
+    reader: PartitionReader, model: str, theta: FloatArray, by_content: bool, part: Partition
+) -> _Seen:
     obs = reader.load(part, check=True)
     sums, hashes = _sums(obs, model, theta), (obs.data_hash,)
     if not by_content:
@@ -93,14 +110,17 @@ def _sums(obs: Observations, model: str, theta: FloatArray) -> NormalSums:
     return settled_sums(likelihood.frames, model, theta, likelihood.start_rotations(theta))[0]
 
 
-def _gram(reader: PartitionReader, model: str, theta: FloatArray, whitening: FloatArray, part: Partition) -> GramSums:
+def _gram(
+    reader: PartitionReader, model: str, theta: FloatArray, whitening: FloatArray, part: Partition
+) -> GramSums:
     likelihood = MarginalLikelihood(reader.load(part), model)
     return gram_sums(likelihood.frames, model, theta, whitening, likelihood.start_rotations(theta))
 
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Sums over stars and frames at the estimate: normal equations, attitudes' response and covariance, residuals.
+    """Sums over stars and frames at the estimate: normal equations, attitudes' response and
+    covariance, residuals.
 
     `richer` are the normal equations of the models of which that of the camera is a special case.
     """
@@ -117,7 +137,10 @@ def _richer(camera: Camera) -> list[Camera]:
     values = dict(zip(camera.parameter_names, camera.theta, strict=True))
     return [
         camera.replace(
-            distortion=name, coefficients=tuple(float(values.get(c.name, 0.0)) for c in get_model(name).coefficients)
+            distortion=name,
+            coefficients=tuple(
+                float(values.get(c.name, 0.0)) for c in get_model(name).coefficients
+            ),
         )
         for name in model_names()
         if camera.distortion in simpler_models(name)
@@ -125,12 +148,19 @@ def _richer(camera: Camera) -> list[Camera]:
 
 
 def _residuals(
-    reader: PartitionReader, camera: Camera, theta: FloatArray, scale: float, n_stars: int, part: Partition
+    reader: PartitionReader,
+    camera: Camera,
+    theta: FloatArray,
+    scale: float,
+    n_stars: int,
+    part: Partition,
 ) -> _Residuals:
     obs = reader.load(part)
     likelihood = MarginalLikelihood(obs, camera.distortion)
     whole, e = likelihood.frames, np.empty((2, obs.n_stars))
-    normal, attitudes = settled_sums(whole, camera.distortion, theta, likelihood.start_rotations(theta), e)
+    normal, attitudes = settled_sums(
+        whole, camera.distortion, theta, likelihood.start_rotations(theta), e
+    )
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px
     size = np.max(np.abs(e), axis=0) / scale
     worst = int(np.argmax(size))
@@ -144,12 +174,16 @@ def _residuals(
         largest=float(size[worst]),
         largest_frame=int(obs.frame[worst]),
     )
-    # Without their further terms these models are the camera's: the attitudes are known, and one pass is enough.
+    # Without their further terms these models are the camera's: the attitudes are known, and one
+    # pass is enough.
     with compiled.using("numpy"):
         richer = tuple(
-            frame_sums(whole, other.distortion, other.theta, attitudes.at(theta))[0] for other in _richer(camera)
+            frame_sums(whole, other.distortion, other.theta, attitudes.at(theta))[0]
+            for other in _richer(camera)
         )
-    return _Residuals(normal, np.sum(attitudes.response, axis=2), np.sum(attitudes.inverse, axis=2), sums, richer)
+    return _Residuals(
+        normal, np.sum(attitudes.response, axis=2), np.sum(attitudes.inverse, axis=2), sums, richer
+    )
 
 
 def _added_residuals(parts: Sequence[_Residuals]) -> _Residuals:
@@ -162,7 +196,9 @@ def _added_residuals(parts: Sequence[_Residuals]) -> _Residuals:
     )
 
 
-def _scatter(reader: PartitionReader, model: str, theta: FloatArray, whole: Normal, part: Partition) -> FrameScatter:
+def _scatter(
+    reader: PartitionReader, model: str, theta: FloatArray, whole: Normal, part: Partition
+) -> FrameScatter:
     likelihood = MarginalLikelihood(reader.load(part), model)
     frames, scale = likelihood.frames, 1.0 / np.sqrt(np.diag(whole.matrix))
     near = frame_sums(frames, model, theta, likelihood.start_rotations(theta))[1].at(theta)
@@ -170,8 +206,12 @@ def _scatter(reader: PartitionReader, model: str, theta: FloatArray, whole: Norm
     return FrameNormals.around(frames, model, theta, near, scale).scatter(scaled)
 
 
-def _stepped(camera: Camera, sums: Sequence[NormalSums], variance: float) -> tuple[RicherModel, ...]:
-    """The richer models of `_richer` after one step; those that the stars do not determine are left out."""
+def _stepped(
+    camera: Camera, sums: Sequence[NormalSums], variance: float
+) -> tuple[RicherModel, ...]:
+    """The richer models of `_richer` after one step; those that the stars do not determine are left
+    out.
+    """
     found = []
     for other, total in zip(_richer(camera), sums, strict=True):
         normal = total.normal
@@ -180,7 +220,12 @@ def _stepped(camera: Camera, sums: Sequence[NormalSums], variance: float) -> tup
         step = -scaled_inverse(normal.matrix) @ normal.gradient
         n_terms = len(step) - len(camera.theta)
         found.append(
-            RicherModel(other.distortion, other.theta + step, n_terms, float(-step @ normal.gradient) / variance)
+            RicherModel(
+                other.distortion,
+                other.theta + step,
+                n_terms,
+                float(-step @ normal.gradient) / variance,
+            )
         )
     return tuple(found)
 
@@ -197,20 +242,23 @@ def calibrate_partitions(
 ) -> Calibration:
     """Refine a calibration of a sample of frames on all partitions.
 
-    `start`: calibration of the sample by the ``efficient`` method; its estimate from interstar angles stays.
-    `cluster`: processes that read the partitions.
-    `duplicates`: what to do with frames that hold the same pixels as another.
-    `progress`: called with (partitions done, partitions) in every pass.
-    CalibrationError when there is no estimate. RepeatedFramesError when frames hold the same pixels and are refused.
-    ObservationError for bad rows, with the file.
+    `start`: calibration of the sample by the ``efficient`` method; its estimate from interstar
+    angles stays. `cluster`: processes that read the partitions.
+    `duplicates`: what to do with frames that hold the same pixels as another. `progress`: called
+    with (partitions done, partitions) in every pass. CalibrationError when there is no estimate.
+    RepeatedFramesError when frames hold the same pixels and are refused. ObservationError for bad
+    rows, with the file.
     """
     reader, model, began = obs.reader, start.camera.distortion, perf_counter()
-    # Chosen here once: what one process has compiled in the meantime must not change the digits of another.
+    # Chosen here once: what one process has compiled in the meantime must not change the digits of
+    # another.
     kernels = loops.kernels(model, obs.n_stars)
     first = start.stages[-1].theta
 
     def total(one: Callable[[Partition], T], together: Callable[[Sequence[T]], T]) -> T:
-        return cluster.reduce(partial(_with_kernels, kernels, one), obs.parts, together, progress=progress)
+        return cluster.reduce(
+            partial(_with_kernels, kernels, one), obs.parts, together, progress=progress
+        )
 
     seen = total(partial(_look, reader, model, first, duplicates == "refuse"), _seen_together)
     _refuse_repeated(seen)
@@ -219,12 +267,22 @@ def calibrate_partitions(
 
     def evaluate(theta: FloatArray) -> Normal:
         known = np.array_equal(theta, first)
-        return (seen.sums if known else total(partial(_normal, reader, model, theta), sum_of)).normal
+        return (
+            seen.sums if known else total(partial(_normal, reader, model, theta), sum_of)
+        ).normal
 
-    found = levenberg_marquardt(evaluate, first, max_iterations=max_iterations, tolerance=_LAST_STEP**2 / dof)
+    found = levenberg_marquardt(
+        evaluate, first, max_iterations=max_iterations, tolerance=_LAST_STEP**2 / dof
+    )
     theta, normal, status = found.theta, found.normal, found.status
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
-        reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
+        reason = (
+            status
+            if not status.ok
+            else Status.SINGULAR
+            if np.isfinite(normal.cost)
+            else Status.NOT_FINITE
+        )
         raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
     whitening = scaled_cholesky(scaled_inverse(normal.matrix) * normal.cost / dof)
     for _ in range(max_iterations):
@@ -232,14 +290,16 @@ def calibrate_partitions(
         here = gram.likelihood(theta, whitening)
         best = optimum(settled(here))
         theta = best.theta
-        # The expansion is exact to second order: so near, its optimum is that of all stars to rounding.
+        # The expansion is exact to second order: so near, its optimum is that of all stars to
+        # rounding.
         if float(np.max(np.abs(here.whiten(theta)))) < _NEAR:
             break
     compressed, sigma = best.compressed, best.sigma
     sampled = replace(start.stages[-1], name="sample")
     ways, costs = np.vstack([found.trajectory, theta]), np.append(found.costs, best.sum_of_squares)
     stage = Stage("refinement", ways, costs, status, found.evaluations + 1, perf_counter() - began)
-    # As in `assemble`: the rotation-volume term moves the maximum by about 0.01 sigma of a small table.
+    # As in `assemble`: the rotation-volume term moves the maximum by about 0.01 sigma of a small
+    # table.
     theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     camera = start.nominal.with_theta(theta)
     scale = sigma * float(np.sqrt(dof / (2.0 * n_stars)))
@@ -280,7 +340,9 @@ def calibrate_partitions(
         compressed=compressed,
         provenance=record,
         fingerprints=None,
-        partitions=replace(rest.sums, richer=_stepped(camera, rest.richer, sigma**2), scatter=scatter),
+        partitions=replace(
+            rest.sums, richer=_stepped(camera, rest.richer, sigma**2), scatter=scatter
+        ),
     )
 
 
@@ -289,10 +351,13 @@ def _refuse_repeated(seen: _Seen) -> None:
     same = np.flatnonzero(seen.content[order][1:] == seen.content[order][:-1])
     if not len(same):
         return
-    pairs = np.sort(np.column_stack([seen.frames[order[same]], seen.frames[order[same + 1]]]), axis=1)
+    pairs = np.sort(
+        np.column_stack([seen.frames[order[same]], seen.frames[order[same + 1]]]), axis=1
+    )
     raise RepeatedFramesError(
         f"{repeated('pixels', pairs, len(pairs))}: they would count twice; remove the "
-        "later ones from the files, or, if you know them to be exposures of their own, keep them (duplicates='keep', "
+        "later ones from the files, or, if you know them to be exposures of their own, keep them "
+        "(duplicates='keep', "
         "--duplicates keep).",
         pairs=pairs.tolist(),
     )

@@ -1,8 +1,10 @@
-"""Why a calibration fails: the slip in table or camera file that would explain the stars, or what is known of them.
+"""Why a calibration fails: the slip in table or camera file that would explain the stars, or what
+is known of them.
 
-Slips are tried on some frames: columns in other units or order, a mirrored image, frames put together anew. What
-explains the stars lets those of each frame agree on one attitude (`consensus`), at the focal length that their angles
-ask for. Nothing is blamed while the table as it is does nearly as well.
+Slips are tried on some frames: columns in other units or order, a mirrored image, frames put
+together anew. What explains the stars lets those of each frame agree on one attitude (`consensus`),
+at the focal length that their angles ask for. Nothing is blamed while the table as it is does
+nearly as well.
 """
 
 from __future__ import annotations
@@ -36,21 +38,25 @@ _HEAD = 64
 _FIELD_RAD = np.radians(20.0)
 # Stars farther from their attitude's place than this fraction of the detector do not agree with it.
 _TOLERANCE = 0.02
-# Mean truncated square below which the stars are explained; that of other axes or units is above a half.
+# Mean truncated square below which the stars are explained; that of other axes or units is above a
+# half.
 _EXPLAINED = 0.35
 # A slip must explain the stars so many times better than the table as it is, or any other slip.
 _CLEARLY = 0.5
 # Focal lengths that are taken for the camera's own, and for those of a wrong unit.
 _SAME_CAMERA, _SAME_UNIT = 1.6, 1.3
 _NEIGHBOURS = 8
-# Scatter of stars that agree, as a fraction of the tolerance: that of noise, or no reason for anything.
+# Scatter of stars that agree, as a fraction of the tolerance: that of noise, or no reason for
+# anything.
 _NOISY, _QUIET = 0.2, 0.1
 _FEW_WRONG = 0.02
 
 
 @dataclass(frozen=True)
 class _Table:
-    """Rows of some frames: pixels (2, N), directions (N,) in degrees, first rows of the frames (K + 1,)."""
+    """Rows of some frames: pixels (2, N), directions (N,) in degrees, first rows of the frames (K +
+    1,).
+    """
 
     pixel: FloatArray
     ra: FloatArray
@@ -66,7 +72,9 @@ class _Table:
 
 @dataclass(frozen=True)
 class _Fit:
-    """How well stars agree: mean truncated square, share that agrees, its scatter and the focal length in px."""
+    """How well stars agree: mean truncated square, share that agrees, its scatter and the focal
+    length in px.
+    """
 
     cost: float
     share: float
@@ -79,7 +87,9 @@ class _Fit:
 
 
 def explained(function: Callable[P, R]) -> Callable[P, R]:
-    """A calibration of observations with a camera, whose error says what is wrong with them where that can be told."""
+    """A calibration of observations with a camera, whose error says what is wrong with them where
+    that can be told.
+    """
     names = tuple(inspect.signature(function).parameters)
 
     @wraps(function)
@@ -90,7 +100,9 @@ def explained(function: Callable[P, R]) -> Callable[P, R]:
             raise
         except CalibrationError as error:
             given = dict(zip(names, args, strict=False)) | kwargs
-            found = explanation(error, given["obs"], given["camera"], screened=function.__name__ == "screen")
+            found = explanation(
+                error, given["obs"], given["camera"], screened=function.__name__ == "screen"
+            )
             if found is None:
                 raise
             raise found from error
@@ -98,8 +110,12 @@ def explained(function: Callable[P, R]) -> Callable[P, R]:
     return calibrated
 
 
-def explanation(error: CalibrationError, obs: object, camera: object, *, screened: bool = False) -> Exception | None:
-    """The error of a calibration with what is wrong with its stars, where that can be told; a stream by its head."""
+def explanation(
+    error: CalibrationError, obs: object, camera: object, *, screened: bool = False
+) -> Exception | None:
+    """The error of a calibration with what is wrong with its stars, where that can be told; a
+    stream by its head.
+    """
     if error.status is None or not isinstance(camera, Camera):
         return None
     if not isinstance(obs, Observations):
@@ -111,7 +127,11 @@ def explanation(error: CalibrationError, obs: object, camera: object, *, screene
         return None
     known = (load()(obs, error.calibration) for load in REASONS)
     first = next((sentence for sentence in known if sentence is not None), None)
-    return None if first is None else CalibrationError(f"{error} First, {first}", error.status, error.undetermined)
+    return (
+        None
+        if first is None
+        else CalibrationError(f"{error} First, {first}", error.status, error.undetermined)
+    )
 
 
 def _head(stream: object) -> Observations | None:
@@ -122,17 +142,22 @@ def _head(stream: object) -> Observations | None:
     if not parts or not all(isinstance(part, Observations) for part in parts):
         return None
     columns: AnyDict = {
-        n: np.concatenate([getattr(part, n) for part in parts]) for n in ("x_px", "y_px", "ra_deg", "dec_deg")
+        n: np.concatenate([getattr(part, n) for part in parts])
+        for n in ("x_px", "y_px", "ra_deg", "dec_deg")
     }
     # Frames of one part need not be those of another, whatever their numbers.
     sizes = np.concatenate([np.diff(part.frame_starts) for part in parts])
     return Observations(frame=np.repeat(np.arange(len(sizes)), sizes), **columns)
 
 
-def find_reason(obs: Observations, camera: Camera, status: Status, *, screened: bool = False) -> str | None:
-    """What explains that a calibration of these stars with this camera fails, in a clause with its remedy.
+def find_reason(
+    obs: Observations, camera: Camera, status: Status, *, screened: bool = False
+) -> str | None:
+    """What explains that a calibration of these stars with this camera fails, in a clause with its
+    remedy.
 
-    None where the stars agree, so that the status has said all there is: too few of them, or the wrong model.
+    None where the stars agree, so that the status has said all there is: too few of them, or the
+    wrong model.
     """
     # The attitudes come without distortion, which bends them less than the slips do.
     camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))
@@ -140,7 +165,9 @@ def find_reason(obs: Observations, camera: Camera, status: Status, *, screened: 
     plain = _fit(table, camera)
     if plain.cost > _EXPLAINED:
         tried = [(_fit(other, camera), text) for text, other in _slips(table, camera)]
-        centred = camera.replace(x0_px=0.5 * (camera.width_px - 1), y0_px=0.5 * (camera.height_px - 1))
+        centred = camera.replace(
+            x0_px=0.5 * (camera.width_px - 1), y0_px=0.5 * (camera.height_px - 1)
+        )
         tried.append((_fit(table, centred), _off_centre(camera)))
         tried += _regrouped(obs, camera)
         enough = min(_EXPLAINED, _CLEARLY * plain.cost)
@@ -186,7 +213,9 @@ def _tolerance_px(camera: Camera) -> float:
 
 
 def _fit(table: _Table, camera: Camera, wider: float = 1.0) -> _Fit:
-    """How well the stars of each frame agree on an attitude, with the focal length that their angles ask for."""
+    """How well the stars of each frame agree on an attitude, with the focal length that their
+    angles ask for.
+    """
     frames = table.frames
     size = max(camera.width_px, camera.height_px)
     focal_px = 0.5 * size / np.tan(0.5 * _FIELD_RAD)
@@ -216,7 +245,10 @@ def _two_slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
         for more, again in _units(table):
             if other.dec is table.dec and again.ra is table.ra:
                 second = more.replace(", ra_deg does not", "")
-                yield f"{text}; and {second}", _Table(table.pixel, other.ra, again.dec, table.starts)
+                yield (
+                    f"{text}; and {second}",
+                    _Table(table.pixel, other.ra, again.dec, table.starts),
+                )
 
 
 def _units(table: _Table) -> Iterator[tuple[str, _Table]]:
@@ -227,15 +259,27 @@ def _units(table: _Table) -> Iterator[tuple[str, _Table]]:
         yield text, _Table(table.pixel, 15.0 * ra, dec, starts)
     if ra.max() <= 2.0 * np.pi:
         if np.abs(dec).max() <= 0.5 * np.pi:
-            text = f"ra_deg and dec_deg look like radians (ra_deg up to {ra.max():.3g}): multiply them by 180/pi"
+            text = (
+                f"ra_deg and dec_deg look like radians (ra_deg up to {ra.max():.3g}): multiply "
+                "them by 180/pi"
+            )
             yield text, _Table(table.pixel, in_degrees(ra), in_degrees(dec), starts)
-        text = f"ra_deg looks like radians (up to {ra.max():.3g}), dec_deg does not: multiply ra_deg by 180/pi"
+        text = (
+            f"ra_deg looks like radians (up to {ra.max():.3g}), dec_deg does not: multiply "
+            "ra_deg by 180/pi"
+        )
         yield text, _Table(table.pixel, in_degrees(ra), dec, starts)
     if np.abs(dec).max() <= 0.5 * np.pi < ra.max():
-        text = f"dec_deg looks like radians (up to {np.abs(dec).max():.3g}), ra_deg does not: multiply it by 180/pi"
+        text = (
+            f"dec_deg looks like radians (up to {np.abs(dec).max():.3g}), ra_deg does not: "
+            "multiply it by 180/pi"
+        )
         yield text, _Table(table.pixel, ra, in_degrees(dec), starts)
     if ra.max() <= 90.0:
-        yield "ra_deg and dec_deg look swapped: exchange the two columns", _Table(table.pixel, dec % 360.0, ra, starts)
+        yield (
+            "ra_deg and dec_deg look swapped: exchange the two columns",
+            _Table(table.pixel, dec % 360.0, ra, starts),
+        )
 
 
 def _mirrored(table: _Table, camera: Camera) -> tuple[str, _Table]:
@@ -248,17 +292,24 @@ def _mirrored(table: _Table, camera: Camera) -> tuple[str, _Table]:
 
 
 def _off_centre(camera: Camera) -> str:
-    given = f"the principal point of the camera, ({camera.x0_px:g}, {camera.y0_px:g}) px, is far off"
+    given = (
+        f"the principal point of the camera, ({camera.x0_px:g}, {camera.y0_px:g}) px, is far off"
+    )
     centre = f"({0.5 * (camera.width_px - 1):g}, {0.5 * (camera.height_px - 1):g})"
     return f"{given}: start from the detector's centre, {centre}"
 
 
 def _one_frame_number() -> str:
-    return "all rows have one frame number, but are stars of several images: give each image its own in column frame"
+    return (
+        "all rows have one frame number, but are stars of several images: give each image its "
+        "own in column frame"
+    )
 
 
 def _regrouped(obs: Observations, camera: Camera) -> list[tuple[_Fit, str]]:
-    """Whether stars that are neighbours in the sky are so in an image, whatever frame they are said to be of."""
+    """Whether stars that are neighbours in the sky are so in an image, whatever frame they are said
+    to be of.
+    """
     from scipy.spatial import cKDTree
 
     if obs.n_stars < 2 * _NEIGHBOURS:
@@ -266,7 +317,10 @@ def _regrouped(obs: Observations, camera: Camera) -> list[tuple[_Fit, str]]:
     sky = cKDTree(obs.directions_icrs)
     seeds = np.unique(np.linspace(0, obs.n_stars - 1, _FRAMES).astype(np.int64))
     near = [np.sort(rows) for rows in sky.query(obs.directions_icrs[seeds], k=_NEIGHBOURS)[1]]
-    text = "the stars fit each other but not their frame numbers: check column frame, which is mixed up"
+    text = (
+        "the stars fit each other but not their frame numbers: check column frame, which is "
+        "mixed up"
+    )
     return [(_fit(_of_rows(obs, near), camera), _one_frame_number() if obs.n_frames == 1 else text)]
 
 
@@ -281,7 +335,9 @@ def _far_apart(table: _Table, camera: Camera) -> bool:
 
 
 def _field_rad(camera: Camera) -> float:
-    return float(2.0 * np.arctan(0.5 * np.hypot(camera.width_px, camera.height_px) / camera.focal_px))
+    return float(
+        2.0 * np.arctan(0.5 * np.hypot(camera.width_px, camera.height_px) / camera.focal_px)
+    )
 
 
 def _far_apart_words(obs: Observations, camera: Camera) -> str:
@@ -289,7 +345,8 @@ def _far_apart_words(obs: Observations, camera: Camera) -> str:
         return _one_frame_number()
     field = significant(float(np.degrees(_field_rad(camera))), 2)
     return (
-        f"frames hold stars that lie farther apart in the sky than the camera sees ({field} degrees): their frame "
+        f"frames hold stars that lie farther apart in the sky than the camera sees ({field} "
+        "degrees): their frame "
         "numbers or directions belong to other rows"
     )
 
@@ -306,7 +363,8 @@ def _wrong_focal(plain: _Fit, camera: Camera) -> str | None:
             return reason
     return (
         f"the stars ask for a focal length of about {camera.length_text(plain.focal_px, 3)}, not "
-        f"{camera.length_text(camera.focal_px, 6)}: start from that, or give the camera that took the images"
+        f"{camera.length_text(camera.focal_px, 6)}: start from that, or give the camera that "
+        "took the images"
     )
 
 
@@ -320,7 +378,8 @@ def _other_units(camera: Camera) -> dict[float, str]:
     return {
         1e-3: short,
         1e3: f"focal_mm looks like metres ({camera.focal_mm:g}): multiply it by 1000",
-        1e-3 * camera.pixel_um: f"focal_mm looks like pixels ({camera.focal_mm:g}): multiply it by the pixel pitch, "
+        1e-3
+        * camera.pixel_um: f"focal_mm looks like pixels ({camera.focal_mm:g}): multiply it by the pixel pitch, "
         f"{1e-3 * camera.pixel_um:g} mm",
         25.4: f"focal_mm looks like inches ({camera.focal_mm:g}): multiply it by 25.4",
     }
@@ -331,18 +390,24 @@ def _as_it_is(plain: _Fit, camera: Camera, status: Status, screened: bool) -> st
     wrong = 1.0 - plain.share
     if wrong > 0.8:
         return (
-            "the stars of a frame fit no common attitude, whatever units, axes and focal length: check their "
+            "the stars of a frame fit no common attitude, whatever units, axes and focal length: "
+            "check their "
             "identification and the frame numbers"
         )
     if wrong > _FEW_WRONG:
         told = f"about {100.0 * wrong:.0f} % of the stars do not fit the others of their frame"
         if screened or wrong > 0.6:
             return f"{told}: identify them again"
-        return f"{told}: leave out wrong identifications (`starcal-uq calibrate OBS CAMERA -o RUN --screen`)"
+        return (
+            f"{told}: leave out wrong identifications (`starcal-uq calibrate OBS CAMERA -o RUN "
+            "--screen`)"
+        )
     quiet = plain.scatter_px < _QUIET * _tolerance_px(camera)
     if quiet or status in (Status.SINGULAR, Status.FOLDED, Status.OUTSIDE_DETECTOR):
         return None
     return (
-        f"the stars scatter by about {significant(plain.scatter_px, 2)} px around their attitudes, by noise or by "
-        "distortion that the model lacks: measure the centroids again, or choose another distortion model"
+        f"the stars scatter by about {significant(plain.scatter_px, 2)} px around their "
+        "attitudes, by noise or by "
+        "distortion that the model lacks: measure the centroids again, or choose another "
+        "distortion model"
     )

@@ -1,4 +1,6 @@
-"""Residuals as sums that add up over any number of stars: by cells of the detector, by frames, and by partitions."""
+"""Residuals as sums that add up over any number of stars: by cells of the detector, by frames, and
+by partitions.
+"""
 
 from __future__ import annotations
 
@@ -23,23 +25,33 @@ class ResidualMap:
     cell_px: float  # Side of a cell
     counts: FloatArray  # (cells,): stars in each
     sums: FloatArray  # (cells, 2): sums of their residuals, px
-    stated2: FloatArray  # (cells,): sums of their squared stated noise, px^2; of ones where they state none
+    # (cells,): sums of their squared stated noise, px^2; of ones where they state none
+    stated2: FloatArray
 
     @classmethod
     def of(
-        cls, camera: Camera, n_stars: int, xy_px: FloatArray, residuals_px: FloatArray, stated_px: FloatArray
+        cls,
+        camera: Camera,
+        n_stars: int,
+        xy_px: FloatArray,
+        residuals_px: FloatArray,
+        stated_px: FloatArray,
     ) -> ResidualMap:
         """Sums over stars at (2, N) with residuals (2, N) and stated noise (N,).
 
-        The cells are made for `n_stars` stars in all, about 25 to each: 4 to 12 along the longer side.
+        The cells are made for `n_stars` stars in all, about 25 to each: 4 to 12 along the longer
+        side.
         """
         width, height = camera.width_px, camera.height_px
         longer = max(width, height)
-        along = int(np.clip(np.sqrt(n_stars / _STARS_PER_CELL * longer / min(width, height)), 4, 12))
+        along = int(
+            np.clip(np.sqrt(n_stars / _STARS_PER_CELL * longer / min(width, height)), 4, 12)
+        )
         cell = longer / along
         nx, ny = int(np.ceil(width / cell - 1e-9)), int(np.ceil(height / cell - 1e-9))
         column, row = (
-            np.clip(((values + 0.5) / cell).astype(int), 0, n - 1) for values, n in zip(xy_px, (nx, ny), strict=True)
+            np.clip(((values + 0.5) / cell).astype(int), 0, n - 1)
+            for values, n in zip(xy_px, (nx, ny), strict=True)
         )
         index = row * nx + column
         return cls(
@@ -64,19 +76,23 @@ class ResidualMap:
 
 @dataclass(frozen=True)
 class RicherModel:
-    """A distortion model with more terms, fitted to all stars by one Gauss-Newton step from the calibration."""
+    """A distortion model with more terms, fitted to all stars by one Gauss-Newton step from the
+    calibration.
+    """
 
     model: str  # Name of the registry
     theta: FloatArray  # (q,): its estimate, px units
     n_terms: int  # Terms beyond those of the calibration
-    # Decrease of the sum of squares, in units of the noise variance: chi-square with `n_terms` degrees of freedom
-    # where the calibration's model holds.
+    # Decrease of the sum of squares, in units of the noise variance: chi-square with `n_terms`
+    # degrees of freedom where the calibration's model holds.
     gain: float
 
 
 @dataclass(frozen=True)
 class FrameScatter:
-    """How frames scatter about an estimate: sums over frames in parameters ``z = (theta - theta_hat) / scale``."""
+    """How frames scatter about an estimate: sums over frames in parameters ``z = (theta -
+    theta_hat) / scale``.
+    """
 
     # `theta`, `scale`, (p,): estimate, px units, and unit of each parameter.
     theta: FloatArray
@@ -88,7 +104,8 @@ class FrameScatter:
     dof: int
     steps: FloatArray  # (p + 1, p + 1): products of (1, z) of the estimates without each frame
     scores: FloatArray  # (p, p): products of the frames' slopes, their leverage corrected
-    # `powers` (3, p), `inner` and `middle` (p, p, p): from which the degrees of freedom of `clustered` follow.
+    # `powers` (3, p), `inner` and `middle` (p, p, p): from which the degrees of freedom of
+    # `clustered` follow.
     powers: FloatArray
     inner: FloatArray
     middle: FloatArray
@@ -116,11 +133,13 @@ class FrameScatter:
 
     @property
     def clustered(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Covariance (p, p) of z from the scatter of the frames, and two degrees of freedom (p,) of its diagonal.
+        """Covariance (p, p) of z from the scatter of the frames, and two degrees of freedom (p,) of
+        its diagonal.
 
-        Bell & McCaffrey (2002): residuals of frame k are multiplied by (I - h_k H^-1 h_k^T)^(-1/2), which frees the
-        covariance of what the fit takes up wherever noise is independent. Degrees of freedom are those of a chi-square
-        of the same variance (Satterthwaite), and of the same skewness, which are fewer where frames are uneven.
+        Bell & McCaffrey (2002): residuals of frame k are multiplied by (I - h_k H^-1 h_k^T)^(-1/2),
+        which frees the covariance of what the fit takes up wherever noise is independent. Degrees
+        of freedom are those of a chi-square of the same variance (Satterthwaite), and of the same
+        skewness, which are fewer where frames are uneven.
         """
         trace, square, cube = self.powers
         square = square + np.sum(self.inner**2, axis=(1, 2))
@@ -131,19 +150,26 @@ class FrameScatter:
 
 @dataclass(frozen=True)
 class PartitionSums:
-    """What is known of all residuals of a calibration that has kept those of a sample of its frames."""
+    """What is known of all residuals of a calibration that has kept those of a sample of its
+    frames.
+    """
 
     # `n_stars`, `n_frames`, (n,): stars and frames of each of n partitions.
     n_stars: IntArray
     n_frames: IntArray
-    chi2: FloatArray  # (n,): their sums of squared residuals, px^2 (or in units of the stated noise)
+    chi2: (
+        FloatArray  # (n,): their sums of squared residuals, px^2 (or in units of the stated noise)
+    )
     residuals: ResidualMap  # Residuals of all stars in cells of the detector
-    stated2: float  # Sum of the squared stated noise of all stars, px^2; their number where they state none
+    # Sum of the squared stated noise of all stars, px^2; their number where they state none
+    stated2: float
     n_beyond: int  # Stars with a residual beyond 4.5 standard deviations
     largest: float  # Largest residual along an axis, standard deviations
     largest_frame: int  # Frame of the largest
     richer: tuple[RicherModel, ...] = ()  # Models of which the calibration's is a special case
-    scatter: FrameScatter | None = None  # How all frames scatter about the estimate; None in a calibration of before
+    scatter: FrameScatter | None = (
+        None  # How all frames scatter about the estimate; None in a calibration of before
+    )
 
     @classmethod
     def joined(cls, parts: Sequence[PartitionSums]) -> PartitionSums:

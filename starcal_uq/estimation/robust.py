@@ -1,4 +1,6 @@
-"""Estimation with a Student-t likelihood: a start that wrong stars do not spoil, and the refinement from there."""
+"""Estimation with a Student-t likelihood: a start that wrong stars do not spoil, and the refinement
+from there.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ from starcal_uq.estimation.student import (
 from starcal_uq.maths.linear import unit_inverse
 from starcal_uq.observations.frames import StarFrames
 
-# A star whose angles to the others are this many times worse than the typical star's is left out of the start.
+# A star whose angles to the others are this many times worse than the typical star's is left out of
+# the start.
 _DISTRUST = 5.0
 _ROUNDS = 8
 # Fits of the optics alone come first: distortion is a fraction of a pixel, wrong stars are not.
@@ -37,7 +40,8 @@ _TRUSTED_SHARE = 0.5
 _PARTNERS, _STARS_AT_ONCE, _SEED = 400, 2000, 20170925
 _NEGLIGIBLE_WEIGHT = 1e-9
 _MAX_STEPS = 60
-# Gains, nat, that are worth no further round: a thousandth of a standard deviation, and a two hundredth for the noise.
+# Gains, nat, that are worth no further round: a thousandth of a standard deviation, and a two
+# hundredth for the noise.
 _GAIN = 1e-7
 _SHAPE_GAIN = 1e-5
 _STEP = 0.02
@@ -59,17 +63,19 @@ class RobustStart:
 
 
 def star_scores(frames: StarFrames, model_name: str, theta: FloatArray) -> FloatArray:
-    """Median over other stars of its frame, at most 400, of the error of the angle to them, px, for every star (N,).
+    """Median over other stars of its frame, at most 400, of the error of the angle to them, px, for
+    every star (N,).
 
-    More than half of a frame's angles to a right star are right where more than half of its stars are, whatever the
-    rest is: no attitude is needed, and no single star decides.
+    More than half of a frame's angles to a right star are right where more than half of its stars
+    are, whatever the rest is: no attitude is needed, and no single star decides.
     """
     b = unproject_theta(model_name, theta, frames.pixel.T).T
     scores, rng = np.empty(frames.n_stars), np.random.default_rng(_SEED)
     for start, stop in zip(frames.starts[:-1].tolist(), frames.starts[1:].tolist(), strict=True):
         others = np.arange(start, stop)
         if len(others) > _PARTNERS:
-            # A draw of so many has a majority of right ones as well, and the time does not grow with the square.
+            # A draw of so many has a majority of right ones as well, and the time does not grow
+            # with the square.
             others = np.sort(rng.choice(others, _PARTNERS, replace=False))
         for first in range(start, stop, _STARS_AT_ONCE):
             mine = np.arange(first, min(first + _STARS_AT_ONCE, stop))
@@ -83,7 +89,9 @@ def star_scores(frames: StarFrames, model_name: str, theta: FloatArray) -> Float
 
 
 def usable_stars(frames: StarFrames, model_name: str, theta: FloatArray) -> BoolArray:
-    """Stars of frames in which at least three agree with the others, so that there is an attitude to speak of."""
+    """Stars of frames in which at least three agree with the others, so that there is an attitude
+    to speak of.
+    """
     scores = star_scores(frames, model_name, theta)
     return _in_threes(frames, scores <= _DISTRUST * np.median(scores))
 
@@ -98,11 +106,13 @@ def _in_threes(frames: StarFrames, kept: BoolArray) -> BoolArray:
     return np.asarray(frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0)
 
 
-def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: FitStages) -> RobustStart:
+def robust_start(
+    frames: StarFrames, model_name: str, theta: FloatArray, fit: FitStages
+) -> RobustStart:
     """Alternate between the paper's stages and leaving out stars that do not fit their frame.
 
-    ``fit(frames, all_parameters)`` gives the stages of Ye & Yang 2017, the first one only, or all. CalibrationError
-    when most stars fit neither their frame nor each other.
+    ``fit(frames, all_parameters)`` gives the stages of Ye & Yang 2017, the first one only, or all.
+    CalibrationError when most stars fit neither their frame nor each other.
     """
     trusted = np.zeros(frames.n_stars, dtype=np.bool_)
     # Coefficients start from zero, as in the paper: a nominal distortion is a guess.
@@ -117,7 +127,8 @@ def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: Fi
         used = subset(frames, trusted)
         if used.n_stars < _TRUSTED_SHARE * frames.n_stars:
             raise CalibrationError(
-                f"only {used.n_stars} of {frames.n_stars} stars agree with the others of their frame: "
+                f"only {used.n_stars} of {frames.n_stars} stars agree with the others of their "
+                "frame: "
                 f"{Status.INCONSISTENT.remedy}.",
                 Status.INCONSISTENT,
             )
@@ -125,14 +136,19 @@ def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: Fi
         at = stages[-1].theta
         if not stages[-1].status.ok:
             raise CalibrationError(
-                f"the calibration did not end well ({stages[-1].status.name}): {stages[-1].status.remedy}.",
+                (
+                    f"the calibration did not end well ({stages[-1].status.name}): "
+                    f"{stages[-1].status.remedy}."
+                ),
                 stages[-1].status,
             )
     weight = np.where(trusted | ~_in_threes(frames, trusted), 1.0, _NEGLIGIBLE_WEIGHT)
     if frames.weight is not None:
         weight = weight * frames.weight**2
     b = unproject_theta(model_name, at, frames.pixel.T)
-    rotations = quest(b, frames.r.T, frames.starts, weight, covariance=False, on_degenerate="flag").rotations
+    rotations = quest(
+        b, frames.r.T, frames.starts, weight, covariance=False, on_degenerate="flag"
+    ).rotations
     return RobustStart(stages, trusted, subset(frames, trusted), rotations)
 
 
@@ -146,14 +162,17 @@ class RobustFit:
     # `sigma`, `nu`: scale and degrees of freedom.
     sigma: float
     nu: float
-    # `sigma_std`, `nu_std`: standard errors of both; `nu_std` is 0 where nu was given, and not finite at a bound.
+    # `sigma_std`, `nu_std`: standard errors of both; `nu_std` is 0 where nu was given, and not
+    # finite at a bound.
     sigma_std: float
     nu_std: float
     information: Information  # Derivatives at the maximum
 
     @property
     def covariance(self) -> FloatArray:
-        """Sandwich covariance (p, p): observed information around the scatter of the stars' scores."""
+        """Sandwich covariance (p, p): observed information around the scatter of the stars'
+        scores.
+        """
         p = len(self.information.score)
         n = 2 * int(np.sum(self.state.seen))
         inverse, scale = unit_inverse(self.information.matrix)
@@ -163,17 +182,25 @@ class RobustFit:
 
 
 def refine(
-    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, nu: float | None, max_iterations: int
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    nu: float | None,
+    max_iterations: int,
 ) -> RobustFit:
     """Maximise the Student-t likelihood over theta, sigma and, where it is None, nu.
 
-    Camera and shape of the noise are nearly independent (one is odd in the residuals, the other even), so that
-    Newton's method on one and the other in turn converges in a few rounds. A free nu has the prior of
-    `starcal_uq.estimation.student.log_excess_prior`, without which clean data would send it to infinity.
+    Camera and shape of the noise are nearly independent (one is odd in the residuals, the other
+    even), so that Newton's method on one and the other in turn converges in a few rounds. A free nu
+    has the prior of `starcal_uq.estimation.student.log_excess_prior`, without which clean data
+    would send it to infinity.
     """
     began = perf_counter()
     theta = np.array(theta, dtype=np.float64)
-    likelihood = StudentLikelihood(frames, model_name, theta, rotations, usable_stars(frames, model_name, theta))
+    likelihood = StudentLikelihood(
+        frames, model_name, theta, rotations, usable_stars(frames, model_name, theta)
+    )
     free = nu is None
     nu = DEFAULT_DOF if nu is None else nu
     # The scale from the middle of the residuals; the state's sigma enters only through the weights.
@@ -209,9 +236,18 @@ def refine(
     likelihood.follow(theta, state, information)
     costs.append(-2.0 * state.value)
     trajectory, costs = trajectory[: len(costs)], costs[: len(trajectory)]
-    stage = Stage("refinement", np.array(trajectory), np.array(costs), status, evaluations, perf_counter() - began)
+    stage = Stage(
+        "refinement",
+        np.array(trajectory),
+        np.array(costs),
+        status,
+        evaluations,
+        perf_counter() - began,
+    )
     with np.errstate(all="ignore"):
-        errors = np.sqrt(np.diag(np.linalg.inv(-shape))) if np.any(shape) else np.full(1 + free, np.nan)
+        errors = (
+            np.sqrt(np.diag(np.linalg.inv(-shape))) if np.any(shape) else np.full(1 + free, np.nan)
+        )
     return RobustFit(
         stage=stage,
         likelihood=likelihood,
@@ -232,7 +268,9 @@ def _step(
     state: StudentState,
     information: Information,
 ) -> tuple[FloatArray, float]:
-    """Newton's step where the observed information allows it, the reweighted one elsewhere; halved until it gains."""
+    """Newton's step where the observed information allows it, the reweighted one elsewhere; halved
+    until it gains.
+    """
     scale = 1.0 / np.sqrt(np.diag(information.reweighted))
     observed = information.matrix * np.outer(scale, scale)
     reweighted = information.reweighted * np.outer(scale, scale)
@@ -250,11 +288,18 @@ def _step(
     return theta, 0.0
 
 
-def _volume_step(likelihood: StudentLikelihood, theta: FloatArray, sigma: float, nu: float) -> FloatArray:
-    """One Newton step for the volume of the attitudes, which the scores leave out: a few tenths of a sigma."""
+def _volume_step(
+    likelihood: StudentLikelihood, theta: FloatArray, sigma: float, nu: float
+) -> FloatArray:
+    """One Newton step for the volume of the attitudes, which the scores leave out: a few tenths of
+    a sigma.
+    """
     information = likelihood.information(theta, likelihood.state(theta, sigma, nu), sigma)
     sd = 1.0 / np.sqrt(np.diag(information.matrix))
-    ends = [[likelihood.log_likelihood(theta + s * e, sigma, nu) for e in _STEP * np.diag(sd)] for s in (1.0, -1.0)]
+    ends = [
+        [likelihood.log_likelihood(theta + s * e, sigma, nu) for e in _STEP * np.diag(sd)]
+        for s in (1.0, -1.0)
+    ]
     slope = (np.array(ends[0]) - np.array(ends[1])) / (2.0 * _STEP)
     moved: FloatArray = theta + sd * np.linalg.solve(information.matrix * np.outer(sd, sd), slope)
     return moved if np.isfinite(moved).all() else theta
@@ -263,7 +308,9 @@ def _volume_step(likelihood: StudentLikelihood, theta: FloatArray, sigma: float,
 def _shape_step(
     likelihood: StudentLikelihood, theta: FloatArray, sigma: float, nu: float, free: bool
 ) -> tuple[float, float, FloatArray, float]:
-    """One Newton step in log sigma and, if free, log(nu - 2); also the Hessian and the gain that was promised."""
+    """One Newton step in log sigma and, if free, log(nu - 2); also the Hessian and the gain that
+    was promised.
+    """
     bound, highest = DOF_RANGE
     start = np.log([sigma, max(nu - bound, _LEAST_EXCESS)]) if free else np.log([sigma])
     d = len(start)
@@ -297,7 +344,12 @@ def _shape_step(
         if density(trial) >= value - 1e-9:
             moved = trial - start
             gain = 0.5 * abs(float(moved @ hessian @ moved))
-            return float(np.exp(trial[0])), bound + float(np.exp(trial[1])) if free else nu, hessian, gain
+            return (
+                float(np.exp(trial[0])),
+                bound + float(np.exp(trial[1])) if free else nu,
+                hessian,
+                gain,
+            )
         step = 0.5 * step
     return sigma, nu, hessian, 0.0
 
@@ -305,7 +357,8 @@ def _shape_step(
 def compress_reweighted(fit: RobustFit) -> CompressedLikelihood:
     """The Gaussian likelihood whose stars have the weights of the fit, compressed around it.
 
-    Its maximum is that of the Student t; it treats the weights as known. Stars without weight are left out.
+    Its maximum is that of the Student t; it treats the weights as known. Stars without weight are
+    left out.
     """
     frames, theta = fit.likelihood.frames, fit.stage.theta
     kept = fit.state.weight > _NEGLIGIBLE_WEIGHT
@@ -313,5 +366,7 @@ def compress_reweighted(fit: RobustFit) -> CompressedLikelihood:
     stated = np.ones(frames.n_stars) if frames.weight is None else frames.weight
     weight = (stated * np.sqrt(fit.state.weight))[remaining]
     rotations = fit.state.rotations[frames.sum(remaining.astype(np.float64)) > 0.0]
-    likelihood = MarginalLikelihood(replace(frames.select(remaining), weight=weight), fit.likelihood.model_name)
+    likelihood = MarginalLikelihood(
+        replace(frames.select(remaining), weight=weight), fit.likelihood.model_name
+    )
     return compress(likelihood, theta, fit.covariance, rotations)

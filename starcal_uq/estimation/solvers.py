@@ -1,8 +1,10 @@
-"""Least-squares solvers: Levenberg-Marquardt on normal equations and MINPACK; IPOPT stands in `ipopt`.
+"""Least-squares solvers: Levenberg-Marquardt on normal equations and MINPACK; IPOPT stands in
+`ipopt`.
 
-The Levenberg-Marquardt iteration is that of More (1978), "The Levenberg-Marquardt algorithm: implementation and
-theory", which MINPACK implements on the full Jacobian; here the trust-region step is found from the p x p normal
-equations, so that an objective over any number of residuals costs what one evaluation of its sums costs.
+The Levenberg-Marquardt iteration is that of More (1978), "The Levenberg-Marquardt algorithm:
+implementation and theory", which MINPACK implements on the full Jacobian; here the trust-region
+step is found from the p x p normal equations, so that an objective over any number of residuals
+costs what one evaluation of its sums costs.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ _INITIAL_BOUND = 100.0
 _SINGULAR = 1e-13
 # Relative change of a cost that is rounding and nothing else.
 _ROUNDING = 1e-10
-# A step this small against the parameters is none, whatever the cost does: data without noise end here.
+# A step this small against the parameters is none, whatever the cost does: data without noise end
+# here.
 _NEGLIGIBLE = 1e-10
 _EPS, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 
@@ -57,12 +60,15 @@ class Constraints:
     # `lower`, `upper`, (p,): bounds.
     lower: FloatArray
     upper: FloatArray
-    # From a CasADi vector of parameters to a CasADi vector that must stay positive (monotonic distortion).
+    # From a CasADi vector of parameters to a CasADi vector that must stay positive (monotonic
+    # distortion).
     positive: Callable[[Any], Any] | None = None
 
 
 def _scaled_step(normal: Normal, scale: FloatArray, bound: float) -> tuple[FloatArray, float]:
-    """Minimise the Gauss-Newton model within ``|D p| <= bound``; returns the step and More's parameter."""
+    """Minimise the Gauss-Newton model within ``|D p| <= bound``; returns the step and More's
+    parameter.
+    """
     matrix = normal.matrix / (scale[:, None] * scale)
     values, vectors = np.linalg.eigh(matrix)
     # Rounding can leave a singular direction slightly negative.
@@ -85,7 +91,8 @@ def _scaled_step(normal: Normal, scale: FloatArray, bound: float) -> tuple[Float
                 lower = damping
             else:
                 upper = damping
-            # Newton's method on 1 / length, which is nearly linear in the damping (More 1978, eq. 5.5).
+            # Newton's method on 1 / length, which is nearly linear in the damping (More 1978, eq.
+            # 5.5).
             slope_of_length = -float(np.sum(slope**2 / (values + damping) ** 3)) / size
             damping -= (size / bound) * (size - bound) / slope_of_length
             if not lower < damping < upper:
@@ -107,7 +114,8 @@ def levenberg_marquardt(
     `max_iterations`: most accepted and refused steps.
     `tolerance`: converged when the predicted relative reduction of the cost is below this.
     `step_tolerance`: converged when the trust region is this small against the scaled parameters.
-    `last`: what becomes of a full step that promises no more than `tolerance`: it is taken and the model evaluated
+    `last`: what becomes of a full step that promises no more than `tolerance`: it is taken and the
+    model evaluated
         there, taken without that, or left to what follows.
     It ends CONVERGED, MAX_ITERATIONS, SINGULAR, STALLED or NOT_FINITE.
     """
@@ -179,12 +187,16 @@ def levenberg_marquardt(
 
 
 def _lengths(matrix: FloatArray) -> FloatArray:
-    """Lengths (p,) of the Jacobian's columns; zero where attitudes take one up, but for rounding."""
+    """Lengths (p,) of the Jacobian's columns; zero where attitudes take one up, but for
+    rounding.
+    """
     return np.sqrt(np.maximum(matrix.diagonal(), 0.0))
 
 
 def _newton_length(normal: Normal, scale: FloatArray) -> float:
-    """Length of the undamped step in scaled parameters: what separates the point from its optimum."""
+    """Length of the undamped step in scaled parameters: what separates the point from its
+    optimum.
+    """
     return float(np.linalg.norm(scale * _scaled_step(normal, scale, np.inf)[0]))
 
 
@@ -197,12 +209,14 @@ def is_singular(matrix: FloatArray) -> bool:
     return bool(values[0] < 1e-12 * values[-1])
 
 
-def minpack(residuals: Residuals, evaluate: Evaluate, start: FloatArray, *, max_iterations: int = 200) -> Solution:
+def minpack(
+    residuals: Residuals, evaluate: Evaluate, start: FloatArray, *, max_iterations: int = 200
+) -> Solution:
     """Minimise a sum of squares with MINPACK's ``lmder`` on explicit residuals.
 
     `residuals`: ``theta -> (r (n,), J (n, p))``.
-    `evaluate`: function that gives the same cost as normal equations, for the final state and the trajectory.
-    `max_iterations`: most evaluations of the residuals.
+    `evaluate`: function that gives the same cost as normal equations, for the final state and the
+    trajectory. `max_iterations`: most evaluations of the residuals.
     """
     from scipy.optimize import leastsq
 

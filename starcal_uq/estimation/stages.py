@@ -1,4 +1,6 @@
-"""The steps of a calibration: the three stages of Ye & Yang 2017, and the refinement on the marginal likelihood."""
+"""The steps of a calibration: the three stages of Ye & Yang 2017, and the refinement on the
+marginal likelihood.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +20,24 @@ from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.loops import attitude_loop, kernels
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.solvers import Constraints, Last, Normal, Solution, levenberg_marquardt, minpack
+from starcal_uq.estimation.solvers import (
+    Constraints,
+    Last,
+    Normal,
+    Solution,
+    levenberg_marquardt,
+    minpack,
+)
 from starcal_uq.estimation.sums import Descent
 from starcal_uq.observations.frames import StarFrames
 
-# Relative gain that the last step of a pair stage promises: 1e-4 sigma or less for 30,000 residuals.
+# Relative gain that the last step of a pair stage promises: 1e-4 sigma or less for 30,000
+# residuals.
 PAIR_TOLERANCE = 1e-13
 # The estimate itself is taken to rounding, so that every start ends in the same digits.
 REFINEMENT_TOLERANCE = 1e-18
-# What a start value for the principal point needs: places to try in widths and heights, on so many stars.
+# What a start value for the principal point needs: places to try in widths and heights, on so many
+# stars.
 _HELD_TOLERANCE = 1e-6
 _GRID = 0.25 * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
 _GRID_STARS, _GRID_ITERATIONS = 20_000, 12
@@ -41,14 +52,15 @@ class Stage:
     Attributes
     ----------
     name : str
-        ``optics``, ``distortion``, ``all`` (the paper's three), ``refinement``, ``stars``, or ``filter`` (recursive
-        methods).
+        ``optics``, ``distortion``, ``all`` (the paper's three), ``refinement``, ``stars``, or
+        ``filter`` (recursive methods).
     trajectory : (n, p) array
         Estimates after each iteration, px units, the start first; of a filter, after each frame.
     cost : (n,) array
-        The stage's own cost along the trajectory: rad^2 over pairs, px^2 in the linear stage and the refinement; of a
-        filter, the sum of its whitened innovations so far, px^2 (or in units of the stated noise). Where the first
-        steps were taken on a sample of the frames, their costs are scaled to all.
+        The stage's own cost along the trajectory: rad^2 over pairs, px^2 in the linear stage and
+        the refinement; of a filter, the sum of its whitened innovations so far, px^2 (or in units
+        of the stated noise). Where the first steps were taken on a sample of the frames, their
+        costs are scaled to all.
     status : Status
         How it ended.
     evaluations : int
@@ -56,8 +68,8 @@ class Stage:
     seconds : float
         Wall time.
     sigmas : (n, p) array or None
-        Standard deviations that a filter claims after each frame, px units; zero where a parameter is not
-        estimated.
+        Standard deviations that a filter claims after each frame, px units; zero where a parameter
+        is not estimated.
     """
 
     name: str
@@ -83,7 +95,9 @@ class Stage:
 
 
 def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
-    """Principal point on the detector, positive focal length and monotonic distortion over the field."""
+    """Principal point on the detector, positive focal length and monotonic distortion over the
+    field.
+    """
     p = len(camera.theta)
     lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
     lower[:3] = (0.0, 0.0, 0.01 * camera.focal_px)
@@ -91,7 +105,9 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
     if n_parameters < p:
         return Constraints(lower[:n_parameters], upper[:n_parameters])
     radius = camera.half_diagonal_px
-    return Constraints(lower, upper, lambda theta: monotonic_expression(camera.distortion, theta, radius))
+    return Constraints(
+        lower, upper, lambda theta: monotonic_expression(camera.distortion, theta, radius)
+    )
 
 
 def _solve(
@@ -110,8 +126,12 @@ def _solve(
         constraints = constraints_for(camera, objective.n_parameters)
         return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)
     if solver == "minpack" and objective.n_pairs <= MAX_EXPLICIT_PAIRS:
-        return minpack(objective.residuals, objective.evaluate, start, max_iterations=max_iterations)
-    return levenberg_marquardt(objective.evaluate, start, max_iterations=max_iterations, tolerance=tolerance, last=last)
+        return minpack(
+            objective.residuals, objective.evaluate, start, max_iterations=max_iterations
+        )
+    return levenberg_marquardt(
+        objective.evaluate, start, max_iterations=max_iterations, tolerance=tolerance, last=last
+    )
 
 
 def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
@@ -129,7 +149,9 @@ def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
 
 
 def begun_on_sample(sample: Stage, whole: Stage, scale: float) -> Stage:
-    """One stage of two: its way on a sample of the frames, with costs times `scale`, and then on all."""
+    """One stage of two: its way on a sample of the frames, with costs times `scale`, and then on
+    all.
+    """
     return Stage(
         name=sample.name,
         trajectory=np.concatenate([sample.trajectory[:-1], whole.trajectory]),
@@ -152,11 +174,17 @@ def optics_stage(
     objective = PairObjective(frames, "none")
     start = np.array(camera.theta[:3])
     zeros = np.zeros(len(camera.theta) - 3)
-    return _timed("optics", lambda: _solve(objective, start, camera, solver, max_iterations, tolerance, last), zeros)
+    return _timed(
+        "optics",
+        lambda: _solve(objective, start, camera, solver, max_iterations, tolerance, last),
+        zeros,
+    )
 
 
 def focal_stage(frames: StarFrames, camera: Camera, max_iterations: int) -> Stage:
-    """Stage 1 for stars that do not determine the principal point without distortion: f alone, on positions."""
+    """Stage 1 for stars that do not determine the principal point without distortion: f alone, on
+    positions.
+    """
     own = MarginalLikelihood(frames, "none")
     zeros = np.zeros(len(camera.theta) - 3)
     return _timed("optics", lambda: _held(own, camera.theta[:3], max_iterations), zeros)
@@ -165,14 +193,18 @@ def focal_stage(frames: StarFrames, camera: Camera, max_iterations: int) -> Stag
 def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> Stage:
     """Stage 2: the coefficients by linear least squares at fixed optics (the paper's section 2.2).
 
-    Ideal points need attitudes, which come from QUEST with the stage-1 optics. The attitudes and f have absorbed much
-    of the distortion by then, so that this is a start value and nothing else.
+    Ideal points need attitudes, which come from QUEST with the stage-1 optics. The attitudes and f
+    have absorbed much of the distortion by then, so that this is a start value and nothing else.
     """
     began = perf_counter()
     model = get_model(camera.distortion)
     f = theta[2]
     offset = frames.pixel - theta[:2, None]
-    found = attitude_loop(frames, "none", theta[:3]) if kernels("none", frames.n_stars) == "numba" else None
+    found = (
+        attitude_loop(frames, "none", theta[:3])
+        if kernels("none", frames.n_stars) == "numba"
+        else None
+    )
     if found is not None and found[1]:
         rotations = found[0]
     else:
@@ -181,17 +213,24 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
         rotations = quest(b, frames.r.T, frames.starts, covariance=False).rotations
     b = frames.rotated(rotations)
     ideal = f * b[:2] / b[2]
-    # Every model is linear in its coefficients; forward models act on ideal points, inverse ones on measured points.
+    # Every model is linear in its coefficients; forward models act on ideal points, inverse ones on
+    # measured points.
     forward = model.direction == "forward"
     at, target = (ideal, offset - ideal) if forward else (offset, ideal - offset)
     n = len(model.coefficients)
-    design = np.array([model.displacement(at[0], at[1], tuple(unit)) for unit in np.eye(n)]).reshape(n, -1)
+    design = np.array(
+        [model.displacement(at[0], at[1], tuple(unit)) for unit in np.eye(n)]
+    ).reshape(n, -1)
     matrix, shift = design @ design.T, design @ target.ravel()
     scale = np.sqrt(np.diag(matrix))
     k = np.linalg.lstsq(matrix / np.outer(scale, scale), shift / scale, rcond=None)[0] / scale
     cost = [float(np.sum(target**2)), float(np.sum((target.ravel() - k @ design) ** 2))]
-    trajectory = np.array([np.concatenate([theta[:3], np.zeros(n)]), np.concatenate([theta[:3], k])])
-    return Stage("distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began)
+    trajectory = np.array(
+        [np.concatenate([theta[:3], np.zeros(n)]), np.concatenate([theta[:3], k])]
+    )
+    return Stage(
+        "distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began
+    )
 
 
 def joint_stage(
@@ -218,31 +257,42 @@ def refinement_stage(
     tolerance: float = REFINEMENT_TOLERANCE,
     last: Last = "seen",
 ) -> Stage:
-    """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao bound.
+    """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao
+    bound.
 
     The attitudes move along; `likelihood` starts its later searches from where they end.
     """
-    return _timed("refinement", lambda: _descended(likelihood, theta, max_iterations, tolerance, last), np.zeros(0))
+    return _timed(
+        "refinement",
+        lambda: _descended(likelihood, theta, max_iterations, tolerance, last),
+        np.zeros(0),
+    )
 
 
 def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations: int) -> Stage:
-    """As `refinement_stage`, from a data sheet: focal length and coefficients first, then all parameters.
+    """As `refinement_stage`, from a data sheet: focal length and coefficients first, then all
+    parameters.
 
-    In a narrow field the principal point hardly matters until the others fit. Moved together with a focal length that
-    is per cent off it leaves along a valley, where the tilt of the field and the coma of the distortion make up for
-    each other. The others are fitted with the principal point held where the data sheet has it and at eight places
-    around; where they fit best, all are set free.
+    In a narrow field the principal point hardly matters until the others fit. Moved together with a
+    focal length that is per cent off it leaves along a valley, where the tilt of the field and the
+    coma of the distortion make up for each other. The others are fitted with the principal point
+    held where the data sheet has it and at eight places around; where they fit best, all are set
+    free.
     """
 
     def run() -> Solution:
         theta = camera.theta
         first = _held(likelihood, theta, max_iterations)
         best = first
-        few = likelihood.frames.part(0, max(1, int(np.searchsorted(likelihood.frames.starts, _GRID_STARS)) - 1))
+        few = likelihood.frames.part(
+            0, max(1, int(np.searchsorted(likelihood.frames.starts, _GRID_STARS)) - 1)
+        )
         trial = MarginalLikelihood(few, likelihood.model_name)
         costs = [_held(trial, first.theta, _GRID_ITERATIONS).normal.cost]
         for shift in _GRID:
-            moved = np.concatenate([theta[:2] + shift * (camera.width_px, camera.height_px), first.theta[2:]])
+            moved = np.concatenate(
+                [theta[:2] + shift * (camera.width_px, camera.height_px), first.theta[2:]]
+            )
             there = _held(trial, moved, _GRID_ITERATIONS)
             costs.append(there.normal.cost)
             if costs[-1] == min(costs):
@@ -260,22 +310,32 @@ def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations:
 
 
 def _held(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Solution:
-    """The best focal length and coefficients for the principal point of theta (p,), from QUEST's attitudes."""
+    """The best focal length and coefficients for the principal point of theta (p,), from QUEST's
+    attitudes.
+    """
     descent = Descent(likelihood.frames, likelihood.model_name, likelihood.start_rotations(theta))
 
     def evaluate(rest: FloatArray) -> Normal:
         normal = descent.evaluate(np.concatenate([theta[:2], rest]))
         return Normal(normal.cost, normal.gradient[2:], normal.matrix[2:, 2:])
 
-    found = levenberg_marquardt(evaluate, theta[2:], max_iterations=max_iterations, tolerance=_HELD_TOLERANCE)
+    found = levenberg_marquardt(
+        evaluate, theta[2:], max_iterations=max_iterations, tolerance=_HELD_TOLERANCE
+    )
     trajectory = np.hstack([np.tile(theta[:2], (len(found.costs), 1)), found.trajectory])
     return replace(found, theta=trajectory[-1], trajectory=trajectory)
 
 
 def _descended(
-    likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int, tolerance: float, last: Last = "seen"
+    likelihood: MarginalLikelihood,
+    theta: FloatArray,
+    max_iterations: int,
+    tolerance: float,
+    last: Last = "seen",
 ) -> Solution:
-    """The minimum of the likelihood's sum of squares, near whose attitudes its later searches start."""
+    """The minimum of the likelihood's sum of squares, near whose attitudes its later searches
+    start.
+    """
     best = likelihood.last_sums
     start = best[1].rotations if best is not None else likelihood.rotations
     start = likelihood.start_rotations(theta) if start is None else start

@@ -1,16 +1,18 @@
 """Attitude-marginalised Student-t likelihood: a wrong star costs a little, not everything.
 
-The two whitened residuals of a star are one draw from a bivariate t with nu degrees of freedom and scale sigma,
+The two whitened residuals of a star are one draw from a bivariate t with nu degrees of freedom and
+scale sigma,
 
     log p(e) = -(nu + 2) / 2 log(1 + |e|^2 / (nu sigma^2)) - 2 log sigma + const,
 
-whose constant does not depend on nu in two dimensions. It is bivariate and not one t per axis, because a wrong
-identification spoils both axes, and because the result must not depend on how the axes are turned. Equivalently, each
-star has its own noise with a gamma-distributed precision; the mean precision given the residual is the weight
-``w = (nu + 2) / (nu + |e|^2 / sigma^2)`` of iteratively reweighted least squares (Lange, Little & Taylor 1989).
+whose constant does not depend on nu in two dimensions. It is bivariate and not one t per axis,
+because a wrong identification spoils both axes, and because the result must not depend on how the
+axes are turned. Equivalently, each star has its own noise with a gamma-distributed precision; the
+mean precision given the residual is the weight ``w = (nu + 2) / (nu + |e|^2 / sigma^2)`` of
+iteratively reweighted least squares (Lange, Little & Taylor 1989).
 
-Attitudes are integrated out by Laplace's method at the best attitude of every frame, with the observed curvature
-``Omega = w (1 - 2 e e^T / (nu sigma^2 + |e|^2))`` of every star.
+Attitudes are integrated out by Laplace's method at the best attitude of every frame, with the
+observed curvature ``Omega = w (1 - 2 e e^T / (nu sigma^2 + |e|^2))`` of every star.
 """
 
 from __future__ import annotations
@@ -25,29 +27,39 @@ from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
 
-# Below two degrees of freedom a t has no variance, and attitudes of frames with doubtful stars have no curvature.
+# Below two degrees of freedom a t has no variance, and attitudes of frames with doubtful stars have
+# no curvature.
 DOF_RANGE = (2.0, 200.0)
-# Wrong stars may lie a thousand sigma away, which no t distribution worth the name produces: free degrees of freedom go
-# down to 2 to take them in, and intervals widen by a third. With 4 they widen by 15 %, whatever the stars are.
+# Wrong stars may lie a thousand sigma away, which no t distribution worth the name produces: free
+# degrees of freedom go down to 2 to take them in, and intervals widen by a third. With 4 they widen
+# by 15 %, whatever the stars are.
 DEFAULT_DOF = 4.0
 _ATTITUDE_STEPS = 60
-# Expected gain of a further attitude step in any frame, nat; it is added to the value, so that its square remains.
+# Expected gain of a further attitude step in any frame, nat; it is added to the value, so that its
+# square remains.
 _GAIN = 1e-7
-# What is good enough after so many steps: where one maximum is about to vanish into another, they get very slow.
+# What is good enough after so many steps: where one maximum is about to vanish into another, they
+# get very slow.
 _ENOUGH, _SLOW_STEPS = 1e-4, 12
-# A frame takes Newton's step where that promises less than this, nat, and the slower step that never overshoots before.
+# A frame takes Newton's step where that promises less than this, nat, and the slower step that
+# never overshoots before.
 _NEWTON_GAIN = 1.0
-# Share of the reweighted determinant below which the observed curvature is not one (few stars, all of them doubtful).
+# Share of the reweighted determinant below which the observed curvature is not one (few stars, all
+# of them doubtful).
 _CURVED = 1e-2
-# Stars whose ideal place lies this many times farther out than any measured one cannot be in the field: they are no
-# tail of the noise, a polynomial distortion knows nothing of them, and they are left out.
+# Stars whose ideal place lies this many times farther out than any measured one cannot be in the
+# field: they are no tail of the noise, a polynomial distortion knows nothing of them, and they are
+# left out.
 _OUT_OF_FIELD = 1.5
-# Points are evaluated together as long as their stars are no more than these: their columns then stay in the cache.
+# Points are evaluated together as long as their stars are no more than these: their columns then
+# stay in the cache.
 _STARS_AT_ONCE = 8192
 
 
 def parse_dof(dof: float | str | None, error: type[Exception]) -> float | None:
-    """The degrees of freedom of a setting: None for "free", `DEFAULT_DOF` for None, else a number in `DOF_RANGE`."""
+    """The degrees of freedom of a setting: None for "free", `DEFAULT_DOF` for None, else a number
+    in `DOF_RANGE`.
+    """
     low, high = DOF_RANGE
     if dof is None:
         return DEFAULT_DOF
@@ -59,7 +71,9 @@ def parse_dof(dof: float | str | None, error: type[Exception]) -> float | None:
 
 
 def log_excess_prior(log_excess: FloatArray) -> FloatArray:
-    """Log prior density of log(nu - 2), where nu - 2 is gamma: shape 2, rate 0.1 (after Juarez & Steel 2010)."""
+    """Log prior density of log(nu - 2), where nu - 2 is gamma: shape 2, rate 0.1 (after Juarez &
+    Steel 2010).
+    """
     return np.asarray(2.0 * log_excess - 0.1 * np.exp(log_excess))
 
 
@@ -68,19 +82,25 @@ class StudentState:
     """The model at the best attitude of every frame."""
 
     value: float  # Log likelihood; -inf where no attitude is a maximum
-    log_volume: float  # The part of it that is the volume of the attitudes, ``-1/2 sum_k log |A^T Omega A|``
+    # The part of it that is the volume of the attitudes, ``-1/2 sum_k log |A^T Omega A|``
+    log_volume: float
     rotations: FloatArray  # (K, 3, 3): R_cam_icrs
     b: FloatArray  # (3, N): catalogue directions in the camera frame
     e: FloatArray  # (2, N): residuals, divided by the stated noise where there is one
-    attitude: FloatArray  # (3, 2, N): derivative of the whitened prediction with respect to the frame's rotation vector
+    # (3, 2, N): derivative of the whitened prediction with respect to the frame's rotation vector
+    attitude: FloatArray
     weight: FloatArray  # (N,): w
-    radial: FloatArray  # (N,): ``2 w / (nu sigma^2 + |e|^2)``: what Omega lacks along e, per squared residual
+    # (N,): ``2 w / (nu sigma^2 + |e|^2)``: what Omega lacks along e, per squared residual
+    radial: FloatArray
     inverse: FloatArray  # (3, 3, K): inverse of ``A^T Omega A`` per frame
-    seen: BoolArray  # (N,): false for stars that cannot be in the field, and in frames without two that can
+    # (N,): false for stars that cannot be in the field, and in frames without two that can
+    seen: BoolArray
 
     @property
     def dof(self) -> int:
-        """Independent numbers in the data after the attitudes: ``sum_k (2 m_k - 3)`` over the stars seen."""
+        """Independent numbers in the data after the attitudes: ``sum_k (2 m_k - 3)`` over the stars
+        seen.
+        """
         return 2 * int(np.sum(self.seen)) - 3 * int(np.sum(self.inverse[0, 0] > 0.0))
 
 
@@ -88,8 +108,8 @@ class StudentLikelihood:
     """Exact log likelihood of a table of observations.
 
     `theta` (p,): parameters near to the ones to evaluate, px units; they say how wide the field is.
-    `rotations` (K, 3, 3): attitudes to start from: good to a fraction of a degree, and not led astray by wrong stars.
-    `usable` (N,): stars of frames that have an attitude; all by default.
+    `rotations` (K, 3, 3): attitudes to start from: good to a fraction of a degree, and not led
+    astray by wrong stars. `usable` (N,): stars of frames that have an attitude; all by default.
     """
 
     def __init__(
@@ -107,14 +127,19 @@ class StudentLikelihood:
         self._seen = frames.rotated(rotations)[2] > 1.0 / np.hypot(1.0, far / theta[2])
         if usable is not None:
             self._seen &= usable
-        self._origin, self._rotations, self._turns = theta, rotations, np.zeros((3, len(theta), frames.n_frames))
+        self._origin, self._rotations, self._turns = (
+            theta,
+            rotations,
+            np.zeros((3, len(theta), frames.n_frames)),
+        )
         self._copies = frames
 
     def follow(self, theta: FloatArray, state: StudentState, information: Information) -> None:
-        """Start later searches at the attitudes that follow, to first order, from those of a state at theta.
+        """Start later searches at the attitudes that follow, to first order, from those of a state
+        at theta.
 
-        A frame with doubtful stars can have several attitudes that are maxima: searches from afar end now in one and
-        now in another, and the likelihood jumps.
+        A frame with doubtful stars can have several attitudes that are maxima: searches from afar
+        end now in one and now in another, and the likelihood jumps.
         """
         self._origin, self._rotations, self._turns = theta, state.rotations, information.turns
 
@@ -136,10 +161,16 @@ class StudentLikelihood:
         """Log likelihood (n,) at theta (n, p), sigma (n,) and nu (n,)."""
         n = max(1, _STARS_AT_ONCE // self.frames.n_stars)
         parts = [slice(i, i + n) for i in range(0, len(theta), n)]
-        return np.concatenate([self._search(theta[i], sigma[i], nu[i])[0].sum(axis=1) for i in parts])
+        return np.concatenate(
+            [self._search(theta[i], sigma[i], nu[i])[0].sum(axis=1) for i in parts]
+        )
 
-    def _search(self, theta: FloatArray, sigma: FloatArray, nu: FloatArray) -> tuple[FloatArray, StudentState]:
-        """Log likelihood (n, K) at the best attitudes of n points, and the model of the points that took longest."""
+    def _search(
+        self, theta: FloatArray, sigma: FloatArray, nu: FloatArray
+    ) -> tuple[FloatArray, StudentState]:
+        """Log likelihood (n, K) at the best attitudes of n points, and the model of the points that
+        took longest.
+        """
         k, left = self.frames.n_frames, np.arange(len(theta))
         values = np.full((len(theta), k), -np.inf)
         # Squares of sigma may overflow.
@@ -168,7 +199,8 @@ class StudentLikelihood:
     def _step(
         self, theta: FloatArray, sigma: FloatArray, nu: FloatArray, rotations: FloatArray
     ) -> tuple[FloatArray, StudentState, FloatArray, FloatArray]:
-        """Log likelihood (nK,) and model of n points at given attitudes, the next step (3, nK), the gain (nK,) of it.
+        """Log likelihood (nK,) and model of n points at given attitudes, the next step (3, nK), the
+        gain (nK,) of it.
 
         Stars and frames are those of the first point, then those of the second, and so on.
         """
@@ -177,7 +209,9 @@ class StudentLikelihood:
             # Numbers that all stars share keep arithmetic cheap.
             point, scale, frame_scale, freedom = theta[0], sigma[0], sigma[0], nu[0]
         else:
-            point, scale, freedom = (np.repeat(x.T, self.frames.n_stars, axis=-1) for x in (theta, sigma, nu))
+            point, scale, freedom = (
+                np.repeat(x.T, self.frames.n_stars, axis=-1) for x in (theta, sigma, nu)
+            )
             frame_scale = np.repeat(sigma, k)
         b = frames.rotated(rotations)
         xy, a = forward_kernel(self.model_name, "attitude")(
@@ -196,16 +230,21 @@ class StudentLikelihood:
         radial = 2.0 * weight / (freedom * scale**2 + square)
         d = np.stack([_dot(along, e) for along in a])
         slope = frames.sum(weight * d)
-        reweighted = frames.sum(np.stack([weight * _dot(a[i], a[j]) for i, j in zip(ROWS, COLUMNS, strict=True)]))
+        reweighted = frames.sum(
+            np.stack([weight * _dot(a[i], a[j]) for i, j in zip(ROWS, COLUMNS, strict=True)])
+        )
         observed = reweighted - frames.sum(_lacking(radial, d))
         safe, safe_determinant = inverse_symmetric(reweighted)
         inverse, determinant = inverse_symmetric(observed)
         xx, xy_, _, yy, _, _ = observed
         curved = (xx > 0.0) & (xx * yy > xy_ * xy_) & (determinant > _CURVED * safe_determinant)
         if not curved.all():
-            # Doubtful stars bend the cost the other way: they are counted as flat, in frames that need it.
+            # Doubtful stars bend the cost the other way: they are counted as flat, in frames that
+            # need it.
             flat = np.minimum(radial, weight / np.maximum(square, np.finfo(float).tiny))
-            milder, milder_determinant = inverse_symmetric(reweighted - frames.sum(_lacking(flat, d)))
+            milder, milder_determinant = inverse_symmetric(
+                reweighted - frames.sum(_lacking(flat, d))
+            )
             usable = ~curved & (milder_determinant > _CURVED * safe_determinant)
             inverse = np.where(usable, milder, inverse)
             determinant = np.where(usable, milder_determinant, determinant)
@@ -221,14 +260,20 @@ class StudentLikelihood:
         seen &= frames.spread(fixed.astype(np.float64)) > 0.0
         weight, radial = np.where(seen, weight, 0.0), np.where(seen, radial, 0.0)
         loss = frames.sum(np.where(seen, 0.5 * (freedom + 2.0) * np.log1p(scaled / freedom), 0.0))
-        log_volume = -0.5 * np.log(np.where(fixed, np.where(curved, determinant, safe_determinant), 1.0))
+        log_volume = -0.5 * np.log(
+            np.where(fixed, np.where(curved, determinant, safe_determinant), 1.0)
+        )
         dof = 2.0 * frames.sum(seen.astype(np.float64)) - 3.0 * fixed
         value: FloatArray = gain - loss - dof * np.log(frame_scale) + log_volume
-        state = StudentState(0.0, float(np.sum(log_volume)), rotations, b, e, a, weight, radial, inverse, seen)
+        state = StudentState(
+            0.0, float(np.sum(log_volume)), rotations, b, e, a, weight, radial, inverse, seen
+        )
         return value, state, step, gain
 
     def derivatives(self, theta: FloatArray, state: StudentState) -> FloatArray:
-        """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed attitudes."""
+        """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed
+        attitudes.
+        """
         _, h, _ = forward_kernel(self.model_name, "first")(
             self.frames.n_stars, theta, state.b, forward_root(self.model_name, theta, state.b)
         )
@@ -265,7 +310,8 @@ class Information:
 
     score: FloatArray  # (p,): gradient
     matrix: FloatArray  # (p, p): observed information
-    reweighted: FloatArray  # (p, p): information if the weights were known; never smaller, and always positive
+    # (p, p): information if the weights were known; never smaller, and always positive
+    reweighted: FloatArray
     variability: FloatArray  # (p, p): sum over stars of the outer products of their scores
     turns: FloatArray  # (3, p, K): d(best attitude) / d(theta) of every frame, rad per px unit
     attitude_noise: FloatArray  # (3, 3): mean over frames of the attitude covariance, rad^2

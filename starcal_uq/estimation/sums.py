@@ -1,24 +1,27 @@
 """What a part of the frames says at one point of the parameters, in one pass over its stars.
 
-`frame_sums` gives the normal equations of the marginal likelihood with every frame's attitude eliminated: `NormalSums`,
-which add up over parts, and `Attitudes`, which stay with the part: where its attitudes stand, and how they follow the
-parameters to first order. A solver that moves both together, as bundle adjusters do, needs one pass for each of its
-steps:
+`frame_sums` gives the normal equations of the marginal likelihood with every frame's attitude
+eliminated: `NormalSums`, which add up over parts, and `Attitudes`, which stay with the part: where
+its attitudes stand, and how they follow the parameters to first order. A solver that moves both
+together, as bundle adjusters do, needs one pass for each of its steps:
 
-    sums, attitudes = frame_sums(part, model, theta, rotations)            # on every part, wherever it is
-    normal = sum_of(all_sums).normal                                       # cost, gradient, Gauss-Newton matrix
-    sums, attitudes = frame_sums(part, model, theta + step, attitudes.at(theta + step))
+    sums, attitudes = frame_sums(part, model, theta, rotations)            # on every part, wherever
+    it is normal = sum_of(all_sums).normal                                       # cost, gradient,
+    Gauss-Newton matrix sums, attitudes = frame_sums(part, model, theta + step, attitudes.at(theta +
+    step))
 
-The stars are visited in blocks of whole frames whose temporaries stay in the processor's cache and are used again. In
-a block, A (3, 2, n) are the derivatives of the pixels with respect to the frames' rotation vectors, H (p, 2, n) those
-with respect to theta, and e the residuals, all whitened. With C the turn of all frames together that follows theta
-best, and H' = H - A C, the sums are
+The stars are visited in blocks of whole frames whose temporaries stay in the processor's cache and
+are used again. In a block, A (3, 2, n) are the derivatives of the pixels with respect to the
+frames' rotation vectors, H (p, 2, n) those with respect to theta, and e the residuals, all
+whitened. With C the turn of all frames together that follows theta best, and H' = H - A C, the sums
+are
 
     cost = e^T e - sum_k (A^T e)_k^T (A^T A)_k^-1 (A^T e)_k,
     matrix = H'^T H' - sum_k (A^T H')_k^T (A^T A)_k^-1 (A^T H')_k.
 
-The principal point and the attitudes are nearly one gauge: without C, the difference of H^T H and what the attitudes
-take of it would lose five digits in a field of ten degrees, and nine in one of one.
+The principal point and the attitudes are nearly one gauge: without C, the difference of H^T H and
+what the attitudes take of it would lose five digits in a field of ten degrees, and nine in one of
+one.
 """
 
 from __future__ import annotations
@@ -120,7 +123,9 @@ class _Buffers:
         return self._columns[: (4 + self.p) * 2 * n].reshape(4 + self.p, 2, n)
 
     def products(self, columns: FloatArray, depth: int) -> FloatArray:
-        """Products of the first rows (those of A) with themselves and the ones that follow, over both axes: (.., n)."""
+        """Products of the first rows (those of A) with themselves and the ones that follow, over
+        both axes: (.., n).
+        """
         rows, _, n = columns.shape
         total = depth * rows - depth * (depth - 1) // 2
         out = self._products[: total * n].reshape(total, n)
@@ -165,15 +170,17 @@ def frame_sums(
 ) -> tuple[NormalSums, Attitudes]:
     """Normal equations of some frames, attitudes eliminated, in one pass.
 
-    `rotations` (K, 3, 3) are R_cam_icrs, the best ones to first order or better, as `Attitudes.at` gives them, and
-    `residuals` (2, N) is filled with the whitened ones there. Returns what adds up over parts, not finite where the
-    model is not, and what stays with the part.
+    `rotations` (K, 3, 3) are R_cam_icrs, the best ones to first order or better, as `Attitudes.at`
+    gives them, and `residuals` (2, N) is filled with the whitened ones there. Returns what adds up
+    over parts, not finite where the model is not, and what stays with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
     fast = frames.axes is None and loops.kernels(model_name, frames.n_stars) == "numba"
     path = loops.frame_loop if fast else _frame_blocks
     with np.errstate(all="ignore"):
-        gram, shift, response, inverse, volume = path(frames, model_name, theta, rotations, residuals)
+        gram, shift, response, inverse, volume = path(
+            frames, model_name, theta, rotations, residuals
+        )
         sums = NormalSums(
             cost=float(gram[0, 0]),
             gradient=-gram[0, 1:],
@@ -183,11 +190,17 @@ def frame_sums(
             n_stars=frames.n_stars,
             n_frames=frames.n_frames,
         )
-    return sums, Attitudes(theta, rotations, shift, response, inverse, volume, model_name if fast else None)
+    return sums, Attitudes(
+        theta, rotations, shift, response, inverse, volume, model_name if fast else None
+    )
 
 
 def _frame_blocks(
-    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, residuals: FloatArray | None
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    residuals: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """As `starcal_uq.estimation.loops.frame_loop`, with NumPy."""
     p, k = len(theta), frames.n_frames
@@ -204,7 +217,9 @@ def _frame_blocks(
 
 
 class _Block(NamedTuple):
-    """A (3, 2, n), e (2, n) and H' (p, 2, n) of some frames, in a buffer that the next block uses again."""
+    """A (3, 2, n), e (2, n) and H' (p, 2, n) of some frames, in a buffer that the next block uses
+    again.
+    """
 
     place: slice
     part: StarFrames
@@ -228,7 +243,11 @@ def _columns(
     p, starts = len(theta), frames.starts
     blocks = frames.parts(BLOCK_STARS)
     largest = max((int(starts[last] - starts[first]) for first, last in blocks), default=0)
-    buffers, kernel, turn = _Buffers(p, largest), forward_kernel(model_name, "first"), np.zeros((3, p))
+    buffers, kernel, turn = (
+        _Buffers(p, largest),
+        forward_kernel(model_name, "first"),
+        np.zeros((3, p)),
+    )
     for first, last in blocks:
         part = frames.part(first, last)
         columns = buffers.columns(part.n_stars)
@@ -251,8 +270,8 @@ def frame_normals(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Normal equations of every single frame, attitudes eliminated, in one pass.
 
-    Returns products (K, p + 1, p + 1) of e and H without what the frame's attitude can reproduce, rotation vectors
-    (3, K) to the best attitudes, rad, and log |A^T A| (K,).
+    Returns products (K, p + 1, p + 1) of e and H without what the frame's attitude can reproduce,
+    rotation vectors (3, K) to the best attitudes, rad, and log |A^T A| (K,).
     """
     p, k = len(theta), frames.n_frames
     rows = p + 4
@@ -265,7 +284,9 @@ def frame_normals(
         solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
         gram = np.empty((k, p + 1, p + 1))
         i, j = np.triu_indices(p + 1)
-        gram[:, i, j] = gram[:, j, i] = (sums[3 * (rows - 1) :] - np.einsum("cqk,cqk->qk", mixed[:, i], solved[:, j])).T
+        gram[:, i, j] = gram[:, j, i] = (
+            sums[3 * (rows - 1) :] - np.einsum("cqk,cqk->qk", mixed[:, i], solved[:, j])
+        ).T
         return gram, solved[:, 0], np.log(determinant)
 
 
@@ -277,7 +298,9 @@ def settled_sums(
     residuals: FloatArray | None = None,
     tolerance: float = ATTITUDE_TOLERANCE_RAD,
 ) -> tuple[NormalSums, Attitudes]:
-    """As `frame_sums`, passes repeated until every attitude is the best one; a cost of infinity where there is none."""
+    """As `frame_sums`, passes repeated until every attitude is the best one; a cost of infinity
+    where there is none.
+    """
     theta = np.asarray(theta, dtype=np.float64)
     for _ in range(ATTITUDE_STEPS):
         sums, attitudes = frame_sums(frames, model_name, theta, rotations, residuals)
@@ -289,7 +312,8 @@ def settled_sums(
 
 
 class Descent:
-    """Normal equations for a solver that moves parameters and attitudes together: one pass for each point.
+    """Normal equations for a solver that moves parameters and attitudes together: one pass for each
+    point.
 
     Parameters
     ----------
@@ -326,7 +350,9 @@ class Descent:
         rotations = self._start if self.best is None else self.best[1].at(theta)
         found = frame_sums(self.frames, self.model_name, theta, rotations)
         normal = found[0].normal
-        if np.isfinite(normal.cost) and (self.best is None or _reaches(normal.cost, self.best[0].cost)):
+        if np.isfinite(normal.cost) and (
+            self.best is None or _reaches(normal.cost, self.best[0].cost)
+        ):
             self.best = found
         return normal
 

@@ -16,17 +16,21 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.core.types import AnyDict, FloatArray
 
-# A standard deviation of a third of its natural size (`_natural`) is no knowledge: the likelihood bends before that.
+# A standard deviation of a third of its natural size (`_natural`) is no knowledge: the likelihood
+# bends before that.
 _OPEN = 0.3
 # So little is no reason to distrust an estimate, and enough to explain why there is none.
 WEAK = 0.05
 # Part of a direction below which a parameter does not count as one of those that it mixes.
 _PART = 0.15
-# Distortion that none explains with more probability than this may be none; the estimate has looked for it all around.
+# Distortion that none explains with more probability than this may be none; the estimate has looked
+# for it all around.
 _NONE_P = 3e-7
-# Principal points known to this part of half the detector without distortion do not depend on whether there is some.
+# Principal points known to this part of half the detector without distortion do not depend on
+# whether there is some.
 _POINT = 0.03
-# A factor on standard deviations, without the coma of a distortion that may be none, that is worth a warning.
+# A factor on standard deviations, without the coma of a distortion that may be none, that is worth
+# a warning.
 COMA_MATTERS = 1.25
 # Ends that undetermined parameters explain.
 EXPLAINED = (
@@ -35,12 +39,14 @@ EXPLAINED = (
 )
 
 
-def open_parameters(matrix: FloatArray, noise: float, camera: Camera, limit: float = _OPEN) -> tuple[str, ...]:
+def open_parameters(
+    matrix: FloatArray, noise: float, camera: Camera, limit: float = _OPEN
+) -> tuple[str, ...]:
     """Names of the parameters of all directions that data leave open.
 
-    `matrix` (p, p): Gauss-Newton matrix of the marginal likelihood, px units.
-    `noise`: noise per axis, px, or the factor on the stated noise.
-    `camera`: its detector, focal length and model say how large each parameter can be at most: half the detector, the
+    `matrix` (p, p): Gauss-Newton matrix of the marginal likelihood, px units. `noise`: noise per
+    axis, px, or the factor on the stated noise. `camera`: its detector, focal length and model say
+    how large each parameter can be at most: half the detector, the
         focal length, a displacement of the corner as large as its distance.
     `limit`: standard deviation, as a fraction of that, from which on a direction is open.
     """
@@ -50,32 +56,43 @@ def open_parameters(matrix: FloatArray, noise: float, camera: Camera, limit: flo
         return ()
     values, vectors = np.linalg.eigh(scaled)
     # What is a hundred times better known than the rest is not what is missing.
-    mixed = np.abs(vectors[:, values < min(1.0 / limit**2, max(1e4 * values[0], 1e-12 * values[-1]))])
+    mixed = np.abs(
+        vectors[:, values < min(1.0 / limit**2, max(1e4 * values[0], 1e-12 * values[-1]))]
+    )
     named = (mixed > _PART * np.max(mixed, axis=0, initial=0.0)).any(axis=1)
     return tuple(name for name, flag in zip(camera.parameter_names, named, strict=True) if flag)
 
 
 def _natural(camera: Camera) -> FloatArray:
     """Largest sensible size (p,) of each parameter, px units."""
-    powers = np.array([c.order for c in get_model(camera.distortion).coefficients], dtype=np.float64)
+    powers = np.array(
+        [c.order for c in get_model(camera.distortion).coefficients], dtype=np.float64
+    )
     sizes = [0.5 * camera.width_px, 0.5 * camera.height_px, camera.focal_px]
     return np.concatenate([sizes, camera.half_diagonal_px ** (1.0 - powers)])
 
 
 def undetermined(
-    likelihood: MarginalLikelihood, theta: FloatArray, matrix: FloatArray, noise: float, camera: Camera, status: Status
+    likelihood: MarginalLikelihood,
+    theta: FloatArray,
+    matrix: FloatArray,
+    noise: float,
+    camera: Camera,
+    status: Status,
 ) -> tuple[tuple[str, ...], FloatArray]:
     """What the data leave open at an estimate theta (p,), and what coma of noise seems to tell.
 
-    The coma of the distortion tells where the principal point is, and in narrow fields nothing else does. Where the
-    distortion may be none, coma of noise tells nothing: the data must determine the point without it.
+    The coma of the distortion tells where the principal point is, and in narrow fields nothing else
+    does. Where the distortion may be none, coma of noise tells nothing: the data must determine the
+    point without it.
 
     Returns
     -------
     names : tuple of str
         Parameters that the data leave open, if that can explain the status.
     factors : (p,) array
-        Standard deviations without the coma over those of the matrix; ones where the coma does not matter.
+        Standard deviations without the coma over those of the matrix; ones where the coma does not
+        matter.
     """
     from scipy.special import fdtrc
 
@@ -104,18 +121,22 @@ def undetermined(
     by_coma = unsure[:2] & (factors[:2] > COMA_MATTERS)
     if by_coma.any() and not status.ok:
         # It is then also why no optimum was found.
-        return tuple(name for name, flag in zip(camera.parameter_names, by_coma, strict=False) if flag), as_found
+        return tuple(
+            name for name, flag in zip(camera.parameter_names, by_coma, strict=False) if flag
+        ), as_found
     return (), factors if unsure[:2].any() else as_found
 
 
 def _without_coma(covariance: FloatArray, told: FloatArray, size: float) -> FloatArray:
-    """Factors (p,), at least 1, on the standard deviations of an estimate whose distortion may be none.
+    """Factors (p,), at least 1, on the standard deviations of an estimate whose distortion may be
+    none.
 
-    `covariance` (p, p): that of the estimate; `told` (p, p): that without distortion, which leaves the point to the
-    tilt of the field. A distortion of noise has noise for a coma: of the point it knows nothing, and a point that is
-    free to follow it makes it larger. What the coma seems to know of the point, in units of what is known without it,
-    is the chi-square of the distortion (`size`) times the relative variance that the point's own adds to the
-    coefficients; f follows them by regression.
+    `covariance` (p, p): that of the estimate; `told` (p, p): that without distortion, which leaves
+    the point to the tilt of the field. A distortion of noise has noise for a coma: of the point it
+    knows nothing, and a point that is free to follow it makes it larger. What the coma seems to
+    know of the point, in units of what is known without it, is the chi-square of the distortion
+    (`size`) times the relative variance that the point's own adds to the coefficients; f follows
+    them by regression.
     """
     seeming = np.diag(told)[:2] / np.diag(covariance)[:2] - 1.0
     growth = float(np.sum(np.maximum(seeming, 0.0))) / size
@@ -125,7 +146,9 @@ def _without_coma(covariance: FloatArray, told: FloatArray, size: float) -> Floa
 
 
 def coma_record(camera: Camera, factors: FloatArray) -> AnyDict:
-    """What a provenance keeps of the factors (p,) of `undetermined`; empty where the coma does not matter."""
+    """What a provenance keeps of the factors (p,) of `undetermined`; empty where the coma does not
+    matter.
+    """
     if not np.any(factors > 1.0):
         return {}
     return {"without_coma": dict(zip(camera.parameter_names, factors.tolist(), strict=True))}
@@ -135,7 +158,9 @@ def what_is_open(names: tuple[str, ...]) -> str:
     """One clause: what the data leave open."""
     apart = len(names) > 1 and not set(names) <= {"x0", "y0"}
     return (
-        f"the data do not tell {join_words(names)} apart" if apart else f"the data do not determine {join_words(names)}"
+        f"the data do not tell {join_words(names)} apart"
+        if apart
+        else f"the data do not determine {join_words(names)}"
     )
 
 
@@ -143,8 +168,14 @@ def what_is_missing(names: tuple[str, ...]) -> str:
     """One clause: what the data leave open, and what would determine it."""
     if set(names) <= {"x0", "y0"}:
         return f"{what_is_open(names)}: more frames, or stars over a wider field, are needed"
-    where = "over the whole field, along both axes," if set(names) & {"x0", "y0", "p1", "p2"} else "at more radii"
-    fewer = ", or a distortion model with fewer coefficients" if set(names) - {"x0", "y0", "f"} else ""
+    where = (
+        "over the whole field, along both axes,"
+        if set(names) & {"x0", "y0", "p1", "p2"}
+        else "at more radii"
+    )
+    fewer = (
+        ", or a distortion model with fewer coefficients" if set(names) - {"x0", "y0", "f"} else ""
+    )
     return f"{what_is_open(names)}: stars {where} are needed{fewer}"
 
 
@@ -158,7 +189,9 @@ _ASTRAY = {
 
 
 def remedy_of(status: Status, names: tuple[str, ...], solver: str = "") -> str:
-    """The remedy of a status, in terms of the parameters that the data leave open, where there are some."""
+    """The remedy of a status, in terms of the parameters that the data leave open, where there are
+    some.
+    """
     if solver == "filter" and status in _ASTRAY and not names:
         return f"{_ASTRAY[status]}: use method='efficient', which weighs all frames together"
     return what_is_missing(names) if names else status.remedy

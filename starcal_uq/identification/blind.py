@@ -1,10 +1,12 @@
-"""The focal length of an unknown camera, from the stars alone: patterns that know no scale, as plate solvers use them.
+"""The focal length of an unknown camera, from the stars alone: patterns that know no scale, as
+plate solvers use them.
 
-Four stars make a pattern whose shape depends on neither scale nor roll (Lang, Hogg et al. 2010, AJ 139, 1782): the two
-farthest apart define axes, and the places of the other two are the pattern's code. The catalogue's patterns are made of
-the brightest stars of the sky, twice as many on each level as on the one before, each star with the nearest of its
-level; so some level suits any field of view. Like codes give an attitude and a focal length, what else they explain
-among the frame's bright stars ranks them, and a match of all stars (`match`) decides.
+Four stars make a pattern whose shape depends on neither scale nor roll (Lang, Hogg et al. 2010, AJ
+139, 1782): the two farthest apart define axes, and the places of the other two are the pattern's
+code. The catalogue's patterns are made of the brightest stars of the sky, twice as many on each
+level as on the one before, each star with the nearest of its level; so some level suits any field
+of view. Like codes give an attitude and a focal length, what else they explain among the frame's
+bright stars ranks them, and a match of all stars (`match`) decides.
 
 All work is counted: so many patterns of so many frames, so many of them matched.
 """
@@ -27,7 +29,13 @@ from starcal_uq.identification.growth import Patch, grow
 from starcal_uq.identification.match import match_frame, start_state
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.pairs import angle_between
-from starcal_uq.identification.pyramid import SIGMAS, CameraTolerance, FieldGeometry, Hypothesis, axes_of
+from starcal_uq.identification.pyramid import (
+    SIGMAS,
+    CameraTolerance,
+    FieldGeometry,
+    Hypothesis,
+    axes_of,
+)
 from starcal_uq.identification.result import FoundOptics
 from starcal_uq.sky.catalogue import StarCatalogue
 
@@ -37,32 +45,40 @@ if TYPE_CHECKING:
 # Stars of the whole sky on the first level; each next one has twice as many.
 _FIRST_LEVEL = 64
 LEVELS = [_FIRST_LEVEL << k for k in range(12)]
-# Levels searched together: those that are made in a second first, then the deeper ones, which only narrow fields need.
+# Levels searched together: those that are made in a second first, then the deeper ones, which only
+# narrow fields need.
 FIRST_GROUP = 20_000
 _GROUPS = (FIRST_GROUP, 40_000, 80_000, 160_000)
-# Stars of a level that a field holds, at the least and at the most, for each star down to a pattern's faintest.
+# Stars of a level that a field holds, at the least and at the most, for each star down to a
+# pattern's faintest.
 _LEAST_IN_FIELD, _MOST_IN_FIELD = 0.3, 8.0
 # Nearest stars that a star makes patterns with, on levels of up to so many stars.
 _NEAREST = ((10_000, 7), (40_000, 6), (200_000, 5))
 # Patterns whose codes are computed together.
 _AT_ONCE = 20_000
-# Patterns of a frame are made of this many of its brightest stars, each with as many of its nearest.
+# Patterns of a frame are made of this many of its brightest stars, each with as many of its
+# nearest.
 _BRIGHTEST, _FRAME_NEAREST = (8, 11, 16, 22, 32), 7
-# Codes differ by less than this, in units of the pattern's longest side: noise, and what an unknown lens bends.
+# Codes differ by less than this, in units of the pattern's longest side: noise, and what an unknown
+# lens bends.
 _CODE_TOLERANCE = 0.012
-# The frame's brightest stars that a pattern's attitude must explain, and how well, as a part of their distance.
+# The frame's brightest stars that a pattern's attitude must explain, and how well, as a part of
+# their distance.
 _EXPLAINED, _BEND = 24, 0.008
-# Patterns are flat in narrow fields; those above 30 degrees are seen with these focal lengths, in detector widths.
+# Patterns are flat in narrow fields; those above 30 degrees are seen with these focal lengths, in
+# detector widths.
 _FLAT, _FOCAL_STEPS = 1.7, (1.85, 1.45, 1.15, 0.92, 0.75, 0.61, 0.5, 0.42)
 _FOCAL_STEP = 1.17
 # Candidates of a frame and parity that are matched with all stars, and the camera tolerances then.
 _MATCHED = 12
 _FOCAL, _CENTRE, _DISTORTION = 0.02, 0.02, 0.004
-# Candidates that explain as much as chance does less often than this, log10, are tried with a lens that bends.
+# Candidates that explain as much as chance does less often than this, log10, are tried with a lens
+# that bends.
 _WORTH_GROWING = -5.0
 # Decimal logarithms of the wrong attitudes expected for a frame to count, and to count alone.
 _COUNTS, _ALONE = -4.0, -9.0
-# Frames that are searched, those of them that must agree where they can, and the stars that one must have.
+# Frames that are searched, those of them that must agree where they can, and the stars that one
+# must have.
 _PROBES, _ENOUGH, _LEAST_STARS = 10, 3, 5
 # Frames of one camera agree in their focal length to this.
 AGREEMENT = 0.02
@@ -78,7 +94,9 @@ def _threes(k: int) -> IntArray:
 
 
 def quads_of(neighbours: IntArray) -> IntArray:
-    """Different sets of four (q, 4): a point, first in its row of `neighbours` (n, k + 1), and three of its nearest."""
+    """Different sets of four (q, 4): a point, first in its row of `neighbours` (n, k + 1), and
+    three of its nearest.
+    """
     three = _threes(neighbours.shape[1] - 1)
     own = np.repeat(neighbours[:, 0], len(three))[:, None]
     quads = np.sort(np.hstack([own, neighbours[:, three].reshape(-1, 3)]), axis=1)
@@ -92,10 +110,12 @@ def quads_of(neighbours: IntArray) -> IntArray:
 
 
 def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Codes (q, 4), the quads with their points in the code's order (a, b, c, d), and the angles from a to b, rad.
+    """Codes (q, 4), the quads with their points in the code's order (a, b, c, d), and the angles
+    from a to b, rad.
 
-    The points are seen in the plane that touches the sphere at their middle, a at 0 and b at 1 of the complex numbers:
-    the code is c and d, with a the end that they are nearer to, and c before d.
+    The points are seen in the plane that touches the sphere at their middle, a at 0 and b at 1 of
+    the complex numbers: the code is c and d, with a the end that they are nearer to, and c before
+    d.
     """
     v = directions[quads]
     frame = axes_of(v, 0, 1)
@@ -139,7 +159,9 @@ def make_level(directions: FloatArray) -> Level:
     # In blocks that stay in the processor's cache.
     blocks = [codes_of(directions, quads[k : k + _AT_ONCE]) for k in range(0, len(quads), _AT_ONCE)]
     codes, quads, size = (np.concatenate(column) for column in zip(*blocks, strict=True))
-    return Level(directions, stars, quads, size, cKDTree(codes, balanced_tree=False, compact_nodes=False))
+    return Level(
+        directions, stars, quads, size, cKDTree(codes, balanced_tree=False, compact_nodes=False)
+    )
 
 
 # Levels of before: catalogues of any depth share those of the bright stars.
@@ -168,7 +190,8 @@ class Levels:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Candidates of a frame: attitudes (c, 3, 3), focal lengths (c,), and how unlikely what they explain is, log10.
+    """Candidates of a frame: attitudes (c, 3, 3), focal lengths (c,), and how unlikely what they
+    explain is, log10.
 
     Of their patterns the points (c, 4) and directions (c, 4, 3).
     """
@@ -182,7 +205,9 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """A frame's stars that are matched, how often chance does so with any focal length, log10, and the lens's bend."""
+    """A frame's stars that are matched, how often chance does so with any focal length, log10, and
+    the lens's bend.
+    """
 
     patch: Patch
     log10_false: float
@@ -198,15 +223,21 @@ class BlindSearch:
         self.width, self.height = float(width_px), float(height_px)
         corner = 0.5 * float(np.hypot(width_px, height_px))
         self.geometry = FieldGeometry(self.width, self.width, self.height, corner)
-        self.tolerance = CameraTolerance(_FOCAL, _CENTRE * self.width, max(1.0, _DISTORTION * corner))
+        self.tolerance = CameraTolerance(
+            _FOCAL, _CENTRE * self.width, max(1.0, _DISTORTION * corner)
+        )
         self.sky = NearbyStars(stars.directions_icrs, stars.mag, self.geometry)
 
     def sizes(self, most: int, focal_px: tuple[float, float]) -> list[int]:
         """Levels with at most this number of stars, of which a field shows enough."""
         return [n for n in LEVELS if n <= most and _useful(n, self.width * self.height, focal_px)]
 
-    def candidates(self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]) -> _Seen:
-        """What patterns of a frame, points (n, 2) from the middle, brightest first, have like ones on these levels."""
+    def candidates(
+        self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]
+    ) -> _Seen:
+        """What patterns of a frame, points (n, 2) from the middle, brightest first, have like ones
+        on these levels.
+        """
         quads = _frame_quads(u)
         found = [
             part
@@ -216,7 +247,13 @@ class BlindSearch:
         parts = [self._explained(u, sigma_px, *part) for part in found]
         if not parts:
             none = np.empty(0)
-            return _Seen(np.empty((0, 3, 3)), none, none, np.empty((0, 4), dtype=np.int64), np.empty((0, 4, 3)))
+            return _Seen(
+                np.empty((0, 3, 3)),
+                none,
+                none,
+                np.empty((0, 4), dtype=np.int64),
+                np.empty((0, 4, 3)),
+            )
         return _Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _focal_steps(self, focal_px: tuple[float, float]) -> Iterator[tuple[float, float, float]]:
@@ -232,9 +269,17 @@ class BlindSearch:
                 yield focal, a, b
 
     def _alike(
-        self, u: FloatArray, quads: IntArray, sizes: list[int], focal: float, low: float, high: float
+        self,
+        u: FloatArray,
+        quads: IntArray,
+        sizes: list[int],
+        focal: float,
+        low: float,
+        high: float,
     ) -> Iterator[tuple[Level, IntArray, IntArray, FloatArray]]:
-        """For each level, its patterns and the frame's that are alike, and the focal lengths that follow."""
+        """For each level, its patterns and the frame's that are alike, and the focal lengths that
+        follow.
+        """
         rays = _rays(u, np.array([focal]))[0]
         codes, quads, size = codes_of(rays, quads)
         faintest = quads.max(axis=1) + 1
@@ -242,7 +287,8 @@ class BlindSearch:
             # Stars of the level in the field, at the longest and the shortest focal length.
             least, most = (n * self.width * self.height / (4.0 * pi * f * f) for f in (high, low))
             use = np.flatnonzero(
-                (_MOST_IN_FIELD * np.maximum(faintest, 12) > least) & (_LEAST_IN_FIELD * faintest < most)
+                (_MOST_IN_FIELD * np.maximum(faintest, 12) > least)
+                & (_LEAST_IN_FIELD * faintest < most)
             )
             if not len(use):
                 continue
@@ -261,31 +307,46 @@ class BlindSearch:
                 yield level, quads[mine[ok]], level.quads[theirs[ok]], f[ok]
 
     def _explained(
-        self, u: FloatArray, sigma_px: FloatArray, level: Level, mine: IntArray, theirs: IntArray, focal: FloatArray
+        self,
+        u: FloatArray,
+        sigma_px: FloatArray,
+        level: Level,
+        mine: IntArray,
+        theirs: IntArray,
+        focal: FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:
-        """Columns of `_Seen`: like patterns, and the odds that their attitudes explain other stars by chance."""
+        """Columns of `_Seen`: like patterns, and the odds that their attitudes explain other stars
+        by chance.
+        """
         m = min(len(u), _EXPLAINED)
         b = _rays(u, focal)
         rows = np.arange(len(mine))[:, None]
-        rotation = axes_of(b[rows, mine], 0, 1).transpose(0, 2, 1) @ axes_of(level.directions[theirs], 0, 1)
+        rotation = axes_of(b[rows, mine], 0, 1).transpose(0, 2, 1) @ axes_of(
+            level.directions[theirs], 0, 1
+        )
         sky = b[:, :m] @ rotation
         corner = u[mine]
         span = np.hypot(*(corner[:, 1] - corner[:, 0]).T)[:, None]
         reach = np.hypot(*(u[:m] - corner.mean(axis=1)[:, None]).transpose(2, 0, 1))
         gate = SIGMAS * sigma_px[:m] + _BEND * (reach + span)
-        distance, _ = level.stars.query(sky.reshape(-1, 3), distance_upper_bound=float((gate / focal[:, None]).max()))
+        distance, _ = level.stars.query(
+            sky.reshape(-1, 3), distance_upper_bound=float((gate / focal[:, None]).max())
+        )
         own = np.any(np.arange(m)[:, None] == mine[:, None, :], axis=2)
         near = (distance.reshape(len(mine), m) * focal[:, None] < gate) & ~own
         density = len(level.directions) / (4.0 * pi * focal**2)
         chance = np.clip(density[:, None] * pi * gate**2, 1e-9, 1.0)
-        # The sum of the logarithms, less that of the choices among the stars that might have been explained.
+        # The sum of the logarithms, less that of the choices among the stars that might have been
+        # explained.
         log10_chance = np.where(near, np.log10(chance * m), 0.0).sum(axis=1)
         return rotation, focal, log10_chance, mine, level.directions[theirs]
 
     def solve(
         self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]
     ) -> Solved | None:
-        """The best attitude of a frame and focal length of the camera, where there is one that counts."""
+        """The best attitude of a frame and focal length of the camera, where there is one that
+        counts.
+        """
         from scipy.spatial import cKDTree
 
         if len(u) < _LEAST_STARS:
@@ -299,12 +360,16 @@ class BlindSearch:
                 break
             focal, rotation = float(seen.focal_px[row]), seen.rotation[row]
             # Patterns of one solution say the same.
-            if any(abs(f / focal - 1.0) < 0.01 and np.abs(r - rotation).max() < 0.01 for f, r in tried):
+            if any(
+                abs(f / focal - 1.0) < 0.01 and np.abs(r - rotation).max() < 0.01 for f, r in tried
+            ):
                 continue
             tried.append((focal, rotation))
             solved = self._match(u, tree, sigma_px, focal, rotation)
             if solved is None and seen.log10_chance[row] < _WORTH_GROWING:
-                solved = self._grow(u, sigma_px, Patch(rotation, focal, seen.points[row], seen.directions[row]))
+                solved = self._grow(
+                    u, sigma_px, Patch(rotation, focal, seen.points[row], seen.directions[row])
+                )
             if solved is not None and (best is None or solved.log10_false < best.log10_false):
                 best = solved
                 if solved.log10_false < _ALONE:
@@ -317,7 +382,9 @@ class BlindSearch:
         """What a lens that hardly bends explains."""
         sky = self.sky.seen_by(replace(self.geometry, focal_px=focal))
         start = start_state(Hypothesis(rotation, 1.0))
-        match = match_frame(u, tree, sigma_px, sky, start, self.tolerance, log10_wanted=_COUNTS - _ANYWHERE)
+        match = match_frame(
+            u, tree, sigma_px, sky, start, self.tolerance, log10_wanted=_COUNTS - _ANYWHERE
+        )
         if match is None:
             return None
         log_scale, _, _, kappa = match.state.shared.tolist()
@@ -328,9 +395,21 @@ class BlindSearch:
     def _grow(self, u: FloatArray, sigma_px: FloatArray, pattern: Patch) -> Solved | None:
         """What a lens that bends explains."""
         middle = np.array([0.5 * (self.width - 1.0), 0.5 * (self.height - 1.0)])
-        camera = Camera(int(self.width), int(self.height), None, None, middle[0], middle[1], focal_px=pattern.focal_px)
+        camera = Camera(
+            int(self.width),
+            int(self.height),
+            None,
+            None,
+            middle[0],
+            middle[1],
+            focal_px=pattern.focal_px,
+        )
         grown = grow(u + middle, sigma_px, pattern, self.sky, camera)
-        return None if grown is None else Solved(grown.patch, grown.log10_false + _ANYWHERE, grown.bend_px)
+        return (
+            None
+            if grown is None
+            else Solved(grown.patch, grown.log10_false + _ANYWHERE, grown.bend_px)
+        )
 
 
 def _frame_quads(u: FloatArray) -> IntArray:
@@ -370,13 +449,16 @@ def find_optics(
     height_px: int,
     ranges: Sequence[tuple[float, float]],
 ) -> tuple[FoundOptics, int, Patch] | None:
-    """The focal length that frames agree on, and the surest frame with its stars; None where there is none.
+    """The focal length that frames agree on, and the surest frame with its stars; None where there
+    is none.
 
-    A frame is points (n, 2) from the detector's middle, brightest first, and their noise (n,), px. `stars` gives a
-    catalogue of at least so many stars of the whole sky, or of all that there are. `ranges` are focal lengths, px, to
-    look for first in the first, then in the next; no level of the catalogue is searched twice for one range.
+    A frame is points (n, 2) from the detector's middle, brightest first, and their noise (n,), px.
+    `stars` gives a catalogue of at least so many stars of the whole sky, or of all that there are.
+    `ranges` are focal lengths, px, to look for first in the first, then in the next; no level of
+    the catalogue is searched twice for one range.
 
-    A frame alone counts where chance makes what it shows less than once in 10^9; otherwise two must agree.
+    A frame alone counts where chance makes what it shows less than once in 10^9; otherwise two must
+    agree.
     """
     probes = _probes([len(points) for points, _ in frames])
     if not probes:
@@ -384,7 +466,9 @@ def find_optics(
     search: BlindSearch | None = None
     for limits in ranges:
         for low, high in pairwise((0, *_GROUPS)):
-            sizes = [n for n in LEVELS if low < n <= high and _useful(n, width_px * height_px, limits)]
+            sizes = [
+                n for n in LEVELS if low < n <= high and _useful(n, width_px * height_px, limits)
+            ]
             if not sizes:
                 continue
             catalogue = stars(sizes[-1])
@@ -398,14 +482,22 @@ def find_optics(
 
 
 def _useful(n: int, detector_px2: float, focal_px: tuple[float, float]) -> bool:
-    """Whether a field shows so many of a level's stars, at some focal length, that a pattern may be among them."""
+    """Whether a field shows so many of a level's stars, at some focal length, that a pattern may be
+    among them.
+    """
     least, most = (n * detector_px2 / (4.0 * pi * f * f) for f in reversed(focal_px))
     return least < _MOST_IN_FIELD * _BRIGHTEST[-1] and most > 4.0 * _LEAST_IN_FIELD
 
 
 def _probes(n_stars: Sequence[int]) -> list[int]:
-    """Frames to be searched: those with most stars, and others of all kinds, because most may be clouds or trees."""
-    order = [k for k in sorted(range(len(n_stars)), key=lambda k: -n_stars[k]) if n_stars[k] >= _LEAST_STARS]
+    """Frames to be searched: those with most stars, and others of all kinds, because most may be
+    clouds or trees.
+    """
+    order = [
+        k
+        for k in sorted(range(len(n_stars)), key=lambda k: -n_stars[k])
+        if n_stars[k] >= _LEAST_STARS
+    ]
     half = _PROBES // 2
     rest = order[half:]
     return order[:half] + [rest[i * len(rest) // half] for i in range(min(half, len(rest)))]

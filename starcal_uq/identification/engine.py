@@ -1,8 +1,9 @@
 """Star identification, lost in space: which catalogue star is each centroid?
 
-Frame by frame, patterns give hypotheses (`pyramid`), each is matched with all stars of the field and refined
-(`match`), and it is accepted when the number of wrong attitudes expected to match as well is small. What the frames
-say together about the camera narrows the tolerances for a second pass over all of them.
+Frame by frame, patterns give hypotheses (`pyramid`), each is matched with all stars of the field
+and refined (`match`), and it is accepted when the number of wrong attitudes expected to match as
+well is small. What the frames say together about the camera narrows the tolerances for a second
+pass over all of them.
 """
 
 from __future__ import annotations
@@ -25,13 +26,24 @@ from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.identification.blind import AGREEMENT, FIRST_GROUP, FOCAL_RANGE, BlindSearch, find_optics
+from starcal_uq.identification.blind import (
+    AGREEMENT,
+    FIRST_GROUP,
+    FOCAL_RANGE,
+    BlindSearch,
+    find_optics,
+)
 from starcal_uq.identification.growth import GrownField, Patch, grow
 from starcal_uq.identification.match import CameraState, Match
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.proposers import Proposer, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
-from starcal_uq.identification.result import FoundOptics, FrameIdentification, Identification, Parity
+from starcal_uq.identification.result import (
+    FoundOptics,
+    FrameIdentification,
+    Identification,
+    Parity,
+)
 from starcal_uq.identification.search import (
     LEAST_SIGMA_PX,
     MIN_STARS,
@@ -51,7 +63,8 @@ from starcal_uq.sky.catalogue import StarCatalogue
 _WORSE_LENS = 4.0
 # This many frames with most stars decide whether another way of searching is worth the time.
 _PROBES = 10
-# After so many frames in vain the focal length is looked for: that takes less time than one such frame.
+# After so many frames in vain the focal length is looked for: that takes less time than one such
+# frame.
 _IN_VAIN = 3
 # So many frames of a camera say enough of it to narrow the search for the others.
 _AGREE = 3
@@ -59,16 +72,18 @@ _AGREE = 3
 _BETTER = 0.7
 # Frames with fewer stars say nothing about the common camera.
 _CAMERA_STARS = 7
-# After a search at any focal length in vain, of frames with so many stars, the other frames get so many triangles.
+# After a search at any focal length in vain, of frames with so many stars, the other frames get so
+# many triangles.
 _RICH_STARS, _FEW_TRIANGLES = 8, 40
 # A focal length is looked for within this factor of the camera's before it is looked for anywhere.
 _NEAR = 2.0
 # A frame says what the lens is where chance does so less often, log10.
 _SURE = -9.0
-# A lens that bends is worth a second look at all frames where it explains so many times the stars of one, or where so
-# many frames are missed.
+# A lens that bends is worth a second look at all frames where it explains so many times the stars
+# of one, or where so many frames are missed.
 _MORE, _MISSED = 1.1, 0.1
-# Error of the principal point that is allowed for: a part of the detector's width, but not more than so many pixels.
+# Error of the principal point that is allowed for: a part of the detector's width, but not more
+# than so many pixels.
 _CENTRE, _LARGEST_CENTRE_PX = 0.02, 20.0
 # Where images do not say it: a focal length in detector widths to begin with.
 _ASSUMED_FOCAL = 5.0
@@ -129,38 +144,43 @@ def identify(
     Parameters
     ----------
     centroids
-        Measured stars: arrays `frame`, `x_px`, `y_px`, `flux`, `sigma_px` with a row for each, and `frame_ids`,
-        `image`, `time_utc` with a row for each frame. Frames without stars keep their place. Flux is compared with the
-        catalogue's magnitudes frame by frame (`brightness`), except where `saturated`, if there, says otherwise;
-        equal fluxes say nothing.
+        Measured stars: arrays `frame`, `x_px`, `y_px`, `flux`, `sigma_px` with a row for each, and
+        `frame_ids`, `image`, `time_utc` with a row for each frame. Frames without stars keep their
+        place. Flux is compared with the catalogue's magnitudes frame by frame (`brightness`),
+        except where `saturated`, if there, says otherwise; equal fluxes say nothing.
     camera
-        The nominal camera. Without one, its size is that of the images (``centroids.meta``), and its focal length what
-        they say, or else what the stars say.
+        The nominal camera. Without one, its size is that of the images (``centroids.meta``), and
+        its focal length what they say, or else what the stars say.
     stars
         Catalogue; it may be deeper than the sensor. Its directions are those of the result.
     calibration
-        A `Calibration` or `Posterior`: its camera takes the place of `camera`, and four standard deviations the place
-        of the tolerances. A better known camera identifies more.
+        A `Calibration` or `Posterior`: its camera takes the place of `camera`, and four standard
+        deviations the place of the tolerances. A better known camera identifies more.
     focal_tolerance
         Relative error of the focal length; 0.03 is three per cent.
     centre_tolerance_px
-        Error of the principal point per axis, px; by default 2 % of the detector's width, but not more than 20.
+        Error of the principal point per axis, px; by default 2 % of the detector's width, but not
+        more than 20.
     distortion_tolerance_px
-        Displacement at the detector's corner by distortion that the nominal camera does not have, px. Where less than
-        half of the frames are found, the others are tried with four times as much, and as mirror images.
+        Displacement at the detector's corner by distortion that the nominal camera does not have,
+        px. Where less than half of the frames are found, the others are tried with four times as
+        much, and as mirror images.
     search_focal
-        Whether the focal length is searched for, from the stars alone, where less than half of the frames are found:
-        within a factor of two of the camera's first, and then for any field of view.
+        Whether the focal length is searched for, from the stars alone, where less than half of the
+        frames are found: within a factor of two of the camera's first, and then for any field of
+        view.
     engine
-        Solver that finds attitudes: "pyramid", this package's pattern search, or "tetra3rs", a solver in Rust, which
-        needs the package of that name (extra `tetra3rs`). Matching and acceptance are the same.
+        Solver that finds attitudes: "pyramid", this package's pattern search, or "tetra3rs", a
+        solver in Rust, which needs the package of that name (extra `tetra3rs`). Matching and
+        acceptance are the same.
     share_camera
-        Whether all frames come from one camera, so that those that are found help to find the others. The result does
-        not depend on the order of the frames.
+        Whether all frames come from one camera, so that those that are found help to find the
+        others. The result does not depend on the order of the frames.
     cache
         Whether the catalogue's pairs are kept on disk, which saves about 0.1 s to 1 s.
     cache_dir
-        Folder of the cache; by default the platform's folder for caches (`$XDG_CACHE_HOME/starcal_uq`).
+        Folder of the cache; by default the platform's folder for caches
+        (`$XDG_CACHE_HOME/starcal_uq`).
     progress
         Called with the number of frames done and to be done.
 
@@ -206,7 +226,9 @@ def identify(
             )
             grown = other.grown(frame, patch)
             if grown is not None:
-                optics = replace(optics, focal_px=grown.camera.focal_px, distortion_px=abs(grown.bend_px))
+                optics = replace(
+                    optics, focal_px=grown.camera.focal_px, distortion_px=abs(grown.bend_px)
+                )
                 other = other.bent(frame, grown, _with(sheet, tolerance, optics, told)[0])
             other.run(progress, False)
             if grown is not None and share_camera:
@@ -215,7 +237,9 @@ def identify(
                 attempt = other
     if told or optics is not None:
         rich = max(map(len, attempt.field.xy), default=0) >= _RICH_STARS
-        attempt.finish(progress, hopeless=searching and rich and optics is None and not attempt.good)
+        attempt.finish(
+            progress, hopeless=searching and rich and optics is None and not attempt.good
+        )
     return attempt.result(optics)
 
 
@@ -232,7 +256,12 @@ class _Attempt:
         share_camera: bool,
         mirrored: bool = False,
     ) -> None:
-        self.centroids, self.camera, self.prepare, self.share_camera = centroids, camera, prepare, share_camera
+        self.centroids, self.camera, self.prepare, self.share_camera = (
+            centroids,
+            camera,
+            prepare,
+            share_camera,
+        )
         self.nominal, self.stars, self.tolerance = camera, catalogue.for_camera(camera), tolerance
         self.parity: Parity = "mirrored" if mirrored else "normal"
         self.field = FrameTable(centroids, camera, mirrored)
@@ -265,12 +294,16 @@ class _Attempt:
 
     def grown(self, k: int, patch: Patch) -> GrownField | None:
         """What a frame shows of the lens around its matched stars, where that is beyond doubt."""
-        sky = NearbyStars(self.stars.directions_icrs, self.stars.mag, field_geometry(self.field.camera))
+        sky = NearbyStars(
+            self.stars.directions_icrs, self.stars.mag, field_geometry(self.field.camera)
+        )
         found = grow(self.field.xy[k], self.field.sigma[k], patch, sky, self.field.camera)
         return found if found is not None and found.log10_false < _SURE else None
 
     def bent(self, k: int, grown: GrownField, nominal: Camera) -> _Attempt:
-        """The same frames, to be searched with a lens that one of them shows, whose own attitude is known."""
+        """The same frames, to be searched with a lens that one of them shows, whose own attitude is
+        known.
+        """
         other = copy(self)
         mirrored = self.parity == "mirrored"
         largest = _bending(self.tolerance, self.camera, grown.bend_px)
@@ -284,7 +317,8 @@ class _Attempt:
         return other
 
     def by_patterns(self, catalogue: StarsByDepth) -> None:
-        """Look in frames that failed at patterns of more of their brightest detections, which may be hot pixels.
+        """Look in frames that failed at patterns of more of their brightest detections, which may
+        be hot pixels.
 
         All frames are looked at where one of the first few is found so.
         """
@@ -295,22 +329,27 @@ class _Attempt:
         for number, k in enumerate(failed):
             if number == _PROBES and all(self.results[i].match is None for i in failed[:number]):
                 return
-            solved = search.solve(self.field.points[k], self.field.sigma[k], search.sizes(FIRST_GROUP, limits), limits)
+            solved = search.solve(
+                self.field.points[k], self.field.sigma[k], search.sizes(FIRST_GROUP, limits), limits
+            )
             if solved is not None:
                 self.results[k] = self.search.near(self.field, k, solved.patch.rotation)
 
     def filled(self, progress: Callable[[int, int], None] | None) -> _Attempt:
-        """The frames with the lens that the best of them shows, where that explains more than this camera does.
+        """The frames with the lens that the best of them shows, where that explains more than this
+        camera does.
 
-        All frames are looked at again where that one shows many more stars, where many others are not identified, or
-        where the lens bends by more than is allowed for.
+        All frames are looked at again where that one shows many more stars, where many others are
+        not identified, or where the lens bends by more than is allowed for.
         """
         solved = [(k, found.match) for k, found in self.results.items() if found.match is not None]
         if not solved:
             return self
         k, match = max(solved, key=lambda one: len(one[1]))
         focal = self.field.camera.focal_px * float(np.exp(match.state.shared[0]))
-        patch = Patch(match.state.rotation, focal, match.centroid, self.stars.directions_icrs[match.star])
+        patch = Patch(
+            match.state.rotation, focal, match.centroid, self.stars.directions_icrs[match.star]
+        )
         grown = self.grown(k, patch)
         if grown is None:
             return self
@@ -328,7 +367,8 @@ class _Attempt:
         return _failed(self.results, self.field)
 
     def run(self, progress: Callable[[int, int], None] | None, stop: bool) -> None:
-        """Search every frame, those with most stars first; with `stop`, only while a third of them is found.
+        """Search every frame, those with most stars first; with `stop`, only while a third of them
+        is found.
 
         What the first ones found say of the camera narrows the search for the others.
         """
@@ -339,7 +379,12 @@ class _Attempt:
             if k in self.results:
                 continue
             tried = len(self.results)
-            if stop and tried >= _IN_VAIN and 3 * n_solved < tried and len(self.field.xy[k]) >= MIN_STARS:
+            if (
+                stop
+                and tried >= _IN_VAIN
+                and 3 * n_solved < tried
+                and len(self.field.xy[k]) >= MIN_STARS
+            ):
                 return
             if self.share_camera and len(useful) >= enough:
                 narrow, enough = self._narrow(useful), 2 * len(useful)
@@ -355,7 +400,9 @@ class _Attempt:
                 progress(len(self.results), len(self.field.ids))
 
     def _in_turn(self) -> list[int]:
-        """Frames with most stars first, but a middling one early: most stars may be those of trees or clouds."""
+        """Frames with most stars first, but a middling one early: most stars may be those of trees
+        or clouds.
+        """
         xy = self.field.xy
         order = sorted(range(len(xy)), key=lambda k: (-len(xy[k]), xy[k][:1].tolist()))
         middle = sum(len(points) >= MIN_STARS for points in xy) // 2
@@ -364,7 +411,9 @@ class _Attempt:
         return order
 
     def _narrow(self, useful: list[Match]) -> tuple[Search, FrameTable, FloatArray]:
-        """The search with the camera that matches agree on, its frames, and by what that camera differs."""
+        """The search with the camera that matches agree on, its frames, and by what that camera
+        differs.
+        """
         shared, covariance = self.search.common_camera(useful)
         camera = _moved(self.field.camera, shared)
         return self.search.narrowed(camera, covariance), self.field.seen_by(camera), shared
@@ -372,7 +421,8 @@ class _Attempt:
     def finish(self, progress: Callable[[int, int], None] | None, hopeless: bool = False) -> None:
         """Search what is left, as mirror images and with a worse lens where most frames fail.
 
-        Where a search at any focal length, mirror images included, was in vain, the frames left get a short look each.
+        Where a search at any focal length, mirror images included, was in vain, the frames left get
+        a short look each.
         """
         if hopeless and not self.n_solved:
             self.search.triangles = min(self.search.triangles, _FEW_TRIANGLES)
@@ -385,14 +435,21 @@ class _Attempt:
         if most:
             self._narrowed = {}
         failed = self._failed()
-        if len(failed) > self.n_solved and self.n_solved < 2 and self.parity == "normal" and not hopeless:
+        if (
+            len(failed) > self.n_solved
+            and self.n_solved < 2
+            and self.parity == "normal"
+            and not hopeless
+        ):
             # Every frame of a camera has one handedness: the one that more frames have.
             field = FrameTable(self.centroids, self.camera, mirrored=True)
             mirror = Search(field.camera, self.stars, self.tolerance, self.search.proposer)
             other = _retry(mirror, field, failed)
             if _solved(other.values()) > self.n_solved:
                 self.parity, self.field, self._search = "mirrored", field, mirror
-                self.results = {k: other[k] if k in other else mirror.frame(field, k) for k in self.results}
+                self.results = {
+                    k: other[k] if k in other else mirror.frame(field, k) for k in self.results
+                }
         # Two attitudes that explain a frame are not told apart by knowing less.
         failed = [k for k in self._failed() if self.results[k].status != "ambiguous"]
         # What shows no lens at any focal length, however it bends, does not show a worse one.
@@ -410,24 +467,34 @@ class _Attempt:
         if self.share_camera and len(useful) > 1:
             second, again, shared = self._narrow(useful)
             # What was not found with a camera known as well is not looked for once more.
-            known = {k for k, t in self._narrowed.items() if not _much_narrower(second.tolerance, t)}
+            known = {
+                k for k, t in self._narrowed.items() if not _much_narrower(second.tolerance, t)
+            }
             given_up = {k for k in known if results[k].match is None}
-            results = [f if k in given_up else second.again(again, k, f, shared) for k, f in enumerate(results)]
+            results = [
+                f if k in given_up else second.again(again, k, f, shared)
+                for k, f in enumerate(results)
+            ]
             refined, useful = again.camera, _useful(results)
             if useful:
                 refined = _moved(refined, second.common_camera(useful)[0])
         elif useful:
             refined = _moved(refined, self.search.common_camera(useful)[0])
         nominal = flipped(self.nominal) if self.parity == "mirrored" else self.nominal
-        return _result(self.field, results, refined, nominal, self.stars, self.parity, self.centroids, optics)
+        return _result(
+            self.field, results, refined, nominal, self.stars, self.parity, self.centroids, optics
+        )
 
 
 def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
-    """The camera as its images describe it, and whether they say its focal length; their size must be stated."""
+    """The camera as its images describe it, and whether they say its focal length; their size must
+    be stated.
+    """
     said = getattr(centroids, "meta", {}).get("optics", {})
     if not said:
         raise IdentificationError(
-            "the centroids do not say the size of their images: give a camera, or measure the images again."
+            "the centroids do not say the size of their images: give a camera, or measure the "
+            "images again."
         )
     width, height = int(said["width_px"]), int(said["height_px"])
     pixel, focal_mm, focal_px = said.get("pixel_um"), said.get("focal_mm"), said.get("focal_px")
@@ -435,7 +502,9 @@ def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
         focal_px = 1000.0 * focal_mm / pixel
     focal = focal_px if focal_px else _ASSUMED_FOCAL * width
     centre = (width - 1) / 2.0, (height - 1) / 2.0
-    camera = Camera(width, height, pixel, None, *centre, name="camera of the images", focal_px=focal)
+    camera = Camera(
+        width, height, pixel, None, *centre, name="camera of the images", focal_px=focal
+    )
     return camera, bool(focal_px)
 
 
@@ -454,8 +523,12 @@ def _found_optics(
     return find_optics(frames, catalogue.for_level, sheet.width_px, sheet.height_px, ranges)
 
 
-def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: bool) -> tuple[Camera, CameraTolerance]:
-    """The camera with the focal length found, and its tolerances; a sheet that allows it is kept."""
+def _with(
+    sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: bool
+) -> tuple[Camera, CameraTolerance]:
+    """The camera with the focal length found, and its tolerances; a sheet that allows it is
+    kept.
+    """
     if told and abs(optics.focal_px / sheet.focal_px - 1.0) < tolerance.focal:
         camera = sheet
     else:
@@ -482,7 +555,9 @@ def _useful(results: Iterable[Found]) -> list[Match]:
 
 
 def _much_narrower(one: CameraTolerance, other: CameraTolerance) -> bool:
-    """Whether the camera is known so much better that a search may find what it did not find before."""
+    """Whether the camera is known so much better that a search may find what it did not find
+    before.
+    """
     return any(a < _BETTER * b for a, b in zip(astuple(one), astuple(other), strict=True))
 
 
@@ -491,10 +566,14 @@ def _relative(found: Found, shared: FloatArray) -> Found:
     if (m := found.match) is None:
         return found
     state = CameraState(m.state.rotation, m.state.shared + shared)
-    return replace(found, match=replace(m, state=state, gradient=m.gradient + m.information @ shared))
+    return replace(
+        found, match=replace(m, state=state, gradient=m.gradient + m.information @ shared)
+    )
 
 
-def calibrated_tolerance(calibration: CalibratedCamera, largest: CameraTolerance) -> CameraTolerance:
+def calibrated_tolerance(
+    calibration: CalibratedCamera, largest: CameraTolerance
+) -> CameraTolerance:
     """Four standard deviations of a calibration, at most the given tolerances."""
     camera = calibration.camera
     p = len(camera.parameter_names)
@@ -520,7 +599,9 @@ def _solved(results: Iterable[Found]) -> int:
     return sum(f.match is not None for f in results)
 
 
-def _retry(search: Search, field: FrameTable, frames: list[int], probes: int = _PROBES) -> dict[int, Found]:
+def _retry(
+    search: Search, field: FrameTable, frames: list[int], probes: int = _PROBES
+) -> dict[int, Found]:
     """Frames searched in another way: all of them, if one of the first few is found so."""
     result = {k: search.frame(field, k) for k in frames[:probes]}
     if _solved(result.values()):
@@ -558,9 +639,17 @@ def _result(
 
     solved = [k for k, f in enumerate(results) if f.match is not None]
     matches = [m for f in results if (m := f.match) is not None]
-    records, star = [], np.concatenate([m.star for m in matches]) if matches else np.empty(0, dtype=np.int64)
-    rows = np.concatenate([field.rows[k][m.centroid] for k, m in zip(solved, matches, strict=True)] or [star])
-    xy = np.concatenate([field.xy[k][m.centroid] for k, m in zip(solved, matches, strict=True)] or [np.empty((0, 2))])
+    records, star = (
+        [],
+        np.concatenate([m.star for m in matches]) if matches else np.empty(0, dtype=np.int64),
+    )
+    rows = np.concatenate(
+        [field.rows[k][m.centroid] for k, m in zip(solved, matches, strict=True)] or [star]
+    )
+    xy = np.concatenate(
+        [field.xy[k][m.centroid] for k, m in zip(solved, matches, strict=True)]
+        or [np.empty((0, 2))]
+    )
     sigma = np.asarray(table.sigma_px, dtype=np.float64)[rows]
     taste, p_value = np.empty((2, 0))
     if matches:
@@ -612,23 +701,35 @@ def _result(
     )
     # Not every table says which frames were left out.
     problems = getattr(table, "problem", [""] * len(records))
-    n_left_out = sum(bool(problems[k]) and record.status == "too few stars" for k, record in enumerate(records))
+    n_left_out = sum(
+        bool(problems[k]) and record.status == "too few stars" for k, record in enumerate(records)
+    )
     return Identification(observations, tuple(records), camera, nominal, parity, n_left_out, optics)
 
 
 def _check(table: CentroidTable, camera: Camera, stars: StarCatalogue) -> None:
     if len(stars) < 100:
         raise IdentificationError(
-            f"the catalogue has {len(stars)} stars, too few to find patterns in: raise its magnitude limit."
+            f"the catalogue has {len(stars)} stars, too few to find patterns in: raise its "
+            "magnitude limit."
         )
-    xy = np.column_stack([np.asarray(table.x_px, dtype=np.float64), np.asarray(table.y_px, dtype=np.float64)])
+    xy = np.column_stack(
+        [np.asarray(table.x_px, dtype=np.float64), np.asarray(table.y_px, dtype=np.float64)]
+    )
     outside = np.flatnonzero(~camera.contains(xy))
     if outside.size:
         row = int(outside[0])
         raise IdentificationError(
-            f"centroid {row + 1} (frame {int(table.frame[row])}) at ({xy[row, 0]:g}, {xy[row, 1]:g}) px is not on the "
-            f"{camera.width_px} x {camera.height_px} detector of the camera: give the camera that took the images."
+            f"centroid {row + 1} (frame {int(table.frame[row])}) at ({xy[row, 0]:g}, "
+            f"{xy[row, 1]:g}) px is not on the "
+            f"{camera.width_px} x {camera.height_px} detector of the camera: give the camera "
+            "that took the images."
         )
     sigma = np.asarray(table.sigma_px, dtype=np.float64)
-    if not np.all(np.isfinite(sigma) & (sigma >= 0.0)) or not np.isfinite(np.asarray(table.flux)).all():
-        raise IdentificationError("a centroid has noise or flux that is no finite number: leave such centroids out.")
+    if (
+        not np.all(np.isfinite(sigma) & (sigma >= 0.0))
+        or not np.isfinite(np.asarray(table.flux)).all()
+    ):
+        raise IdentificationError(
+            "a centroid has noise or flux that is no finite number: leave such centroids out."
+        )

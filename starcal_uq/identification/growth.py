@@ -1,10 +1,12 @@
-"""From a patch of matched stars to the whole field: a lens that bends is learnt from the middle outwards.
+"""From a patch of matched stars to the whole field: a lens that bends is learnt from the middle
+outwards.
 
-The stars that a search at any focal length matched lie where a pinhole is right to a pixel. Attitude, focal length,
-principal point and two radial terms are fitted to them and predict the stars around them, each with its uncertainty. A
-star is looked for within that, but only among as many of the brightest as leave hardly one there by chance;
-the fit to all that are found reaches farther, until nothing more is found. The number of brightest stars and
-centroids that are compared follows from the uncertainty, at each place.
+The stars that a search at any focal length matched lie where a pinhole is right to a pixel.
+Attitude, focal length, principal point and two radial terms are fitted to them and predict the
+stars around them, each with its uncertainty. A star is looked for within that, but only among as
+many of the brightest as leave hardly one there by chance; the fit to all that are found reaches
+farther, until nothing more is found. The number of brightest stars and centroids that are compared
+follows from the uncertainty, at each place.
 """
 
 from __future__ import annotations
@@ -24,15 +26,19 @@ from starcal_uq.identification.pyramid import SIGMAS, FieldGeometry
 from starcal_uq.maths.intervals import median_of
 from starcal_uq.maths.linear import scaled_inverse
 
-# What is fitted; k1 and k2 are known to so much, as displacements at the corner in units of its distance.
+# What is fitted; k1 and k2 are known to so much, as displacements at the corner in units of its
+# distance.
 _MODEL, _BEND_SD = "brown", (0.1, 0.05)
-# Standard deviations of the logarithm of the focal length, and of the principal point in detector widths.
+# Standard deviations of the logarithm of the focal length, and of the principal point in detector
+# widths.
 _FOCAL_SD, _CENTRE_SD = 0.05, 0.015
-# Centroids met by chance in a gate, at the most, and those that are compared, for each star and in addition.
+# Centroids met by chance in a gate, at the most, and those that are compared, for each star and in
+# addition.
 _CHANCE, _PER_STAR, _MORE = 0.1, 1.5, 8
 # Rounds of fitting and matching, and steps of one fit.
 _ROUNDS, _STEPS = 30, 4
-# Catalogue and lens have errors of their own, px; and no lens of two terms that misses by more, in corner distances.
+# Catalogue and lens have errors of their own, px; and no lens of two terms that misses by more, in
+# corner distances.
 _LEAST_NOISE_PX, _WORST_NOISE = 0.1, 0.01
 # A field is learnt from no fewer stars: twice as many numbers as are fitted, and some more.
 _LEAST_STARS = 12
@@ -40,7 +46,8 @@ _LEAST_STARS = 12
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Stars of one frame that are matched: rows (m,) of its centroids, brightest first, and directions (m, 3).
+    """Stars of one frame that are matched: rows (m,) of its centroids, brightest first, and
+    directions (m, 3).
 
     `rotation` (3, 3) is its attitude, b = R r.
     """
@@ -53,10 +60,11 @@ class Patch:
 
 @dataclass(frozen=True, eq=False)
 class GrownField:
-    """A camera as one frame shows it, with the covariance of its parameters, and the stars that show it.
+    """A camera as one frame shows it, with the covariance of its parameters, and the stars that
+    show it.
 
-    `log10_false` is the decimal logarithm of the number of wrong attitudes on the whole sky, with any such lens, that
-    are expected to match as well.
+    `log10_false` is the decimal logarithm of the number of wrong attitudes on the whole sky, with
+    any such lens, that are expected to match as well.
     """
 
     camera: Camera
@@ -79,11 +87,15 @@ class _Fit:
     noise: float
 
 
-def grow(xy: FloatArray, sigma_px: FloatArray, patch: Patch, sky: NearbyStars, camera: Camera) -> GrownField | None:
-    """The camera of a frame, centroids (n, 2) with noise (n,), px, brightest first, from its matched patch.
+def grow(
+    xy: FloatArray, sigma_px: FloatArray, patch: Patch, sky: NearbyStars, camera: Camera
+) -> GrownField | None:
+    """The camera of a frame, centroids (n, 2) with noise (n,), px, brightest first, from its
+    matched patch.
 
-    `sky` is searched as deep as the frame needs; `camera` gives size, pitch and name, and the principal point that is
-    expected. None where too few stars are matched, or where they do not determine the lens.
+    `sky` is searched as deep as the frame needs; `camera` gives size, pitch and name, and the
+    principal point that is expected. None where too few stars are matched, or where they do not
+    determine the lens.
     """
     corner, area = camera.corner_radius_px, float(camera.width_px * camera.height_px)
     sigma = np.hypot(sigma_px, _LEAST_NOISE_PX)
@@ -115,11 +127,15 @@ def grow(xy: FloatArray, sigma_px: FloatArray, patch: Patch, sky: NearbyStars, c
         coefficients=tuple(fit.theta[3:].tolist()),
     )
     # No lens shows the detector's corners more than once.
-    corners = np.array([[x, y] for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)])
+    corners = np.array(
+        [[x, y] for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)]
+    )
     if not np.isfinite(unproject_theta(_MODEL, fit.theta, corners)).all():
         return None
     typical = fit.noise * float(median_of(sigma))
-    expected = _log10_false(len(xy), len(centroid), len(stars), sky.depth(len(xy)), typical, area, len(fit.theta))
+    expected = _log10_false(
+        len(xy), len(centroid), len(stars), sky.depth(len(xy)), typical, area, len(fit.theta)
+    )
     found = Patch(fit.rotation, grown.focal_px, centroid, r)
     return GrownField(grown, fit.covariance, found, expected)
 
@@ -132,8 +148,16 @@ def _prior(camera: Camera, focal_px: float) -> tuple[FloatArray, FloatArray]:
     return np.array([*camera.centre_px, focal_px, 0.0, 0.0]), np.array(sd)
 
 
-def _fitted(fit: _Fit, xy: FloatArray, sigma: FloatArray, r: FloatArray, prior: tuple[FloatArray, FloatArray]) -> _Fit:
-    """Least squares with the prior, of stars (m, 2) with directions (m, 3), and the noise that they show."""
+def _fitted(
+    fit: _Fit,
+    xy: FloatArray,
+    sigma: FloatArray,
+    r: FloatArray,
+    prior: tuple[FloatArray, FloatArray],
+) -> _Fit:
+    """Least squares with the prior, of stars (m, 2) with directions (m, 3), and the noise that they
+    show.
+    """
     mean, sd = prior
     # Offsets count in units of the prior, angles in pixels.
     scale = np.concatenate([sd, np.full(3, 1.0 / mean[2])])
@@ -144,7 +168,14 @@ def _fitted(fit: _Fit, xy: FloatArray, sigma: FloatArray, r: FloatArray, prior: 
         b = np.ascontiguousarray((r @ rotation.T).T)
         place, d_theta, d_phi = forward_kernel(_MODEL, "first")(m, theta, b, np.zeros(2))
         e = (xy.T - place) / sigma
-        noise = max(1.0, float(np.sqrt(median_of(np.sum(e * e, axis=0)) / (2.0 * log(2.0) * max(1.0 - 4.0 / m, 0.3)))))
+        noise = max(
+            1.0,
+            float(
+                np.sqrt(
+                    median_of(np.sum(e * e, axis=0)) / (2.0 * log(2.0) * max(1.0 - 4.0 / m, 0.3))
+                )
+            ),
+        )
         weight = np.minimum(1.0, SIGMAS * noise / np.maximum(np.hypot(*e), 1e-9)) / noise**2
         j = np.concatenate([d_theta, d_phi]).reshape(p + 3, 2, m) / sigma * scale[:, None, None]
         normal = np.einsum("iam,jam,m->ij", j, j, weight)
@@ -172,8 +203,12 @@ def _in_field(fit: _Fit, sky: NearbyStars, camera: Camera, n_centroids: int) -> 
     return seen
 
 
-def _near(fit: _Fit, xy: FloatArray, noise: FloatArray, r: FloatArray, area: float) -> tuple[IntArray, IntArray]:
-    """Centroids and stars, by rank in brightness of directions (n, 3), where the one is predicted from the other."""
+def _near(
+    fit: _Fit, xy: FloatArray, noise: FloatArray, r: FloatArray, area: float
+) -> tuple[IntArray, IntArray]:
+    """Centroids and stars, by rank in brightness of directions (n, 3), where the one is predicted
+    from the other.
+    """
     from scipy.spatial import cKDTree
 
     n = len(r)
@@ -184,7 +219,9 @@ def _near(fit: _Fit, xy: FloatArray, noise: FloatArray, r: FloatArray, area: flo
     spread = 0.5 * np.einsum("ian,ik,kan->n", j, fit.covariance, j)
     gate = SIGMAS * np.sqrt(float(median_of(noise)) ** 2 + spread)
     # As many stars as leave little to chance, in steps of two: each step has its own centroids.
-    level = np.exp2(np.floor(np.log2(np.maximum(_CHANCE * area / (pi * gate**2), 1.0)))).astype(np.int64)
+    level = np.exp2(np.floor(np.log2(np.maximum(_CHANCE * area / (pi * gate**2), 1.0)))).astype(
+        np.int64
+    )
     used = np.flatnonzero(np.arange(n) < level)
     level = np.minimum(level, int(np.exp2(np.ceil(np.log2(max(n, len(xy), 1))))))
     centroid = np.full(n, -1)
@@ -202,12 +239,17 @@ def _near(fit: _Fit, xy: FloatArray, noise: FloatArray, r: FloatArray, area: flo
     return centroid[star], star
 
 
-def _log10_false(n: int, m: int, in_field: int, n_sky: int, noise_px: float, area: float, n_lens: int) -> float:
-    """Log10 of the wrong attitudes on the sky, with any lens, at which m of n centroids have a star within the gate.
+def _log10_false(
+    n: int, m: int, in_field: int, n_sky: int, noise_px: float, area: float, n_lens: int
+) -> float:
+    """Log10 of the wrong attitudes on the sky, with any lens, at which m of n centroids have a star
+    within the gate.
 
-    Attitude and lens are free to be right for half as many stars as they have numbers: a first one is any of the sky,
-    the others any of the field. The rest are met by chance.
+    Attitude and lens are free to be right for half as many stars as they have numbers: a first one
+    is any of the sky, the others any of the field. The rest are met by chance.
     """
     free = (n_lens + 3 + 1) // 2
     hit = min(in_field / area * pi * (SIGMAS * noise_px) ** 2, 1.0)
-    return (log(n_sky) + (free - 1) * log(max(in_field, 2)) + (m - free) * log(hit)) / log(10.0) + log10_choices(n, m)
+    return (log(n_sky) + (free - 1) * log(max(in_field, 2)) + (m - free) * log(hit)) / log(
+        10.0
+    ) + log10_choices(n, m)

@@ -1,11 +1,15 @@
-"""From a hypothesis to matched stars: the rest of the stars, refined camera and attitude, and the odds of chance.
+"""From a hypothesis to matched stars: the rest of the stars, refined camera and attitude, and the
+odds of chance.
 
-In ideal pixels u (offsets from the nominal principal point, nominal distortion removed) a star at direction r is at
+In ideal pixels u (offsets from the nominal principal point, nominal distortion removed) a star at
+direction r is at
 
-    u = F p (1 + kappa |p|^2 / |p_c|^2 / (F |p_c|)) + d,    p = (q_x, q_y) / q_z,    q = exp([phi]x) R r
+    u = F p (1 + kappa |p|^2 / |p_c|^2 / (F |p_c|)) + d,    p = (q_x, q_y) / q_z,    q = exp([phi]x)
+    R r
 
-with F the focal length, d the shift of the principal point, and kappa px of radial displacement at the corner p_c. The
-parameters (phi, ln F, d, kappa) follow from damped least squares, the damping being the stated tolerances.
+with F the focal length, d the shift of the principal point, and kappa px of radial displacement at
+the corner p_c. The parameters (phi, ln F, d, kappa) follow from damped least squares, the damping
+being the stated tolerances.
 """
 
 from __future__ import annotations
@@ -31,7 +35,8 @@ if TYPE_CHECKING:
 N_SHARED = 4
 # Catalogue and lens have errors of their own: no gate is narrower than for this noise.
 _LEAST_GATE_SIGMA_PX = 0.1
-# A star is ambiguous if the next one, on the sky or on the detector, is not this much farther in sigma^2: exp(-14).
+# A star is ambiguous if the next one, on the sky or on the detector, is not this much farther in
+# sigma^2: exp(-14).
 _DISTINCT = 28.0
 
 
@@ -39,7 +44,8 @@ _DISTINCT = 28.0
 class CameraState:
     """Attitude (b = R r) and camera relative to the nominal one.
 
-    `shared` (4,) are ln of the focal length over its nominal value, shift of the principal point (px), kappa (px).
+    `shared` (4,) are ln of the focal length over its nominal value, shift of the principal point
+    (px), kappa (px).
     """
 
     rotation: FloatArray
@@ -48,13 +54,15 @@ class CameraState:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Stars of one frame: rows (m,) of its centroids and of the catalogue, with residuals (m, 2), px.
+    """Stars of one frame: rows (m,) of its centroids and of the catalogue, with residuals (m, 2),
+    px.
 
-    `gate_px` is the largest distance accepted, for the centroid of median noise; `noise_scale` the noise found over
-    that stated, at least 1; `log10_false` the decimal logarithm of the expected number of wrong attitudes on the whole
-    sky that match as well. `n_ambiguous` centroids fit more than one star; `n_unlike_brightness` were left out because
-    they are farther from their star, and less of its brightness, than chance explains; no match has more than
-    `n_possible`, the centroids, or the stars in the field if those are fewer. `information` (4, 4) is on the shared
+    `gate_px` is the largest distance accepted, for the centroid of median noise; `noise_scale` the
+    noise found over that stated, at least 1; `log10_false` the decimal logarithm of the expected
+    number of wrong attitudes on the whole sky that match as well. `n_ambiguous` centroids fit more
+    than one star; `n_unlike_brightness` were left out because they are farther from their star, and
+    less of its brightness, than chance explains; no match has more than `n_possible`, the
+    centroids, or the stars in the field if those are fewer. `information` (4, 4) is on the shared
     parameters, attitude eliminated; times their best value it is `gradient` (4,).
     """
 
@@ -93,12 +101,14 @@ def match_frame(
     radial: bool = True,
     polished: bool = False,
 ) -> Match | None:
-    """Match all centroids of a frame, ideal pixels u (n, 2) and their `tree`, with a gate that shrinks to the noise.
+    """Match all centroids of a frame, ideal pixels u (n, 2) and their `tree`, with a gate that
+    shrinks to the noise.
 
-    With instrumental magnitudes (n,), NaN where not known, doubtful matches of unlike brightness are left out. `radial`
-    says whether kappa is fitted, and `polished` that `start` is good to the noise already, so that the gate starts
-    small. None where fewer than four stars are matched, or where it shows on the way that there will be too few for
-    less than ten to the `log10_wanted` false matches.
+    With instrumental magnitudes (n,), NaN where not known, doubtful matches of unlike brightness
+    are left out. `radial` says whether kappa is fitted, and `polished` that `start` is good to the
+    noise already, so that the gate starts small. None where fewer than four stars are matched, or
+    where it shows on the way that there will be too few for less than ten to the `log10_wanted`
+    false matches.
     """
     g = sky.geometry
     focal = g.focal_px * float(np.exp(start.shared[0]))
@@ -138,23 +148,32 @@ def match_frame(
             noise_scale = _noise_scale(e, sigma_px[centroid])
     predicted, _ = _predict(state, r, g)
     limit = final * noise_scale
-    centroid, star, ambiguous = _mutual(tree, u, predicted, limit, (sigma_px * noise_scale) ** 2 * _DISTINCT)
+    centroid, star, ambiguous = _mutual(
+        tree, u, predicted, limit, (sigma_px * noise_scale) ** 2 * _DISTINCT
+    )
     if len(star) < 4:
         return None
     e = u[centroid] - predicted[star]
     refused = np.zeros(len(star), dtype=np.bool_)
     if mag is not None:
-        misfit = np.sum(e * e, axis=1) / (np.maximum(sigma_px[centroid], _LEAST_GATE_SIGMA_PX) * noise_scale) ** 2
+        misfit = (
+            np.sum(e * e, axis=1)
+            / (np.maximum(sigma_px[centroid], _LEAST_GATE_SIGMA_PX) * noise_scale) ** 2
+        )
         refused = unlike_brightness(mag[centroid] - sky.mag[ranks[star]], misfit)
     if refused.any():
         centroid, star = centroid[~refused], star[~refused]
         if len(star) < 4:
             return None
         state, e = _fit(state, _linearised(state, u, sigma_px, r, centroid, star, g), prior)
-    information, gradient = _information(state, _linearised(state, u, sigma_px * noise_scale, r, centroid, star, g))
+    information, gradient = _information(
+        state, _linearised(state, u, sigma_px * noise_scale, r, centroid, star, g)
+    )
     in_field = max(int(_on_detector(predicted, g).sum()), 4)
     density = in_field / (g.width_px * g.height_px)
-    expected = log10_false_matches(len(u), len(star), density, depth, typical * noise_scale, g, tolerance)
+    expected = log10_false_matches(
+        len(u), len(star), density, depth, typical * noise_scale, g, tolerance
+    )
     return Match(
         state,
         centroid,
@@ -172,7 +191,8 @@ def match_frame(
 
 
 _MUCH_WIDER = 3.0
-# At the start stars may lie this many times the first gate away, and this part of those wanted must be seen.
+# At the start stars may lie this many times the first gate away, and this part of those wanted must
+# be seen.
 _WIDER, _SEEN = 1.5, 0.7
 
 
@@ -186,7 +206,9 @@ def _enough(
     tolerance: CameraTolerance,
     log10_wanted: float,
 ) -> int:
-    """Stars of n centroids that are matched on the way to fewer than ten to the `log10_wanted` false matches."""
+    """Stars of n centroids that are matched on the way to fewer than ten to the `log10_wanted`
+    false matches.
+    """
     density = max(in_field, 4) / (g.width_px * g.height_px)
     wanted = 4
     for wanted in range(4, n + 1):
@@ -198,7 +220,9 @@ def _enough(
 
 def _on_detector(predicted: FloatArray, g: FieldGeometry) -> BoolArray:
     """Which stars are on the detector, or just outside."""
-    inside: BoolArray = np.all(np.abs(predicted) < 0.5 * np.array([g.width_px, g.height_px]) + 30.0, axis=1)
+    inside: BoolArray = np.all(
+        np.abs(predicted) < 0.5 * np.array([g.width_px, g.height_px]) + 30.0, axis=1
+    )
     return inside
 
 
@@ -211,18 +235,22 @@ def log10_false_matches(
     geometry: FieldGeometry,
     tolerance: CameraTolerance,
 ) -> float:
-    """Log10 of the number of wrong attitudes, on the whole sky, at which m of n centroids have a star within the gate.
+    """Log10 of the number of wrong attitudes, on the whole sky, at which m of n centroids have a
+    star within the gate.
 
-    A first centroid is any of the `n_sky` stars, a second one any star at its distance within the tolerance of the
-    focal length; each of the other m - 2 has a star within the gate with probability ``density pi gate^2``. What the
-    free principal point and distortion can take up widens the gate.
+    A first centroid is any of the `n_sky` stars, a second one any star at its distance within the
+    tolerance of the focal length; each of the other m - 2 has a star within the gate with
+    probability ``density pi gate^2``. What the free principal point and distortion can take up
+    widens the gate.
     """
     length = 0.4 * max(geometry.width_px, geometry.height_px)
     bias = geometry.relative_bias(tolerance)
     area = pi * (gate_px**2 + (0.5 * bias * length) ** 2)
     ring = 2.0 * pi * length**2 * 2.0 * (tolerance.focal + bias + gate_px / length)
     hit = min(density_px2 * area, 1.0)
-    return (log(n_sky) + log(density_px2 * ring) + (m - 2) * log(hit)) / log(10.0) + log10_choices(n, m)
+    return (log(n_sky) + log(density_px2 * ring) + (m - 2) * log(hit)) / log(10.0) + log10_choices(
+        n, m
+    )
 
 
 def log10_choices(n: int, m: int) -> float:
@@ -231,9 +259,16 @@ def log10_choices(n: int, m: int) -> float:
 
 
 def _prior(tolerance: CameraTolerance, radial: bool) -> FloatArray:
-    """Information (7,) of the tolerances, read as two standard deviations; none about the attitude."""
+    """Information (7,) of the tolerances, read as two standard deviations; none about the
+    attitude.
+    """
     sd = np.array(
-        [tolerance.focal / 2.0, tolerance.centre_px / 2.0, tolerance.centre_px / 2.0, tolerance.distortion_px / 2.0]
+        [
+            tolerance.focal / 2.0,
+            tolerance.centre_px / 2.0,
+            tolerance.centre_px / 2.0,
+            tolerance.distortion_px / 2.0,
+        ]
     )
     if not radial:
         sd[3] = 1e-6
@@ -263,7 +298,9 @@ def _jacobian(state: CameraState, r: FloatArray, g: FieldGeometry) -> tuple[Floa
     j[:, :, :3] *= focal
     j[:, :, 3] = focal * p.T
     j[0, :, 4] = j[1, :, 5] = 1.0
-    j[:, :, 6] = focal * p.T * (np.einsum("ni,ni->n", p, p) * (focal / g.corner_px) ** 2 / g.corner_px)
+    j[:, :, 6] = (
+        focal * p.T * (np.einsum("ni,ni->n", p, p) * (focal / g.corner_px) ** 2 / g.corner_px)
+    )
     return u, j
 
 
@@ -279,7 +316,9 @@ def _linearised(
     star: IntArray,
     g: FieldGeometry,
 ) -> _Linear:
-    """Residuals (2, m), their derivatives (2, m, q), weights (m,), and the weighted derivatives as rows (2 m, q)."""
+    """Residuals (2, m), their derivatives (2, m, q), weights (m,), and the weighted derivatives as
+    rows (2 m, q).
+    """
     predicted, j = _jacobian(state, r[star], g)
     weight = 1.0 / sigma_px[centroid]
     return (u[centroid] - predicted).T, j, weight, (j * weight[:, None]).reshape(-1, j.shape[2])
@@ -312,11 +351,13 @@ def _information(state: CameraState, linear: _Linear) -> tuple[FloatArray, Float
 def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
     """Noise found over noise stated, from the median of the squared residuals; between 1 and 4.
 
-    Less one standard deviation of that, so that chance does not widen the gates: false stars come with their area.
+    Less one standard deviation of that, so that chance does not widen the gates: false stars come
+    with their area.
     """
     m = len(e)
     squared = np.sum(e * e, axis=1) / sigma_px**2
-    # Chi-square with two degrees of freedom has the median 2 ln 2; seven parameters were fitted, damped.
+    # Chi-square with two degrees of freedom has the median 2 ln 2; seven parameters were fitted,
+    # damped.
     share = max(1.0 - 5.0 / (2.0 * m), 0.3)
     noise = float(np.sqrt(median_of(squared) / (2.0 * np.log(2.0) * share)))
     noise /= 1.0 + 0.5 / (np.log(2.0) * np.sqrt(m))
@@ -324,15 +365,22 @@ def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
 
 
 def _mutual(
-    tree: cKDTree, u: FloatArray, predicted: FloatArray, limit_px: FloatArray, distinct_px2: FloatArray | None = None
+    tree: cKDTree,
+    u: FloatArray,
+    predicted: FloatArray,
+    limit_px: FloatArray,
+    distinct_px2: FloatArray | None = None,
 ) -> tuple[IntArray, IntArray, int]:
-    """Nearest mutual neighbours within limits (n,): centroids, stars, and how many were left out as ambiguous.
+    """Nearest mutual neighbours within limits (n,): centroids, stars, and how many were left out as
+    ambiguous.
 
-    `tree` is that of the centroids u (n, 2), of which only those nearest to a star are looked at further.
+    `tree` is that of the centroids u (n, 2), of which only those nearest to a star are looked at
+    further.
     """
     farthest = float(limit_px.max()) * (1.0 + 1e-9)
     nearest_centroid = tree.query(predicted, distance_upper_bound=farthest)[1]
-    # A star without a centroid near it is not the nearest one of any, but may make another ambiguous.
+    # A star without a centroid near it is not the nearest one of any, but may make another
+    # ambiguous.
     near = np.flatnonzero((nearest_centroid < len(u)) | (distinct_px2 is not None))
     predicted, nearest_centroid = predicted[near], nearest_centroid[near]
     rows = np.unique(nearest_centroid[nearest_centroid < len(u)])
@@ -344,7 +392,9 @@ def _mutual(
     mutual = (nearest_centroid[star] == rows) & (nearest <= limit_px[rows] ** 2)
     ambiguous = np.zeros(len(rows), dtype=np.bool_)
     if distinct_px2 is not None:
-        next_star = np.partition(d2, 1, axis=1)[:, 1] if d2.shape[1] > 1 else np.full(len(rows), np.inf)
+        next_star = (
+            np.partition(d2, 1, axis=1)[:, 1] if d2.shape[1] > 1 else np.full(len(rows), np.inf)
+        )
         next_centroid = tree.query(predicted[star], k=[2])[0][:, 0] ** 2
         ambiguous = mutual & (np.minimum(next_star, next_centroid) - nearest < distinct_px2[rows])
     keep = mutual & ~ambiguous

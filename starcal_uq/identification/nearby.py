@@ -11,15 +11,18 @@ import numpy as np
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.identification.pyramid import FieldGeometry
 
-# Centroids are compared with the catalogue down to where a field holds this many stars for each, and some more.
+# Centroids are compared with the catalogue down to where a field holds this many stars for each,
+# and some more.
 _STARS_PER_CENTROID, _STARS_MORE = 2.0, 20
-# All stars are looked at sooner than a tree gives its list, where they are so few; where they are more, making the tree
-# takes as long as so many looks at all of them.
+# All stars are looked at sooner than a tree gives its list, where they are so few; where they are
+# more, making the tree takes as long as so many looks at all of them.
 _FEW, _LOOKS = 20_000, 300
 
 
 class NearbyStars:
-    """A catalogue, unit vectors (N, 3) and magnitudes (N,), searched to the depth that suits a frame."""
+    """A catalogue, unit vectors (N, 3) and magnitudes (N,), searched to the depth that suits a
+    frame.
+    """
 
     def __init__(self, directions: FloatArray, mag: FloatArray, geometry: FieldGeometry) -> None:
         self.rows: IntArray = np.argsort(mag, kind="stable").astype(np.int64)
@@ -57,5 +60,7 @@ class NearbyStars:
 
 
 def _step(wanted: float) -> int:
-    """The next power of the square root of two: few different depths, because each has its own tree."""
+    """The next power of the square root of two: few different depths, because each has its own
+    tree.
+    """
     return int(np.ceil(2.0 ** (np.ceil(2.0 * np.log2(wanted)) / 2.0)))

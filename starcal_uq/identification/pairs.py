@@ -1,9 +1,10 @@
 """Pairs of catalogue stars sorted by angle: what a pattern search looks things up in, kept on disk.
 
-Patterns are made of the brightest stars of each neighbourhood only, so that a field holds about as many of them
-everywhere on the sky. A range of angles is a slice of the sorted pairs (the purpose of the k-vector of Mortari et al.
-2004, reached by binary search). The neighbours of each star are sorted by angle too, and a table of equal steps says
-where each step begins: thousands of questions "which stars are at this angle from that star" are one look-up.
+Patterns are made of the brightest stars of each neighbourhood only, so that a field holds about as
+many of them everywhere on the sky. A range of angles is a slice of the sorted pairs (the purpose of
+the k-vector of Mortari et al. 2004, reached by binary search). The neighbours of each star are
+sorted by angle too, and a table of equal steps says where each step begins: thousands of questions
+"which stars are at this angle from that star" are one look-up.
 """
 
 from __future__ import annotations
@@ -28,13 +29,16 @@ from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-# Stars a field should hold; a star with this many brighter ones within a field's area around it is no pattern star.
+# Stars a field should hold; a star with this many brighter ones within a field's area around it is
+# no pattern star.
 PATTERN_STARS = 18
-# Pairs that are listed at the most, about: in narrow fields, with most stars, those at larger angles are left out.
+# Pairs that are listed at the most, about: in narrow fields, with most stars, those at larger
+# angles are left out.
 _MOST_PAIRS = 5_000_000
 # Steps of angle in the table of neighbours of a star, and of all of them.
 _STEPS, _ALL_STEPS = (8, 256), 1 << 22
-# Numbers of the table of cubes that says where no star is near, its least chord, and questions that it is worth.
+# Numbers of the table of cubes that says where no star is near, its least chord, and questions that
+# it is worth.
 _CUBES, _LEAST_CUBE, _MANY = 1 << 22, 2.0**-12, 5_000
 # Pairs whose angles are computed together.
 _AT_ONCE = 1 << 17
@@ -46,9 +50,10 @@ _VERSION = 2
 class StarPairs:
     """Pattern stars and the angles between them; n stars, P pairs.
 
-    `star` (n,) are rows of the catalogue; pairs are of pattern stars `first` and `second` (P,), sorted by `angle`, rad.
-    `neighbour` (2 P,) are the partners of pattern star 0, then of star 1 and so on, those of one star by increasing
-    angle, with `neighbour_angle` (2 P,), rad; `neighbour_start` (n + 1,) is the first of each star.
+    `star` (n,) are rows of the catalogue; pairs are of pattern stars `first` and `second` (P,),
+    sorted by `angle`, rad. `neighbour` (2 P,) are the partners of pattern star 0, then of star 1
+    and so on, those of one star by increasing angle, with `neighbour_angle` (2 P,), rad;
+    `neighbour_start` (n + 1,) is the first of each star.
     """
 
     star: IntArray
@@ -63,7 +68,9 @@ class StarPairs:
     def __len__(self) -> int:
         return len(self.star)
 
-    def near_angle(self, star: IntArray, angle_rad: FloatArray, tolerance_rad: float) -> tuple[IntArray, IntArray]:
+    def near_angle(
+        self, star: IntArray, angle_rad: FloatArray, tolerance_rad: float
+    ) -> tuple[IntArray, IntArray]:
         """Pattern stars at angles (m,) from pattern stars `star` (m,), each within the tolerance.
 
         Of each hit the index into `star`, and the pattern star, (h,) each.
@@ -82,11 +89,14 @@ class StarPairs:
         n = int(total[-1]) if len(total) else 0
         question = np.repeat(some, count)
         row = np.arange(n) + np.repeat(start - (total - count), count)
-        inside = np.flatnonzero(np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad)
+        inside = np.flatnonzero(
+            np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad
+        )
         return question[inside], self.neighbour[row[inside]]
 
     def near_place(self, directions: FloatArray, chord: float) -> tuple[IntArray, FloatArray]:
-        """Rows of the unit vectors (m, 3) that may have a pattern star within a chord, and how near the nearest is.
+        """Rows of the unit vectors (m, 3) that may have a pattern star within a chord, and how near
+        the nearest is.
 
         For many of them a table of small cubes says where there is none, sooner than the tree.
         """
@@ -100,7 +110,9 @@ class StarPairs:
 
     @cached_property
     def _cubes(self) -> dict[float, BoolArray]:
-        """For each size of cubes those, by hash, that a pattern star is in, or not farther from than such a size."""
+        """For each size of cubes those, by hash, that a pattern star is in, or not farther from
+        than such a size.
+        """
         return {}
 
     def ready(self) -> StarPairs:
@@ -117,10 +129,14 @@ class StarPairs:
 
     @cached_property
     def _steps(self) -> tuple[NDArray[np.int32], int, float]:
-        """Where each step of each star's neighbours begins, (n * steps + 1,), the steps, and how many of them a rad."""
+        """Where each step of each star's neighbours begins, (n * steps + 1,), the steps, and how
+        many of them a rad.
+        """
         steps = min(max(_ALL_STEPS // max(len(self), 1), _STEPS[0]), _STEPS[1])
         width = (float(self.angle[-1]) if len(self.angle) else 1.0) / steps * (1.0 + 1e-12)
-        star = np.repeat(np.arange(len(self), dtype=np.int32) * np.int32(steps), np.diff(self.neighbour_start))
+        star = np.repeat(
+            np.arange(len(self), dtype=np.int32) * np.int32(steps), np.diff(self.neighbour_start)
+        )
         star += np.minimum(self.neighbour_angle * (1.0 / width), steps - 1.0).astype(np.int32)
         edges = np.zeros(len(self) * steps + 1, dtype=np.int32)
         np.cumsum(np.bincount(star, minlength=len(edges) - 1), out=edges[1:])
@@ -128,9 +144,15 @@ class StarPairs:
 
 
 def find_star_pairs(
-    directions: FloatArray, mag: FloatArray, field_sr: float, max_angle_rad: float, per_field: int = PATTERN_STARS
+    directions: FloatArray,
+    mag: FloatArray,
+    field_sr: float,
+    max_angle_rad: float,
+    per_field: int = PATTERN_STARS,
 ) -> StarPairs:
-    """Choose pattern stars, `per_field` of them in a field of view, and list their pairs up to the largest angle."""
+    """Choose pattern stars, `per_field` of them in a field of view, and list their pairs up to the
+    largest angle.
+    """
     from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
 
@@ -138,14 +160,22 @@ def find_star_pairs(
     # Twice as many as needed on average leaves enough far from the Milky Way.
     order = order[: int(np.ceil(2.5 * per_field * 4.0 * np.pi / field_sr))]
     near = (
-        cKDTree(directions[order]).query_pairs(_chord(np.sqrt(field_sr / np.pi)), output_type="ndarray").reshape(-1, 2)
+        cKDTree(directions[order])
+        .query_pairs(_chord(np.sqrt(field_sr / np.pi)), output_type="ndarray")
+        .reshape(-1, 2)
     )
     brighter = np.bincount(near[:, 1], minlength=len(order))
     star = order[brighter < per_field].astype(np.int64)
     chosen = np.ascontiguousarray(directions[star])
-    # Stars at random have n^2 (1 - cos angle) / 4 pairs, which is n^2 angle^2 / 8 where there are many.
+    # Stars at random have n^2 (1 - cos angle) / 4 pairs, which is n^2 angle^2 / 8 where there are
+    # many.
     max_angle_rad = min(max_angle_rad, float(np.sqrt(8.0 * _MOST_PAIRS) / max(len(star), 1)))
-    pairs = cKDTree(chosen).query_pairs(_chord(max_angle_rad), output_type="ndarray").reshape(-1, 2).astype(np.int32)
+    pairs = (
+        cKDTree(chosen)
+        .query_pairs(_chord(max_angle_rad), output_type="ndarray")
+        .reshape(-1, 2)
+        .astype(np.int32)
+    )
     angle = np.empty(len(pairs))
     for rows in (slice(k, k + _AT_ONCE) for k in range(0, len(pairs), _AT_ONCE)):
         angle[rows] = angle_between(chosen[pairs[rows, 0]], chosen[pairs[rows, 1]])
@@ -155,9 +185,12 @@ def find_star_pairs(
     same = np.flatnonzero(np.diff(angle) == 0.0)
     same = np.union1d(same, same + 1)
     pairs[same] = pairs[same[np.lexsort((pairs[same, 1], pairs[same, 0], angle[same]))]]
-    # Each pair twice, in the order of angles, which transposing a sparse row keeps: by counts, without comparing.
+    # Each pair twice, in the order of angles, which transposing a sparse row keeps: by counts,
+    # without comparing.
     twice = np.arange(2 * len(pairs), dtype=np.int32)
-    row = csr_array((twice, pairs.ravel(), np.array([0, len(twice)], dtype=np.int32)), shape=(1, len(star)))
+    row = csr_array(
+        (twice, pairs.ravel(), np.array([0, len(twice)], dtype=np.int32)), shape=(1, len(star))
+    )
     by_star = row.tocsc()
     neighbour = pairs[:, ::-1].ravel()[by_star.data]
     first, second = np.ascontiguousarray(pairs.T)
@@ -170,7 +203,9 @@ def _cubes_near(directions: FloatArray, size: float) -> BoolArray:
     table = np.zeros(_CUBES, dtype=np.bool_)
     inside = directions / size - np.floor(directions / size)
     steps = (-1, 0, 1)
-    apart = [[np.maximum(np.maximum(k - x, x - k - 1.0), 0.0) ** 2 for k in steps] for x in inside.T]
+    apart = [
+        [np.maximum(np.maximum(k - x, x - k - 1.0), 0.0) ** 2 for k in steps] for x in inside.T
+    ]
     for i, j, k in product(range(3), repeat=3):
         near = apart[0][i] + apart[1][j] + apart[2][k] <= 1.0 + 1e-6
         table[_hash(directions[near] / size + (i - 1.0, j - 1.0, k - 1.0))] = True
@@ -178,14 +213,20 @@ def _cubes_near(directions: FloatArray, size: float) -> BoolArray:
 
 
 def _hash(place: FloatArray) -> NDArray[np.int32]:
-    """A number below `_CUBES` of the unit cube that each place (m, 3) is in; that integers overflow is meant."""
+    """A number below `_CUBES` of the unit cube that each place (m, 3) is in; that integers overflow
+    is meant.
+    """
     x, y, z = np.floor(place).astype(np.int32).T
-    number: NDArray[np.int32] = x * np.int32(73856093) ^ y * np.int32(19349663) ^ z * np.int32(83492791)
+    number: NDArray[np.int32] = (
+        x * np.int32(73856093) ^ y * np.int32(19349663) ^ z * np.int32(83492791)
+    )
     return number & np.int32(_CUBES - 1)
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Angles (...) in rad between unit vectors (..., 3), from the chord, which keeps its digits at small angles."""
+    """Angles (...) in rad between unit vectors (..., 3), from the chord, which keeps its digits at
+    small angles.
+    """
     difference = a - b
     chord = np.sqrt(np.einsum("...i,...i->...", difference, difference))
     angle: FloatArray = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
@@ -205,7 +246,9 @@ def prepared_star_pairs(
     cache: bool,
     cache_dir: str | os.PathLike[str] | None = None,
 ) -> StarPairs:
-    """The pairs that this process has used before, or else those of the file where `cache` is on, or new ones."""
+    """The pairs that this process has used before, or else those of the file where `cache` is on,
+    or new ones.
+    """
     key = _digest(directions, mag, field_sr, max_angle_rad, PATTERN_STARS)
     pairs = _recent.pop(key, None)
     if pairs is None:
@@ -233,10 +276,11 @@ def cached_star_pairs(
     cache_dir: str | os.PathLike[str] | None = None,
     per_field: int = PATTERN_STARS,
 ) -> StarPairs:
-    """`find_star_pairs`, from a file of the cache folder where there is one, leaving one there where there is none.
+    """`find_star_pairs`, from a file of the cache folder where there is one, leaving one there
+    where there is none.
 
-    The file's name is a hash of the catalogue and of all parameters. A damaged file is replaced; a folder that cannot
-    be written to does no harm.
+    The file's name is a hash of the catalogue and of all parameters. A damaged file is replaced; a
+    folder that cannot be written to does no harm.
     """
     folder = default_cache_dir() if cache_dir is None else Path(cache_dir)
     path = folder / f"star-pairs-{_digest(directions, mag, field_sr, max_angle_rad, per_field)}.npz"
@@ -247,7 +291,9 @@ def cached_star_pairs(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
-            np.savez(temporary, **{field.name: getattr(pairs, field.name) for field in fields(StarPairs)})
+            np.savez(
+                temporary, **{field.name: getattr(pairs, field.name) for field in fields(StarPairs)}
+            )
     except (OSError, RunFolderError):
         # The cache only saves time: without it everything works.
         return pairs
@@ -259,7 +305,11 @@ def default_cache_dir() -> Path:
     if base := os.environ.get("XDG_CACHE_HOME"):
         return Path(base) / "starcal_uq"
     if sys.platform == "win32":  # pragma: no cover
-        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "starcal_uq" / "Cache"
+        return (
+            Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+            / "starcal_uq"
+            / "Cache"
+        )
     if sys.platform == "darwin":  # pragma: no cover
         return Path.home() / "Library" / "Caches" / "starcal_uq"
     return Path.home() / ".cache" / "starcal_uq"
@@ -272,8 +322,17 @@ def _read(path: Path) -> StarPairs | None:
         archive = read_arrays(path)
         pairs = StarPairs(**{name: archive[name] for name in names})
         n, p = len(pairs.star), len(pairs.angle)
-        sizes = (len(pairs.first), len(pairs.second), len(pairs.neighbour) / 2, len(pairs.neighbour_angle) / 2)
-        fits = pairs.directions.shape == (n, 3) and len(pairs.neighbour_start) == n + 1 and all(s == p for s in sizes)
+        sizes = (
+            len(pairs.first),
+            len(pairs.second),
+            len(pairs.neighbour) / 2,
+            len(pairs.neighbour_angle) / 2,
+        )
+        fits = (
+            pairs.directions.shape == (n, 3)
+            and len(pairs.neighbour_start) == n + 1
+            and all(s == p for s in sizes)
+        )
     except Exception:  # whatever is wrong with a file of the cache, the pairs are made again
         return None
     return pairs if fits else None

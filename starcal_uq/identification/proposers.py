@@ -22,8 +22,9 @@ from starcal_uq.sky.gaia import write_gaia_records
 
 ENGINES: tuple[Engine, ...] = get_args(Engine)
 
-# Batches of hypotheses from points, their noise, the camera, its tolerances, the number of centroids to look at, and
-# the number of those that were searched before: `pyramid.hypotheses` with its catalogue, or another solver's.
+# Batches of hypotheses from points, their noise, the camera, its tolerances, the number of
+# centroids to look at, and the number of those that were searched before: `pyramid.hypotheses` with
+# its catalogue, or another solver's.
 Proposer: TypeAlias = Callable[
     [FloatArray, FloatArray, FieldGeometry, CameraTolerance, int, int], Iterator[list[Hypothesis]]
 ]
@@ -37,7 +38,9 @@ def prepare_engine(
     cache: bool,
     cache_dir: str | PathLike[str] | None,
 ) -> Proposer:
-    """The catalogue prepared for one of `ENGINES`; `MissingExtraError` where its package is not installed."""
+    """The catalogue prepared for one of `ENGINES`; `MissingExtraError` where its package is not
+    installed.
+    """
     if engine == "tetra3rs":
         return PlateSolver(stars, geometry, tolerance).hypotheses
     if engine != "pyramid":
@@ -58,17 +61,22 @@ def prepare_pairs(
     # Rounded, so that cameras of nearly the same field share a file.
     largest = float(np.ceil(largest * 200.0) / 200.0)
     field_sr = float(f"{w * h / f**2:.2g}")
-    return prepared_star_pairs(stars.directions_icrs, stars.mag, field_sr, largest, cache, cache_dir)
+    return prepared_star_pairs(
+        stars.directions_icrs, stars.mag, field_sr, largest, cache, cache_dir
+    )
 
 
-# The table of patterns is made for fields this much smaller and larger than the tolerance of the focal length asks for.
+# The table of patterns is made for fields this much smaller and larger than the tolerance of the
+# focal length asks for.
 _FIELD_MARGIN = 0.02
 
 
 class PlateSolver:
     """A pattern table of tetra3rs for one catalogue and field of view."""
 
-    def __init__(self, stars: StarCatalogue, geometry: FieldGeometry, tolerance: CameraTolerance) -> None:
+    def __init__(
+        self, stars: StarCatalogue, geometry: FieldGeometry, tolerance: CameraTolerance
+    ) -> None:
         solver = _package()
         fov_deg = _field_deg(geometry)
         margin = tolerance.focal + _FIELD_MARGIN
@@ -106,7 +114,8 @@ class PlateSolver:
         result = self._database.solve_from_centroids(
             centroids,
             camera_model=solver.CameraModel(geometry.focal_px, width, height),
-            fov_max_error_deg=_field_deg(geometry) * (tolerance.focal + geometry.relative_bias(tolerance)),
+            fov_max_error_deg=_field_deg(geometry)
+            * (tolerance.focal + geometry.relative_bias(tolerance)),
             # No limit in time, only in patterns: the same result on every machine.
             solve_timeout_ms=None,
         )

@@ -1,13 +1,14 @@
 """The pyramid search: from bare centroids to hypotheses about attitude and focal length.
 
-After Mortari, Samaan, Bruccoleri & Junkins 2004, Navigation 51(3), 171-183: triangles of centroids, in an order that
-does not stay with one centroid, so that a false one costs little; a triangle is looked up in the catalogue by its
-sides, and a fourth star confirms it. Here the focal length is only known within a tolerance. Each catalogue pair that
-may be the first side fixes it, and the other sides are compared after dividing by it: their tolerance holds only noise,
-the shift of the principal point and distortion.
+After Mortari, Samaan, Bruccoleri & Junkins 2004, Navigation 51(3), 171-183: triangles of centroids,
+in an order that does not stay with one centroid, so that a false one costs little; a triangle is
+looked up in the catalogue by its sides, and a fourth star confirms it. Here the focal length is
+only known within a tolerance. Each catalogue pair that may be the first side fixes it, and the
+other sides are compared after dividing by it: their tolerance holds only noise, the shift of the
+principal point and distortion.
 
-Points are *ideal pixels*: offsets from the principal point, with the distortion of the nominal camera removed, shape
-(n, 2); the direction is (x, y, f).
+Points are *ideal pixels*: offsets from the principal point, with the distortion of the nominal
+camera removed, shape (n, 2); the direction is (x, y, f).
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ _GROUP = 10
 _LEAST_BASE = 0.12
 # Hypotheses of one triangle that are handed on, those with most support.
 _HANDED_ON = 6
-# Catalogue triangles that one search of a frame looks at. More than three times as many as any that found an attitude
-# took; so many fit by chance where the camera is too little known for the noise, and more of them would say no more.
+# Catalogue triangles that one search of a frame looks at. More than three times as many as any that
+# found an attitude took; so many fit by chance where the camera is too little known for the noise,
+# and more of them would say no more.
 _MOST_CANDIDATES = 100_000
-# Pairs of the catalogue that one search of a frame tries as a base: twice as many as any took in fields of two degrees
-# and more, half of whose brightest detections were false.
+# Pairs of the catalogue that one search of a frame tries as a base: twice as many as any took in
+# fields of two degrees and more, half of whose brightest detections were false.
 _MOST_PAIRS = 5_000_000
 
 
@@ -40,8 +42,8 @@ _MOST_PAIRS = 5_000_000
 class CameraTolerance:
     """How far the camera may be from its nominal values.
 
-    Relative error of the focal length, error of the principal point per axis, px, and unknown displacement at the
-    farthest corner, px.
+    Relative error of the focal length, error of the principal point per axis, px, and unknown
+    displacement at the farthest corner, px.
     """
 
     focal: float
@@ -66,31 +68,41 @@ class FieldGeometry:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """An attitude to be verified: rotation (3, 3), b = R r, and the focal length over its nominal value."""
+    """An attitude to be verified: rotation (3, 3), b = R r, and the focal length over its nominal
+    value.
+    """
 
     rotation: FloatArray
     scale: float
 
 
 def mortari_order(n: int) -> IntArray:
-    """Triangles of n centroids, (n choose 3, 3), in Mortari's order: neighbours in the list first, and none twice."""
+    """Triangles of n centroids, (n choose 3, 3), in Mortari's order: neighbours in the list first,
+    and none twice.
+    """
     triangles = [
-        (i, i + dj, i + dj + dk) for dj in range(1, n - 1) for dk in range(1, n - dj) for i in range(n - dj - dk)
+        (i, i + dj, i + dj + dk)
+        for dj in range(1, n - 1)
+        for dk in range(1, n - dj)
+        for i in range(n - dj - dk)
     ]
     return np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
 
 def first_order(n: int, more: bool) -> IntArray:
-    """The triangles of a first search among n centroids: all of them, or the first half where there are more centroids.
+    """The triangles of a first search among n centroids: all of them, or the first half where there
+    are more centroids.
 
-    Half of the triangles find what most of them would; the rest are better spent on other centroids.
+    Half of the triangles find what most of them would; the rest are better spent on other
+    centroids.
     """
     triangles = mortari_order(n)
     return triangles[: len(triangles) // 2] if more else triangles
 
 
 def remaining_order(n: int, searched: int) -> IntArray:
-    """Triangles of n centroids whose numbers are all even or all odd, without those of a first search.
+    """Triangles of n centroids whose numbers are all even or all odd, without those of a first
+    search.
 
     A quarter of all triangles, and yet any five true stars have three of one parity among them.
     """
@@ -98,7 +110,9 @@ def remaining_order(n: int, searched: int) -> IntArray:
     parity = triangles % 2
     kept = triangles[np.all(parity == parity[:, :1], axis=1)]
     done = {tuple(three) for three in first_order(searched, n > searched).tolist()}
-    return np.array([three for three in kept.tolist() if tuple(three) not in done], dtype=np.int64).reshape(-1, 3)
+    return np.array(
+        [three for three in kept.tolist() if tuple(three) not in done], dtype=np.int64
+    ).reshape(-1, 3)
 
 
 def hypotheses(
@@ -112,9 +126,9 @@ def hypotheses(
 ) -> Iterator[list[Hypothesis]]:
     """For each triangle, the hypotheses that a fourth star supports, best first.
 
-    Triangles are made of the first `max_centroids` of `points` (n, 2), ideal pixels, brightest first; only those that a
-    search of the first `searched` has left (`remaining_order`). Ends where too many pairs or triangles of the catalogue
-    fit.
+    Triangles are made of the first `max_centroids` of `points` (n, 2), ideal pixels, brightest
+    first; only those that a search of the first `searched` has left (`remaining_order`). Ends where
+    too many pairs or triangles of the catalogue fit.
     """
     n = min(len(points), max_centroids)
     if n < 4:
@@ -133,11 +147,16 @@ def hypotheses(
         if left < 0 or pairs_left < 0:
             return
         if len(candidates):
-            yield _supported(triangle, candidates, u, sigma, angle, length, pairs, geometry, tolerance)
+            yield _supported(
+                triangle, candidates, u, sigma, angle, length, pairs, geometry, tolerance
+            )
 
 
-def _sorted_triangles(triangles: IntArray, length: FloatArray, geometry: FieldGeometry) -> list[tuple[int, int, int]]:
-    """Triangles as (i, j, k) with the base i-j: the shortest side that is long enough, otherwise the longest.
+def _sorted_triangles(
+    triangles: IntArray, length: FloatArray, geometry: FieldGeometry
+) -> list[tuple[int, int, int]]:
+    """Triangles as (i, j, k) with the base i-j: the shortest side that is long enough, otherwise
+    the longest.
 
     Star k is nearer to i than to j, which leaves the fewest stars to look at.
     """
@@ -150,7 +169,10 @@ def _sorted_triangles(triangles: IntArray, length: FloatArray, geometry: FieldGe
     rows = np.arange(len(triangles))
     chosen, base = options[rows, best], size[rows, best]
     order = np.lexsort((base, rows // _GROUP))
-    return [(i, j, k) if length[i, k] <= length[j, k] else (j, i, k) for i, j, k in chosen[order].tolist()]
+    return [
+        (i, j, k) if length[i, k] <= length[j, k] else (j, i, k)
+        for i, j, k in chosen[order].tolist()
+    ]
 
 
 def _key(triangle: tuple[int, int, int]) -> tuple[int, int]:
@@ -168,7 +190,9 @@ def _look_up(
     tolerance: CameraTolerance,
     bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]],
 ) -> IntArray:
-    """Catalogue triangles (m, 3) with these sides and this handedness; `bases` keeps the pairs for each base."""
+    """Catalogue triangles (m, 3) with these sides and this handedness; `bases` keeps the pairs for
+    each base.
+    """
     i, j, k = triangle
     f, bias = geometry.focal_px, geometry.relative_bias(tolerance)
     noise = SIGMAS * np.sqrt(2.0) * float(max(sigma[i], sigma[j], sigma[k])) / f
@@ -178,7 +202,10 @@ def _look_up(
         slack = base * (tolerance.focal + bias) + SIGMAS * np.hypot(sigma[i], sigma[j]) / f
         low, high = np.searchsorted(pairs.angle, (base - slack, base + slack))
         one, two, size = pairs.first[low:high], pairs.second[low:high], pairs.angle[low:high] / base
-        a, c = np.concatenate([one, two], dtype=np.int64), np.concatenate([two, one], dtype=np.int64)
+        a, c = (
+            np.concatenate([one, two], dtype=np.int64),
+            np.concatenate([two, one], dtype=np.int64),
+        )
         bases[key] = a, c, np.concatenate([size, size])
     a, c, scale = bases[key]
     near = angle[i, k]
@@ -187,7 +214,10 @@ def _look_up(
     far = angle[j, k]
     far_tol = noise * np.hypot(1.0, far / base) + bias * far
     second, expected = c[row], scale[row] * far
-    keep = np.abs(angle_between(pairs.directions[second], pairs.directions[third]) - expected) < far_tol
+    keep = (
+        np.abs(angle_between(pairs.directions[second], pairs.directions[third]) - expected)
+        < far_tol
+    )
     row, second, third = row[keep], second[keep], third[keep]
     candidates = np.column_stack([a[row], second, third])
     # A flat triangle has no handedness beyond the noise.
@@ -213,7 +243,9 @@ def _supported(
     r = pairs.directions[candidates]
     perimeter = angle[i, j] + angle[j, k] + angle[k, i]
     measured = (
-        angle_between(r[:, 0], r[:, 1]) + angle_between(r[:, 1], r[:, 2]) + angle_between(r[:, 2], r[:, 0])
+        angle_between(r[:, 0], r[:, 1])
+        + angle_between(r[:, 1], r[:, 2])
+        + angle_between(r[:, 2], r[:, 0])
     ) / perimeter
     scale = 1.0 / measured
     b = _directions(u, geometry.focal_px * scale)
@@ -251,13 +283,17 @@ def _triple(directions: FloatArray, triangles: IntArray) -> FloatArray:
     """Triple products (m,) of triangles (m, 3)."""
     a, b, c = (directions[triangles[:, column]].T for column in range(3))
     product: FloatArray = (
-        a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+        a[0] * (b[1] * c[2] - b[2] * c[1])
+        + a[1] * (b[2] * c[0] - b[0] * c[2])
+        + a[2] * (b[0] * c[1] - b[1] * c[0])
     )
     return product
 
 
 def axes_of(v: FloatArray, p: int, q: int) -> FloatArray:
-    """Orthonormal axes (m, 3 axes, 3) of triangles (m, 3, 3): towards the middle, and along one side."""
+    """Orthonormal axes (m, 3 axes, 3) of triangles (m, 3, 3): towards the middle, and along one
+    side.
+    """
     z = v.sum(axis=1)
     z = z / np.sqrt(np.einsum("mi,mi->m", z, z))[:, None]
     x = v[:, q] - v[:, p]

@@ -31,24 +31,26 @@ class FrameIdentification:
     image : str
         Name of its image.
     status : str
-        "identified"; "not identified": no attitude is accepted; "ambiguous": more than one is; "too few stars": fewer
-        than four centroids.
+        "identified"; "not identified": no attitude is accepted; "ambiguous": more than one is; "too
+        few stars": fewer than four centroids.
     n_centroids, n_identified : int
         Centroids, and those with a catalogue star.
     n_ambiguous : int
-        Centroids left out because two stars, or two centroids, are too close to tell which is which.
+        Centroids left out because two stars, or two centroids, are too close to tell which is
+        which.
     n_unlike_brightness : int
-        Centroids left out because they are farther from their star, and less of its brightness, than chance explains.
+        Centroids left out because they are farther from their star, and less of its brightness,
+        than chance explains.
     log10_expected_false : float
-        Decimal logarithm of the number of wrong attitudes, on the whole sky, expected to match as well; NaN if not
-        identified.
+        Decimal logarithm of the number of wrong attitudes, on the whole sky, expected to match as
+        well; NaN if not identified.
     quaternion : (4,) array or None
         Scalar last, of R_cam_icrs (b = R r).
     noise_scale : float
         Noise found over noise stated, at least 1: the gate was widened by it.
     taste, taste_p_value : float
-        Shuster's TASTE with the refined camera and the stated noise, chi-square with 2m - 3 degrees of freedom, and its
-        p-value.
+        Shuster's TASTE with the refined camera and the stated noise, chi-square with 2m - 3 degrees
+        of freedom, and its p-value.
     milliseconds : float
         Time spent on the frame.
     """
@@ -83,8 +85,8 @@ class FoundOptics:
     distortion_px : float
         Largest displacement that their lens showed at the detector's corner.
     log10_expected_false : float
-        Decimal logarithm of the number of wrong attitudes, on the whole sky and at any focal length, expected to match
-        as well as the best of the frames.
+        Decimal logarithm of the number of wrong attitudes, on the whole sky and at any focal
+        length, expected to match as well as the best of the frames.
     """
 
     focal_px: float
@@ -102,18 +104,20 @@ class Identification(Shown):
     Attributes
     ----------
     observations : Observations
-        The identified stars. In a mirrored set, `x_px` is counted from the right edge: width_px - 1 - x.
+        The identified stars. In a mirrored set, `x_px` is counted from the right edge: width_px - 1
+        - x.
     frames : tuple of FrameIdentification
         Every frame that was given, identified or not.
     camera : Camera
-        Refined from all identified frames, damped by the tolerances: for matching, not a calibration. Its principal
-        point is counted as the observations are.
+        Refined from all identified frames, damped by the tolerances: for matching, not a
+        calibration. Its principal point is counted as the observations are.
     nominal : Camera
         The camera of the search, counted likewise.
     parity : str
         "normal", or "mirrored" where the images are mirror images of the sky.
     n_left_out : int
-        Frames whose images had been left out before, when the centroids were measured; the text is of the others.
+        Frames whose images had been left out before, when the centroids were measured; the text is
+        of the others.
     optics : FoundOptics or None
         What the stars alone said of the lens, where the search had to ask them.
     """
@@ -132,10 +136,15 @@ class Identification(Shown):
         return sum(frame.status == "identified" for frame in self.frames)
 
     def __repr__(self) -> str:
-        return f"Identification({self.n_identified} of {len(self.frames)} frames, {self.observations.n_stars} stars)"
+        return (
+            f"Identification({self.n_identified} of {len(self.frames)} frames, "
+            f"{self.observations.n_stars} stars)"
+        )
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row for each frame, with the fields of `FrameIdentification`; the quaternion in columns qx to qw."""
+        """One row for each frame, with the fields of `FrameIdentification`; the quaternion in
+        columns qx to qw.
+        """
         import pandas as pd
 
         rows = []

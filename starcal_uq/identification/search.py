@@ -31,14 +31,17 @@ MAX_EXPECTED_FALSE = 1e-4
 _LOG10_ACCEPTED = float(np.log10(MAX_EXPECTED_FALSE))
 # Fewer stars than this are not identified: three have no redundancy beyond the focal length.
 MIN_STARS = 4
-# Centroids are not believed to be better than this: catalogue positions and the lens have errors of their own.
+# Centroids are not believed to be better than this: catalogue positions and the lens have errors of
+# their own.
 LEAST_SIGMA_PX = 0.05
-# Above this expectation the search goes on after a first success, to see whether another attitude fits too.
+# Above this expectation the search goes on after a first success, to see whether another attitude
+# fits too.
 _BEYOND_DOUBT = 1e-8
 # Triangles are made of so many centroids first, and then of so many.
 _CENTROIDS = (10, 16)
 _MAX_TRIANGLES = 200
-# A match with more than this noise, or with less than half of what can be, is compared with those of more triangles.
+# A match with more than this noise, or with less than half of what can be, is compared with those
+# of more triangles.
 _POOR_FIT = 1.3
 _MORE_TRIANGLES = 5
 # Triangles of a frame that is tried once more with a worse lens, whose many hypotheses take long.
@@ -85,12 +88,19 @@ class FrameTable:
         self.camera = flipped(camera) if mirrored else camera
         self.ids = [int(i) for i in table.frame_ids]
         x = np.asarray(table.x_px, dtype=np.float64)
-        xy = np.column_stack([camera.width_px - 1 - x if mirrored else x, np.asarray(table.y_px, dtype=np.float64)])
+        xy = np.column_stack(
+            [camera.width_px - 1 - x if mirrored else x, np.asarray(table.y_px, dtype=np.float64)]
+        )
         frame = np.asarray(table.frame)
         # lexsort is stable: centroids of equal brightness keep their order.
         order = np.lexsort((-np.asarray(table.flux, dtype=np.float64), frame))
-        edges = np.searchsorted(frame[order], self.ids, side="left"), np.searchsorted(frame[order], self.ids, "right")
-        self.rows: list[IntArray] = [order[i:j].astype(np.int64) for i, j in zip(*edges, strict=True)]
+        edges = (
+            np.searchsorted(frame[order], self.ids, side="left"),
+            np.searchsorted(frame[order], self.ids, "right"),
+        )
+        self.rows: list[IntArray] = [
+            order[i:j].astype(np.int64) for i, j in zip(*edges, strict=True)
+        ]
         self.xy: list[FloatArray] = [xy[rows] for rows in self.rows]
         sigma = np.hypot(np.asarray(table.sigma_px, dtype=np.float64), LEAST_SIGMA_PX)
         self.sigma: list[FloatArray] = [sigma[rows] for rows in self.rows]
@@ -106,7 +116,9 @@ class FrameTable:
         if not len(stacked):
             return [xy.copy() for xy in self.xy]
         b = unproject(camera, stacked)
-        return np.split(camera.focal_px * b[:, :2] / b[:, 2:], np.cumsum([len(xy) for xy in self.xy])[:-1])
+        return np.split(
+            camera.focal_px * b[:, :2] / b[:, 2:], np.cumsum([len(xy) for xy in self.xy])[:-1]
+        )
 
     def seen_by(self, camera: Camera) -> FrameTable:
         """The same frames in the ideal pixels of another camera."""
@@ -143,7 +155,9 @@ class Search:
     def widened(self, factor: float) -> Search:
         """The same for a lens with more distortion."""
         other = copy(self)
-        other.tolerance = replace(self.tolerance, distortion_px=self.tolerance.distortion_px * factor)
+        other.tolerance = replace(
+            self.tolerance, distortion_px=self.tolerance.distortion_px * factor
+        )
         other.centroids, other.triangles = _CENTROIDS[:1], _MAX_TRIANGLES_WIDE
         return other
 
@@ -158,7 +172,9 @@ class Search:
             min(max(float(sd[1]), float(sd[2]), 1.0), t.centre_px),
             min(max(float(sd[3]), 0.3), t.distortion_px),
         )
-        other.geometry = replace(self.geometry, focal_px=camera.focal_px, corner_px=camera.corner_radius_px)
+        other.geometry = replace(
+            self.geometry, focal_px=camera.focal_px, corner_px=camera.corner_radius_px
+        )
         other.sky = self.sky.seen_by(other.geometry)
         return other
 
@@ -176,7 +192,9 @@ class Search:
         match = self._matched(field, k, start_state(Hypothesis(rotation, 1.0)), polished=True)
         accepted = match is not None and match.log10_false < _LOG10_ACCEPTED
         return Found(
-            "identified" if accepted else "not identified", match if accepted else None, perf_counter() - clock
+            "identified" if accepted else "not identified",
+            match if accepted else None,
+            perf_counter() - clock,
         )
 
     def again(self, field: FrameTable, k: int, first: Found, shared: FloatArray) -> Found:
@@ -194,7 +212,9 @@ class Search:
             return Found("not identified", None, seconds)
         return Found(first.status, match, seconds)
 
-    def _matched(self, field: FrameTable, k: int, start: CameraState, polished: bool = False) -> Match | None:
+    def _matched(
+        self, field: FrameTable, k: int, start: CameraState, polished: bool = False
+    ) -> Match | None:
         return match_frame(
             field.points[k],
             field.tree(k),
@@ -217,14 +237,19 @@ class Search:
             searched = n_centroids
             if accepted:
                 best = min(accepted, key=lambda match: match.log10_false)
-                # An attitude with far fewer matches is the same one caught on a neighbouring star, or chance.
+                # An attitude with far fewer matches is the same one caught on a neighbouring star,
+                # or chance.
                 rivals = [m for m in accepted if m.log10_false < 0.5 * best.log10_false]
                 differ = any(_other_stars(m, best) for m in rivals)
                 return ("ambiguous", None) if differ else ("identified", best)
         return "not identified", None
 
-    def _accepted(self, field: FrameTable, k: int, n_centroids: int, searched: int) -> Iterator[Match]:
-        """Acceptable matches, up to the first that is beyond doubt and complete, or some triangles more."""
+    def _accepted(
+        self, field: FrameTable, k: int, n_centroids: int, searched: int
+    ) -> Iterator[Match]:
+        """Acceptable matches, up to the first that is beyond doubt and complete, or some triangles
+        more.
+        """
         points, sigma = field.points[k], field.sigma[k]
         batches = self.proposer(points, sigma, self.geometry, self.tolerance, n_centroids, searched)
         left = self.triangles
@@ -238,14 +263,17 @@ class Search:
                     continue
                 yield match
                 if match.log10_false < np.log10(_BEYOND_DOUBT):
-                    # A triangle with the wrong star of a close pair gives nearly the right attitude: it matches too
-                    # many stars for chance, but few of all that could be, and badly.
+                    # A triangle with the wrong star of a close pair gives nearly the right
+                    # attitude: it matches too many stars for chance, but few of all that could be,
+                    # and badly.
                     if match.noise_scale < _POOR_FIT and len(match) > 0.5 * match.n_possible:
                         return
                     left = min(left, _MORE_TRIANGLES)
 
     def common_camera(self, matches: list[Match]) -> tuple[FloatArray, FloatArray]:
-        """Shared parameters (4,) from all frames with the tolerances as prior, and their covariance (4, 4)."""
+        """Shared parameters (4,) from all frames with the tolerances as prior, and their covariance
+        (4, 4).
+        """
         t = self.tolerance
         last = t.distortion_px / 2.0 if self.radial else 1e-6
         sd = np.array([t.focal / 2.0, t.centre_px / 2.0, t.centre_px / 2.0, last])
@@ -255,9 +283,11 @@ class Search:
 
 
 def _other_stars(one: Match, other: Match) -> bool:
-    """Whether two matches of a frame say different things: less than half of the smaller one's stars are the other's.
+    """Whether two matches of a frame say different things: less than half of the smaller one's
+    stars are the other's.
 
-    Attitudes do not tell: that of the same stars moves with the principal point, by degrees where it is hardly known.
+    Attitudes do not tell: that of the same stars moves with the principal point, by degrees where
+    it is hardly known.
     """
     pairs = set(zip(one.centroid.tolist(), one.star.tolist(), strict=True))
     common = pairs.intersection(zip(other.centroid.tolist(), other.star.tolist(), strict=True))
@@ -271,7 +301,9 @@ def flipped(camera: Camera) -> Camera:
 
 def field_geometry(camera: Camera) -> FieldGeometry:
     """The camera as the search sees it."""
-    return FieldGeometry(camera.focal_px, camera.width_px, camera.height_px, camera.corner_radius_px)
+    return FieldGeometry(
+        camera.focal_px, camera.width_px, camera.height_px, camera.corner_radius_px
+    )
 
 
 def has_radial(camera: Camera) -> bool:

@@ -1,4 +1,6 @@
-"""Background and noise of an image, by SExtractor's code (`sep`), and which of its pixels can be used."""
+"""Background and noise of an image, by SExtractor's code (`sep`), and which of its pixels can be
+used.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ _MESH_PX = 64
 _SATURATED_FRACTION = 0.2
 # Noise in counts below which an image is coarse: its median is wrong by up to half a count.
 _COARSE = 20.0
-# Random numbers of the blur, repeated over the image: drawing one for every pixel would take as long as the rest.
+# Random numbers of the blur, repeated over the image: drawing one for every pixel would take as
+# long as the rest.
 _BLUR_TILE = 65_537
 _UNEVEN = 1.15
 # With this part of the pixels at the lowest value, the noise below is cut off.
@@ -30,11 +33,12 @@ _CUT_OFF = 0.05
 class PreparedImage:
     """An image made ready for detection and fits.
 
-    `counts` (height, width) are above the background, 0 where there is no value; `noise` is that of the background. Of
-    pixels, all are `usable` and none `saturated` where these are None. `counts_per_e` is the inverse gain, 0 where
-    unknown; it may be measured, read off the noise of the background. `parity` is the remainder of (x + y) / 2 of the
-    pixels that were measured, those that see green in a mosaic of colours; the others hold the mean of their
-    neighbours, and are not usable. None where all were measured.
+    `counts` (height, width) are above the background, 0 where there is no value; `noise` is that of
+    the background. Of pixels, all are `usable` and none `saturated` where these are None.
+    `counts_per_e` is the inverse gain, 0 where unknown; it may be measured, read off the noise of
+    the background. `parity` is the remainder of (x + y) / 2 of the pixels that were measured, those
+    that see green in a mosaic of colours; the others hold the mean of their neighbours, and are not
+    usable. None where all were measured.
     """
 
     counts: Any
@@ -51,9 +55,10 @@ def prepare_image(
 ) -> tuple[PreparedImage, float, float]:
     """Background and noise of an image, and their medians (counts).
 
-    Without a `gain` (electrons per count) it is read off the noise of the background if that will do; `read_noise_e`
-    (electrons, a floor of the noise) needs the gain. `saturation` (counts) is what the image says where it is None.
-    Refused are images without a pixel that has a value, with equal ones alone, or with too many saturated.
+    Without a `gain` (electrons per count) it is read off the noise of the background if that will
+    do; `read_noise_e` (electrons, a floor of the noise) needs the gain. `saturation` (counts) is
+    what the image says where it is None. Refused are images without a pixel that has a value, with
+    equal ones alone, or with too many saturated.
     """
     with extra("images", "star images"):
         import sep
@@ -62,8 +67,8 @@ def prepare_image(
     parity, shape = image.green_parity, image.data.shape
     if parity is not None:
         image = replace(image, data=_measured_pixels(image.data, parity), mosaic="")
-    # A copy, which becomes the counts above the background where it stands: a new array for each step takes longer
-    # than the step.
+    # A copy, which becomes the counts above the background where it stands: a new array for each
+    # step takes longer than the step.
     with np.errstate(over="ignore"):
         data = np.array(image.data, dtype=np.float32, order="C")
     # Whole numbers are all finite.
@@ -84,10 +89,14 @@ def prepare_image(
         fraction = np.count_nonzero(too_bright) / data.size
         if fraction > _SATURATED_FRACTION:
             raise ImageError(
-                f"{name}: {100.0 * fraction:.0f} % of the pixels are saturated; expose shorter, or leave the image out."
+                f"{name}: {100.0 * fraction:.0f} % of the pixels are saturated; expose shorter, "
+                "or leave the image out."
             )
     if low == high:
-        raise ImageError(f"{name}: every pixel has the value {low:g}; check the exposure, or leave the image out.")
+        raise ImageError(
+            f"{name}: every pixel has the value {low:g}; check the exposure, or leave the image "
+            "out."
+        )
     if too_bright is not None:
         usable = ~too_bright if usable is None else usable & ~too_bright
     if mask is not None:
@@ -106,7 +115,8 @@ def prepare_image(
     if background.globalrms > _UNEVEN * 1.4826 * float(median_of(np.abs(counts[::5, ::5]).ravel())):
         # Where the background is steep, its slope inside a mesh is no noise.
         spread = sep.Background(counts, mask=mask, bw=mesh_x, bh=mesh)
-    # Numbers are rounded to whole counts at best; floating-point images without noise get a floor to divide by.
+    # Numbers are rounded to whole counts at best; floating-point images without noise get a floor
+    # to divide by.
     floor = 12.0**-0.5 if image.data.dtype.kind in "ui" else 1e-7 * (high - low)
     if gain and read_noise_e:
         floor = max(floor, read_noise_e / gain)
@@ -126,7 +136,9 @@ def prepare_image(
         too_bright = None if too_bright is None else _at_their_places(too_bright, parity, shape)
         counts = _filled(_at_their_places(counts, parity, shape), parity)
         noise = np.pad(np.repeat(noise, 2, axis=1), ((0, 0), (0, shape[1] % 2)), mode="edge")
-    frame = PreparedImage(counts, noise, usable, too_bright, counts_per_e, not gain and counts_per_e > 0.0, parity)
+    frame = PreparedImage(
+        counts, noise, usable, too_bright, counts_per_e, not gain and counts_per_e > 0.0, parity
+    )
     return frame, float(background.globalback), max(float(spread.globalrms) / _CLIPPED, floor)
 
 
@@ -148,7 +160,9 @@ def _at_their_places(pixels: Any, parity: int, shape: tuple[int, ...]) -> Any:
 
 
 def _filled(counts: Any, parity: int) -> Any:
-    """`counts` with the mean of the neighbours, which have been measured, where they are zero for a mosaic."""
+    """`counts` with the mean of the neighbours, which have been measured, where they are zero for a
+    mosaic.
+    """
     height, width = counts.shape
     padded = np.pad(counts, 1, mode="reflect") if min(height, width) > 1 else np.pad(counts, 1)
     means = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
@@ -159,10 +173,11 @@ def _filled(counts: Any, parity: int) -> Any:
 
 
 def _smooth(image: Image, filled: Any) -> Any:
-    """Counts whose median means something: whole numbers with little noise are blurred by up to half a count.
+    """Counts whose median means something: whole numbers with little noise are blurred by up to
+    half a count.
 
-    Their median jumps from one to the next, and the mode, 2.5 medians less 1.5 means, jumps further: a fifth of a count
-    is a sigma of the filtered image.
+    Their median jumps from one to the next, and the mode, 2.5 medians less 1.5 means, jumps
+    further: a fifth of a count is a sigma of the filtered image.
     """
     if image.data.dtype.kind not in "ui":
         return filled
@@ -186,14 +201,17 @@ def _cut_noise(counts: Any) -> tuple[float, float]:
 
 
 _CELL_PX = 64
-# The slope counts where it is known this well, on so many meshes and with so little scatter about the line.
+# The slope counts where it is known this well, on so many meshes and with so little scatter about
+# the line.
 _LARGEST_ERROR, _FEWEST_MESHES, _LARGEST_CHI2 = 0.1, 24, 2.0
 # Variance that is left of Gaussian noise clipped at 3 sigma.
 _CLIPPED_VARIANCE = 0.9733
 
 
 def counts_per_electron(data: Any) -> float:
-    """Inverse gain of an image, from counts with background; 0 where its background does not say it."""
+    """Inverse gain of an image, from counts with background; 0 where its background does not say
+    it.
+    """
     height, width = (size // _CELL_PX for size in data.shape)
     if height * width < _FEWEST_MESHES:
         return 0.0
@@ -217,12 +235,15 @@ def counts_per_electron(data: Any) -> float:
     if np.count_nonzero(good) < _FEWEST_MESHES:
         return 0.0
     x, y = level[good].astype(np.float64), variance[good].astype(np.float64)
-    # All with the typical error: by its own, a mesh whose variance is low by chance would weigh more.
+    # All with the typical error: by its own, a mesh whose variance is low by chance would weigh
+    # more.
     return _slope(x, y, float(np.median(y) * np.sqrt(2.0 / np.median(n[good]))))
 
 
 def _slope(x: FloatArray, y: FloatArray, sigma: float) -> float:
-    """Slope of the straight line through points, 0 where it is not positive, not well known, or no line fits."""
+    """Slope of the straight line through points, 0 where it is not positive, not well known, or no
+    line fits.
+    """
     use = np.ones(len(x), dtype=np.bool_)
     slope, error = 0.0, np.inf
     for _ in range(3):

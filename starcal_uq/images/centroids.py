@@ -1,4 +1,5 @@
-"""The centroids table: star positions measured in images, frame by frame, before any star has a name.
+"""The centroids table: star positions measured in images, frame by frame, before any star has a
+name.
 
 It is what passes from the images to the identification.
 """
@@ -18,7 +19,14 @@ from numpy.typing import ArrayLike
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.files import as_plain, atomic_path, ensure_new, read_parquet, reading, table_ending
+from starcal_uq.core.files import (
+    as_plain,
+    atomic_path,
+    ensure_new,
+    read_parquet,
+    reading,
+    table_ending,
+)
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.observations.rows import FrameRows, locked
 
@@ -119,11 +127,14 @@ class Centroids(FrameRows, Shown):
 
     def __post_init__(self) -> None:
         for names, key in ((COLUMNS, "frame"), (FRAME_COLUMNS, "frame_ids")):
-            arrays = {name: _array(name, getattr(self, name), kind) for name, (kind, _) in names.items()}
+            arrays = {
+                name: _array(name, getattr(self, name), kind) for name, (kind, _) in names.items()
+            }
             for name, values in arrays.items():
                 if len(values) != len(arrays[key]):
                     raise ObservationError(
-                        f"centroids: {name} has {len(values)} entries and {key} has {len(arrays[key])}; give equal "
+                        f"centroids: {name} has {len(values)} entries and {key} has "
+                        f"{len(arrays[key])}; give equal "
                         "lengths.",
                         column=name,
                     )
@@ -131,9 +142,13 @@ class Centroids(FrameRows, Shown):
             for name, values in arrays.items():
                 object.__setattr__(self, name, locked(values[order]))
         if np.any(self.frame_ids[1:] == self.frame_ids[:-1]):
-            raise ObservationError("centroids: frame_ids holds a number twice; number the frames differently.")
+            raise ObservationError(
+                "centroids: frame_ids holds a number twice; number the frames differently."
+            )
         if len(stray := np.setdiff1d(self.frame, self.frame_ids)):
-            raise ObservationError(f"centroids: frame {stray[0]} is not among frame_ids; list every frame there.")
+            raise ObservationError(
+                f"centroids: frame {stray[0]} is not among frame_ids; list every frame there."
+            )
         object.__setattr__(self, "messages", tuple(self.messages))
         object.__setattr__(self, "meta", dict(self.meta))
 
@@ -225,7 +240,9 @@ class Centroids(FrameRows, Shown):
 
                 arrow = pa.table({name: getattr(self, name) for name in COLUMNS})
                 metadata = {_KEY.encode(): text.encode()}
-                parquet.write_table(arrow.replace_schema_metadata(metadata), temporary, compression="zstd")
+                parquet.write_table(
+                    arrow.replace_schema_metadata(metadata), temporary, compression="zstd"
+                )
 
     def _table(self, text: str) -> Any:
         with extra("images", "ECSV tables"):
@@ -254,30 +271,45 @@ class Centroids(FrameRows, Shown):
             columns, text = read(path)
             if text is None:
                 raise ObservationError(
-                    f"{path}: the list of frames is missing; give a table that `starcal-uq centroid` or "
+                    f"{path}: the list of frames is missing; give a table that `starcal-uq "
+                    "centroid` or "
                     "Centroids.save wrote."
                 )
             if missing := [name for name in COLUMNS if name not in columns]:
                 raise ObservationError(
-                    f"{path}: column {missing[0]} is missing; write the table again.", column=missing[0]
+                    f"{path}: column {missing[0]} is missing; write the table again.",
+                    column=missing[0],
                 )
-            with reading(path, "a table of centroids with its list of frames", "write it again", ObservationError):
+            with reading(
+                path,
+                "a table of centroids with its list of frames",
+                "write it again",
+                ObservationError,
+            ):
                 document: AnyDict = json.loads(text)
                 frames: AnyDict = {name: document["frames"][name] for name in FRAME_COLUMNS}
                 messages, meta = tuple(map(str, document["messages"])), dict(document["meta"])
-            return cls(**{name: columns[name] for name in COLUMNS}, **frames, messages=messages, meta=meta)
+            return cls(
+                **{name: columns[name] for name in COLUMNS}, **frames, messages=messages, meta=meta
+            )
 
     def __repr__(self) -> str:
-        return f"Centroids({self.n_stars} stars, {self.n_frames} frames, {self.n_left_out} left out)"
+        return (
+            f"Centroids({self.n_stars} stars, {self.n_frames} frames, {self.n_left_out} left out)"
+        )
 
 
 def _array(name: str, values: Any, kind: type) -> Any:
     try:
         array: Any = np.array(values, dtype=kind)
     except (TypeError, ValueError) as error:
-        raise ObservationError(f"centroids: column {name} cannot be converted ({error}).", column=name) from None
+        raise ObservationError(
+            f"centroids: column {name} cannot be converted ({error}).", column=name
+        ) from None
     if array.ndim != 1:
-        raise ObservationError(f"centroids: column {name} has shape {array.shape}; give one value each.", column=name)
+        raise ObservationError(
+            f"centroids: column {name} has shape {array.shape}; give one value each.", column=name
+        )
     return array
 
 
@@ -294,7 +326,9 @@ def _read_csv(path: Path) -> tuple[Mapping[str, Any], str | None]:
         names, *rows = [row for row in csv.reader(file, strict=True) if row]
     cells = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
     columns: AnyDict = {
-        name: [_TRUTH[cell] for cell in cells[name]] if kind is np.bool_ else np.array(cells[name], str).astype(kind)
+        name: [_TRUTH[cell] for cell in cells[name]]
+        if kind is np.bool_
+        else np.array(cells[name], str).astype(kind)
         for name, (kind, _) in COLUMNS.items()
         if name in cells
     }

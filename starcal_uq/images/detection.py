@@ -1,4 +1,6 @@
-"""The stars of one image: background, detection, measured PSF, fit, and the rejection of what is no star."""
+"""The stars of one image: background, detection, measured PSF, fit, and the rejection of what is no
+star.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +27,16 @@ from starcal_uq.images.fits import (
     windowed,
 )
 from starcal_uq.images.image import Image
-from starcal_uq.images.psf import FIRST_SIGMA_PX, half_stamp_px, measure_psf, moment_sigma_px, pixel_at
+from starcal_uq.images.psf import (
+    FIRST_SIGMA_PX,
+    half_stamp_px,
+    measure_psf,
+    moment_sigma_px,
+    pixel_at,
+)
 
-# Half the detection kernel: what lies farther out adds 1 % to the signal-to-noise ratio and doubles the time.
+# Half the detection kernel: what lies farther out adds 1 % to the signal-to-noise ratio and doubles
+# the time.
 _KERNEL_HALF_SIGMAS, _KERNEL_HALF_MAX = 2.5, 5
 _MAX_DETECTIONS = 5000
 # A width is preferred to that of the PSF if it lowers chi squared by this much.
@@ -54,9 +63,10 @@ class DetectionOptions:
 class FrameStars:
     """The stars of one image, brightest first, by columns of `Centroids` but ``frame``.
 
-    Median background and noise, counts, and the width of the star images. Fluxes are in electrons by the gain that was
-    given; one that was read off the noise of the background serves the noise of the stars only. Messages say what was
-    left out, without the name of the image; centroids are `windowed` where star images are no round Gaussians.
+    Median background and noise, counts, and the width of the star images. Fluxes are in electrons
+    by the gain that was given; one that was read off the noise of the background serves the noise
+    of the stars only. Messages say what was left out, without the name of the image; centroids are
+    `windowed` where star images are no round Gaussians.
     """
 
     columns: dict[str, Any]
@@ -79,7 +89,8 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
     messages: list[str] = []
     if image.mosaic:
         messages.append(
-            f"of the mosaic of colours ({image.mosaic}), the green pixels were measured, each at its own place."
+            f"of the mosaic of colours ({image.mosaic}), the green pixels were measured, each at "
+            "its own place."
         )
     objects, n_blobs = _without_blobs(objects, moment_sigma_px(objects, start))
     measured = measure_psf(frame, objects)
@@ -88,16 +99,20 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
         sigma = options.psf_sigma_px
     elif measured is None and len(objects):
         messages.append(
-            f"the stars do not suffice to measure the width of their images, so {sigma:g} px was taken; "
+            f"the stars do not suffice to measure the width of their images, so {sigma:g} px was "
+            "taken; "
             "give psf_sigma_px."
         )
     stamps, fit = _fit(frame, objects, sigma)
-    kind = _classify(frame, objects, stamps, fit, measured is not None or options.psf_sigma_px is not None)
+    kind = _classify(
+        frame, objects, stamps, fit, measured is not None or options.psf_sigma_px is not None
+    )
     shape = "" if measured is None else measured.shape_words
     if shape:
         fit = windowed(frame, fit)
         messages.append(
-            f"the star images are {shape}, so their centroids are windowed, and what their shape adds to the errors is "
+            f"the star images are {shape}, so their centroids are windowed, and what their shape "
+            "adds to the errors is "
             "not in sigma."
         )
     counts = {word: int(np.count_nonzero(kind == code)) for code, word in enumerate(_KINDS)}
@@ -106,14 +121,18 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
         words = [f"{n} {word}" for word, n in list(counts.items())[1:] if n]
         total = sum(list(counts.values())[1:])
         were = "was" if total == 1 else "were"
-        messages.append(f"{plural(total, 'detection')} {were} left out as no star: {', '.join(words)}.")
+        messages.append(
+            f"{plural(total, 'detection')} {were} left out as no star: {', '.join(words)}."
+        )
     keep = np.flatnonzero(kind == 0)
     order = keep[np.argsort(-fit.flux[keep], kind="stable")][: options.max_stars]
     columns = _columns(image, frame, fit, stamps, sigma, gain, order)
     if not len(order):
         messages.append("no star was found.")
     measured_gain = 1.0 / frame.counts_per_e if frame.gain_is_measured else None
-    return FrameStars(columns, background, noise, float(sigma), gain, messages, measured_gain, bool(shape))
+    return FrameStars(
+        columns, background, noise, float(sigma), gain, messages, measured_gain, bool(shape)
+    )
 
 
 def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOptions) -> Any:
@@ -134,7 +153,8 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     n_above = len(above)
 
     def extract(image: Any, noise: Any, levels: int) -> tuple[Any, Any]:
-        # sep prepares a list for all pixels that it may have to keep, which takes longer than a small image.
+        # sep prepares a list for all pixels that it may have to keep, which takes longer than a
+        # small image.
         most = sep.get_extract_pixstack()
         sep.set_extract_pixstack(min(most, n_above + _PIXELS_MORE, image.size + _PIXELS_MORE))
         try:
@@ -152,27 +172,36 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
         return found
 
     try:
-        objects, labels = _taken_apart(filtered, frame.noise, *extract(filtered, frame.noise, 1), extract, above)
+        objects, labels = _taken_apart(
+            filtered, frame.noise, *extract(filtered, frame.noise, 1), extract, above
+        )
     except Exception as error:  # sep raises bare exceptions when its buffers are full
         raise ImageError(
-            f"{name}: there are too many bright pixels to tell stars apart; raise the threshold, or leave the image "
+            f"{name}: there are too many bright pixels to tell stars apart; raise the threshold, "
+            "or leave the image "
             "out."
         ) from error
     labels = labels.ravel()
     inside = above[labels[above] != 0]
-    objects["flux"] = np.bincount(labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1)[1:]
+    objects["flux"] = np.bincount(
+        labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1
+    )[1:]
     objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
     return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
 
 
 def _mosaic_noise(line: Any) -> float:
-    """Factor of the noise left by a filter, the product of `line` with itself, where half of the pixels were measured.
+    """Factor of the noise left by a filter, the product of `line` with itself, where half of the
+    pixels were measured.
 
-    The others are the mean of their four neighbours, so that each that was measured has some of the weights of these.
+    The others are the mean of their four neighbours, so that each that was measured has some of the
+    weights of these.
     """
     weights = np.pad(np.outer(line, line), 2)
     own = weights[1:-1, 1:-1]
-    own = own + 0.25 * (weights[:-2, 1:-1] + weights[2:, 1:-1] + weights[1:-1, :-2] + weights[1:-1, 2:])
+    own = own + 0.25 * (
+        weights[:-2, 1:-1] + weights[2:, 1:-1] + weights[1:-1, :-2] + weights[1:-1, 2:]
+    )
     place = np.add.outer(np.arange(len(own)), np.arange(len(own))) % 2
     worst = max(np.sum(own[place == parity] ** 2) for parity in (0, 1))
     return float(np.sqrt(worst / np.sum(weights**2)))
@@ -192,7 +221,8 @@ def _taken_apart(
     extract: Callable[[Any, Any, int], tuple[Any, Any]],
     above: IntArray,
 ) -> tuple[Any, Any]:
-    """Objects and their map of numbers, zero but in pixels `above`, with those taken apart that have several peaks.
+    """Objects and their map of numbers, zero but in pixels `above`, with those taken apart that
+    have several peaks.
 
     No other can fall apart, and to look for it in all takes as long as all the rest.
     """
@@ -226,7 +256,10 @@ def _taken_apart(
             for name in (axis, f"{axis}min", f"{axis}max"):
                 parts[name] += first
         ends = (
-            (parts["xmin"] == 0) | (parts["ymin"] == 0) | (parts["xmax"] == width - 1) | (parts["ymax"] == height - 1)
+            (parts["xmin"] == 0)
+            | (parts["ymin"] == 0)
+            | (parts["xmax"] == width - 1)
+            | (parts["ymax"] == height - 1)
         )
         parts["flag"][ends] |= sep.OBJ_TRUNC
         numbers = numbers[1:-1, 1:-1]
@@ -237,23 +270,29 @@ def _taken_apart(
     return np.concatenate(kept), labels
 
 
-# Rows that are filtered together, what stays in the processor's caches, and numbers that one product gives in a line.
+# Rows that are filtered together, what stays in the processor's caches, and numbers that one
+# product gives in a line.
 _ROWS, _BAND = 96, 24
 
 
 def _filtered(counts: Any, line: Any) -> Any:
-    """`counts` filtered by a kernel that is the product of a symmetric `line` with itself, with zeros around."""
+    """`counts` filtered by a kernel that is the product of a symmetric `line` with itself, with
+    zeros around.
+    """
     (height, width), edge = counts.shape, len(line) // 2
     whole = -(-width // _BAND) * _BAND
     filtered = np.empty((height, width), dtype=np.float32)
     padded = np.zeros((_ROWS + 2 * edge, whole + 2 * edge), dtype=np.float32)
     rows = np.empty((len(padded), whole), dtype=np.float32)
-    # Sums along a line are products with a band matrix, of each piece with the edges of its neighbours.
+    # Sums along a line are products with a band matrix, of each piece with the edges of its
+    # neighbours.
     band = np.zeros((_BAND, _BAND + 2 * edge), dtype=np.float32)
     for k in range(_BAND):
         band[k, k : k + len(line)] = line
     across = np.ascontiguousarray(band.T)
-    pieces = np.lib.stride_tricks.sliding_window_view(padded, _BAND + 2 * edge, axis=1)[:, ::_BAND].swapaxes(0, 1)
+    pieces = np.lib.stride_tricks.sliding_window_view(padded, _BAND + 2 * edge, axis=1)[
+        :, ::_BAND
+    ].swapaxes(0, 1)
     along = rows.reshape(len(padded), -1, _BAND).swapaxes(0, 1)
     for first in range(0, height, _ROWS):
         n = min(_ROWS, height - first)
@@ -270,7 +309,9 @@ def _filtered(counts: Any, line: Any) -> Any:
 
 
 def _without_blobs(objects: Any, sigma: float) -> tuple[Any, int]:
-    """Detections without those much larger than a star, such as the Moon, and without what lies on them."""
+    """Detections without those much larger than a star, such as the Moon, and without what lies on
+    them.
+    """
     large = objects["a"] > _BLOB_SIGMAS * max(sigma, 1.0)
     keep = ~large
     for blob in objects[large]:
@@ -288,7 +329,9 @@ def _fit(frame: PreparedImage, objects: Any, sigma: float) -> tuple[Stamps, Star
     """Windowed centroids as a start, then the fit of the pixel-integrated star image."""
     half = half_stamp_px(sigma)
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
-    stamps = cut_stamps(frame.counts, frame.usable, x, y, half, frame.noise, frame.counts_per_e, frame.parity)
+    stamps = cut_stamps(
+        frame.counts, frame.usable, x, y, half, frame.noise, frame.counts_per_e, frame.parity
+    )
     width = np.full(len(x), sigma)
     xw, yw, good = window_positions(
         stamps, frame.counts.shape, x, y, np.hypot(width, 12.0**-0.5), width, _START_STEP_PX
@@ -302,7 +345,9 @@ def _fit(frame: PreparedImage, objects: Any, sigma: float) -> tuple[Stamps, Star
 _KINDS = ("star", "too sharp for a star (hot pixel or cosmic ray)", "extended", "not measurable")
 
 
-def _classify(frame: PreparedImage, objects: Any, stamps: Stamps, fit: StarFit, psf_known: bool) -> IntArray:
+def _classify(
+    frame: PreparedImage, objects: Any, stamps: Stamps, fit: StarFit, psf_known: bool
+) -> IntArray:
     """Index into `_KINDS` of each detection."""
     height, width = frame.counts.shape
     kind = np.zeros(len(objects), dtype=np.int64)
@@ -324,17 +369,31 @@ def _core_is_whole(stamps: Stamps, fit: StarFit) -> BoolArray:
     whole: BoolArray = np.all(stamps.fine, axis=(1, 2))
     cut, grid = np.flatnonzero(~whole), np.arange(stamps.counts.shape[1])
     u, v = (fit.x_px - stamps.x0)[cut, None, None], (fit.y_px - stamps.y0)[cut, None, None]
-    far = np.hypot(grid[None, None, :] - u, grid[None, :, None] - v) > 2.0 * fit.sigma_px[cut, None, None]
+    far = (
+        np.hypot(grid[None, None, :] - u, grid[None, :, None] - v)
+        > 2.0 * fit.sigma_px[cut, None, None]
+    )
     whole[cut] = (stamps.fine[cut] | far).all((1, 2))
     return whole
 
 
 def _columns(
-    image: Image, frame: PreparedImage, fit: StarFit, stamps: Stamps, sigma: float, gain: float | None, order: IntArray
+    image: Image,
+    frame: PreparedImage,
+    fit: StarFit,
+    stamps: Stamps,
+    sigma: float,
+    gain: float | None,
+    order: IntArray,
 ) -> AnyDict:
     """The columns of the table for the chosen stars."""
     height, width = frame.counts.shape
-    x, y, flux, covariance = fit.x_px[order], fit.y_px[order], fit.flux[order], fit.covariance[order]
+    x, y, flux, covariance = (
+        fit.x_px[order],
+        fit.y_px[order],
+        fit.flux[order],
+        fit.covariance[order],
+    )
     rows, columns = pixel_at(y, height), pixel_at(x, width)
     steps = np.arange(-1, 2)
     box = (
@@ -361,7 +420,9 @@ def _columns(
         "flux": flux * (gain or 1.0),
         "snr": flux / np.sqrt(covariance[:, 2, 2]),
         "peak": np.nanmax(image.data[box].astype(np.float64), axis=(1, 2), initial=-np.inf),
-        "saturated": np.zeros(len(order), np.bool_) if frame.saturated is None else frame.saturated[core].any((1, 2)),
+        "saturated": np.zeros(len(order), np.bool_)
+        if frame.saturated is None
+        else frame.saturated[core].any((1, 2)),
         "blended": blended,
         "edge": margin < 3.0 * sigma,
     }

@@ -1,4 +1,5 @@
-"""Centroids of the stars in images: background and detection by SExtractor's code (`sep`), then a fit of each star.
+"""Centroids of the stars in images: background and detection by SExtractor's code (`sep`), then a
+fit of each star.
 
 A frame that cannot be used is left out with its reason; the others go on.
 """
@@ -66,44 +67,49 @@ def extract_centroids(
     Parameters
     ----------
     images
-        An image, a file, a folder of image files (in the order of their names), or several of them. The first frame
-        has the number 0; a file may hold several (see `read_images`). Files of a folder that are none are named in
-        `messages`.
+        An image, a file, a folder of image files (in the order of their names), or several of them.
+        The first frame has the number 0; a file may hold several (see `read_images`). Files of a
+        folder that are none are named in `messages`.
     camera
         If given, every image must be the size of its detector.
     gain_e_per_count
-        Electrons per count; by default what the file says. Without it, it is read off the noise of the background
-        where that is bright and uneven enough, for `sigma_px` only. Where it is not, the photon noise of the stars
-        themselves is left away, so that `sigma_px` of bright stars comes out too small. A message says which.
+        Electrons per count; by default what the file says. Without it, it is read off the noise of
+        the background where that is bright and uneven enough, for `sigma_px` only. Where it is not,
+        the photon noise of the stars themselves is left away, so that `sigma_px` of bright stars
+        comes out too small. A message says which.
     read_noise_e
         Read noise, electrons per pixel: a floor for the measured noise (needs the gain).
     saturation
-        Counts at and above which a pixel is saturated; by default what the file says, or the full scale of its
-        integers. Saturated pixels are not used.
+        Counts at and above which a pixel is saturated; by default what the file says, or the full
+        scale of its integers. Saturated pixels are not used.
     threshold_sigma
         Detection threshold in the image filtered by the PSF, in standard deviations of that image.
     min_pixels
         Pixels above the threshold that a star needs, in the filtered image.
     psf_sigma_px
-        Width of the star images before integration over pixels; by default it is measured in each image.
+        Width of the star images before integration over pixels; by default it is measured in each
+        image.
     max_stars
         Keep at most so many stars per frame, the brightest.
     correct_pixel_phase
-        Centroids of undersampled star images that are no Gaussians are drawn to the centres of the pixels. Where the
-        places of many stars show it (4 standard deviations), it is taken out, and a message says how much it was. All
-        images are then taken to be of one camera.
+        Centroids of undersampled star images that are no Gaussians are drawn to the centres of the
+        pixels. Where the places of many stars show it (4 standard deviations), it is taken out, and
+        a message says how much it was. All images are then taken to be of one camera.
     bayer
-        Colours of the 2 x 2 pixels in the first corner, row by row, of images whose pixels see one colour each; by
-        default what the file says (``BAYERPAT``, raw files), "none" for none. The green pixels alone are then measured,
-        each at its place, so that positions are those of the whole detector.
+        Colours of the 2 x 2 pixels in the first corner, row by row, of images whose pixels see one
+        colour each; by default what the file says (``BAYERPAT``, raw files), "none" for none. The
+        green pixels alone are then measured, each at its place, so that positions are those of the
+        whole detector.
     workers
-        Processes, with the same results for any number of them; 0 stays in this one. None takes as many as there are
-        processors from a hundred images on; fewer are measured before a process has started.
+        Processes, with the same results for any number of them; 0 stays in this one. None takes as
+        many as there are processors from a hundred images on; fewer are measured before a process
+        has started.
     progress
         Called with (files done, files in all).
     keep
-        Folder in which the stars of a hundred files and more are kept as they are measured; a later call with the same
-        files and options goes on from them (`starcal_uq.core.store.finished` removes them).
+        Folder in which the stars of a hundred files and more are kept as they are measured; a later
+        call with the same files and options goes on from them (`starcal_uq.core.store.finished`
+        removes them).
 
     Returns
     -------
@@ -132,7 +138,9 @@ def extract_centroids(
         workers = processors() if len(sources) >= _WORTH_PROCESSES else 0
     kept = None
     if keep is not None and len(sources) >= _WORTH_PROCESSES:
-        kept = Kept(keep, ["centroids", _files(sources), camera, options, bayer], (_Frame, FrameStars))
+        kept = Kept(
+            keep, ["centroids", _files(sources), camera, options, bayer], (_Frame, FrameStars)
+        )
     table = _Table(messages=messages)
     frames, interrupted = run_tasks(
         task,
@@ -165,7 +173,9 @@ def _files(sources: Sequence[Source]) -> list[list[str | int]]:
 
 @dataclass(frozen=True)
 class _Frame:
-    """What became of one frame: its entry in the table, messages, hash of its pixels, and its stars, if it has any."""
+    """What became of one frame: its entry in the table, messages, hash of its pixels, and its
+    stars, if it has any.
+    """
 
     entry: AnyDict
     messages: list[str]
@@ -183,8 +193,8 @@ class _Measure:
     bayer: Bayer | None = None
 
     def __call__(self, number: int) -> list[_Frame]:
-        # glibc gives memory back to the system when arrays the size of an image are freed, and gets it again page by
-        # page, until a larger one has been freed. This one is never written to.
+        # glibc gives memory back to the system when arrays the size of an image are freed, and gets
+        # it again page by page, until a larger one has been freed. This one is never written to.
         np.empty(_KEPT_BYTES, dtype=np.uint8)
         source = self.sources[number]
         if isinstance(source, Image):
@@ -206,7 +216,9 @@ class _Measure:
         except (ImageError, MissingExtraError) as error:
             return _left_out(error, name, None, image.time_utc or "", sha256.digest())
         entry = _entry(name, image.time_utc or "")
-        entry.update(background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px)
+        entry.update(
+            background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px
+        )
         entry["rendered"] = str(image.header.get("CREATOR", "")).startswith("starcal-uq")
         entry["optics"] = optics_of(image.header, image.width_px, image.height_px)
         entry["place"] = place_of(image.header)
@@ -226,7 +238,11 @@ def _entry(name: str, time_utc: str = "", problem: str = "") -> AnyDict:
 
 
 def _left_out(
-    error: ImageError | MissingExtraError, name: str, source: Any, time_utc: str = "", sha256: bytes | None = None
+    error: ImageError | MissingExtraError,
+    name: str,
+    source: Any,
+    time_utc: str = "",
+    sha256: bytes | None = None,
 ) -> _Frame:
     """The entry of an image that cannot be used, with its reason."""
     text = str(error)
@@ -272,12 +288,20 @@ class _Table:
         known = [gain for gain in self.gains if gain is not None]
         if known and len(known) < len(self.gains):
             # One unit for the whole table: counts are what every frame has.
-            self.messages.append("The gain is known for some frames only; give one for all to get comparable fluxes.")
-        measured = [s.measured_gain_e_per_count for s in self.stars if s.measured_gain_e_per_count is not None]
+            self.messages.append(
+                "The gain is known for some frames only; give one for all to get comparable fluxes."
+            )
+        measured = [
+            s.measured_gain_e_per_count
+            for s in self.stars
+            if s.measured_gain_e_per_count is not None
+        ]
         if measured:
             self.messages.append(
-                f"The gain is not given; the noise of the background says {float(np.median(measured)):.3g} electrons "
-                f"per count in {plural(len(measured), 'frame')}, which was taken for the photon noise of the stars."
+                "The gain is not given; the noise of the background says "
+                f"{float(np.median(measured)):.3g} electrons "
+                f"per count in {plural(len(measured), 'frame')}, which was taken for the photon "
+                "noise of the stars."
             )
         n_without = len(self.gains) - len(known) - len(measured)
         if n_without:
@@ -290,7 +314,9 @@ class _Table:
         optics = common_optics(list(said.values()))
         meta = {
             "settings": asdict(options),
-            "gain_e_per_count": known[0] if len(set(known)) == 1 and len(known) == len(self.gains) else None,
+            "gain_e_per_count": known[0]
+            if len(set(known)) == 1 and len(known) == len(self.gains)
+            else None,
             "gain_from_noise_e_per_count": float(np.median(measured)) if measured else None,
             "flux_unit": "electrons" if known and len(known) == len(self.gains) else "counts",
             "pixel_phase_px": list(amplitudes),
@@ -302,16 +328,26 @@ class _Table:
             "place": common_place([entry.get("place", {}) for entry in self.frames]),
         }
         if known and len(known) < len(self.gains):
-            per_star = np.repeat([g or 1.0 for g in self.gains], [len(s.columns["x_px"]) for s in self.stars])
+            per_star = np.repeat(
+                [g or 1.0 for g in self.gains], [len(s.columns["x_px"]) for s in self.stars]
+            )
             columns["flux"] = columns["flux"] / per_star
         frames: AnyDict = {name: [entry[name] for entry in self.frames] for name in FRAME_COLUMNS}
         return Centroids(**columns, **frames, messages=tuple(self.messages), meta=meta)
 
     def _correct_pixel_phase(self, columns: AnyDict) -> tuple[float, float]:
-        """Take errors by pixel phase out of `columns`, and give their amplitudes in x and y, pixels."""
+        """Take errors by pixel phase out of `columns`, and give their amplitudes in x and y,
+        pixels.
+        """
         sharp = [stars.windowed and stars.psf_sigma_px < _UNDERSAMPLED_PX for stars in self.stars]
-        rows = np.repeat(np.array(sharp, dtype=np.bool_), [len(stars.columns["x_px"]) for stars in self.stars])
-        clear = rows & (columns["snr"] > _PHASE_SNR) & ~(columns["blended"] | columns["saturated"] | columns["edge"])
+        rows = np.repeat(
+            np.array(sharp, dtype=np.bool_), [len(stars.columns["x_px"]) for stars in self.stars]
+        )
+        clear = (
+            rows
+            & (columns["snr"] > _PHASE_SNR)
+            & ~(columns["blended"] | columns["saturated"] | columns["edge"])
+        )
         x, y = columns["x_px"].copy(), columns["y_px"].copy()
         found = phase_error(x[clear], y[clear]), phase_error(y[clear], x[clear])
         moved = []
@@ -325,8 +361,10 @@ class _Table:
                 moved.append(f"{error.amplitude_px:.3f} \u00b1 {error.sigma_px:.3f} px in {name}")
         if moved:
             self.messages.append(
-                f"Centroids crowd at the centres of the pixels in {plural(sum(sharp), 'frame')}, because the star "
-                f"images are too sharp for the pixels; errors of up to {' and '.join(moved)} were taken out."
+                f"Centroids crowd at the centres of the pixels in {plural(sum(sharp), 'frame')}, "
+                "because the star "
+                f"images are too sharp for the pixels; errors of up to {' and '.join(moved)} "
+                "were taken out."
             )
         return found[0].amplitude_px, found[1].amplitude_px
 
@@ -345,17 +383,25 @@ def _sources(images: Source | Iterable[Source]) -> tuple[list[Source], list[str]
             sources.append(source)
             continue
         inside = sorted(Path(source).iterdir())
-        files = [path for path in inside if path.name.lower().endswith(IMAGE_ENDINGS) and not path.is_dir()]
+        files = [
+            path
+            for path in inside
+            if path.name.lower().endswith(IMAGE_ENDINGS) and not path.is_dir()
+        ]
         if not files:
             raise ImageError(
-                f"{source}: the folder holds no image ({', '.join(IMAGE_ENDINGS)}); name the folder that does, as "
+                f"{source}: the folder holds no image ({', '.join(IMAGE_ENDINGS)}); name the "
+                "folder that does, as "
                 "subfolders are not searched."
             )
         sources += files
         others = [path for path in inside if path not in files and not path.name.startswith(".")]
         for reason, names in (
             ("subfolders are not searched", [path.name for path in others if path.is_dir()]),
-            ("the ending is of no image that is read", [path.name for path in others if not path.is_dir()]),
+            (
+                "the ending is of no image that is read",
+                [path.name for path in others if not path.is_dir()],
+            ),
         ):
             if names:
                 more = [f"and {len(names) - _MOST_NAMES} more"] if len(names) > _MOST_NAMES else []

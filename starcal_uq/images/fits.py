@@ -1,8 +1,9 @@
-"""Fits of a Gaussian star image, integrated over pixels, to the pixels around many detections at once.
+"""Fits of a Gaussian star image, integrated over pixels, to the pixels around many detections at
+once.
 
-Each star has position and flux; weights are the inverse variances that the fitted star itself implies, iterated. This
-is maximum likelihood to first order, so that its scatter is the Cramer-Rao bound, and it has no pixel-phase error
-because the integration over pixels is in the model.
+Each star has position and flux; weights are the inverse variances that the fitted star itself
+implies, iterated. This is maximum likelihood to first order, so that its scatter is the Cramer-Rao
+bound, and it has no pixel-phase error because the integration over pixels is in the model.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from starcal_uq.images.background import PreparedImage
 from starcal_uq.maths.intervals import median_of
 
 _ITERATIONS = 10
-# A star is left alone when its step is this small, in standard deviations, or in px, parts of its flux and log width.
+# A star is left alone when its step is this small, in standard deviations, or in px, parts of its
+# flux and log width.
 _TOLERANCE_SIGMAS, _TOLERANCE = 1e-2, 1e-4
-# So many may be left that have not settled: they swing at the limit of detection, by less than they are known.
+# So many may be left that have not settled: they swing at the limit of detection, by less than they
+# are known.
 _LEFT_MOVING = 0.02
 _SQRT_2PI = float(np.sqrt(2.0 * np.pi))
 
@@ -30,9 +33,10 @@ _SQRT_2PI = float(np.sqrt(2.0 * np.pi))
 class Stamps:
     """Squares of pixels (n, m, m) around n positions, from first column `x0` and row `y0` (n,) on.
 
-    `counts` are above the background, 0 where not `fine`; `good` are pixels to use, `fine` those that are good, or no
-    loss: those between, in a mosaic of colours, hold the mean of their neighbours. `variance` (n,) is that of the
-    background, counts squared; `counts_per_e` the inverse gain, and 0 leaves photon noise of the star away.
+    `counts` are above the background, 0 where not `fine`; `good` are pixels to use, `fine` those
+    that are good, or no loss: those between, in a mosaic of colours, hold the mean of their
+    neighbours. `variance` (n,) is that of the background, counts squared; `counts_per_e` the
+    inverse gain, and 0 leaves photon noise of the star away.
     """
 
     x0: IntArray
@@ -46,16 +50,25 @@ class Stamps:
     def subset(self, chosen: Any) -> Stamps:
         """The stamps of some of the stars."""
         counts, good, fine = self.counts[chosen], self.good[chosen], self.fine[chosen]
-        return Stamps(self.x0[chosen], self.y0[chosen], counts, good, fine, self.variance[chosen], self.counts_per_e)
+        return Stamps(
+            self.x0[chosen],
+            self.y0[chosen],
+            counts,
+            good,
+            fine,
+            self.variance[chosen],
+            self.counts_per_e,
+        )
 
 
 @dataclass(frozen=True)
 class StarFit:
     """Result of `fit_stars` for n stars: positions in the image, px, and fluxes, counts.
 
-    `covariance` (n, 3, 3) of (x, y, flux) is infinite where the pixels do not determine the star; `sigma_px` (n,) is
-    the width of the star image, before integration over pixels; `weight` (n, m, m) the inverse variance of each pixel,
-    0 where it was not used; `residual` (n, m, m) counts minus the other stars of the field that reach into the stamp.
+    `covariance` (n, 3, 3) of (x, y, flux) is infinite where the pixels do not determine the star;
+    `sigma_px` (n,) is the width of the star image, before integration over pixels; `weight` (n, m,
+    m) the inverse variance of each pixel, 0 where it was not used; `residual` (n, m, m) counts
+    minus the other stars of the field that reach into the stamp.
     """
 
     x_px: FloatArray
@@ -77,14 +90,17 @@ def cut_stamps(
     counts_per_e: float,
     parity: int | None = None,
 ) -> Stamps:
-    """Cut the pixels around positions; what lies outside the image or is not `usable` is marked as not good.
+    """Cut the pixels around positions; what lies outside the image or is not `usable` is marked as
+    not good.
 
     Of a mosaic, the pixels with this `parity` were measured.
     """
     height, width = counts.shape
     size = 2 * half_px + 1
     x0, y0 = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
-    variance = np.asarray(noise[y0.clip(0, height - 1), x0.clip(0, width - 1)], dtype=np.float64) ** 2
+    variance = (
+        np.asarray(noise[y0.clip(0, height - 1), x0.clip(0, width - 1)], dtype=np.float64) ** 2
+    )
     x0, y0 = x0 - half_px, y0 - half_px
     inside = (x0 >= 0) & (x0 <= width - size) & (y0 >= 0) & (y0 <= height - size)
     stamp, good = np.zeros((len(x0), size, size)), np.ones((len(x0), size, size), dtype=np.bool_)
@@ -94,12 +110,16 @@ def cut_stamps(
         corner = y0[inside], x0[inside]
         for target, source in ((stamp, counts), (good, usable)):
             if source is not None:
-                target[inside] = np.lib.stride_tricks.sliding_window_view(source, (size, size))[corner]
+                target[inside] = np.lib.stride_tricks.sliding_window_view(source, (size, size))[
+                    corner
+                ]
     if not inside.all():
         steps = np.arange(size)
         columns, rows = x0[~inside, None] + steps, y0[~inside, None] + steps
         at = (rows.clip(0, height - 1)[:, :, None], columns.clip(0, width - 1)[:, None, :])
-        part = ((columns >= 0) & (columns < width))[:, None, :] & ((rows >= 0) & (rows < height))[:, :, None]
+        part = ((columns >= 0) & (columns < width))[:, None, :] & ((rows >= 0) & (rows < height))[
+            :, :, None
+        ]
         stamp[~inside], good[~inside] = counts[at], part if usable is None else part & usable[at]
     fine = good
     if parity is not None:
@@ -115,9 +135,11 @@ def cut_stamps(
 def _profiles(
     stamps: Stamps, u: FloatArray, v: FloatArray, sigma: FloatArray, derivatives: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Parts of a star's light in each pixel along x and along y, and as further rows their `derivatives`.
+    """Parts of a star's light in each pixel along x and along y, and as further rows their
+    `derivatives`.
 
-    Shape (n, 1 + derivatives, m) each; the first derivative is by the position, the second by the log width.
+    Shape (n, 1 + derivatives, m) each; the first derivative is by the position, the second by the
+    log width.
     """
     n, m = len(u), stamps.counts.shape[1]
     inverse = np.concatenate([1.0 / sigma] * 2)[:, None]
@@ -138,9 +160,11 @@ def _profiles(
 
 
 def _below(z: FloatArray, density: FloatArray) -> FloatArray:
-    """Normal distribution function where its density is known, to 7.5e-8 (Abramowitz & Stegun 26.2.17).
+    """Normal distribution function where its density is known, to 7.5e-8 (Abramowitz & Stegun
+    26.2.17).
 
-    No pixel is known so well, and SciPy's exact function takes longer to import than an image takes to measure.
+    No pixel is known so well, and SciPy's exact function takes longer to import than an image takes
+    to measure.
     """
     t = np.abs(z)
     t *= 0.2316419
@@ -155,8 +179,11 @@ def _below(z: FloatArray, density: FloatArray) -> FloatArray:
 
 
 def _contracted(x: FloatArray, image: FloatArray, y: FloatArray) -> FloatArray:
-    """Sums over pixels of y_a image x_b, (n, a, b), for rows (n, b, m) along x and (n, a, m) along y."""
-    # The star image is a product of two profiles, so that no product with one needs all pixels of all stars at once.
+    """Sums over pixels of y_a image x_b, (n, a, b), for rows (n, b, m) along x and (n, a, m) along
+    y.
+    """
+    # The star image is a product of two profiles, so that no product with one needs all pixels of
+    # all stars at once.
     total: FloatArray = y @ (image @ x.transpose(0, 2, 1))
     return total
 
@@ -167,12 +194,18 @@ def _gaussian(px: FloatArray, py: FloatArray) -> FloatArray:
 
 
 def fit_stars(
-    stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: float | FloatArray, *, pairs: Any = None, once: bool = False
+    stamps: Stamps,
+    x: FloatArray,
+    y: FloatArray,
+    sigma_px: float | FloatArray,
+    *,
+    pairs: Any = None,
+    once: bool = False,
 ) -> StarFit:
     """Fit position and flux of each star from x, y (n,) in the image.
 
-    `pairs` (p, 2) are stars (i, j) of which j reaches into the stamp of i; it is subtracted there. With `once` each
-    star is moved once only, where the places are known.
+    `pairs` (p, 2) are stars (i, j) of which j reaches into the stamp of i; it is subtracted there.
+    With `once` each star is moved once only, where the places are known.
     """
     state = _settled(stamps, x, y, sigma_px, pairs=pairs, left_moving=1.0 if once else _LEFT_MOVING)
     u, v, flux, log_sigma = state
@@ -192,9 +225,12 @@ def fit_widths(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Fit the width of each star as well: its position, flux and width, (n,) each.
 
-    `left_moving` is the part of the stars that need not have settled, where a median is all that is wanted.
+    `left_moving` is the part of the stars that need not have settled, where a median is all that is
+    wanted.
     """
-    u, v, flux, log_sigma = _settled(stamps, x, y, sigma_px, free_sigma=True, left_moving=left_moving)
+    u, v, flux, log_sigma = _settled(
+        stamps, x, y, sigma_px, free_sigma=True, left_moving=left_moving
+    )
     return u + stamps.x0, v + stamps.y0, flux, np.exp(log_sigma)
 
 
@@ -229,7 +265,9 @@ def _settled(
             # The flux is linear: start at its best value.
             weight = part.good / part.variance[:, None, None]
             top = _contracted(px[:, :1], weight * part.counts, py[:, :1])
-            state[2] = flux = _ratio(top, _contracted(px[:, :1] ** 2, weight, py[:, :1] ** 2))[:, 0, 0]
+            state[2] = flux = _ratio(top, _contracted(px[:, :1] ** 2, weight, py[:, :1] ** 2))[
+                :, 0, 0
+            ]
         light = None
         if others is not None:
             others[moving] = 0.0
@@ -240,7 +278,11 @@ def _settled(
         rest *= weight
         first = _contracted(px, rest, py)
         gradient = np.empty((len(moving), 3 + free_sigma))
-        gradient[:, 0], gradient[:, 1], gradient[:, 2] = flux * first[:, 0, 1], flux * first[:, 1, 0], first[:, 0, 0]
+        gradient[:, 0], gradient[:, 1], gradient[:, 2] = (
+            flux * first[:, 0, 1],
+            flux * first[:, 1, 0],
+            first[:, 0, 0],
+        )
         if free_sigma:
             gradient[:, 3] = flux * (first[:, 0, 2] + first[:, 2, 0])
         solution, determined = _solve(normal, gradient[:, :, None])
@@ -268,7 +310,8 @@ def _settled(
 
 
 def _to_their_end(step: FloatArray, last: FloatArray, moving: IntArray) -> FloatArray:
-    """Steps (q, k) of the stars that move, which swing, as about a hot pixel, or creep, to where their sum will end.
+    """Steps (q, k) of the stars that move, which swing, as about a hot pixel, or creep, to where
+    their sum will end.
 
     `last` (q, n) are the steps before, and become these.
     """
@@ -294,13 +337,16 @@ def _weighted(
     return rest, np.divide(stamps.good, bright, out=bright)
 
 
-# The derivatives by x, y, flux and log width as sums of products of a row along y and a row along x, over the flux.
+# The derivatives by x, y, flux and log width as sums of products of a row along y and a row along
+# x, over the flux.
 _PRODUCTS = (((0, 1),), ((1, 0),), ((0, 0),), ((0, 2), (2, 0)))
 
 
 @lru_cache
 def _products(k: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pairs of k rows along an axis, and the matrix from sums over their products to normal matrices, flattened."""
+    """Pairs of k rows along an axis, and the matrix from sums over their products to normal
+    matrices, flattened.
+    """
     first, second = np.triu_indices(k)
     place = np.zeros((k, k), dtype=np.int64)
     place[first, second] = place[second, first] = np.arange(len(first))
@@ -345,10 +391,11 @@ def _ratio(top: FloatArray, bottom: FloatArray) -> FloatArray:
 
 
 def _solve(normal: FloatArray, right: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Solutions (p, q, n) for normal matrices (n, p, p) and right sides (n, p, q), and which are determined.
+    """Solutions (p, q, n) for normal matrices (n, p, p) and right sides (n, p, q), and which are
+    determined.
 
-    By elimination in all of them at once; normal matrices need no exchange of rows. What the pivots have lost says how
-    nearly singular a matrix is, whatever the units.
+    By elimination in all of them at once; normal matrices need no exchange of rows. What the pivots
+    have lost says how nearly singular a matrix is, whatever the units.
     """
     p = normal.shape[1]
     a = np.concatenate([normal, right], axis=2).transpose(1, 2, 0).copy()
@@ -402,12 +449,14 @@ def window_positions(
     star_px: FloatArray,
     step_px: float | FloatArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Windowed centroids from positions (n,), and which are to be believed: whole windows with light in them.
+    """Windowed centroids from positions (n,), and which are to be believed: whole windows with
+    light in them.
 
-    SExtractor's XWIN and YWIN (Bertin & Arnouts): where the first moment of the light in a Gaussian window (n,) around
-    it is nought. All stars are moved at once, by steps that suit a Gaussian star of width `star_px` (n,): SExtractor's
-    suit a window as wide as the star, and swing in a wider one. The last steps are shorter than `step_px` (n,).
-    `stamps` of an image of this shape reach to where the windows end.
+    SExtractor's XWIN and YWIN (Bertin & Arnouts): where the first moment of the light in a Gaussian
+    window (n,) around it is nought. All stars are moved at once, by steps that suit a Gaussian star
+    of width `star_px` (n,): SExtractor's suit a window as wide as the star, and swing in a wider
+    one. The last steps are shorter than `step_px` (n,). `stamps` of an image of this shape reach to
+    where the windows end.
     """
     good = np.isfinite(x) & np.isfinite(y)
     if not len(x):
@@ -441,9 +490,17 @@ def window_positions(
     x, y = at[0] + stamps.x0, at[1] + stamps.y0
     height, width = shape
     radius = _WINDOW_SIGMAS * window_px
-    good &= (x - radius >= -0.5) & (x + radius <= width - 0.5) & (y - radius >= -0.5) & (y + radius <= height - 0.5)
+    good &= (
+        (x - radius >= -0.5)
+        & (x + radius <= width - 0.5)
+        & (y - radius >= -0.5)
+        & (y + radius <= height - 0.5)
+    )
     cut = np.flatnonzero(good & ~stamps.fine.all((1, 2)))
-    u, v = (steps + stamps.x0[cut, None]) - x[cut, None], (steps + stamps.y0[cut, None]) - y[cut, None]
+    u, v = (
+        (steps + stamps.x0[cut, None]) - x[cut, None],
+        (steps + stamps.y0[cut, None]) - y[cut, None],
+    )
     far = u[:, None, :] ** 2 + v[:, :, None] ** 2 > radius[cut, None, None] ** 2
     good[cut] = (stamps.fine[cut] | far).all((1, 2))
     return x, y, good
@@ -453,12 +510,17 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     """`fit` with windowed centroids and their covariance for the stars that stand alone."""
     window = np.maximum(_WINDOW_SIGMA_PX, 1.2 * fit.sigma_px)
     half = int(np.ceil(_WINDOW_SIGMAS * window.max(initial=_WINDOW_SIGMA_PX)))
-    stamps = cut_stamps(frame.counts, None, fit.x_px, fit.y_px, half, frame.noise, frame.counts_per_e, frame.parity)
+    stamps = cut_stamps(
+        frame.counts, None, fit.x_px, fit.y_px, half, frame.noise, frame.counts_per_e, frame.parity
+    )
     steps_px = np.maximum(_WINDOW_STEP_PX, _WINDOW_STEP_SIGMAS * np.sqrt(fit.covariance[:, 0, 0]))
-    x, y, whole = window_positions(stamps, frame.counts.shape, fit.x_px, fit.y_px, window, fit.sigma_px, steps_px)
+    x, y, whole = window_positions(
+        stamps, frame.counts.shape, fit.x_px, fit.y_px, window, fit.sigma_px, steps_px
+    )
     steps = np.arange(2 * half + 1)
     u, v = (steps + stamps.x0[:, None]) - x[:, None], (steps + stamps.y0[:, None]) - y[:, None]
-    # Moments up to the second along each axis, of the light in the window and of the variance in its square.
+    # Moments up to the second along each axis, of the light in the window and of the variance in
+    # its square.
     powers_u, powers_v = (np.stack([np.ones_like(w), w, w * w], axis=1) for w in (u, v))
     wu, wv = (np.exp(-0.5 * w * w / window[:, None] ** 2)[:, None, :] for w in (u, v))
     sums = _contracted(powers_u * wu, stamps.counts, powers_v * wv)
@@ -472,7 +534,12 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
         variance *= 2.0
     spread = _second_moments(_contracted(powers_u * wu**2, variance, powers_v * wv**2))
     near = near_pairs(fit.x_px, fit.y_px, 4.0 * float(window.max(initial=0.0)))
-    use = whole & (light > 0.0) & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0) & stamps.good.all((1, 2))
+    use = (
+        whole
+        & (light > 0.0)
+        & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0)
+        & stamps.good.all((1, 2))
+    )
     use[near[fit.flux[near[:, 1]] > 0.01 * fit.flux[near[:, 0]], 0]] = False
     gradient = _window_gradient(sums, window, fit, use)
     noise = spread / np.where(light > 0.0, light, np.inf)[:, None, None] ** 2
@@ -480,7 +547,9 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     covariance = fit.covariance.copy()
     covariance[:, :2, :2] = inverse @ noise @ inverse.transpose(0, 2, 1)
     x, y = np.where(use, x, fit.x_px), np.where(use, y, fit.y_px)
-    return replace(fit, x_px=x, y_px=y, covariance=np.where(use[:, None, None], covariance, fit.covariance))
+    return replace(
+        fit, x_px=x, y_px=y, covariance=np.where(use[:, None, None], covariance, fit.covariance)
+    )
 
 
 def _second_moments(sums: FloatArray) -> FloatArray:
@@ -489,13 +558,15 @@ def _second_moments(sums: FloatArray) -> FloatArray:
     return np.stack(rows, axis=1).reshape(-1, 2, 2)
 
 
-def _window_gradient(sums: FloatArray, window: FloatArray, fit: StarFit, alone: BoolArray) -> FloatArray:
+def _window_gradient(
+    sums: FloatArray, window: FloatArray, fit: StarFit, alone: BoolArray
+) -> FloatArray:
     """How far a windowed first moment falls when its window moves on by 1 px, shape (n, 2, 2).
 
-    The window follows the star, so that noise in the moment moves the centroid by the inverse of this: by a factor 2
-    where the window is as wide as the star (SExtractor's ERRX2WIN takes that for all), by hardly more than 1 where it
-    is wide. The second moments of the light in the window are the median of the bright stars'; one faint star's are
-    noise.
+    The window follows the star, so that noise in the moment moves the centroid by the inverse of
+    this: by a factor 2 where the window is as wide as the star (SExtractor's ERRX2WIN takes that
+    for all), by hardly more than 1 where it is wide. The second moments of the light in the window
+    are the median of the bright stars'; one faint star's are noise.
     """
     bright = alone & (fit.flux > _GRADIENT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
     # Stars of one width, mostly all, have one answer.
@@ -507,5 +578,7 @@ def _window_gradient(sums: FloatArray, window: FloatArray, fit: StarFit, alone: 
         moments = np.broadcast_to(median_of(np.moveaxis(second, 0, -1)), moments.shape)
     # Light without a peak does not hold the window; the floor keeps the errors finite.
     values, axes = np.linalg.eigh(np.eye(2) - moments / window[:, None, None] ** 2)
-    gradient: FloatArray = (axes * np.maximum(values, _LEAST_GRADIENT)[:, None, :]) @ axes.transpose(0, 2, 1)
+    gradient: FloatArray = (
+        axes * np.maximum(values, _LEAST_GRADIENT)[:, None, :]
+    ) @ axes.transpose(0, 2, 1)
     return gradient[which]

@@ -1,4 +1,6 @@
-"""Frames read from files: FITS, TIFF, PNG, JPEG, BMP and raw files become arrays whose first row is y = 0."""
+"""Frames read from files: FITS, TIFF, PNG, JPEG, BMP and raw files become arrays whose first row is
+y = 0.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,8 @@ _SIZES = re.compile(rb"NAXIS[1-9] *= *(\d{1,20})")
 _PIXEL_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16B": 2}
 # ISO 8601 as far as names of files allow it: colons are left out or replaced.
 _TIME_IN_NAME = re.compile(
-    r"(?<!\d)(\d{4})-?(\d\d)-?(\d\d)T(\d\d)[-:_.]?(\d\d)[-:_.]?(\d\d)(?:[.,](\d{1,6})(?!\d))?(?!\d)", re.ASCII
+    r"(?<!\d)(\d{4})-?(\d\d)-?(\d\d)T(\d\d)[-:_.]?(\d\d)[-:_.]?(\d\d)(?:[.,](\d{1,6})(?!\d))?(?!\d)",
+    re.ASCII,
 )
 
 
@@ -67,8 +70,8 @@ class Image:
     Attributes
     ----------
     data : array, shape (height, width)
-        Counts; ``data[y, x]`` is the pixel whose centre is (x, y). Integers as the file holds them, or floating-point
-        numbers, where NaN marks a pixel without a value.
+        Counts; ``data[y, x]`` is the pixel whose centre is (x, y). Integers as the file holds them,
+        or floating-point numbers, where NaN marks a pixel without a value.
     name : str
         Name, in messages and tables; of a file its name without the folder.
     time_utc : str or None
@@ -84,8 +87,8 @@ class Image:
     messages : tuple of str
         Notes on what was done to the pixels in reading, one sentence each.
     mosaic : {"", "RGGB", "BGGR", "GRBG", "GBRG"}
-        Colours of the 2 x 2 pixels in the first corner, row by row, where each pixel sees one colour; empty where all
-        see the same.
+        Colours of the 2 x 2 pixels in the first corner, row by row, where each pixel sees one
+        colour; empty where all see the same.
     """
 
     data: np.ndarray[Any, Any]
@@ -101,10 +104,13 @@ class Image:
     def __post_init__(self) -> None:
         data = np.asarray(self.data)
         if self.mosaic and self.mosaic not in MOSAICS:
-            raise ImageError(f"{self._label}: the mosaic is {self.mosaic!r}; give one of {', '.join(MOSAICS)}.")
+            raise ImageError(
+                f"{self._label}: the mosaic is {self.mosaic!r}; give one of {', '.join(MOSAICS)}."
+            )
         if data.ndim != 2 or data.dtype.kind not in "buif":
             raise ImageError(
-                f"{self._label}: the pixels are {data.dtype} of shape {data.shape}; give numbers in rows and columns."
+                f"{self._label}: the pixels are {data.dtype} of shape {data.shape}; give numbers "
+                "in rows and columns."
             )
         if not data.size:
             raise ImageError(f"{self._label}: the image has no pixels; leave it out.")
@@ -126,15 +132,22 @@ class Image:
 
     @property
     def green_parity(self) -> int | None:
-        """Remainder of (x + y) / 2 of the pixels that see green in a mosaic; None where there is none."""
+        """Remainder of (x + y) / 2 of the pixels that see green in a mosaic; None where there is
+        none.
+        """
         return (self.mosaic[0] != "G") if self.mosaic else None
 
     def as_mosaic(self, bayer: Bayer | None) -> Image:
-        """The image with the mosaic that the user declares, "none" for none; as it is where that is None."""
+        """The image with the mosaic that the user declares, "none" for none; as it is where that is
+        None.
+        """
         if bayer is None:
             return self
         if any(message.endswith(COLOURS_WORDS) for message in self.messages):
-            raise ImageError(f"{self._label}: the colours of its mosaic were put together before; leave out bayer.")
+            raise ImageError(
+                f"{self._label}: the colours of its mosaic were put together before; leave out "
+                "bayer."
+            )
         return replace(self, mosaic="" if bayer == "none" else bayer)
 
     def check_size(self, camera: Camera) -> None:
@@ -147,8 +160,10 @@ class Image:
         """
         if (self.width_px, self.height_px) != (camera.width_px, camera.height_px):
             raise ImageError(
-                f"{self._label}: the image is {self.width_px} x {self.height_px} px and the camera has "
-                f"{camera.width_px} x {camera.height_px} px; give the camera file that belongs to it."
+                f"{self._label}: the image is {self.width_px} x {self.height_px} px and the "
+                "camera has "
+                f"{camera.width_px} x {camera.height_px} px; give the camera file that belongs "
+                "to it."
             )
 
     def __repr__(self) -> str:
@@ -157,12 +172,13 @@ class Image:
 
 
 def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Image:
-    """Read one frame (``.fits``, ``.fits.gz``, ``.tiff``, ``.png``, ``.jpg``, ``.bmp``, or a camera's raw file).
+    """Read one frame (``.fits``, ``.fits.gz``, ``.tiff``, ``.png``, ``.jpg``, ``.bmp``, or a
+    camera's raw file).
 
-    The rows are kept in the order of the file, so the first row is y = 0. A colour image becomes its luminance; of a
-    file with several frames the first is taken, of a FITS file with several images the first of the camera's size, or
-    the largest; without a time in the header, one in the file's name is taken (such as
-    2019-07-29T204726); `messages` of the result say so.
+    The rows are kept in the order of the file, so the first row is y = 0. A colour image becomes
+    its luminance; of a file with several frames the first is taken, of a FITS file with several
+    images the first of the camera's size, or the largest; without a time in the header, one in the
+    file's name is taken (such as 2019-07-29T204726); `messages` of the result say so.
 
     Parameters
     ----------
@@ -174,7 +190,8 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     Raises
     ------
     ImageError
-        If the file is missing, truncated, no image, of the wrong size, or declares more pixels than it can hold.
+        If the file is missing, truncated, no image, of the wrong size, or declares more pixels than
+        it can hold.
     MissingExtraError
         If the library for its format is not installed.
     """
@@ -185,7 +202,9 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     else:
         images = {image.name: image for image in _read(path.with_name(part[1]), camera, every=True)}
         if path.name not in images:
-            raise ImageError(f"{path}: there is no such frame; the file has {', '.join(_few(list(images)))}.")
+            raise ImageError(
+                f"{path}: there is no such frame; the file has {', '.join(_few(list(images)))}."
+            )
         image = images[path.name]
     if camera is not None:
         image.check_size(camera)
@@ -193,13 +212,15 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
 
 
 def read_images(path: str | os.PathLike[str], camera: Camera | None = None) -> list[Image]:
-    """Read all frames of a file: planes of a FITS cube, images of a FITS file, pages of a TIFF file.
+    """Read all frames of a file: planes of a FITS cube, images of a FITS file, pages of a TIFF
+    file.
 
-    Those of one size are taken, that of the camera or the largest. A file with several frames names them
-    ``cube.fits[0]``, ``cube.fits[1]`` and so on, by the plane or the page; where a FITS file has several images, by
-    their HDU, ``images.fits[1]``, and cubes among them by HDU and plane, ``cubes.fits[1,0]``. Each plane of a cube has
-    a time of its own where the header states the time between planes (``KCT``, a third axis of time, ``DATE-END``) or
-    the exposure, after which the next is then taken to have begun.
+    Those of one size are taken, that of the camera or the largest. A file with several frames names
+    them ``cube.fits[0]``, ``cube.fits[1]`` and so on, by the plane or the page; where a FITS file
+    has several images, by their HDU, ``images.fits[1]``, and cubes among them by HDU and plane,
+    ``cubes.fits[1,0]``. Each plane of a cube has a time of its own where the header states the time
+    between planes (``KCT``, a third axis of time, ``DATE-END``) or the exposure, after which the
+    next is then taken to have begun.
 
     Parameters
     ----------
@@ -220,7 +241,10 @@ def _read(path: Path, camera: Camera | None, every: bool) -> list[Image]:
     data = _read_bytes(path)
     name = path.name.lower()
     if not name.endswith(IMAGE_ENDINGS):
-        raise ImageError(f"{path}: the ending {path.suffix or '(none)'} is unknown; use {', '.join(IMAGE_ENDINGS)}.")
+        raise ImageError(
+            f"{path}: the ending {path.suffix or '(none)'} is unknown; use "
+            f"{', '.join(IMAGE_ENDINGS)}."
+        )
     if name.endswith(FITS_ENDINGS):
         images = _read_fits(path, data, camera, every)
     elif name.endswith(RAW_ENDINGS):
@@ -229,7 +253,17 @@ def _read(path: Path, camera: Camera | None, every: bool) -> list[Image]:
         raw = read_raw(path, data)
         header = {"EXPTIME": raw.exposure_s, "FOCALLEN": raw.focal_mm}
         header = {key: value for key, value in header.items() if value is not None}
-        images = [Image(raw.pixels, path.name, None, raw.exposure_s, raw.saturation, header, mosaic=raw.mosaic)]
+        images = [
+            Image(
+                raw.pixels,
+                path.name,
+                None,
+                raw.exposure_s,
+                raw.saturation,
+                header,
+                mosaic=raw.mosaic,
+            )
+        ]
     else:
         images = _read_picture(path, data, camera, every)
     return [_with_named_time(image) for image in images]
@@ -239,7 +273,9 @@ def _with_named_time(image: Image) -> Image:
     time = time_in_name(image.name)
     if image.time_utc is not None or time is None:
         return image
-    return replace(image, time_utc=time, messages=(*image.messages, time_in_name_message(image.name)))
+    return replace(
+        image, time_utc=time, messages=(*image.messages, time_in_name_message(image.name))
+    )
 
 
 def _few(names: list[str]) -> list[str]:
@@ -262,7 +298,9 @@ def time_in_name(name: str) -> str | None:
 
 def time_in_name_message(name: str) -> str:
     """What is said of an image whose time is that in its name."""
-    return f"{name}: the time was taken from the name of the file, as UTC; the file itself has none."
+    return (
+        f"{name}: the time was taken from the name of the file, as UTC; the file itself has none."
+    )
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -275,7 +313,9 @@ def _read_bytes(path: Path) -> bytes:
     except FileNotFoundError:
         raise ImageError(f"{path}: the file does not exist; check the path.") from None
     except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror}); check its permissions.") from error
+        raise ImageError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions."
+        ) from error
     if not data:
         raise ImageError(f"{path}: the file is empty; copy it again or leave it out.")
     return data
@@ -286,7 +326,9 @@ def _broken(path: Path) -> ImageError:
 
 
 def _check_declared(path: Path, declared: int, stored: int) -> None:
-    """Refuse an image of `declared` bytes that a file of `stored` bytes cannot hold, before memory is taken for it."""
+    """Refuse an image of `declared` bytes that a file of `stored` bytes cannot hold, before memory
+    is taken for it.
+    """
     try:
         check_size(declared, stored)
     except ValueError as error:
@@ -294,7 +336,10 @@ def _check_declared(path: Path, declared: int, stored: int) -> None:
 
 
 def _too_much(path: Path, error: ValueError) -> ImageError:
-    return ImageError(f"{path}: the file is damaged ({error}); copy it again, or save the image without compression.")
+    return ImageError(
+        f"{path}: the file is damaged ({error}); copy it again, or save the image without "
+        "compression."
+    )
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:
@@ -322,11 +367,14 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> l
     if data.startswith(b"\x1f\x8b"):
         data = _unpacked(path, data)
     if not data.startswith(b"SIMPLE"):
-        raise ImageError(f"{path}: the file is not a FITS image; check what it is, or name it by its format.")
+        raise ImageError(
+            f"{path}: the file is not a FITS image; check what it is, or name it by its format."
+        )
     _check_counts(path, data)
     taken: list[tuple[int, Any, AnyDict, str]] = []
     with warnings.catch_warnings():
-        # Astropy warns of a truncated file and then pads it or fails later; both are one error here.
+        # Astropy warns of a truncated file and then pads it or fails later; both are one error
+        # here.
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", message=".*(truncated|Error validating header).*")
         try:
@@ -334,11 +382,23 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> l
                 chosen, images, words = _science_images(hdus, camera)
                 for place in chosen if every else chosen[:1]:
                     hdu = hdus[place]
-                    _check_declared(path, math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8, max(stored, len(data)))
+                    _check_declared(
+                        path,
+                        math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8,
+                        max(stored, len(data)),
+                    )
                     pixels, header = np.array(hdu.data), _plain(hdu.header)
-                    unit = next((str(h.comments["GAIN"]) for h in (hdu.header, hdus[0].header) if "GAIN" in h), "")
+                    unit = next(
+                        (
+                            str(h.comments["GAIN"])
+                            for h in (hdu.header, hdus[0].header)
+                            if "GAIN" in h
+                        ),
+                        "",
+                    )
                     if place and header.get("INHERIT", True):
-                        # Exposures of several images say in the first header what is common to them.
+                        # Exposures of several images say in the first header what is common to
+                        # them.
                         header = _plain(hdus[0].header) | header
                     taken.append((place, pixels, header, unit))
         except ImageError:
@@ -352,7 +412,11 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> l
     shape = taken[0][1].shape
     size = f"{shape[-1]} x {shape[-2]} px"
     if len(images) > len(taken):
-        what = f"the one of {size} in HDU {chosen[0]} was" if len(taken) == 1 else f"{len(taken)} of {size} were"
+        what = (
+            f"the one of {size} in HDU {chosen[0]} was"
+            if len(taken) == 1
+            else f"{len(taken)} of {size} were"
+        )
         words = [f"of {len(images)} images in the file, {what} taken.", *words]
     found: list[Image] = []
     for place, pixels, header, unit in taken:
@@ -376,12 +440,18 @@ def _planes(pixels: Any, header: Mapping[str, Any]) -> tuple[Any, list[str]]:
     if n == 1:
         return frames, []
     if n == 3 and "RGB" in f"{header.get('CTYPE3', '')} {header.get('COLORSPC', '')}".upper():
-        return _grey([np.ascontiguousarray(colour) for colour in frames], None)[0][None], [COLOURS_WORDS]
+        return _grey([np.ascontiguousarray(colour) for colour in frames], None)[0][None], [
+            COLOURS_WORDS
+        ]
     cycle, by = _cycle_s(header, n)
     if cycle is None:
-        return frames, [f"{n} planes were read as frames; the header does not say how they follow in time."]
+        return frames, [
+            f"{n} planes were read as frames; the header does not say how they follow in time."
+        ]
     if by == "EXPTIME":
-        return frames, [f"{n} planes were read as frames, each taken to begin where the one before ends ({by})."]
+        return frames, [
+            f"{n} planes were read as frames, each taken to begin where the one before ends ({by})."
+        ]
     return frames, [f"{n} planes were read as frames, {cycle:g} s apart ({by})."]
 
 
@@ -389,11 +459,15 @@ def _cycle_s(header: Mapping[str, Any], n: int) -> tuple[float | None, str]:
     """Seconds from one of n planes to the next, and the keyword that says it."""
     if kinetic := _positive(header, "KCT"):
         return kinetic, "KCT"
-    unit = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}.get(str(header.get("CUNIT3", "")).strip())
+    unit = {"": 1.0, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}.get(
+        str(header.get("CUNIT3", "")).strip()
+    )
     if str(header.get("CTYPE3", "")).strip().upper() in ("TIME", "UTC", "UT") and unit:
         return (step * unit if (step := _positive(header, "CDELT3")) else None), "CDELT3"
     try:
-        first, last = (datetime.fromisoformat(str(header[key]).strip()) for key in ("DATE-OBS", "DATE-END"))
+        first, last = (
+            datetime.fromisoformat(str(header[key]).strip()) for key in ("DATE-OBS", "DATE-END")
+        )
         span = (last - first).total_seconds()
     except (KeyError, ValueError, TypeError):
         span = 0.0
@@ -403,9 +477,17 @@ def _cycle_s(header: Mapping[str, Any], n: int) -> tuple[float | None, str]:
 
 
 def _fits_image(
-    path: Path, name: str, pixels: Any, header: AnyDict, unit: str, messages: list[str], plane: tuple[int, int]
+    path: Path,
+    name: str,
+    pixels: Any,
+    header: AnyDict,
+    unit: str,
+    messages: list[str],
+    plane: tuple[int, int],
 ) -> Image:
-    """The image of pixels and header; `plane` is its place among planes, and `unit` the comment of GAIN."""
+    """The image of pixels and header; `plane` is its place among planes, and `unit` the comment of
+    GAIN.
+    """
     pixels = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
     exposure = _positive(header, "EXPTIME", "EXPOSURE")
     time, words = _middle(header, exposure, *plane)
@@ -416,7 +498,8 @@ def _fits_image(
         gain = bare if _PER_COUNT.search(unit) else None
         if gain is None:
             messages.append(
-                f"{name}: GAIN ({bare:g}) does not say that it is in electrons per count and was not used; give "
+                f"{name}: GAIN ({bare:g}) does not say that it is in electrons per count and was "
+                "not used; give "
                 "the gain."
             )
     mosaic, words = _stated_mosaic(header, pixels.shape[0])
@@ -435,13 +518,16 @@ def _fits_image(
 
 
 def _stated_mosaic(header: Mapping[str, Any], height: int) -> tuple[str, str]:
-    """The mosaic of colours that a header states, from the first row stored; or why it is not used."""
+    """The mosaic of colours that a header states, from the first row stored; or why it is not
+    used.
+    """
     stated = str(header.get("BAYERPAT", "") or header.get("COLORTYP", "")).strip().upper()
     if stated not in MOSAICS:
         if "BAYERPAT" not in header or not stated:
             return "", ""
         return "", (
-            f"the pixels are a mosaic of colours ({stated}) that is not known here and were read as grey, which makes "
+            f"the pixels are a mosaic of colours ({stated}) that is not known here and were read "
+            "as grey, which makes "
             f"centroids worse than predicted; give bayer, one of {', '.join(MOSAICS)}."
         )
     across, down = (int(header.get(key, 0) or 0) % 2 for key in ("XBAYROFF", "YBAYROFF"))
@@ -459,10 +545,14 @@ def _check_counts(path: Path, data: bytes) -> None:
         raise _broken(path) from None
 
 
-def _science_images(hdus: Any, camera: Camera | None) -> tuple[list[int], dict[int, tuple[int, ...]], list[str]]:
-    """Places of the images of the camera's size, or else of the largest; the sizes of all; what is to be said.
+def _science_images(
+    hdus: Any, camera: Camera | None
+) -> tuple[list[int], dict[int, tuple[int, ...]], list[str]]:
+    """Places of the images of the camera's size, or else of the largest; the sizes of all; what is
+    to be said.
 
-    Images of that size that are named as the noise, quality or background of another are not among them.
+    Images of that size that are named as the noise, quality or background of another are not among
+    them.
     """
     shapes: dict[int, tuple[int, ...]] = {}
     words: list[str] = []
@@ -476,7 +566,9 @@ def _science_images(hdus: Any, camera: Camera | None) -> tuple[list[int], dict[i
         if not shapes or ("truncated" in str(error) and size not in shapes.values()):
             raise
         if "truncated" in str(error):
-            words.append(f"the file is cut off after HDU {max(shapes)}, and what follows was not read.")
+            words.append(
+                f"the file is cut off after HDU {max(shapes)}, and what follows was not read."
+            )
     if not shapes:
         return [], {}, []
     best = max(shapes, key=lambda place: (shapes[place] == size, np.prod(shapes[place])))
@@ -484,7 +576,10 @@ def _science_images(hdus: Any, camera: Camera | None) -> tuple[list[int], dict[i
     names = {place: str(hdus[place].header.get("EXTNAME", "")).strip().upper() for place in alike}
     beside = [place for place in alike if place != best and _BESIDES.match(names[place])]
     if beside:
-        words.append(f"{', '.join(names[place] for place in beside)} were not read, being no frames by their names.")
+        words.append(
+            f"{', '.join(names[place] for place in beside)} were not read, being no frames by "
+            "their names."
+        )
     return [place for place in alike if place not in beside], shapes, words
 
 
@@ -493,22 +588,31 @@ def _plain(header: Any) -> AnyDict:
     for card in header.cards:
         try:
             key, value = card.keyword, card.value
-        except Exception:  # astropy raises errors of its own for a value that is none; the others are as good as before
+        # astropy raises errors of its own for a value that is none; the others are as good as
+        # before
+        except Exception:
             continue
-        if key and key not in ("COMMENT", "HISTORY") and isinstance(value, str | bool | int | float):
+        if (
+            key
+            and key not in ("COMMENT", "HISTORY")
+            and isinstance(value, str | bool | int | float)
+        ):
             plain.setdefault(key, value)
     return plain
 
 
 # What is said of an image that was made of colours.
 COLOURS_WORDS = (
-    "the colour image was turned into luminance; colours sampled in a mosaic make centroids worse than predicted."
+    "the colour image was turned into luminance; colours sampled in a mosaic make centroids "
+    "worse than predicted."
 )
 
 
 @cache
 def _silence_libtiff() -> None:
-    """Pillow raises what is wrong with a TIFF file; its library also prints it, into the words of a command."""
+    """Pillow raises what is wrong with a TIFF file; its library also prints it, into the words of a
+    command.
+    """
     import ctypes
 
     from PIL import _imaging
@@ -535,7 +639,9 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
             picture: Any = PIL.Image.open(io.BytesIO(data), formats=_PICTURES)
         except PIL.UnidentifiedImageError:
             if data.startswith(b"SIMPLE"):
-                raise ImageError(f"{path}: the file is a FITS image; give its name the ending .fits.") from None
+                raise ImageError(
+                    f"{path}: the file is a FITS image; give its name the ending .fits."
+                ) from None
             picture = None
         except Exception as error:
             raise _broken(path) from error
@@ -550,10 +656,14 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
             deep = deep_colours(path, data, _check_declared)
             if deep is None:
                 raise ImageError(
-                    f"{path}: the file is not an image, is damaged, or is of a kind that is not read; save it as FITS "
+                    f"{path}: the file is not an image, is damaged, or is of a kind that is not "
+                    "read; save it as FITS "
                     "or as a grey TIFF or PNG."
                 )
-            pages = [_grey([np.ascontiguousarray(page[..., k]) for k in range(3)], 65535.0) for page in deep]
+            pages = [
+                _grey([np.ascontiguousarray(page[..., k]) for k in range(3)], 65535.0)
+                for page in deep
+            ]
             n_pages = len(pages)
         else:
             declared = 0
@@ -574,12 +684,17 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
     best = max(sizes, key=lambda shape: (shape == size, np.prod(shape)))
     chosen = [k for k, shape in enumerate(sizes) if shape == best][: None if every else 1]
     words = []
-    if (picture is not None and picture.format == "JPEG") or path.suffix.lower() in (".jpg", ".jpeg"):
+    if (picture is not None and picture.format == "JPEG") or path.suffix.lower() in (
+        ".jpg",
+        ".jpeg",
+    ):
         words.append("JPEG compression changes the noise; use FITS, TIFF or PNG where you can.")
     if n_pages > 1 and not every:
         words.append(f"the first of {n_pages} planes was taken.")
     elif n_pages > len(chosen):
-        words.append(f"of {n_pages} pages, {len(chosen)} of {best[1]} x {best[0]} px were read as frames.")
+        words.append(
+            f"of {n_pages} pages, {len(chosen)} of {best[1]} x {best[0]} px were read as frames."
+        )
     elif n_pages > 1:
         words.append(f"{n_pages} pages were read as frames.")
     found: list[Image] = []
@@ -645,13 +760,16 @@ def _checked(path: Path, pixels: Any, messages: list[str]) -> Any:
     if bad:
         pixels = np.where(good, pixels, np.nan)
         messages.append(
-            f"{path.name}: {plural(bad, 'pixel')} without a value (NaN) {'was' if bad == 1 else 'were'} masked."
+            f"{path.name}: {plural(bad, 'pixel')} without a value (NaN) "
+            f"{'was' if bad == 1 else 'were'} masked."
         )
     return pixels.astype(np.float32)
 
 
 def _full_scale(pixels: Any) -> float | None:
-    """Saturation of integers: the highest value of their type, or of a converter with fewer bits that is reached."""
+    """Saturation of integers: the highest value of their type, or of a converter with fewer bits
+    that is reached.
+    """
     if pixels.dtype.kind not in "ui" or pixels.dtype.itemsize > 2:
         return None
     highest = int(pixels.max())
@@ -674,7 +792,8 @@ def _positive(header: Mapping[str, Any], *keys: str) -> float | None:
 def _middle(
     header: Mapping[str, Any], exposure_s: float | None, plane: int = 0, planes: int = 1
 ) -> tuple[str | None, str]:
-    """Middle of the exposure, UTC: DATE-AVG, or DATE-OBS (its start) plus half the exposure; why a time is not used.
+    """Middle of the exposure, UTC: DATE-AVG, or DATE-OBS (its start) plus half the exposure; why a
+    time is not used.
 
     Of several planes, DATE-AVG is the middle of all, and DATE-OBS the start of the first.
     """
@@ -696,7 +815,10 @@ def _middle(
         if "T" not in text:
             continue
         if not FIRST_YEAR <= time.year <= LAST_YEAR:
-            problem = f"{key} is of the year {time.year}, not of {FIRST_YEAR} to {LAST_YEAR}, and was not used."
+            problem = (
+                f"{key} is of the year {time.year}, not of {FIRST_YEAR} to {LAST_YEAR}, and was "
+                "not used."
+            )
             continue
         if time.tzinfo is not None:
             time = time.astimezone(UTC).replace(tzinfo=None)

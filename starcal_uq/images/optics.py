@@ -1,4 +1,6 @@
-"""What image files say of lens, detector and place: pixel pitch, focal length and site, where they do."""
+"""What image files say of lens, detector and place: pixel pitch, focal length and site, where they
+do.
+"""
 
 from __future__ import annotations
 
@@ -32,15 +34,20 @@ _PIXEL_UM, _FOCAL_MM = (0.3, 200.0), (0.5, 50_000.0)
 
 
 def optics_of(header: Mapping[str, Any], width_px: int, height_px: int) -> AnyDict:
-    """Size of an image, and ``pixel_um``, ``focal_mm`` and ``focal_px`` as far as its header has them.
+    """Size of an image, and ``pixel_um``, ``focal_mm`` and ``focal_px`` as far as its header has
+    them.
 
-    Of FITS: XPIXSZ, PIXSIZE1 (um), FOCALLEN (mm), and the scale of PIXSCALE, SECPIX (arcsec) or a tangent plane's
-    CDELT1 or CD1_1, CD2_1 (deg). Of Exif: FocalLength, FocalPlaneXResolution, FocalLengthIn35mmFilm.
+    Of FITS: XPIXSZ, PIXSIZE1 (um), FOCALLEN (mm), and the scale of PIXSCALE, SECPIX (arcsec) or a
+    tangent plane's CDELT1 or CD1_1, CD2_1 (deg). Of Exif: FocalLength, FocalPlaneXResolution,
+    FocalLengthIn35mmFilm.
     """
     found: AnyDict = {"width_px": int(width_px), "height_px": int(height_px)}
     pixel = _within(_PIXEL_UM, header, "XPIXSZ", "PIXSIZE1", "PIXSIZE")
     focal = _within(_FOCAL_MM, header, "FOCALLEN", "FocalLength")
-    per_unit, unit = _number(header, "FocalPlaneXResolution"), _number(header, "FocalPlaneResolutionUnit")
+    per_unit, unit = (
+        _number(header, "FocalPlaneXResolution"),
+        _number(header, "FocalPlaneResolutionUnit"),
+    )
     if pixel is None and per_unit and per_unit > 0.0:
         pixel = _UNIT_UM.get(unit or 2.0, 0.0) / per_unit
         pixel = pixel if _PIXEL_UM[0] <= pixel <= _PIXEL_UM[1] else None
@@ -60,21 +67,34 @@ def optics_of(header: Mapping[str, Any], width_px: int, height_px: int) -> AnyDi
 
 
 def place_of(header: Mapping[str, Any]) -> AnyDict:
-    """Latitude and longitude (degrees, north and east positive), height (m) and the keys that say so, or nothing.
+    """Latitude and longitude (degrees, north and east positive), height (m) and the keys that say
+    so, or nothing.
 
-    Of FITS: OBSGEO-B, -L, -H or OBSGEO-X, -Y, -Z (m), SITELAT and SITELONG, LAT-OBS and LONG-OBS with ALT-OBS; degrees
-    as a number or as "52 13 04.5".
+    Of FITS: OBSGEO-B, -L, -H or OBSGEO-X, -Y, -Z (m), SITELAT and SITELONG, LAT-OBS and LONG-OBS
+    with ALT-OBS; degrees as a number or as "52 13 04.5".
     """
     xyz = [_number(header, f"OBSGEO-{axis}") for axis in "XYZ"]
     for north, east, up in _PLACES:
         latitude, longitude = _angle(header, north), _angle(header, east)
-        if latitude is not None and longitude is not None and abs(latitude) <= 90.0 and abs(longitude) <= 360.0:
+        if (
+            latitude is not None
+            and longitude is not None
+            and abs(latitude) <= 90.0
+            and abs(longitude) <= 360.0
+        ):
             return _place(latitude, longitude, _number(header, up) or 0.0, f"{north}, {east}")
-    if all(value is not None for value in xyz) and 6.3e6 < float(np.linalg.norm(np.array(xyz, dtype=float))) < 6.4e6:
+    if (
+        all(value is not None for value in xyz)
+        and 6.3e6 < float(np.linalg.norm(np.array(xyz, dtype=float))) < 6.4e6
+    ):
         import erfa
 
-        longitude, latitude, height = (float(value) for value in erfa.gc2gd(1, np.array(xyz, dtype=float)))
-        return _place(float(np.degrees(latitude)), float(np.degrees(longitude)), height, "OBSGEO-X, -Y, -Z")
+        longitude, latitude, height = (
+            float(value) for value in erfa.gc2gd(1, np.array(xyz, dtype=float))
+        )
+        return _place(
+            float(np.degrees(latitude)), float(np.degrees(longitude)), height, "OBSGEO-X, -Y, -Z"
+        )
     return {}
 
 
@@ -99,7 +119,9 @@ def _angle(header: Mapping[str, Any], key: str) -> float | None:
 
 
 def common_place(places: Sequence[AnyDict]) -> AnyDict:
-    """The place that all images state which state one; nothing where they differ by more than a kilometre."""
+    """The place that all images state which state one; nothing where they differ by more than a
+    kilometre.
+    """
     said = [place for place in places if place]
     if not said:
         return {}
@@ -120,7 +142,11 @@ def common_optics(optics: Sequence[AnyDict]) -> AnyDict:
         return {}
     sizes = [(said["width_px"], said["height_px"]) for said in optics]
     most = Counter(sizes).most_common(1)[0][0]
-    alike = (tuple(sorted(said.items())) for said, size in zip(optics, sizes, strict=True) if size == most)
+    alike = (
+        tuple(sorted(said.items()))
+        for said, size in zip(optics, sizes, strict=True)
+        if size == most
+    )
     return dict(Counter(alike).most_common(1)[0][0])
 
 

@@ -1,8 +1,9 @@
 """Errors of centroids by the place of the star in its pixel, found from the stars' places alone.
 
-Stars fall everywhere in their pixels alike. Where the light of a star is too sharp for the pixels, centroids are drawn
-to the pixels' centres, and measured places crowd there: a displacement by -A sin(2 pi x) makes the mean of cos(2 pi x)
-pi A. Neither a catalogue nor a model of the star image is needed.
+Stars fall everywhere in their pixels alike. Where the light of a star is too sharp for the pixels,
+centroids are drawn to the pixels' centres, and measured places crowd there: a displacement by -A
+sin(2 pi x) makes the mean of cos(2 pi x) pi A. Neither a catalogue nor a model of the star image is
+needed.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _ITERATIONS = 30
 class PhaseError:
     """Displacement of centroids along one axis by -amplitude sin(2 pi x).
 
-    The amplitude is 0 where it is not significant; its standard deviation is infinite with too few stars.
+    The amplitude is 0 where it is not significant; its standard deviation is infinite with too few
+    stars.
     """
 
     amplitude_px: float
@@ -48,13 +50,16 @@ def phase_error(along_px: FloatArray, across_px: FloatArray) -> PhaseError:
     sums = np.bincount(index.reshape(-1), cosine - mean)
     amplitude, error = mean / np.pi, float(np.sqrt(np.sum(sums**2))) / len(along_px) / np.pi
     # Crowding away from the centres has other causes, such as sharp stars taken for hot pixels.
-    return PhaseError(min(amplitude, _LARGEST_PX) if amplitude > _SIGNIFICANT * error else 0.0, error)
+    return PhaseError(
+        min(amplitude, _LARGEST_PX) if amplitude > _SIGNIFICANT * error else 0.0, error
+    )
 
 
 def without_phase_error(
     along_px: FloatArray, variance_px2: FloatArray, amplitude_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions (n,) put back where they were, and what their standard deviations are multiplied by.
+    """Positions (n,) put back where they were, and what their standard deviations are multiplied
+    by.
 
     Noise blurs the phase, so noisy ones are moved less.
     """

@@ -16,10 +16,12 @@ FIRST_SIGMA_PX = 1.2
 _STAMP_HALF_SIGMAS = 4.0
 _PSF_STARS, _PSF_SNR, _MISFIT_SNR = 40, 15.0, 30.0
 _WIDTHS = (0.25, 15.0)
-# Star images with this part of their light beyond the Gaussian, or so much longer than wide, are no round Gaussians.
+# Star images with this part of their light beyond the Gaussian, or so much longer than wide, are no
+# round Gaussians.
 _MISFIT, _ELONGATED = 0.1, 1.2
 _MOMENT_WINDOW_PX = 1.5
-# The fits of this part of the stars need not have converged: for the size of stamps, and for a median.
+# The fits of this part of the stars need not have converged: for the size of stamps, and for a
+# median.
 _LEFT_MOVING = (0.8, 0.15)
 
 
@@ -27,8 +29,8 @@ _LEFT_MOVING = (0.8, 0.15)
 class Psf:
     """What the star images of a frame look like: width, px, before integration over pixels.
 
-    `beyond` is light beyond the Gaussian as a part of it, 0 where it is not significant; `elongation` is length over
-    width, with the pixel, 1 where it is not significant.
+    `beyond` is light beyond the Gaussian as a part of it, 0 where it is not significant;
+    `elongation` is length over width, with the pixel, 1 where it is not significant.
     """
 
     sigma_px: float
@@ -40,7 +42,9 @@ class Psf:
         """What keeps the star images from being round Gaussians; empty where nothing does."""
         words = []
         if abs(self.beyond) > _MISFIT:
-            words.append(f"no Gaussians ({abs(100.0 * self.beyond):.0f} % of their light is elsewhere)")
+            words.append(
+                f"no Gaussians ({abs(100.0 * self.beyond):.0f} % of their light is elsewhere)"
+            )
         if self.elongation > _ELONGATED:
             words.append(f"elongated ({self.elongation:.1f} : 1)")
         return " and ".join(words)
@@ -57,22 +61,30 @@ def moment_sigma_px(objects: Any, default: float) -> float:
 def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     """Width and shape of the star images; None where unknown.
 
-    The median over bright stars that stand alone; where there is none, the common width that suits the faint ones.
+    The median over bright stars that stand alone; where there is none, the common width that suits
+    the faint ones.
     """
     sigma = moment_sigma_px(objects, FIRST_SIGMA_PX)
-    noise = frame.noise[pixel_at(objects["y"], frame.counts.shape[0]), pixel_at(objects["x"], frame.counts.shape[1])]
+    noise = frame.noise[
+        pixel_at(objects["y"], frame.counts.shape[0]), pixel_at(objects["x"], frame.counts.shape[1])
+    ]
     snr = objects["flux"] / (noise * np.sqrt(4.0 * np.pi) * sigma)
     alone = objects["flag"] == 0
     bright = alone & (snr > _PSF_SNR)
     if not bright.any():
         return _common_width(frame, objects[alone], sigma)
     chosen = objects[bright][: 10 * _PSF_STARS]
-    # The brightest of equally faint stars are those whose noise adds light and width: then more are taken.
+    # The brightest of equally faint stars are those whose noise adds light and width: then more are
+    # taken.
     clear = np.count_nonzero(snr[bright] > 4.0 * _PSF_SNR) >= _PSF_STARS
     most = _PSF_STARS if clear else 5 * _PSF_STARS
     # Moments are of the filtered image, in which stars are wider.
     first = max(float(np.sqrt(max(sigma**2 - FIRST_SIGMA_PX**2, 0.0))), 0.6 * sigma)
-    x, y, widths = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), np.full(len(chosen), first)
+    x, y, widths = (
+        chosen["x"].astype(np.float64),
+        chosen["y"].astype(np.float64),
+        np.full(len(chosen), first),
+    )
     for left_moving in _LEFT_MOVING:
         clean, stamps = _clean_stamps(frame, chosen, sigma, most)
         if not len(clean):
@@ -86,8 +98,11 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
         # The second fit, of stamps that suit the width, starts where the first has ended.
         x, y = np.where(good, x, chosen["x"]), np.where(good, y, chosen["y"])
         widths = np.where(good, widths, sigma)
-    # All pixels with the same weight, so that what counts as core and wings does not hang on whether the gain is known.
-    stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, 0.0, frame.parity)
+    # All pixels with the same weight, so that what counts as core and wings does not hang on
+    # whether the gain is known.
+    stamps = cut_stamps(
+        frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, 0.0, frame.parity
+    )
     width = sigma
     if frame.counts_per_e:
         x, y, _, widths = fit_widths(stamps, x, y, widths, _LEFT_MOVING[0])
@@ -98,7 +113,9 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     if np.count_nonzero(good) <= 3:
         return Psf(sigma)
     return Psf(
-        sigma, _significant(stamps.counts[good].sum((1, 2)) / fit.flux[good] - 1.0), _elongation(stamps, fit, good)
+        sigma,
+        _significant(stamps.counts[good].sum((1, 2)) / fit.flux[good] - 1.0),
+        _elongation(stamps, fit, good),
     )
 
 
@@ -110,15 +127,26 @@ def _significant(values: FloatArray) -> float:
 
 
 def _elongation(stamps: Stamps, fit: StarFit, good: BoolArray) -> float:
-    """Length over width of the star images by their second moments in a window, whose part is taken out."""
+    """Length over width of the star images by their second moments in a window, whose part is taken
+    out.
+    """
     window = max(_MOMENT_WINDOW_PX, 1.2 * float(median_of(fit.sigma_px)))
     steps = np.arange(stamps.counts.shape[1])
-    u, v = (steps - (fit.x_px - stamps.x0)[good, None]), (steps - (fit.y_px - stamps.y0)[good, None])
-    light = stamps.counts[good] * np.exp(-0.5 * (v[:, :, None] ** 2 + u[:, None, :] ** 2) / window**2)
+    u, v = (
+        (steps - (fit.x_px - stamps.x0)[good, None]),
+        (steps - (fit.y_px - stamps.y0)[good, None]),
+    )
+    light = stamps.counts[good] * np.exp(
+        -0.5 * (v[:, :, None] ** 2 + u[:, None, :] ** 2) / window**2
+    )
     total = light.sum((1, 2))
     xx, yy = np.sum(light.sum(1) * u**2, 1) / total, np.sum(light.sum(2) * v**2, 1) / total
     xy = np.einsum("nhw,nh,nw->n", light, v, u) / total
-    mean, half, cross = 0.5 * float(median_of(xx + yy)), _significant(0.5 * (xx - yy)), _significant(xy)
+    mean, half, cross = (
+        0.5 * float(median_of(xx + yy)),
+        _significant(0.5 * (xx - yy)),
+        _significant(xy),
+    )
     apart = float(np.hypot(half, cross))
     if not apart < mean < window**2 - apart:
         return 1.0
@@ -127,15 +155,21 @@ def _elongation(stamps: Stamps, fit: StarFit, good: BoolArray) -> float:
 
 
 def _common_width(frame: PreparedImage, objects: Any, sigma: float) -> Psf | None:
-    """The one width that lowers chi squared most over all stars, found by parabolas in its logarithm."""
+    """The one width that lowers chi squared most over all stars, found by parabolas in its
+    logarithm.
+    """
     chosen = objects[: 5 * _PSF_STARS]
     for _ in range(6):
         clean, stamps = _clean_stamps(frame, chosen, sigma, 5 * _PSF_STARS)
         chosen = chosen[clean]
         if len(chosen) < 3:
             return None
-        fit = fit_stars(stamps, chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), sigma)
-        low, here, high = (float(np.sum(explained(stamps, fit, scale))) for scale in (0.8, 1.0, 1.25))
+        fit = fit_stars(
+            stamps, chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), sigma
+        )
+        low, here, high = (
+            float(np.sum(explained(stamps, fit, scale))) for scale in (0.8, 1.0, 1.25)
+        )
         bend = low - 2.0 * here + high
         step = 0.5 * (low - high) / bend if bend < 0.0 else np.sign(high - low)
         last, sigma = sigma, float(np.clip(sigma * 1.25 ** np.clip(step, -2.0, 2.0), *_WIDTHS))
@@ -144,11 +178,20 @@ def _common_width(frame: PreparedImage, objects: Any, sigma: float) -> Psf | Non
     return Psf(sigma)
 
 
-def _clean_stamps(frame: PreparedImage, objects: Any, sigma: float, most: int) -> tuple[IntArray, Stamps]:
+def _clean_stamps(
+    frame: PreparedImage, objects: Any, sigma: float, most: int
+) -> tuple[IntArray, Stamps]:
     """Which detections have all their pixels and no hot pixel, and their stamps."""
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
     stamps = cut_stamps(
-        frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, frame.counts_per_e, frame.parity
+        frame.counts,
+        frame.usable,
+        x,
+        y,
+        half_stamp_px(sigma),
+        frame.noise,
+        frame.counts_per_e,
+        frame.parity,
     )
     clean = np.flatnonzero(stamps.fine.all((1, 2)) & ~_single_pixels(stamps))[:most]
     return clean.astype(np.int64), stamps.subset(clean)

@@ -1,4 +1,6 @@
-"""What needs a library that is not always there: cameras' raw files (rawpy) and colours of 16 bits (OpenCV)."""
+"""What needs a library that is not always there: cameras' raw files (rawpy) and colours of 16 bits
+(OpenCV).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ _SIZE_TAGS = 256, 257
 
 @dataclass(frozen=True)
 class RawFrame:
-    """Counts of a raw file, the pattern of its colours ("" for none), and what else it says, None where it does not."""
+    """Counts of a raw file, the pattern of its colours ("" for none), and what else it says, None
+    where it does not.
+    """
 
     pixels: Any
     mosaic: str
@@ -33,7 +37,11 @@ def read_raw(path: Path, data: bytes) -> RawFrame:
 
     Its clock is the camera's own, of no stated zone, and is not taken for a time.
     """
-    with extra("raw", f"{path}: raw files of cameras", "save the image as FITS without turning it into colours"):
+    with extra(
+        "raw",
+        f"{path}: raw files of cameras",
+        "save the image as FITS without turning it into colours",
+    ):
         import rawpy
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
@@ -44,20 +52,30 @@ def read_raw(path: Path, data: bytes) -> RawFrame:
             white, exposure, focal = (float(value or 0.0) or None for value in said)
     except Exception as error:  # whatever the broken bytes lead to
         raise ImageError(
-            f"{path}: the file is damaged, or no raw file that LibRaw reads; copy it again, or save it as FITS."
+            f"{path}: the file is damaged, or no raw file that LibRaw reads; copy it again, or "
+            "save it as FITS."
         ) from error
     mosaic = "" if pattern is None else colours
     if pixels.ndim != 2 or (mosaic and (pattern.shape != (2, 2) or mosaic not in get_args(Mosaic))):
-        raise ImageError(f"{path}: its mosaic of colours is not red, green, green and blue; save a grey image as FITS.")
+        raise ImageError(
+            f"{path}: its mosaic of colours is not red, green, green and blue; save a grey image "
+            "as FITS."
+        )
     return RawFrame(pixels, mosaic, white, exposure, focal)
 
 
-def deep_colours(path: Path, data: bytes, check_declared: Callable[[Path, int, int], None]) -> list[Any] | None:
-    """Pages (height, width, 3) of 16 bits of a colour PNG or TIFF file, red first; None where it is none."""
+def deep_colours(
+    path: Path, data: bytes, check_declared: Callable[[Path, int, int], None]
+) -> list[Any] | None:
+    """Pages (height, width, 3) of 16 bits of a colour PNG or TIFF file, red first; None where it is
+    none.
+    """
     is_png = data.startswith(b"\x89PNG")
     if not is_png and not _is_deep_tiff(path, data, check_declared):
         return None
-    with extra("raw", f"{path}: colours of 16 bits", "save the image as FITS, or as a grey TIFF or PNG"):
+    with extra(
+        "raw", f"{path}: colours of 16 bits", "save the image as FITS, or as a grey TIFF or PNG"
+    ):
         import cv2
     content = np.frombuffer(data, dtype=np.uint8)
     # What is wrong with a file is said in one sentence, and not by the library too.
@@ -73,14 +91,20 @@ def deep_colours(path: Path, data: bytes, check_declared: Callable[[Path, int, i
         return None
     finally:
         logging.setLogLevel(level)
-    if not len(pages) or any(page is None or page.dtype != np.uint16 or page.ndim != 3 for page in pages):
+    if not len(pages) or any(
+        page is None or page.dtype != np.uint16 or page.ndim != 3 for page in pages
+    ):
         return None
     # OpenCV has blue first, and perhaps transparency last.
     return [page[..., 2::-1] for page in pages]
 
 
-def _is_deep_tiff(path: Path, data: bytes, check_declared: Callable[[Path, int, int], None]) -> bool:
-    """Whether a file is a TIFF of three or four colours of 16 bits that can hold the pixels that it declares."""
+def _is_deep_tiff(
+    path: Path, data: bytes, check_declared: Callable[[Path, int, int], None]
+) -> bool:
+    """Whether a file is a TIFF of three or four colours of 16 bits that can hold the pixels that it
+    declares.
+    """
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     try:

@@ -1,8 +1,10 @@
-"""The only importer of ArviZ: one set of functions over ArviZ 0.23 (`InferenceData`) and 1.x (`DataTree`).
+"""The only importer of ArviZ: one set of functions over ArviZ 0.23 (`InferenceData`) and 1.x
+(`DataTree`).
 
-The containers differ. Numbers come from the array functions of `arviz_stats`, the package behind 1.x, beside 0.23 too:
-they need NumPy and SciPy alone, while 0.23 loads matplotlib, xarray and all of its plots, which takes seconds. Its
-`psislw` takes *negated* log weights, where 0.23's takes log weights, without complaint when given the wrong ones.
+The containers differ. Numbers come from the array functions of `arviz_stats`, the package behind
+1.x, beside 0.23 too: they need NumPy and SciPy alone, while 0.23 loads matplotlib, xarray and all
+of its plots, which takes seconds. Its `psislw` takes *negated* log weights, where 0.23's takes log
+weights, without complaint when given the wrong ones.
 """
 
 from __future__ import annotations
@@ -21,9 +23,11 @@ from starcal_uq.core.types import FloatArray
 if TYPE_CHECKING:
     import xarray as xr
 
-# Tail ESS is the smaller of the ESS of these two quantiles (Vehtari et al. 2021), stated because the default differs.
+# Tail ESS is the smaller of the ESS of these two quantiles (Vehtari et al. 2021), stated because
+# the default differs.
 _TAIL = (0.05, 0.95)
-# Log weights closer than this are equal for every purpose, and a Pareto tail cannot be fitted to them.
+# Log weights closer than this are equal for every purpose, and a Pareto tail cannot be fitted to
+# them.
 _EQUAL_WEIGHTS = 1e-9
 
 
@@ -37,7 +41,9 @@ def is_legacy() -> bool:
 def _legacy() -> Any:
     with warnings.catch_warnings():
         # 0.23 announces 1.x once a day; nothing that a user of this package could act on.
-        warnings.filterwarnings("ignore", message=r"\s*ArviZ is undergoing a major refactor", category=FutureWarning)
+        warnings.filterwarnings(
+            "ignore", message=r"\s*ArviZ is undergoing a major refactor", category=FutureWarning
+        )
         return importlib.import_module("arviz")
 
 
@@ -51,7 +57,9 @@ def _diagnostic(name: str, values: FloatArray, **options: Any) -> float:
 
 
 def to_arviz(groups: Mapping[str, xr.Dataset]) -> Any:
-    """Wrap datasets (chain, draw), by their names in ArviZ's schema, in the container of the installed ArviZ."""
+    """Wrap datasets (chain, draw), by their names in ArviZ's schema, in the container of the
+    installed ArviZ.
+    """
     if is_legacy():
         return _legacy().InferenceData(**groups)
     import xarray as xr
@@ -80,11 +88,12 @@ def mcse_mean(values: FloatArray) -> float:
 
 
 def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pareto-smoothed importance sampling (Vehtari et al. 2024) of rows of the log of target over proposal (..., n).
+    """Pareto-smoothed importance sampling (Vehtari et al. 2024) of rows of the log of target over
+    proposal (..., n).
 
-    Returns the smoothed logarithms, normalised so that the weights of a row sum to one, and the shape of the fitted
-    Pareto tail (...), below 0.7 of which the weights can be trusted: 0 where the largest weights are all equal, which
-    leaves no tail to fit.
+    Returns the smoothed logarithms, normalised so that the weights of a row sum to one, and the
+    shape of the fitted Pareto tail (...), below 0.7 of which the weights can be trusted: 0 where
+    the largest weights are all equal, which leaves no tail to fit.
     """
     values = np.array(log_weights, dtype=float)
     n = values.shape[-1]
@@ -95,7 +104,8 @@ def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     top = largest[..., -1:]
     smoothed = values - top - np.log(np.sum(np.exp(values - top), axis=-1, keepdims=True))
     if not np.all(flat):
-        # Trial shapes of the tail fit that are out of the question get the weight exp(-large), by way of 1 / inf.
+        # Trial shapes of the tail fit that are out of the question get the weight exp(-large), by
+        # way of 1 / inf.
         with np.errstate(over="ignore"):
             smoothed[~flat], khat[~flat] = _array_stats().psislw(-values[~flat])
     return smoothed, khat

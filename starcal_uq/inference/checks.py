@@ -1,7 +1,8 @@
-"""The only judge of draws: convergence, an independent estimate, the compressed likelihood, bounds, the priors' part.
+"""The only judge of draws: convergence, an independent estimate, the compressed likelihood, bounds,
+the priors' part.
 
-`measure` computes the numbers and `check_draws` holds them against their bounds, once, while sampling. Everything that
-shows or collects checks takes them from `Diagnostics.checks`.
+`measure` computes the numbers and `check_draws` holds them against their bounds, once, while
+sampling. Everything that shows or collects checks takes them from `Diagnostics.checks`.
 """
 
 from __future__ import annotations
@@ -14,8 +15,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.camera.distortion import Parameter, next_simpler
-from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, plural, significant
-from starcal_uq.core.status import MORE, PLAN, Check, Level, Question, model_remedy, pass_or_fail, pass_or_warn
+from starcal_uq.core.formatting import (
+    count,
+    decimals_for,
+    fixed,
+    join_words,
+    percent,
+    plural,
+    significant,
+)
+from starcal_uq.core.status import (
+    MORE,
+    PLAN,
+    Check,
+    Level,
+    Question,
+    model_remedy,
+    pass_or_fail,
+    pass_or_warn,
+)
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.estimation.student import DEFAULT_DOF
 from starcal_uq.inference.derived import derived_quantities
@@ -32,20 +50,25 @@ RHAT_BOUND = 1.01
 ESS_BOUND = 400.0
 KHAT_BOUND = 0.7
 ACCEPTANCE_RANGE = (0.1, 0.98)
-# Differences that would matter, in standard deviations; four Monte Carlo errors of the comparison are allowed on top.
+# Differences that would matter, in standard deviations; four Monte Carlo errors of the comparison
+# are allowed on top.
 AGREEMENT_BOUND = 0.05
 AGREEMENT_ERRORS = 4.0
-# Largest tolerated difference between compressed and exact log likelihood within three standard deviations, nat.
+# Largest tolerated difference between compressed and exact log likelihood within three standard
+# deviations, nat.
 COMPRESSED_BOUND = 0.5
-# Weights between exp(-0.1) and exp(0.1) cannot distort anything. k-hat does not know that: it is blind to scale, and
-# the cubic remainder of a good expansion has a heavy tail at 1e-5 nat.
+# Weights between exp(-0.1) and exp(0.1) cannot distort anything. k-hat does not know that: it is
+# blind to scale, and the cubic remainder of a good expansion has a heavy tail at 1e-5 nat.
 _HARMLESS = 0.1
-# A difference on the surface of so many standard deviations at which the likelihoods are the same: a hundredth of what
-# would matter inside of it, and draws outside are a few times further off at most.
+# A difference on the surface of so many standard deviations at which the likelihoods are the same:
+# a hundredth of what would matter inside of it, and draws outside are a few times further off at
+# most.
 _REACH_SD, _EQUAL = 3.0, 0.005
-# Standard errors, from ten batches, that are counted to a difference which a sample of frames tells.
+# Standard errors, from ten batches, that are counted to a difference which a sample of frames
+# tells.
 _SAMPLE_ERRORS = 5.0
-# Tolerated share of draws that no camera can have, and number of draws tried for distortions that fold.
+# Tolerated share of draws that no camera can have, and number of draws tried for distortions that
+# fold.
 _BOUNDS_SHARE = 1e-3
 _FOLD_DRAWS = 40
 _PRIOR_SHARE = 0.5
@@ -69,10 +92,11 @@ class CompressionCheck:
 
     # Largest difference within three standard deviations of the mode, relative to the mode, nat.
     max_difference: float = float("nan")
-    # Pareto shape of the weights exact over compressed at the checked draws; 0 where all of them lie within 0.1 nat.
+    # Pareto shape of the weights exact over compressed at the checked draws; 0 where all of them
+    # lie within 0.1 nat.
     khat: float = float("nan")
-    # `n_frames`, `of_frames`: frames of the sample that was compared, its uncertainty being part of `max_difference`,
-    # and those that it stands for; 0 where all were compared.
+    # `n_frames`, `of_frames`: frames of the sample that was compared, its uncertainty being part of
+    # `max_difference`, and those that it stands for; 0 where all were compared.
     n_frames: int = 0
     of_frames: int = 0
 
@@ -90,14 +114,17 @@ def check_compression(
     laplace: Laplace,
     sample: FrameSample | None = None,
 ) -> CompressionCheck:
-    """Compare two log likelihoods three standard deviations from the mode, and at posterior draws if they differ there.
+    """Compare two log likelihoods three standard deviations from the mode, and at posterior draws
+    if they differ there.
 
-    What is left out of the expansion grows with the third power of the distance from the mode, so that a few points on
-    the surface see as much of it as hundreds of draws. Below `_EQUAL` there, no draw can come near a bound.
+    What is left out of the expansion grows with the third power of the distance from the mode, so
+    that a few points on the surface see as much of it as hundreds of draws. Below `_EQUAL` there,
+    no draw can come near a bound.
 
-    With a sample of frames the expansion is compared on these, and stated is what they tell for all, with
-    `_SAMPLE_ERRORS` standard errors on top. That the compressed likelihood holds all frames, as `exact` does, is then
-    seen at two points on the surface that no direction is missing in.
+    With a sample of frames the expansion is compared on these, and stated is what they tell for
+    all, with `_SAMPLE_ERRORS` standard errors on top. That the compressed likelihood holds all
+    frames, as `exact` does, is then seen at two points on the surface that no direction is missing
+    in.
 
     `target`: its origin is the mode.
     `draws` (n, p+1): posterior draws, (n, p+2) where one parameter is added.
@@ -113,7 +140,11 @@ def check_compression(
         arguments = target.arguments(np.concatenate([mode, points]))
         found = exact(*arguments) - compressed(*arguments)
         # Of other stars than those of the calibration the exact one may be nothing.
-        return np.asarray(found[1:] - found[0]) if np.isfinite(found).all() else np.full(len(points), np.inf)
+        return (
+            np.asarray(found[1:] - found[0])
+            if np.isfinite(found).all()
+            else np.full(len(points), np.inf)
+        )
 
     def known(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Differences (n,) and what they may be larger by."""
@@ -123,7 +154,9 @@ def check_compression(
         by_batch = sample.left_out(*target.arguments(np.concatenate([mode, points])))
         by_batch = by_batch[:, 1:] - by_batch[:, :1]
         # A single frame says nothing of others.
-        scatter = by_batch.std(axis=0, ddof=1) if len(by_batch) > 1 else np.full(len(points), np.inf)
+        scatter = (
+            by_batch.std(axis=0, ddof=1) if len(by_batch) > 1 else np.full(len(points), np.inf)
+        )
         return by_batch.mean(axis=0), _SAMPLE_ERRORS * scatter / np.sqrt(len(by_batch))
 
     found, slack = known(target.natural(_surface(target.dim)))
@@ -131,7 +164,9 @@ def check_compression(
     whole = 0.0
     if sample is not None:
         diagonal = np.full((1, target.dim), _REACH_SD / np.sqrt(target.dim))
-        whole = float(np.max(np.abs(differences(target.natural(np.concatenate([diagonal, -diagonal]))))))
+        whole = float(
+            np.max(np.abs(differences(target.natural(np.concatenate([diagonal, -diagonal])))))
+        )
     if not np.isfinite([on_surface, whole]).all():
         return CompressionCheck(np.inf, np.inf, *frames)
     if max(on_surface, whole) <= _EQUAL:
@@ -141,7 +176,9 @@ def check_compression(
     difference, slack = known(draws)
     # The factor is lower triangular, so its leading block is the factor of theta's covariance.
     scale = np.diag(laplace.transform)[:p]
-    z = np.linalg.solve(laplace.transform[:p, :p] / scale[:, None], ((theta - laplace.mode[:p]) / scale).T)
+    z = np.linalg.solve(
+        laplace.transform[:p, :p] / scale[:, None], ((theta - laplace.mode[:p]) / scale).T
+    )
     near = np.sum(z * z, axis=0) <= _REACH_SD**2
     size = np.abs(difference) + slack
     max_difference = max(float(np.max(size[near])) if np.any(near) else float(np.max(size)), whole)
@@ -150,14 +187,18 @@ def check_compression(
 
 
 def _surface(dim: int) -> FloatArray:
-    """Points (4 dim, dim) three standard deviations from the mode: both ways along the axes of two random bases."""
+    """Points (4 dim, dim) three standard deviations from the mode: both ways along the axes of two
+    random bases.
+    """
     rng = np.random.default_rng(0)
     axes = np.concatenate([np.linalg.qr(rng.standard_normal((dim, dim)))[0] for _ in range(2)])
     return _REACH_SD * np.concatenate([axes, -axes])
 
 
 def chain_order(values: FloatArray) -> FloatArray:
-    """Arrange (ensemble, step, walker, ...) as (ensemble, draw, ...) in the order of `posterior.DRAW_ORDER`."""
+    """Arrange (ensemble, step, walker, ...) as (ensemble, draw, ...) in the order of
+    `posterior.DRAW_ORDER`.
+    """
     e, s, w = values.shape[:3]
     halves = values.reshape(e, 2, s // 2, w, *values.shape[3:])
     return np.moveaxis(halves, 3, 2).reshape(e, s * w, *values.shape[3:])
@@ -181,7 +222,9 @@ def measure(
     likelihood_used: str,
     n_evaluations: int,
 ) -> Diagnostics:
-    """Compute the numbers that `check_draws` judges of draws (n_ensembles, n_draws, p+1), px units, in chain order."""
+    """Compute the numbers that `check_draws` judges of draws (n_ensembles, n_draws, p+1), px units,
+    in chain order.
+    """
     from starcal_uq.inference import arviz as arviz_compat
 
     n_sampled = chains.u.shape[-1]
@@ -223,11 +266,18 @@ def measure(
 def check_draws(
     post: Posterior, notes: Sequence[str] = (), derived: tuple[Derived, ...] | None = None
 ) -> tuple[Check, ...]:
-    """Hold everything that is known of draws against its bound; checks that they have already are not looked at."""
+    """Hold everything that is known of draws against its bound; checks that they have already are
+    not looked at.
+    """
     derived = derived_quantities(post) if derived is None else derived
     checks = [_rhat(post), _effective_draws(post), _acceptance(post), _derived(post, derived)]
     checks += [_digits(post), _bounds(post)]
-    several = (_degrees_of_freedom(post), _independent(post), _evaluation(post), _likelihood(post, notes))
+    several = (
+        _degrees_of_freedom(post),
+        _independent(post),
+        _evaluation(post),
+        _likelihood(post, notes),
+    )
     return (*checks, *(check for check in several if check is not None), _priors(post))
 
 
@@ -240,12 +290,17 @@ def _rhat(post: Posterior) -> Check:
         if bad
         else f"The {post.n_ensembles} separately seeded ensembles sampled the same distribution."
     )
-    return _sampling(post, "R-hat", not bad, fixed(float(np.max(values)), 4), f"< {RHAT_BOUND}", sentence)
+    return _sampling(
+        post, "R-hat", not bad, fixed(float(np.max(values)), 4), f"< {RHAT_BOUND}", sentence
+    )
 
 
 def _effective_draws(post: Posterior) -> Check:
     """Is the effective number of draws large enough, bulk and tail?"""
-    bulk, tail = (values[list(post.sampled)] for values in (post.diagnostics.ess_bulk, post.diagnostics.ess_tail))
+    bulk, tail = (
+        values[list(post.sampled)]
+        for values in (post.diagnostics.ess_bulk, post.diagnostics.ess_tail)
+    )
     fewest = np.minimum(bulk, tail)
     bad = _names(post, ~(fewest > ESS_BOUND))
     sentence = (
@@ -255,7 +310,9 @@ def _effective_draws(post: Posterior) -> Check:
     )
     value = f"{count(int(np.min(bulk)))} bulk, {count(int(np.min(tail)))} tail"
     longer = ESS_BOUND / float(np.min(fewest))
-    return _sampling(post, "Effective draws", not bad, value, f"> {ESS_BOUND:g} each", sentence, longer)
+    return _sampling(
+        post, "Effective draws", not bad, value, f"> {ESS_BOUND:g} each", sentence, longer
+    )
 
 
 def _acceptance(post: Posterior) -> Check:
@@ -266,19 +323,28 @@ def _acceptance(post: Posterior) -> Check:
     sentence = (
         "The sampler moves freely."
         if good
-        else "The sampler hardly moves, or moves in tiny steps: the posterior is far from its Gaussian approximation."
+        else (
+            "The sampler hardly moves, or moves in tiny steps: the posterior is far from its "
+            "Gaussian approximation."
+        )
     )
     value = f"{fixed(float(np.min(rates)), 2)} to {fixed(float(np.max(rates)), 2)}"
     remedy = "" if good else resample(post, moves="stretch", n_steps=10 * post.n_steps)
     level = pass_or_fail(good)
-    return Check("Acceptance", Question.CONVERGED, level, value, f"{low:g} to {high:g}", sentence, remedy)
+    return Check(
+        "Acceptance", Question.CONVERGED, level, value, f"{low:g} to {high:g}", sentence, remedy
+    )
 
 
 def _derived(post: Posterior, derived: Sequence[Derived]) -> Check:
     """Did what follows from the parameters converge, too?"""
     derived = sorted(derived, key=lambda d: -d.rhat)
     rhat, ess = max(d.rhat for d in derived), min(min(d.ess_bulk, d.ess_tail) for d in derived)
-    late = [d.name for d in derived if not (d.rhat < RHAT_BOUND and min(d.ess_bulk, d.ess_tail) > ESS_BOUND)]
+    late = [
+        d.name
+        for d in derived
+        if not (d.rhat < RHAT_BOUND and min(d.ess_bulk, d.ess_tail) > ESS_BOUND)
+    ]
     sentence = (
         f"{late[0].capitalize()} has not converged: raise n_steps."
         if late
@@ -290,7 +356,8 @@ def _derived(post: Posterior, derived: Sequence[Derived]) -> Check:
 def _digits(post: Posterior) -> Check:
     """Does Monte Carlo error leave the printed digits alone?"""
     names, d = post.parameter_names, post.diagnostics
-    # Digits are printed to the second one of sigma; the unit of the last is what the error must not exceed.
+    # Digits are printed to the second one of sigma; the unit of the last is what the error must not
+    # exceed.
     worst, largest = names[0], 0.0
     for i in post.sampled:
         scale = post.parameters[i].scale
@@ -302,7 +369,10 @@ def _digits(post: Posterior) -> Check:
     sentence = (
         "Monte Carlo error does not reach the last printed digit of any mean."
         if good
-        else f"Monte Carlo error reaches the last printed digit of {worst}: raise n_steps before quoting it."
+        else (
+            f"Monte Carlo error reaches the last printed digit of {worst}: raise n_steps before "
+            "quoting it."
+        )
     )
     value = f"{fixed(largest, 2)} units of the last digit ({worst})"
     remedy = "" if good else _longer(post, largest**2)
@@ -318,7 +388,13 @@ def _degrees_of_freedom(post: Posterior) -> Check | None:
     values = post.dof_draws.reshape(post.n_ensembles, -1)
     low, middle, high = np.quantile(values, (0.025, 0.5, 0.975))
     sentence = f"dof has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
-    return _converged(post, "Degrees of freedom", arviz_compat.rhat(values), arviz_compat.ess_bulk(values), sentence)
+    return _converged(
+        post,
+        "Degrees of freedom",
+        arviz_compat.rhat(values),
+        arviz_compat.ess_bulk(values),
+        sentence,
+    )
 
 
 def _bounds(post: Posterior) -> Check:
@@ -329,69 +405,115 @@ def _bounds(post: Posterior) -> Check:
     outside = float(np.mean(~camera.contains(theta[:, :2]) | (theta[:, 2] <= 0.0)))
     few = theta[np.linspace(0, len(theta) - 1, _FOLD_DRAWS).astype(int)]
     radius = camera.corner_radius_px
-    folded = float(np.mean([fold_radius_px(camera.distortion, draw, radius) <= radius for draw in few]))
+    folded = float(
+        np.mean([fold_radius_px(camera.distortion, draw, radius) <= radius for draw in few])
+    )
     sd = post.sd[:3]
     edges = np.array([camera.width_px - 0.5, camera.height_px - 0.5])
-    room = np.concatenate([(post.mean[:2] + 0.5) / sd[:2], (edges - post.mean[:2]) / sd[:2], post.mean[2:3] / sd[2:3]])
+    room = np.concatenate(
+        [(post.mean[:2] + 0.5) / sd[:2], (edges - post.mean[:2]) / sd[:2], post.mean[2:3] / sd[2:3]]
+    )
     good = outside <= _BOUNDS_SHARE and folded == 0.0
     remedy, advice = "" if good else PLAN, ""
     if good:
-        sentence = "No draw has its principal point off the detector, f below zero or a distortion that folds."
+        sentence = (
+            "No draw has its principal point off the detector, f below zero or a distortion that "
+            "folds."
+        )
     elif folded > 0.0:
-        sentence = "The distortion of some draws folds over within the field: the data do not determine it."
+        sentence = (
+            "The distortion of some draws folds over within the field: the data do not determine "
+            "it."
+        )
         remedy = _simpler(post)
     else:
-        sentence = f"{percent(outside)} of the draws have their principal point off the detector or f below zero."
+        sentence = (
+            f"{percent(outside)} of the draws have their principal point off the detector or f "
+            "below zero."
+        )
         advice = MORE
     value = f"nearest bound {significant(float(np.min(room)))} sigma away"
     bound = f"≤ {percent(_BOUNDS_SHARE, 1)} of draws outside"
-    return Check("Bounds", Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy, advice)
+    return Check(
+        "Bounds", Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy, advice
+    )
 
 
 def _independent(post: Posterior) -> Check:
-    """Does importance sampling around the Laplace approximation, which uses no Markov chain, give the same?"""
+    """Does importance sampling around the Laplace approximation, which uses no Markov chain, give
+    the same?
+    """
     d = post.diagnostics
     fewest = float(np.min(d.ess_bulk[list(post.sampled)]))
     tolerance = AGREEMENT_BOUND + AGREEMENT_ERRORS * math.sqrt(1.0 / fewest + 1.0 / d.psis_ess)
     light, agree = d.psis_khat < KHAT_BOUND, max(d.agreement_mean, d.agreement_sd) <= tolerance
     if not light:
-        sentence = "The posterior is far from Gaussian, so the independent check by importance sampling says nothing."
+        sentence = (
+            "The posterior is far from Gaussian, so the independent check by importance sampling "
+            "says nothing."
+        )
     elif agree:
-        sentence = "Importance sampling, which uses no Markov chain, gives the same means and sigmas."
+        sentence = (
+            "Importance sampling, which uses no Markov chain, gives the same means and sigmas."
+        )
     else:
-        sentence = "Importance sampling gives other means or sigmas: at least one of the two is wrong."
+        sentence = (
+            "Importance sampling gives other means or sigmas: at least one of the two is wrong."
+        )
     if not post.laplace.converged:
-        sentence += " Newton's method did not settle on the mode; importance sampling starts from its last step."
-    value = f"means {fixed(d.agreement_mean, 3)} sigma, sigmas {percent(d.agreement_sd)}, k-hat {fixed(d.psis_khat, 2)}"
+        sentence += (
+            " Newton's method did not settle on the mode; importance sampling starts from its "
+            "last step."
+        )
+    value = (
+        f"means {fixed(d.agreement_mean, 3)} sigma, sigmas {percent(d.agreement_sd)}, k-hat "
+        f"{fixed(d.psis_khat, 2)}"
+    )
     bound = f"{fixed(tolerance, 3)} sigma, {percent(tolerance)}, {KHAT_BOUND:g}"
     remedy = "" if light and agree else _longer(post) if light else _simpler(post)
     level = pass_or_fail(light and agree)
-    return Check("Independent posterior", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+    return Check(
+        "Independent posterior", Question.TRUSTWORTHY, level, value, bound, sentence, remedy
+    )
 
 
 def _evaluation(post: Posterior) -> Check | None:
     """Was the compressed likelihood good enough, where it was used or tried?"""
     d = post.diagnostics
     compression = CompressionCheck(d.compressed_max_difference, d.compressed_khat)
-    compressed, compared = d.likelihood_used == "compressed", not np.isnan(compression.max_difference)
+    compressed, compared = (
+        d.likelihood_used == "compressed",
+        not np.isnan(compression.max_difference),
+    )
     if not compressed and not compared:
         return None
     level, remedy, advice = Level.PASS, "", ""
-    value = f"{significant(compression.max_difference)} nat, k-hat {fixed(compression.khat, 2)}" if compared else ""
+    value = (
+        f"{significant(compression.max_difference)} nat, k-hat {fixed(compression.khat, 2)}"
+        if compared
+        else ""
+    )
     if not compressed:
-        sentence = f"The exact likelihood was sampled, because the fast one departs from it by {value}."
+        sentence = (
+            f"The exact likelihood was sampled, because the fast one departs from it by {value}."
+        )
         value = "exact"
     elif not compared:
         level, value = Level.WARN, "not checked"
-        sentence = "The compressed likelihood was not compared with the exact one: the observations were not at hand."
+        sentence = (
+            "The compressed likelihood was not compared with the exact one: the observations "
+            "were not at hand."
+        )
         remedy, advice = "sc.sample(obs, cal)", "Sample where the observations are at hand."
     elif compression.good:
         sentence = "The fast likelihood equals the exact one wherever the posterior is."
         n_frames, of_frames = d.compressed_frames
         if n_frames:
             sentence = (
-                f"The fast likelihood equals the exact one wherever the posterior is, as {count(n_frames)} of "
-                f"{plural(of_frames, 'frame')} tell with {_SAMPLE_ERRORS:g} standard errors counted in."
+                "The fast likelihood equals the exact one wherever the posterior is, as "
+                f"{count(n_frames)} of "
+                f"{plural(of_frames, 'frame')} tell with {_SAMPLE_ERRORS:g} standard errors "
+                "counted in."
             )
     else:
         level, remedy = Level.FAIL, resample(post, evaluation="exact")
@@ -411,9 +533,20 @@ def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
         if good
         else "Pairs of stars were taken as independent, which they are not."
     )
-    sentence, remedy = " ".join([sentence, *notes]), "" if good else resample(post, likelihood="pairs")
+    sentence, remedy = (
+        " ".join([sentence, *notes]),
+        "" if good else resample(post, likelihood="pairs"),
+    )
     level = pass_or_fail(good)
-    return Check("Kind of likelihood", Question.TRUSTWORTHY, level, kind, "not 'pairs_naive'", sentence, remedy)
+    return Check(
+        "Kind of likelihood",
+        Question.TRUSTWORTHY,
+        level,
+        kind,
+        "not 'pairs_naive'",
+        sentence,
+        remedy,
+    )
 
 
 def _priors(post: Posterior) -> Check:
@@ -430,18 +563,32 @@ def _priors(post: Posterior) -> Check:
         remedy, advice = PLAN, MORE
     elif pulled:
         furthest = fixed(float(np.max(pull)), 1)
-        sentence = f"The data put {join_words(pulled)} {furthest} prior standard deviations away from the prior's mean."
+        sentence = (
+            f"The data put {join_words(pulled)} {furthest} prior standard deviations away from "
+            "the prior's mean."
+        )
         advice = "Correct the nominal camera, or state a wider prior in a TOML file (--priors)."
     else:
         sentence = "The data decide every parameter; the priors hardly matter."
     value = f"sigma {percent(float(share[largest]))} of the prior's ({names[largest]})"
     level = pass_or_warn(not limited and not pulled)
     bound = f"≤ {percent(_PRIOR_SHARE)}"
-    return Check("Influence of the priors", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
+    return Check(
+        "Influence of the priors",
+        Question.TRUSTWORTHY,
+        level,
+        value,
+        bound,
+        sentence,
+        remedy,
+        advice,
+    )
 
 
 def _simpler(post: Posterior) -> str:
-    """Fewer coefficients for the data to determine; frames that determine them where there are none."""
+    """Fewer coefficients for the data to determine; frames that determine them where there are
+    none.
+    """
     name = next_simpler(post.camera.distortion)
     return f"{model_remedy(name)} or {PLAN}" if name else PLAN
 
@@ -451,26 +598,45 @@ def _names(post: Posterior, which: BoolArray) -> list[str]:
 
 
 def _converged(post: Posterior, name: str, rhat: float, ess: float, sentence: str) -> Check:
-    value, bound = f"R-hat {fixed(rhat, 4)}, {count(int(ess))} draws", f"< {RHAT_BOUND}, > {ESS_BOUND:g}"
-    return _sampling(post, name, rhat < RHAT_BOUND and ess > ESS_BOUND, value, bound, sentence, ESS_BOUND / ess)
+    value, bound = (
+        f"R-hat {fixed(rhat, 4)}, {count(int(ess))} draws",
+        f"< {RHAT_BOUND}, > {ESS_BOUND:g}",
+    )
+    return _sampling(
+        post, name, rhat < RHAT_BOUND and ess > ESS_BOUND, value, bound, sentence, ESS_BOUND / ess
+    )
 
 
 def _sampling(
-    post: Posterior, name: str, good: bool, value: str, bound: str, sentence: str, longer: float = 1.0
+    post: Posterior,
+    name: str,
+    good: bool,
+    value: str,
+    bound: str,
+    sentence: str,
+    longer: float = 1.0,
 ) -> Check:
     remedy = "" if good else _longer(post, longer)
     return Check(name, Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy)
 
 
 def _longer(post: Posterior, factor: float = 1.0) -> str:
-    """Sampling again with `factor` times as many steps and some in reserve, but 2 to 20 times as many."""
+    """Sampling again with `factor` times as many steps and some in reserve, but 2 to 20 times as
+    many.
+    """
     return resample(post, n_steps=post.n_steps * min(max(2, math.ceil(1.2 * factor)), 20))
 
 
 def resample(post: Posterior, **changes: Any) -> str:
-    """Sampling again with some settings changed: a command and a call; of a likelihood of the user's, the call."""
+    """Sampling again with some settings changed: a command and a call; of a likelihood of the
+    user's, the call.
+    """
     settings: Mapping[str, Any] = {**post.provenance.get("settings", {}), **changes}
-    kept = {name: settings[name] for name in _OPTIONS if settings.get(name, _OPTIONS[name][1]) != _OPTIONS[name][1]}
+    kept = {
+        name: settings[name]
+        for name in _OPTIONS
+        if settings.get(name, _OPTIONS[name][1]) != _OPTIONS[name][1]
+    }
     words = {name: repr(value) for name, value in kept.items()}
     if kept.get("likelihood", "marginal") not in LIKELIHOODS:
         # An object that was passed is evaluated as it is, and no command takes it.
@@ -479,4 +645,7 @@ def resample(post: Posterior, **changes: Any) -> str:
     call = f"sc.sample(obs, cal{''.join(f', {name}={word}' for name, word in words.items())})"
     if words.get("likelihood") == "likelihood":
         return call
-    return f"starcal-uq sample RUN --force{''.join(f' {_OPTIONS[name][0]} {kept[name]}' for name in words)} or {call}"
+    return (
+        "starcal-uq sample RUN "
+        f"--force{''.join(f' {_OPTIONS[name][0]} {kept[name]}' for name in words)} or {call}"
+    )

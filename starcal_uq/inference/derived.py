@@ -1,7 +1,8 @@
-"""Quantities that follow from the sampled parameters, with the same diagnostics as the parameters themselves.
+"""Quantities that follow from the sampled parameters, with the same diagnostics as the parameters
+themselves.
 
-Convergence of every parameter does not imply that of their combinations: strongly coupled parameters can look settled
-while a difference of them is not.
+Convergence of every parameter does not imply that of their combinations: strongly coupled
+parameters can look settled while a difference of them is not.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from starcal_uq.inference.posterior import Derived, Posterior
 
 
 def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
-    """Displacement by the distortion at the corner, the common rotation about each axis, and the focal length in mm.
+    """Displacement by the distortion at the corner, the common rotation about each axis, and the
+    focal length in mm.
 
     That in mm is left out where the pixel pitch is unknown.
     """
@@ -33,12 +35,18 @@ def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
 
 
 def corner_displacement_px(post: Posterior) -> FloatArray:
-    """Displacement (n,) of a star in the farthest corner by the distortion of each draw, along the radius, px."""
+    """Displacement (n,) of a star in the farthest corner by the distortion of each draw, along the
+    radius, px.
+    """
     camera = post.camera
-    corners = np.array([(x, y) for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)])
+    corners = np.array(
+        [(x, y) for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)]
+    )
     offsets = corners - camera.theta[:2]
     far = offsets[int(np.argmax(np.hypot(*offsets.T)))]
-    du, dv = get_model(camera.distortion).displacement(far[0], far[1], list(post.theta_draws[:, 3:].T))
+    du, dv = get_model(camera.distortion).displacement(
+        far[0], far[1], list(post.theta_draws[:, 3:].T)
+    )
     return np.asarray((du * far[0] + dv * far[1]) / np.hypot(*far), dtype=np.float64)
 
 

@@ -20,7 +20,8 @@ from starcal_uq.core.tasks import Progress, interrupt_between_steps
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.inference.target import Density, student_t_log_density
 
-# Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is out of reach.
+# Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is
+# out of reach.
 PROPOSAL_DF = 8.0
 _INDEPENDENCE_WEIGHT = 0.7
 _CHUNK_STEPS = 25
@@ -37,7 +38,8 @@ class EnsembleSettings:
     n_walkers: int
     n_steps: int
     n_burn: int
-    # "mixture" or "stretch": ``mixture`` is 0.7 of an independence proposal and 0.3 of differential evolution.
+    # "mixture" or "stretch": ``mixture`` is 0.7 of an independence proposal and 0.3 of differential
+    # evolution.
     moves: Moves
 
 
@@ -51,12 +53,15 @@ class Chains:
 
 
 def student_t_proposal(df: float) -> Callable[[FloatArray, Any], tuple[FloatArray, FloatArray]]:
-    """An independence proposal for `emcee.moves.MHMove`: a standard multivariate t, whatever the present point."""
+    """An independence proposal for `emcee.moves.MHMove`: a standard multivariate t, whatever the
+    present point.
+    """
 
     def propose(u: FloatArray, random: Any) -> tuple[FloatArray, FloatArray]:
         normal = random.standard_normal(u.shape)
         new = normal / np.sqrt(random.chisquare(df, (len(u), 1)) / df)
-        # Hastings: log q(old | new) - log q(new | old), and q does not depend on where it comes from.
+        # Hastings: log q(old | new) - log q(new | old), and q does not depend on where it comes
+        # from.
         return new, student_t_log_density(u, df) - student_t_log_density(new, df)
 
     return propose
@@ -87,10 +92,10 @@ def run_ensembles(
 ) -> Chains:
     """Run one ensemble per seed, each from its own draws of the Laplace approximation.
 
-    `density` takes whitened points (n, dim). The checkpoint is rewritten while sampling and read at the start; a
-    resumed run gives the same draws, bit for bit, as one that was not interrupted. It is left in place, and passed over
-    where the `fingerprint` of data and settings is another. `moves` stand in for those of the settings. SamplingError
-    if a start is not finite.
+    `density` takes whitened points (n, dim). The checkpoint is rewritten while sampling and read at
+    the start; a resumed run gives the same draws, bit for bit, as one that was not interrupted. It
+    is left in place, and passed over where the `fingerprint` of data and settings is another.
+    `moves` stand in for those of the settings. SamplingError if a start is not finite.
     """
     import emcee
 
@@ -103,10 +108,14 @@ def run_ensembles(
     with store.kept(), interrupt_between_steps() as check_interrupt:
         for index in range(store.ensemble, len(seeds)):
             state = store.state or _start(density, dim, seeds[index], settings.n_walkers)
-            sampler = emcee.EnsembleSampler(settings.n_walkers, dim, density, moves=weighted, vectorize=True)
+            sampler = emcee.EnsembleSampler(
+                settings.n_walkers, dim, density, moves=weighted, vectorize=True
+            )
             for first, last in _chunks(store.step, settings, chunk):
                 sampler.reset()
-                steps = sampler.sample(state, iterations=last - first, skip_initial_state_check=True)
+                steps = sampler.sample(
+                    state, iterations=last - first, skip_initial_state_check=True
+                )
                 for step, last_state in enumerate(steps, start=first + 1):
                     state = last_state
                     check_interrupt()
@@ -118,10 +127,14 @@ def run_ensembles(
 
 
 def autocorrelation(values: FloatArray) -> FloatArray:
-    """Integrated autocorrelation times (d,) in steps of draws (ensemble, step, walker, d), averaged over ensembles."""
+    """Integrated autocorrelation times (d,) in steps of draws (ensemble, step, walker, d), averaged
+    over ensembles.
+    """
     from emcee.autocorr import integrated_time
 
-    return np.asarray(np.mean([integrated_time(chain, tol=0, quiet=True) for chain in values], axis=0))
+    return np.asarray(
+        np.mean([integrated_time(chain, tol=0, quiet=True) for chain in values], axis=0)
+    )
 
 
 def _start(density: Density, dim: int, seed: np.random.SeedSequence, n_walkers: int) -> Any:
@@ -133,7 +146,8 @@ def _start(density: Density, dim: int, seed: np.random.SeedSequence, n_walkers: 
     bad = int(np.sum(~np.isfinite(density(u))))
     if bad:
         raise SamplingError(
-            f"{bad} of {n_walkers} start points drawn around the calibrated camera have no posterior density: check "
+            f"{bad} of {n_walkers} start points drawn around the calibrated camera have no "
+            "posterior density: check "
             "that the calibration converged, or use more stars."
         )
     return emcee.State(u, random_state=random.get_state())
@@ -171,7 +185,9 @@ class _Store:
             self._read(path)
 
     def add(self, index: int, first: int, last: int, sampler: Any, state: Any) -> None:
-        """Keep steps [first, last) of an ensemble unless they are burn-in; now and then, write the checkpoint."""
+        """Keep steps [first, last) of an ensemble unless they are burn-in; now and then, write the
+        checkpoint.
+        """
         if first >= self._n_burn:
             kept = slice(first - self._n_burn, last - self._n_burn)
             self._u[index, kept] = sampler.get_chain()
@@ -231,21 +247,42 @@ class _Store:
                 content = read_arrays(path)
                 if str(content["fingerprint"]) != self._fingerprint:
                     return
-                shapes = {"u": self._u.shape, "log_density": self._log_density.shape, "accepted": self._accepted.shape}
+                shapes = {
+                    "u": self._u.shape,
+                    "log_density": self._log_density.shape,
+                    "accepted": self._accepted.shape,
+                }
                 n_walkers, dim = self._u.shape[2:]
-                shapes |= {"coords": (n_walkers, dim), "log_prob": (n_walkers,), "place": (2,), "rest": (2,)}
+                shapes |= {
+                    "coords": (n_walkers, dim),
+                    "log_prob": (n_walkers,),
+                    "place": (2,),
+                    "rest": (2,),
+                }
                 for name, shape in (shapes | {"gauss": ()}).items():
                     kinds = "iu" if name in ("place", "rest", "accepted") else "f"
                     found = content[name]
-                    if found.shape != shape or found.dtype.kind not in kinds or not np.isfinite(found).all():
+                    if (
+                        found.shape != shape
+                        or found.dtype.kind not in kinds
+                        or not np.isfinite(found).all()
+                    ):
                         raise ValueError(f"{name} does not hold what it should")
                 position, has_gauss = (int(v) for v in content["rest"])
-                random_state = ("MT19937", content["key"], position, has_gauss, float(content["gauss"]))
+                random_state = (
+                    "MT19937",
+                    content["key"],
+                    position,
+                    has_gauss,
+                    float(content["gauss"]),
+                )
                 np.random.RandomState(0).set_state(random_state)
         except SamplingError:
             # What cannot be gone on with is made again.
             return
-        self.state = emcee.State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
+        self.state = emcee.State(
+            content["coords"], log_prob=content["log_prob"], random_state=random_state
+        )
         self._u, self._log_density = content["u"], content["log_density"]
         self._accepted = content["accepted"]
         self.ensemble, self.step = (int(v) for v in content["place"])

@@ -1,7 +1,9 @@
-"""The exact Gaussian likelihood of all stars, and what a compressed one leaves out of it on a sample of frames.
+"""The exact Gaussian likelihood of all stars, and what a compressed one leaves out of it on a
+sample of frames.
 
-What an expansion leaves out adds up over frames. So its sum over all of them is told by some: their mean times the
-number of frames, with the standard error that batches of them show. The cost is then the same for any number of stars.
+What an expansion leaves out adds up over frames. So its sum over all of them is told by some: their
+mean times the number of frames, with the standard error that batches of them show. The cost is then
+the same for any number of stars.
 """
 
 from __future__ import annotations
@@ -32,15 +34,19 @@ SAMPLED_FRAMES, BATCHES = 1000, 10
 class ExactMarginal:
     """The exact Gaussian likelihood around a calibration, point by point.
 
-    Attitudes are those that follow from the ones at the estimate to first order, so that a pass over the stars is
-    enough for a point.
+    Attitudes are those that follow from the ones at the estimate to first order, so that a pass
+    over the stars is enough for a point.
     """
 
-    def __init__(self, obs: Observations | StarFrames, cal: Calibration, rotations: FloatArray | None = None) -> None:
+    def __init__(
+        self, obs: Observations | StarFrames, cal: Calibration, rotations: FloatArray | None = None
+    ) -> None:
         model, theta = cal.camera.distortion, cal.theta
         if cal.star_errors is not None and not isinstance(obs, StarFrames):
             start = quaternion_to_rotation(cal.quaternions)
-            self._one: MarginalLikelihood = StarLikelihood(obs, model, theta, start, cal.star_errors, cal.sigma)
+            self._one: MarginalLikelihood = StarLikelihood(
+                obs, model, theta, start, cal.star_errors, cal.sigma
+            )
             self._one.use_rotations(self._one.rotations_at(theta))
             return
         self._one = MarginalLikelihood(obs, model, axes=True)
@@ -58,16 +64,23 @@ class ExactMarginal:
 class FrameSample:
     """What the compressed likelihood of a calibration leaves out, told by a sample of its frames.
 
-    A sample of `n_frames` is taken of `obs` where its frames are many; they stand for `of_frames`, by default those of
-    `obs`.
+    A sample of `n_frames` is taken of `obs` where its frames are many; they stand for `of_frames`,
+    by default those of `obs`.
     """
 
     def __init__(self, obs: Observations, cal: Calibration, of_frames: int | None = None) -> None:
         some, places = frame_sample(obs, SAMPLED_FRAMES)
-        self.n_frames, self.of_frames = some.n_frames, obs.n_frames if of_frames is None else of_frames
+        self.n_frames, self.of_frames = (
+            some.n_frames,
+            obs.n_frames if of_frames is None else of_frames,
+        )
         self._whole = cal.compressed
         covariance = self._whole.whitening @ self._whole.whitening.T
-        rotations = quaternion_to_rotation(cal.quaternions)[places] if len(cal.quaternions) == obs.n_frames else None
+        rotations = (
+            quaternion_to_rotation(cal.quaternions)[places]
+            if len(cal.quaternions) == obs.n_frames
+            else None
+        )
         frames = StarFrames.from_observations(some, axes=True)
         frame = np.repeat(np.arange(some.n_frames), frames.sizes)
         plain = replace(cal, star_errors=None)
@@ -88,11 +101,14 @@ class FrameSample:
         return other
 
     def left_out(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Exact less compressed log likelihood of all frames, as every batch by itself has it, (B, n)."""
+        """Exact less compressed log likelihood of all frames, as every batch by itself has it, (B,
+        n).
+        """
         theta = self._at(theta)
         return np.array(
             [
-                (exact.log_likelihood(theta, sigma) - expanded.log_likelihood(theta, sigma)) * stands_for
+                (exact.log_likelihood(theta, sigma) - expanded.log_likelihood(theta, sigma))
+                * stands_for
                 for exact, expanded, stands_for in self._batches
             ]
         )

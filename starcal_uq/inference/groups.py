@@ -1,17 +1,21 @@
-"""What ArviZ wants besides the draws: prior, data, log likelihood, and images drawn from prior and posterior.
+"""What ArviZ wants besides the draws: prior, data, log likelihood, and images drawn from prior and
+posterior.
 
-The unit of the log likelihood is a frame. Its m stars share an attitude, which is integrated out, so that they are
-2 m - 3 independent numbers and no star has a density of its own; given the parameters, frames are independent.
-With the whitened residuals e at the best attitude, and A their derivative with respect to it,
+The unit of the log likelihood is a frame. Its m stars share an attitude, which is integrated out,
+so that they are 2 m - 3 independent numbers and no star has a density of its own; given the
+parameters, frames are independent. With the whitened residuals e at the best attitude, and A their
+derivative with respect to it,
 
-    log p(frame) = -e.e / (2 sigma^2) - (2 m - 3) log sigma - 1/2 log |A^T A| - (2 m - 3) / 2 log(2 pi),
+    log p(frame) = -e.e / (2 sigma^2) - (2 m - 3) log sigma - 1/2 log |A^T A| - (2 m - 3) / 2 log(2
+    pi),
 
 a density per px^(2 m), the attitude being flat in its rotation vector (rad); with Student's t as in
 `starcal_uq.estimation.student`. Nothing is linearised in the parameters.
 
-A drawn image is one that the same stars would make in another exposure of the same frame: parameters, noise and
-attitude are drawn, and noise is added. What the eye can compare is its `residual`: the part of its distance from the
-estimate's prediction that no small turn of the frame makes, for the data and for the drawn images alike.
+A drawn image is one that the same stars would make in another exposure of the same frame:
+parameters, noise and attitude are drawn, and noise is added. What the eye can compare is its
+`residual`: the part of its distance from the estimate's prediction that no small turn of the frame
+makes, for the data and for the drawn images alike.
 """
 
 from __future__ import annotations
@@ -41,7 +45,14 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
 
-Group = Literal["prior", "observed_data", "constant_data", "log_likelihood", "prior_predictive", "posterior_predictive"]
+Group = Literal[
+    "prior",
+    "observed_data",
+    "constant_data",
+    "log_likelihood",
+    "prior_predictive",
+    "posterior_predictive",
+]
 GROUPS: tuple[Group, ...] = get_args(Group)
 LOG_LIKELIHOOD = "frame_log_density"
 _PIXELS = ("x_px", "y_px", "residual_x_px", "residual_y_px")
@@ -62,11 +73,13 @@ def arviz_data(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Any:
-    """A posterior with all of ArviZ's groups, made on demand: ``InferenceData`` (0.23) or ``DataTree`` (1.x).
+    """A posterior with all of ArviZ's groups, made on demand: ``InferenceData`` (0.23) or
+    ``DataTree`` (1.x).
 
-    The draws are thinned, evenly along every chain, so that all groups have the same. The log likelihood takes about
-    0.3 microseconds a star and draw and 8 bytes a frame and draw, images take 64 bytes a star and draw: 6 s and 30 MB
-    for 1000 frames of 18 stars. `Posterior.data` has all draws, without these groups, and costs nothing.
+    The draws are thinned, evenly along every chain, so that all groups have the same. The log
+    likelihood takes about 0.3 microseconds a star and draw and 8 bytes a frame and draw, images
+    take 64 bytes a star and draw: 6 s and 30 MB for 1000 frames of 18 stars. `Posterior.data` has
+    all draws, without these groups, and costs nothing.
 
     Parameters
     ----------
@@ -75,9 +88,9 @@ def arviz_data(
     obs : Observations
         The data that it was sampled from; images can be drawn for other frames, too.
     groups : sequence of str, optional
-        Which of ``prior``, ``observed_data``, ``constant_data``, ``log_likelihood``, ``prior_predictive`` and
-        ``posterior_predictive`` come beside ``posterior`` and ``sample_stats``; by default all that the likelihood of
-        the posterior has.
+        Which of ``prior``, ``observed_data``, ``constant_data``, ``log_likelihood``,
+        ``prior_predictive`` and ``posterior_predictive`` come beside ``posterior`` and
+        ``sample_stats``; by default all that the likelihood of the posterior has.
     n_draws : int
         Draws over all chains, and of the prior.
     n_frames : int
@@ -90,14 +103,14 @@ def arviz_data(
     Returns
     -------
     InferenceData or DataTree
-        The log likelihood has the dimensions chain, draw and frame, images chain, draw and star, where ``star_frame``
-        and ``star_id`` are coordinates. Every variable has its ``units``.
+        The log likelihood has the dimensions chain, draw and frame, images chain, draw and star,
+        where ``star_frame`` and ``star_id`` are coordinates. Every variable has its ``units``.
 
     Raises
     ------
     SamplingError
-        For an unknown group, or one that there is not: the log likelihood needs the data of the posterior, and a
-        likelihood of star positions in which frames are independent.
+        For an unknown group, or one that there is not: the log likelihood needs the data of the
+        posterior, and a likelihood of star positions in which frames are independent.
     """
     return to_arviz(_datasets(post, obs, groups, n_draws, n_frames, seed, progress))
 
@@ -113,17 +126,24 @@ def write_arviz(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[str, ...]:
-    """Write what `arviz_data` gives as netCDF, all or nothing, for programs that read ArviZ's schema; its groups."""
+    """Write what `arviz_data` gives as netCDF, all or nothing, for programs that read ArviZ's
+    schema; its groups.
+    """
     made = _datasets(post, obs, None, n_draws, _FRAMES, seed, progress)
 
     def fill(file: Any) -> None:
         for name, dataset in made.items():
             variables: Variables = {
-                str(key): (tuple(map(str, v.dims)), v.values, dict(v.attrs)) for key, v in dataset.variables.items()
+                str(key): (tuple(map(str, v.dims)), v.values, dict(v.attrs))
+                for key, v in dataset.variables.items()
             }
             # Coordinates that are no dimensions, as xarray names them to itself.
             beside = " ".join(str(key) for key in dataset.coords if key not in dataset.dims)
-            write_group(file.create_group(name), variables, dataset.attrs | ({"coordinates": beside} if beside else {}))
+            write_group(
+                file.create_group(name),
+                variables,
+                dataset.attrs | ({"coordinates": beside} if beside else {}),
+            )
 
     write_netcdf(path, fill)
     return tuple(made)
@@ -183,11 +203,15 @@ def _refused(post: Posterior, same_data: bool) -> dict[str, str]:
     likelihood = post.diagnostics.likelihood
     predictive = ("log_likelihood", "posterior_predictive")
     if post.star_error_px > 0.0:
-        return dict.fromkeys(predictive, "stars bring errors along, so that frames depend on each other")
+        return dict.fromkeys(
+            predictive, "stars bring errors along, so that frames depend on each other"
+        )
     if likelihood not in (_GAUSSIAN, _STUDENT):
         return dict.fromkeys(predictive, f"the likelihood {likelihood!r} is none of star positions")
     if not same_data:
-        return {"log_likelihood": "these are not the observations, all of them, that the posterior was sampled from"}
+        return {
+            "log_likelihood": "these are not the observations, all of them, that the posterior was sampled from"
+        }
     return {}
 
 
@@ -196,7 +220,10 @@ class _Draws:
 
     def __init__(self, post: Posterior, values: FloatArray, places: Any) -> None:
         self.shape = values.shape[:2]
-        self.theta, self.sigma = values[..., :-1].reshape(-1, values.shape[2] - 1), values[..., -1].ravel()
+        self.theta, self.sigma = (
+            values[..., :-1].reshape(-1, values.shape[2] - 1),
+            values[..., -1].ravel(),
+        )
         self.dof: FloatArray | None = None
         if post.dof_draws is not None:
             self.dof = post.dof_draws.reshape(post.n_ensembles, -1)[:, places].ravel()
@@ -215,13 +242,23 @@ class _Frames:
         self.gaussian = MarginalLikelihood(self.frames, self.model)
         self.reference, cost = self.gaussian.profile(post.camera.theta)
         if not np.isfinite(cost):
-            raise SamplingError("the calibrated camera does not fit these frames: are they those of the posterior?")
+            raise SamplingError(
+                "the calibrated camera does not fit these frames: are they those of the posterior?"
+            )
         self._near = self.gaussian.sums(post.camera.theta)[1]
         self.student: StudentLikelihood | None = None
         if post.diagnostics.likelihood == _STUDENT:
             theta, sigma = post.camera.theta, float(np.mean(post.draws[:, -1]))
-            nu = float(np.mean(post.dof_draws if post.dof_draws is not None else post.provenance["settings"]["dof"]))
-            self.student = StudentLikelihood(self.frames, self.model, theta, self.reference.rotations)
+            nu = float(
+                np.mean(
+                    post.dof_draws
+                    if post.dof_draws is not None
+                    else post.provenance["settings"]["dof"]
+                )
+            )
+            self.student = StudentLikelihood(
+                self.frames, self.model, theta, self.reference.rotations
+            )
             state = self.student.state(theta, sigma, nu)
             self.student.follow(theta, state, self.student.information(theta, state, sigma))
 
@@ -229,7 +266,9 @@ class _Frames:
         return self.gaussian.profile(theta, self._near.at(theta))[0]
 
 
-def _log_likelihood(post: Posterior, obs: Observations, draws: _Draws, progress: Progress | None) -> xr.Dataset:
+def _log_likelihood(
+    post: Posterior, obs: Observations, draws: _Draws, progress: Progress | None
+) -> xr.Dataset:
     import xarray as xr
 
     at = _Frames(post, obs)
@@ -247,7 +286,10 @@ def _log_likelihood(post: Posterior, obs: Observations, draws: _Draws, progress:
             values[i] = -0.5 * (squares / sigma**2 + state.log_determinant) - dof * np.log(sigma)
         if progress is not None:
             progress(i + 1, len(values))
-    about = {"units": "nat", "long_name": "log density of the stars of a frame, its attitude integrated out"}
+    about = {
+        "units": "nat",
+        "long_name": "log density of the stars of a frame, its attitude integrated out",
+    }
     array = (("chain", "draw", "frame"), (values + constant).reshape(*draws.shape, -1), about)
     return xr.Dataset({LOG_LIKELIHOOD: array}, draws.coords() | {"frame": obs.frame_ids})
 
@@ -274,22 +316,31 @@ class _Images:
         state, frames = self._at.reference, self._at.frames
         self._predicted = frames.pixel - frames.in_pixels(state.e)
         self._theta = post.camera.theta
-        self._coords: dict[str, Any] = {"star": np.arange(obs.n_stars), "star_frame": ("star", obs.frame)}
+        self._coords: dict[str, Any] = {
+            "star": np.arange(obs.n_stars),
+            "star_frame": ("star", obs.frame),
+        }
         if obs.star_id is not None:
             self._coords["star_id"] = ("star", np.asarray(obs.star_id, dtype=str))
 
-    def _dataset(self, pixels: FloatArray, dims: tuple[str, ...], coords: dict[str, Any]) -> xr.Dataset:
+    def _dataset(
+        self, pixels: FloatArray, dims: tuple[str, ...], coords: dict[str, Any]
+    ) -> xr.Dataset:
         """Positions (..., 2, n) and their residuals."""
         import xarray as xr
 
         flat = (pixels - self._predicted).reshape(-1, *self._predicted.shape)
         weight = self._at.frames.weight
         whitened = flat if weight is None else flat * weight
-        rest = self._at.frames.in_pixels(self._at.gaussian.project_out(self._at.reference, whitened))
+        rest = self._at.frames.in_pixels(
+            self._at.gaussian.project_out(self._at.reference, whitened)
+        )
         rest = rest.reshape(pixels.shape)
         values = (pixels[..., 0, :], pixels[..., 1, :], rest[..., 0, :], rest[..., 1, :])
         named = zip(_PIXELS, values, strict=True)
-        return xr.Dataset({k: ((*dims, "star"), v, {"units": "px"}) for k, v in named}, coords | self._coords)
+        return xr.Dataset(
+            {k: ((*dims, "star"), v, {"units": "px"}) for k, v in named}, coords | self._coords
+        )
 
     def observed(self) -> xr.Dataset:
         """The data."""
@@ -318,13 +369,17 @@ class _Images:
                 noise[:, ~state.seen] = np.nan
             else:
                 state = self._at.profile(theta)
-            turns = sigma * np.einsum("abk,bk->ak", _roots(state.inverse), rng.standard_normal((3, frames.n_frames)))
+            turns = sigma * np.einsum(
+                "abk,bk->ak", _roots(state.inverse), rng.standard_normal((3, frames.n_frames))
+            )
             moved = np.einsum("axn,an->xn", state.attitude, frames.spread(turns))
             pixels[i] = frames.pixel + frames.in_pixels(moved + noise - state.e)
         return self._dataset(pixels.reshape(*draws.shape, 2, n), ("chain", "draw"), draws.coords())
 
     def of_prior(self, prior: FloatArray, rng: np.random.Generator) -> xr.Dataset:
-        """Images by cameras of the prior, pointed as the estimate says; NaN where a camera has none."""
+        """Images by cameras of the prior, pointed as the estimate says; NaN where a camera has
+        none.
+        """
         frames, n = self._at.frames, self._at.frames.n_stars
         b = frames.rotated(self._at.reference.rotations)
         project = forward_kernel(self._at.model, "attitude")
@@ -339,7 +394,9 @@ class _Images:
 
 
 def _roots(inverse: FloatArray) -> FloatArray:
-    """Square roots (3, 3, K) of covariances (3, 3, K), which are nothing where a frame has no attitude."""
+    """Square roots (3, 3, K) of covariances (3, 3, K), which are nothing where a frame has no
+    attitude.
+    """
     fixed = inverse[0, 0] > 0.0
     covariance = np.where(fixed[:, None, None], np.moveaxis(inverse, 2, 0), np.eye(3))
     return np.asarray(np.moveaxis(np.linalg.cholesky(covariance), 0, 2) * fixed)

@@ -1,9 +1,12 @@
 """The likelihoods by name, each ready to be sampled.
 
 - ``marginal``: Gaussian centroids, attitudes marginalised. The default, and efficient.
-- ``pairs``: the paper's objective over interstar angles as a composite likelihood, with Godambe's curvature.
-- ``pairs_naive``: the same with all pairs taken as independent. It claims far too much, and is here to show that.
-- ``student_t``: heavy tails per star, attitudes marginalised, for tables with wrong identifications.
+- ``pairs``: the paper's objective over interstar angles as a composite likelihood, with Godambe's
+  curvature.
+- ``pairs_naive``: the same with all pairs taken as independent. It claims far too much, and is here
+  to show that.
+- ``student_t``: heavy tails per star, attitudes marginalised, for tables with wrong
+  identifications.
 """
 
 from __future__ import annotations
@@ -58,7 +61,9 @@ class Source:
     # What `fast` leaves out, told by some of the frames; None where `exact` itself is compared.
     sample: FrameSample | None = None
     scatters: bool = False  # True where the scatter of the frames is in the likelihood already
-    inflation: FloatArray | None = None  # (p,): factors on sigma that it holds, of a calibration that has accepted some
+    inflation: FloatArray | None = (
+        None  # (p,): factors on sigma that it holds, of a calibration that has accepted some
+    )
 
 
 def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bool) -> None:
@@ -66,25 +71,36 @@ def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bo
     if not isinstance(likelihood, str):
         if not callable(getattr(likelihood, "log_likelihood", None)):
             raise SamplingError(
-                f"likelihood is a {type(likelihood).__name__}: give one of {', '.join(LIKELIHOODS)}, or an object with "
+                f"likelihood is a {type(likelihood).__name__}: give one of "
+                f"{', '.join(LIKELIHOODS)}, or an object with "
                 "a method log_likelihood(theta, sigma)."
             )
     elif likelihood in EVALUATIONS:
         raise SamplingError(
-            f"likelihood={likelihood!r} says how a likelihood is evaluated, not which: use evaluation={likelihood!r}."
+            f"likelihood={likelihood!r} says how a likelihood is evaluated, not which: use "
+            f"evaluation={likelihood!r}."
         )
     elif likelihood not in LIKELIHOODS:
-        raise SamplingError(f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}.")
+        raise SamplingError(
+            f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}."
+        )
     if evaluation not in EVALUATIONS:
-        raise SamplingError(f"evaluation {evaluation!r} is unknown: use one of {', '.join(EVALUATIONS)}.")
+        raise SamplingError(
+            f"evaluation {evaluation!r} is unknown: use one of {', '.join(EVALUATIONS)}."
+        )
     if dof is not None and likelihood != "student_t":
-        raise SamplingError("degrees of freedom (dof) belong to likelihood='student_t': leave dof out, or use that.")
+        raise SamplingError(
+            "degrees of freedom (dof) belong to likelihood='student_t': leave dof out, or use that."
+        )
     if has_observations or not isinstance(likelihood, str):
         return
     if likelihood != "marginal":
         raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
     if evaluation == "exact":
-        raise SamplingError("the exact likelihood needs the observations: give them, or evaluate the compressed form.")
+        raise SamplingError(
+            "the exact likelihood needs the observations: give them, or evaluate the compressed "
+            "form."
+        )
 
 
 def label_of(likelihood: str | Likelihood) -> str:
@@ -95,9 +111,14 @@ def label_of(likelihood: str | Likelihood) -> str:
 
 
 def find_source(
-    likelihood: str | Likelihood, obs: Observations | None, cal: Calibration, dof: float | str | None
+    likelihood: str | Likelihood,
+    obs: Observations | None,
+    cal: Calibration,
+    dof: float | str | None,
 ) -> Source:
-    """The likelihood of a name (see `LIKELIHOODS`), or the object that was passed, around a calibration."""
+    """The likelihood of a name (see `LIKELIHOODS`), or the object that was passed, around a
+    calibration.
+    """
     if not isinstance(likelihood, str):
         at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
         return Source(label_of(likelihood), *at, exact=likelihood.log_likelihood, fast=None)
@@ -113,8 +134,10 @@ def find_source(
     if (ignored := _settings(cal).get("ignored_distortion")) is None:
         return source
     sentence = (
-        f"The method {cal.method!r} ignores the distortion (model {ignored!r} was given): this posterior is that of a "
-        "camera without any, and neither its centre nor its width holds otherwise; use method='efficient'."
+        f"The method {cal.method!r} ignores the distortion (model {ignored!r} was given): this "
+        "posterior is that of a "
+        "camera without any, and neither its centre nor its width holds otherwise; use "
+        "method='efficient'."
     )
     check = Check(
         "Method of the calibration",
@@ -129,10 +152,12 @@ def find_source(
 
 
 def _inflated(source: Source, factors: FloatArray) -> Source:
-    """The likelihood that is wider by `factors` (p,) on each sigma, its maximum and correlations the same.
+    """The likelihood that is wider by `factors` (p,) on each sigma, its maximum and correlations
+    the same.
 
-    It is evaluated at ``theta_hat + D^-1 (theta - theta_hat)``, as composite ones are (Ribatet, Cooley & Davison 2012).
-    Tempering would take one factor for all parameters, and would widen sigma, too.
+    It is evaluated at ``theta_hat + D^-1 (theta - theta_hat)``, as composite ones are (Ribatet,
+    Cooley & Davison 2012). Tempering would take one factor for all parameters, and would widen
+    sigma, too.
     """
 
     def at(theta: FloatArray) -> FloatArray:
@@ -150,35 +175,42 @@ def _inflated(source: Source, factors: FloatArray) -> Source:
     )
 
 
-def _named_source(likelihood: str, obs: Observations | None, cal: Calibration, dof: float | str | None) -> Source:
+def _named_source(
+    likelihood: str, obs: Observations | None, cal: Calibration, dof: float | str | None
+) -> Source:
     settings = _settings(cal)
     if obs is None and settings.get("stream") and settings.get("method") == "samaan":
         raise SamplingError(
-            "a stream leaves only the quadratic likelihood around the estimate, and samaan's is far from its maximum: "
+            "a stream leaves only the quadratic likelihood around the estimate, and samaan's is "
+            "far from its maximum: "
             "give obs, or calibrate with method='griffith' and parameters='all'."
         )
     if likelihood == "marginal":
         return _marginal(obs, cal)
     if cal.star_errors is not None:
         raise SamplingError(
-            f"the calibration holds errors of the stars, which the likelihood {likelihood!r} does not know: sample "
+            f"the calibration holds errors of the stars, which the likelihood {likelihood!r} "
+            "does not know: sample "
             "with likelihood='marginal', or calibrate without star_errors."
         )
     if obs is None:
         raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
     if cal.partitions is not None:
         raise SamplingError(
-            f"the likelihood {likelihood!r} needs all stars at once, which partitioned observations do not give: use "
+            f"the likelihood {likelihood!r} needs all stars at once, which partitioned "
+            "observations do not give: use "
             "likelihood='marginal'."
         )
     if not cal.has_residuals:
         raise SamplingError(
-            f"the likelihood {likelihood!r} needs the attitudes and residuals of every frame, which a stream does not "
+            f"the likelihood {likelihood!r} needs the attitudes and residuals of every frame, "
+            "which a stream does not "
             "keep: calibrate the table with method='efficient', or use likelihood='marginal'."
         )
     if likelihood != "student_t" and settings.get("method") in ("samaan", "griffith"):
         raise SamplingError(
-            f"the likelihood {likelihood!r} has its maximum at the least-squares estimate over pairs, which method "
+            f"the likelihood {likelihood!r} has its maximum at the least-squares estimate over "
+            "pairs, which method "
             f"{settings['method']!r} does not find: calibrate with method='three_stage'."
         )
     if likelihood == "student_t":
@@ -192,7 +224,9 @@ def _settings(cal: Calibration) -> dict[str, Any]:
 
 
 def resolved_dof(cal: Calibration, dof: float | str | None) -> float | Literal["free"]:
-    """Degrees of freedom, "free" or a number in range: as given, else the calibration's, else the default."""
+    """Degrees of freedom, "free" or a number in range: as given, else the calibration's, else the
+    default.
+    """
     if dof is None and _settings(cal).get("likelihood") == "student_t":
         dof = _settings(cal)["dof"]
     nu = parse_dof(dof, SamplingError)
@@ -202,7 +236,8 @@ def resolved_dof(cal: Calibration, dof: float | str | None) -> float | Literal["
 def _marginal(obs: Observations | None, cal: Calibration) -> Source:
     if _settings(cal).get("likelihood") == "student_t":
         raise SamplingError(
-            "the calibration was made with likelihood='student_t': sample with the same, or calibrate again with "
+            "the calibration was made with likelihood='student_t': sample with the same, or "
+            "calibrate again with "
             "likelihood='marginal'."
         )
     exact, sample = None, None
@@ -232,18 +267,29 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
         residual_dof=cal.dof,
         adjusted=adjusted,
     )
-    variability = "the noise of every star" if expanded.variability == "expected" else "the scatter between frames"
+    variability = (
+        "the noise of every star"
+        if expanded.variability == "expected"
+        else "the scatter between frames"
+    )
     notes: tuple[str, ...] = (
-        "It is the composite one over pairs of stars, with Godambe's curvature; its variability comes from "
+        "It is the composite one over pairs of stars, with Godambe's curvature; its variability "
+        "comes from "
         f"{variability}.",
-        "sigma is estimated from the pixel residuals at the best attitudes; pairs have no say in it.",
+        (
+            "sigma is estimated from the pixel residuals at the best attitudes; pairs have no "
+            "say in "
+            "it."
+        ),
     )
     sigma, dof = expanded.sigma, float(expanded.dof)
     if not adjusted:
         sigma, dof = expanded.tau / expanded.pair_noise, float(expanded.n_pairs)
         failure = (
-            f"The {expanded.n_pairs} pairs of stars are treated as independent (pairs_naive): the intervals are about "
-            f"{expanded.narrowness:.1f} times too narrow and must not be used; use likelihood='pairs' or 'marginal'."
+            f"The {expanded.n_pairs} pairs of stars are treated as independent (pairs_naive): "
+            "the intervals are about "
+            f"{expanded.narrowness:.1f} times too narrow and must not be used; use "
+            "likelihood='pairs' or 'marginal'."
         )
         warnings.warn(failure, NaivePairsWarning, stacklevel=5)
         notes = (failure,)
@@ -263,8 +309,9 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
 class _AdjustedStudent:
     """Student-t log likelihood with the curvature that the stars' scores show.
 
-    Stars are a mixture of right and wrong ones and no t distribution, so that the curvature of its likelihood is not
-    the precision of its estimate. It is evaluated at ``theta_hat + C (theta - theta_hat)``, as composite ones are.
+    Stars are a mixture of right and wrong ones and no t distribution, so that the curvature of its
+    likelihood is not the precision of its estimate. It is evaluated at ``theta_hat + C (theta -
+    theta_hat)``, as composite ones are.
     """
 
     def __init__(self, fit: Any, nu: float | None) -> None:
@@ -291,13 +338,16 @@ def _student(obs: Observations, cal: Calibration, dof: float | str | None) -> So
     fit = refine(frames, cal.camera.distortion, cal.theta, rotations, nu, _MAX_REFINEMENT)
     if not fit.stage.status.ok:
         raise SamplingError(
-            f"the maximum of the Student-t likelihood was not found ({fit.stage.status.name}): calibrate with "
+            f"the maximum of the Student-t likelihood was not found ({fit.stage.status.name}): "
+            "calibrate with "
             "likelihood='student_t' first."
         )
     extra = None
     if nu is None:
         low = DOF_RANGE[0]
-        log_sd = fit.nu_std / (fit.nu - low) if np.isfinite(fit.nu_std) and fit.nu_std > 0.0 else 1.0
+        log_sd = (
+            fit.nu_std / (fit.nu - low) if np.isfinite(fit.nu_std) and fit.nu_std > 0.0 else 1.0
+        )
         extra = Extra("dof", log_excess_prior, fit.nu, min(log_sd, 1.0), low)
     return Source(
         name="student_t",
@@ -309,7 +359,13 @@ def _student(obs: Observations, cal: Calibration, dof: float | str | None) -> So
         fast=None,
         extra=extra,
         notes=(
-            "It is a bivariate Student t per star, with the curvature that the scatter of the stars' scores shows.",
-            "sigma is the scale of the Student t, which is below the standard deviation of its residuals.",
+            (
+                "It is a bivariate Student t per star, with the curvature that the scatter of the "
+                "stars' scores shows."
+            ),
+            (
+                "sigma is the scale of the Student t, which is below the standard deviation of its "
+                "residuals."
+            ),
         ),
     )

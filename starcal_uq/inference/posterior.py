@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 Variables = dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]
 
 DRAW_ORDER = (
-    "chain is one separately seeded ensemble; within a chain, draws are ordered by half of the run, then walker, then "
+    "chain is one separately seeded ensemble; within a chain, draws are ordered by half of the "
+    "run, then walker, then "
     "step in that half, so that split R-hat compares the two halves in time and all ensembles"
 )
 
@@ -69,7 +70,12 @@ class Laplace:
     iterations: int
     converged: bool
 
-    SHAPES: ClassVar[Shapes] = {"names": ("d",), "mode": ("d",), "covariance": ("d", "d"), "transform": ("d", "d")}
+    SHAPES: ClassVar[Shapes] = {
+        "names": ("d",),
+        "mode": ("d",),
+        "covariance": ("d", "d"),
+        "transform": ("d", "d"),
+    }
 
     @property
     def mean(self) -> FloatArray:
@@ -111,7 +117,8 @@ class Derived:
 class Diagnostics:
     """Evidence that the draws are draws from the posterior.
 
-    Arrays over parameters have the order of `Posterior.parameter_names` and hold NaN for a noise that was given.
+    Arrays over parameters have the order of `Posterior.parameter_names` and hold NaN for a noise
+    that was given.
 
     Attributes
     ----------
@@ -128,7 +135,8 @@ class Diagnostics:
     n_evaluations : int
         Points at which the likelihood was evaluated while sampling, burn-in included.
     psis_khat : float
-        Pareto shape of the importance weights of draws around the Laplace approximation; good below 0.7.
+        Pareto shape of the importance weights of draws around the Laplace approximation; good below
+        0.7.
     psis_ess : float
         Equivalent number of independent draws of these weights.
     psis_mean, psis_sd : array (p+1,)
@@ -140,17 +148,20 @@ class Diagnostics:
     agreement_sd : float
         Largest relative difference between their standard deviations.
     compressed_max_difference : float
-        Largest difference between compressed and exact log likelihood found within three standard deviations of the
-        mode, relative to the mode, nat; NaN where it was not checked.
+        Largest difference between compressed and exact log likelihood found within three standard
+        deviations of the mode, relative to the mode, nat; NaN where it was not checked.
     compressed_khat : float
-        Pareto shape of the weights exact over compressed at the checked draws; 0 where all differences are below 0.1
-        nat, and no tail can matter.
+        Pareto shape of the weights exact over compressed at the checked draws; 0 where all
+        differences are below 0.1 nat, and no tail can matter.
     compressed_frames : tuple of int
-        Frames that were compared for it and those that they stand for; zeros where all were compared.
+        Frames that were compared for it and those that they stand for; zeros where all were
+        compared.
     likelihood_used : str
-        How it was evaluated: ``compressed``, ``exact``, or the name of the likelihood that was passed.
+        How it was evaluated: ``compressed``, ``exact``, or the name of the likelihood that was
+        passed.
     likelihood : str
-        ``marginal``, ``pairs``, ``pairs_naive``, ``student_t``, or the name of the likelihood that was passed.
+        ``marginal``, ``pairs``, ``pairs_naive``, ``student_t``, or the name of the likelihood that
+        was passed.
     checks : tuple of Check
         Every check of the draws, made once while sampling.
     derived : tuple of Derived
@@ -181,7 +192,10 @@ class Diagnostics:
     derived: tuple[Derived, ...] = ()
 
     SHAPES: ClassVar[Shapes] = {
-        **dict.fromkeys(("rhat", "ess_bulk", "ess_tail", "mcse", "autocorrelation", "psis_mean", "psis_sd"), ("p",)),
+        **dict.fromkeys(
+            ("rhat", "ess_bulk", "ess_tail", "mcse", "autocorrelation", "psis_mean", "psis_sd"),
+            ("p",),
+        ),
         **dict.fromkeys(("laplace_mean", "laplace_sd"), ("p",)),
     }
 
@@ -231,7 +245,8 @@ class Posterior(Shown):
     dof_draws : array (n,) or None
         Draws of the degrees of freedom of a Student-t likelihood where they were free.
     star_error_px : float
-        Direction error of a star per axis, px, where the calibration holds such errors; a frame's attitude has it, too.
+        Direction error of a star per axis, px, where the calibration holds such errors; a frame's
+        attitude has it, too.
     """
 
     parameter_names: tuple[str, ...]
@@ -253,10 +268,20 @@ class Posterior(Shown):
     star_error_px: float = 0.0
 
     SHAPES: ClassVar[Shapes] = {
-        **{"parameter_names": ("p+1",), "draws": ("n", "p+1"), "log_posterior": ("n",), "dof_draws": ("n",)},
+        **{
+            "parameter_names": ("p+1",),
+            "draws": ("n", "p+1"),
+            "log_posterior": ("n",),
+            "dof_draws": ("n",),
+        },
         **{"information": ("p", "p"), "rotation_per_theta": (3, "p"), "attitude_noise": (3, 3)},
     }
-    FINITE: ClassVar[tuple[str, ...]] = ("draws", "log_posterior", "information", "rotation_per_theta")
+    FINITE: ClassVar[tuple[str, ...]] = (
+        "draws",
+        "log_posterior",
+        "information",
+        "rotation_per_theta",
+    )
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -307,7 +332,9 @@ class Posterior(Shown):
 
     @property
     def inflation(self) -> FloatArray | None:
-        """Factors (p,) of an accepted inflation that the draws hold; None where there is none, or they do not."""
+        """Factors (p,) of an accepted inflation that the draws hold; None where there is none, or
+        they do not.
+        """
         factors = self.provenance.get("inflation")
         return None if factors is None else np.array([factors[name] for name in self.camera_names])
 
@@ -320,8 +347,9 @@ class Posterior(Shown):
     def data(self) -> Any:
         """Draws as ArviZ knows them: ``InferenceData`` (0.23) or ``DataTree`` (1.x).
 
-        Chain is the ensemble; coefficients are divided by `Parameter.scale` (k1 in 1e-10 px^-2), because ArviZ
-        reports a wrong effective sample size and prints zero for tiny numbers; units are attributes.
+        Chain is the ensemble; coefficients are divided by `Parameter.scale` (k1 in 1e-10 px^-2),
+        because ArviZ reports a wrong effective sample size and prints zero for tiny numbers; units
+        are attributes.
         """
         from starcal_uq.inference.arviz import to_arviz
 
@@ -342,12 +370,20 @@ class Posterior(Shown):
             shown[i].name: (
                 ("chain", "draw"),
                 (self.draws[:, i] / shown[i].scale).reshape(shape),
-                {"units": shown[i].scaled_unit, "long_name": shown[i].description, "scale": shown[i].scale},
+                {
+                    "units": shown[i].scaled_unit,
+                    "long_name": shown[i].description,
+                    "scale": shown[i].scale,
+                },
             )
             for i in self.sampled
         }
         if self.dof_draws is not None:
-            about: AnyDict = {"units": "1", "long_name": "degrees of freedom of Student's t", "scale": 1.0}
+            about: AnyDict = {
+                "units": "1",
+                "long_name": "degrees of freedom of Student's t",
+                "scale": 1.0,
+            }
             variables["dof"] = (("chain", "draw"), self.dof_draws.reshape(shape), about)
         attrs: AnyDict = {
             "inference_library": "emcee",
@@ -359,15 +395,18 @@ class Posterior(Shown):
         }
         if not self.sigma_sampled:
             attrs[f"{self.sigma_name}_given"] = float(self.sigma_draws[0])
-        stats: Variables = {"lp": (("chain", "draw"), self.log_posterior.reshape(shape), {"units": "nat"})}
+        stats: Variables = {
+            "lp": (("chain", "draw"), self.log_posterior.reshape(shape), {"units": "nat"})
+        }
         return {"posterior": (variables, coords, attrs), "sample_stats": (stats, coords, attrs)}
 
     def summary(self) -> pd.DataFrame:
-        """One row per parameter: prior, posterior and diagnostics, plain and divided by the parameter's scale.
+        """One row per parameter: prior, posterior and diagnostics, plain and divided by the
+        parameter's scale.
 
-        Columns are ``parameter``, ``unit``, ``prior_mean``, ``prior_sd``, ``mean``, ``sd``, ``q2.5``, ``q50``,
-        ``q97.5``, ``mcse``, ``rhat``, ``ess_bulk``, ``ess_tail``, then ``scaled_unit`` and ``scaled_...`` of every
-        number that has the unit.
+        Columns are ``parameter``, ``unit``, ``prior_mean``, ``prior_sd``, ``mean``, ``sd``,
+        ``q2.5``, ``q50``, ``q97.5``, ``mcse``, ``rhat``, ``ess_bulk``, ``ess_tail``, then
+        ``scaled_unit`` and ``scaled_...`` of every number that has the unit.
         """
         import pandas as pd
 
@@ -392,14 +431,17 @@ class Posterior(Shown):
         return pd.DataFrame(columns)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """All draws in px units, with columns ``ensemble``, ``walker`` and ``step`` before the parameters.
+        """All draws in px units, with columns ``ensemble``, ``walker`` and ``step`` before the
+        parameters.
 
         The unit of each column stands in ``.attrs["units"]``.
         """
         import pandas as pd
 
         half = self.n_steps // 2
-        ensemble, part, walker, step = np.indices((self.n_ensembles, 2, self.n_walkers, half)).reshape(4, -1)
+        ensemble, part, walker, step = np.indices(
+            (self.n_ensembles, 2, self.n_walkers, half)
+        ).reshape(4, -1)
         place = {"ensemble": ensemble, "walker": walker, "step": part * half + step}
         draws = dict(zip(self.parameter_names, self.draws.T, strict=True))
         table = pd.DataFrame({**place, **draws})
@@ -408,7 +450,9 @@ class Posterior(Shown):
 
     @bounded
     def thin(self, n: int, seed: int | np.random.SeedSequence | None = None) -> FloatArray:
-        """A random subset (n, p+1) of the draws without replacement; all of them if there are fewer than n."""
+        """A random subset (n, p+1) of the draws without replacement; all of them if there are fewer
+        than n.
+        """
         rng = np.random.default_rng(seed)
         return self.draws[rng.permutation(len(self.draws))[:n]]
 
@@ -423,8 +467,12 @@ class Posterior(Shown):
         ensure_new(path, force)
         arrays: Arrays = {}
         record = to_plain(self, arrays, _ARRAYS)
-        # The draws themselves are in px units, one column a parameter; those of ArviZ's group are scaled.
-        own = {"units": ", ".join(p.unit for p in self.parameters), "columns": ", ".join(self.parameter_names)}
+        # The draws themselves are in px units, one column a parameter; those of ArviZ's group are
+        # scaled.
+        own = {
+            "units": ", ".join(p.unit for p in self.parameters),
+            "columns": ", ".join(self.parameter_names),
+        }
         attrs = {"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})}
 
         # xarray would do it, but loads Dask for a lock, which takes longer than sampling.
@@ -433,7 +481,9 @@ class Posterior(Shown):
             held["draws"][2].update(own)
             write_group(file, held, attrs)
             for group, (variables, coords, about) in self._groups().items():
-                dimensions: Variables = {name: ((name,), values, {}) for name, values in coords.items()}
+                dimensions: Variables = {
+                    name: ((name,), values, {}) for name, values in coords.items()
+                }
                 write_group(file.create_group(group), dimensions | variables, about)
 
         write_netcdf(path, fill)
@@ -451,14 +501,20 @@ class Posterior(Shown):
 
         remedy = "run `starcal-uq sample RUN --force` again"
         if not Path(path).is_file():
-            raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
+            raise RunFolderError(
+                f"{path}: there is no such file; run `starcal-uq sample RUN` first."
+            )
         with reading(path, "a posterior of this version", remedy):
             check_hdf5(path)
             with h5netcdf.File(path, "r") as file:
                 if file.attrs.get("format") != _FORMAT:
                     raise ValueError("another format")
                 record = json.loads(str(file.attrs["record"]))
-                arrays = {name: np.asarray(file.variables[name][...]) for name in _ARRAYS if name in file.variables}
+                arrays = {
+                    name: np.asarray(file.variables[name][...])
+                    for name in _ARRAYS
+                    if name in file.variables
+                }
             made = from_plain(cls, record, arrays)
             if made.n_ensembles * made.n_walkers * made.n_steps != len(made.draws):
                 raise ValueError("it holds another number of draws than it says")
@@ -474,7 +530,9 @@ def write_group(group: Any, variables: Variables, attrs: AnyDict) -> None:
             if dimension not in group.dimensions:
                 group.dimensions[dimension] = size
         # Steps that were rejected repeat their walker's place: two fifths of the bytes.
-        options: AnyDict = {"compression": "gzip", "compression_opts": 1} if values.size > _WORTH_PACKING else {}
+        options: AnyDict = (
+            {"compression": "gzip", "compression_opts": 1} if values.size > _WORTH_PACKING else {}
+        )
         if values.dtype.kind == "U":
             import h5py
 

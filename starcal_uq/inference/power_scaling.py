@@ -1,9 +1,9 @@
 """How much the posterior depends on the prior, and on the likelihood, by power scaling.
 
-Kallioinen, Paananen, Burkner & Vehtari (2024, Statistics and Computing 34:57): prior or likelihood is raised to a power
-alpha near 1, which importance weights of the existing draws do without sampling again (Pareto-smoothed). How fast the
-posterior moves, per doubling of alpha, is measured by the cumulative Jensen-Shannon distance of Nguyen & Vreeken
-(2015).
+Kallioinen, Paananen, Burkner & Vehtari (2024, Statistics and Computing 34:57): prior or likelihood
+is raised to a power alpha near 1, which importance weights of the existing draws do without
+sampling again (Pareto-smoothed). How fast the posterior moves, per doubling of alpha, is measured
+by the cumulative Jensen-Shannon distance of Nguyen & Vreeken (2015).
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 _DELTA = 0.01
 THRESHOLD = 0.05
 CONFLICT, WEAK, FINE = "prior-data conflict", "weak likelihood", "fine"
-# Powers at which the importance weights must still hold, for the gradient to describe more than a point.
+# Powers at which the importance weights must still hold, for the gradient to describe more than a
+# point.
 _CHECKED = (0.8, 1.25)
 
 
@@ -40,7 +41,8 @@ class PriorSensitivity(Shown):
     names : tuple of str
         The sampled parameters, then further quantities.
     prior, likelihood : array (q,)
-        Cumulative Jensen-Shannon distance per doubling of the power of prior and likelihood, at power 1.
+        Cumulative Jensen-Shannon distance per doubling of the power of prior and likelihood, at
+        power 1.
     prior_mean_shift, likelihood_mean_shift : array (q,)
         Change of the posterior mean per doubling of the power, in posterior standard deviations.
     prior_sd_change, likelihood_sd_change : array (q,)
@@ -48,8 +50,8 @@ class PriorSensitivity(Shown):
     prior_khat, likelihood_khat : float
         Largest Pareto shape of the weights at powers 0.8 and 1.25; below 0.7 they can be trusted.
     diagnosis : tuple of str
-        ``prior-data conflict`` where the posterior is sensitive to both, ``weak likelihood`` where it is sensitive to
-        the prior only, ``fine`` otherwise.
+        ``prior-data conflict`` where the posterior is sensitive to both, ``weak likelihood`` where
+        it is sensitive to the prior only, ``fine`` otherwise.
     threshold : float
         Sensitivity from which the posterior counts as sensitive.
     """
@@ -90,7 +92,9 @@ class PriorSensitivity(Shown):
 
 
 def prior_sensitivity(
-    posterior: Posterior, extra: Mapping[str, FloatArray] | None = None, threshold: float = THRESHOLD
+    posterior: Posterior,
+    extra: Mapping[str, FloatArray] | None = None,
+    threshold: float = THRESHOLD,
 ) -> PriorSensitivity:
     """Power-scale the prior and the likelihood of a posterior.
 
@@ -111,12 +115,18 @@ def prior_sensitivity(
     columns = {posterior.parameter_names[i]: posterior.draws[:, i] for i in posterior.sampled}
     for name, values in (extra or {}).items():
         if np.shape(values) != posterior.log_posterior.shape:
-            raise PriorError(f"{name!r} has shape {np.shape(values)}: give one value for each of the draws.")
+            raise PriorError(
+                f"{name!r} has shape {np.shape(values)}: give one value for each of the draws."
+            )
         columns[name] = np.asarray(values, dtype=np.float64)
     log_prior = posterior.priors.log_density_theta(posterior.theta_draws)
     if posterior.sigma_sampled:
-        log_prior = log_prior + posterior.priors.log_density_log_sigma(np.log(posterior.sigma_draws))
-    prior, likelihood = (_component(c, columns) for c in (log_prior, posterior.log_posterior - log_prior))
+        log_prior = log_prior + posterior.priors.log_density_log_sigma(
+            np.log(posterior.sigma_draws)
+        )
+    prior, likelihood = (
+        _component(c, columns) for c in (log_prior, posterior.log_posterior - log_prior)
+    )
     return PriorSensitivity(
         names=tuple(columns),
         prior=prior.distance,
@@ -127,7 +137,10 @@ def prior_sensitivity(
         likelihood_sd_change=likelihood.sd_change,
         prior_khat=prior.khat,
         likelihood_khat=likelihood.khat,
-        diagnosis=tuple(_diagnosis(a, b, threshold) for a, b in zip(prior.distance, likelihood.distance, strict=True)),
+        diagnosis=tuple(
+            _diagnosis(a, b, threshold)
+            for a, b in zip(prior.distance, likelihood.distance, strict=True)
+        ),
         threshold=threshold,
     )
 
@@ -158,7 +171,8 @@ def _component(log_density: FloatArray, columns: Mapping[str, FloatArray]) -> _C
     # Derivatives with respect to log2(alpha) at 1: d E[q] / d alpha = cov(q, log density).
     doubling = float(np.log(2.0))
     for values in columns.values():
-        # Standardised: 1e-15 px^-4 and 5852 px are alike then, and the distance does not depend on scale.
+        # Standardised: 1e-15 px^-4 and 5852 px are alike then, and the distance does not depend on
+        # scale.
         z = (values - values.mean()) / values.std()
         per_doubling = [cjs_distance(z, w) / np.log2(1.0 + _DELTA) for w in weights]
         distance.append(float(np.mean(per_doubling)))
@@ -168,9 +182,11 @@ def _component(log_density: FloatArray, columns: Mapping[str, FloatArray]) -> _C
 
 
 def cjs_distance(values: FloatArray, weights: FloatArray) -> float:
-    """Cumulative Jensen-Shannon distance, 0 to 1, between draws (n,) with equal weights and with others that sum to 1.
+    """Cumulative Jensen-Shannon distance, 0 to 1, between draws (n,) with equal weights and with
+    others that sum to 1.
 
-    The larger one of those of the values and of their negatives, as the divergence is not symmetric in sign.
+    The larger one of those of the values and of their negatives, as the divergence is not symmetric
+    in sign.
     """
     order = np.argsort(values)
     width = np.diff(values[order])

@@ -1,8 +1,10 @@
-"""What the prior says before any data: cameras drawn from it, and the images they would make of the observed stars.
+"""What the prior says before any data: cameras drawn from it, and the images they would make of the
+observed stars.
 
-A prior is checked in terms that can be judged by eye: fields of view, displacements at the corner, shifts of field
-positions. With observations, it is also checked against them: each drawn camera images the observed stars, and
-attitude-free summaries of such images are compared with those of the real one.
+A prior is checked in terms that can be judged by eye: fields of view, displacements at the corner,
+shifts of field positions. With observations, it is also checked against them: each drawn camera
+images the observed stars, and attitude-free summaries of such images are compared with those of the
+real one.
 """
 
 from __future__ import annotations
@@ -15,7 +17,12 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.camera.projection import fold_radius_px, forward_kernel, forward_root, unproject_theta
+from starcal_uq.camera.projection import (
+    fold_radius_px,
+    forward_kernel,
+    forward_root,
+    unproject_theta,
+)
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.settings import bounded, check_memory
@@ -50,14 +57,16 @@ class PriorPredictive(Shown):
     observed : array (q,)
         Values for the data; NaN for those that only a camera has.
     tail : array (q,)
-        Prior predictive tail probability of the data: two-sided, but for ``residual_px`` that of a larger one, since a
-        camera simpler than the prior's is no conflict.
+        Prior predictive tail probability of the data: two-sided, but for ``residual_px`` that of a
+        larger one, since a camera simpler than the prior's is no conflict.
     field_px : array (g, 2)
         Field positions, px.
     shift_px : array (n, g)
-        Distance by which a drawn camera moves them from where the nominal camera puts them, best rotation removed, px.
+        Distance by which a drawn camera moves them from where the nominal camera puts them, best
+        rotation removed, px.
     folded : float
-        Share of the drawn cameras whose distortion folds over inside the field, or which have no image of it.
+        Share of the drawn cameras whose distortion folds over inside the field, or which have no
+        image of it.
     off_detector : float
         Share of the drawn cameras with the principal point off the detector.
     """
@@ -73,9 +82,15 @@ class PriorPredictive(Shown):
 
     @property
     def surprising(self) -> tuple[str, ...]:
-        """Quantities in which the data lie outside the prior's central 99 %, allowing for their number."""
+        """Quantities in which the data lie outside the prior's central 99 %, allowing for their
+        number.
+        """
         n = int(np.sum(np.isfinite(self.tail)))
-        return tuple(name for name, tail in zip(self.names, self.tail, strict=True) if tail < _SURPRISE / max(n, 1))
+        return tuple(
+            name
+            for name, tail in zip(self.names, self.tail, strict=True)
+            if tail < _SURPRISE / max(n, 1)
+        )
 
     @property
     def ok(self) -> bool:
@@ -95,14 +110,20 @@ class PriorPredictive(Shown):
 
 @bounded
 def prior_predictive(
-    priors: Priors, camera: Camera, obs: Observations | None = None, *, n_draws: int = 200, seed: int = 0
+    priors: Priors,
+    camera: Camera,
+    obs: Observations | None = None,
+    *,
+    n_draws: int = 200,
+    seed: int = 0,
 ) -> PriorPredictive:
     """Draw cameras from a prior and look at what they would see.
 
-    Of each camera: the field of view, the displacement by distortion at the corner, and the shift of field positions
-    from the nominal camera. Of each image of the observed stars, seen with the nominal camera and the best attitude of
-    each frame: the scale (percent, positive for a longer focal length), the cubic distortion at the corner, and the
-    residuals that neither explains. These summaries do not depend on what any calibration found.
+    Of each camera: the field of view, the displacement by distortion at the corner, and the shift
+    of field positions from the nominal camera. Of each image of the observed stars, seen with the
+    nominal camera and the best attitude of each frame: the scale (percent, positive for a longer
+    focal length), the cubic distortion at the corner, and the residuals that neither explains.
+    These summaries do not depend on what any calibration found.
 
     Parameters
     ----------
@@ -124,19 +145,24 @@ def prior_predictive(
     """
     if priors.distortion != camera.distortion:
         raise PriorError(
-            f"the priors are for {priors.distortion!r}, the camera has {camera.distortion!r}: use one model."
+            f"the priors are for {priors.distortion!r}, the camera has {camera.distortion!r}: "
+            "use one model."
         )
     if n_draws < 100:
         raise PriorError(f"n_draws is {n_draws}: at least 100 are needed for tail probabilities.")
     if obs is not None and priors.per_star_sigma != (obs.sigma_px is not None):
         raise PriorError(
-            "the priors' noise is not of the kind of the observations: make them with per_star_sigma to suit."
+            "the priors' noise is not of the kind of the observations: make them with "
+            "per_star_sigma to suit."
         )
     rng = np.random.default_rng(seed)
     draws = priors.draw(n_draws, rng)
     field = _field(camera)
     check_memory(f"n_draws={n_draws}", 8.0 * n_draws * len(field))
-    columns = {name: np.full(n_draws, np.nan) for name in ("fov_h_deg", "fov_v_deg", "corner_displacement_px")}
+    columns = {
+        name: np.full(n_draws, np.nan)
+        for name in ("fov_h_deg", "fov_v_deg", "corner_displacement_px")
+    }
     shift, folded = np.full((n_draws, len(field)), np.nan), np.zeros(n_draws, dtype=bool)
     nominal = unproject_theta(camera.distortion, camera.theta, field)
     for i, theta in enumerate(draws[:, :-1]):
@@ -167,7 +193,9 @@ def prior_predictive(
 
 
 def _tail(values: FloatArray, observed: float, name: str) -> float:
-    """Tail probability of a value under draws; beyond all of them, by the normal tail of their median and spread."""
+    """Tail probability of a value under draws; beyond all of them, by the normal tail of their
+    median and spread.
+    """
     from scipy.special import erfc
 
     drawn = values[np.isfinite(values)]
@@ -178,7 +206,10 @@ def _tail(values: FloatArray, observed: float, name: str) -> float:
     if share > 0.0:
         return share
     low, middle, high = np.quantile(drawn, (0.16, 0.5, 0.84))
-    spread = max(float(high - middle) if observed > middle else float(middle - low), np.finfo(np.float64).tiny)
+    spread = max(
+        float(high - middle) if observed > middle else float(middle - low),
+        np.finfo(np.float64).tiny,
+    )
     return min(float(erfc(abs(observed - middle) / spread / np.sqrt(2.0))), 1.0 / len(drawn))
 
 
@@ -196,8 +227,12 @@ def _folds(camera: Camera, theta: FloatArray) -> bool:
 def _field_of_view(camera: Camera, theta: FloatArray) -> tuple[float, float]:
     """Full angles (horizontal, vertical) between the middles of opposite edges, degrees."""
     (cx, cy), w, h = camera.centre_px, camera.width_px - 0.5, camera.height_px - 0.5
-    b = unproject_theta(camera.distortion, theta, np.array([(-0.5, cy), (w, cy), (cx, -0.5), (cx, h)]))
-    horizontal, vertical = (np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v) for u, v in ((b[0], b[1]), (b[2], b[3])))
+    b = unproject_theta(
+        camera.distortion, theta, np.array([(-0.5, cy), (w, cy), (cx, -0.5), (cx, h)])
+    )
+    horizontal, vertical = (
+        np.arctan2(np.linalg.norm(np.cross(u, v)), u @ v) for u, v in ((b[0], b[1]), (b[2], b[3]))
+    )
     return float(np.rad2deg(horizontal)), float(np.rad2deg(vertical))
 
 
@@ -219,16 +254,22 @@ class _Images:
     """Images of the observed stars, summarised with the nominal camera."""
 
     def __init__(self, camera: Camera, obs: Observations) -> None:
-        chosen = np.unique(np.linspace(0, obs.n_frames - 1, min(_MAX_FRAMES, obs.n_frames)).astype(np.int64))
+        chosen = np.unique(
+            np.linspace(0, obs.n_frames - 1, min(_MAX_FRAMES, obs.n_frames)).astype(np.int64)
+        )
         self.camera = camera
         self.frames = StarFrames.from_observations(obs.select_frames(obs.frame_ids[chosen]))
-        self.rotations = MarginalLikelihood(self.frames, camera.distortion).start_rotations(camera.theta)
+        self.rotations = MarginalLikelihood(self.frames, camera.distortion).start_rotations(
+            camera.theta
+        )
         self.b = self.frames.rotated(self.rotations)
 
     def observed(self) -> dict[str, float]:
         return self._summary(self.frames.pixel)
 
-    def replicate(self, draws: FloatArray, folded: Any, rng: np.random.Generator) -> dict[str, FloatArray]:
+    def replicate(
+        self, draws: FloatArray, folded: Any, rng: np.random.Generator
+    ) -> dict[str, FloatArray]:
         model, n = self.camera.distortion, self.frames.n_stars
         project: Callable[..., Any] = forward_kernel(model, "attitude")
         rows = []
@@ -250,7 +291,9 @@ class _Images:
         return dict.fromkeys(("scale_percent", "cubic_corner_px", "residual_px"), float("nan"))
 
     def _summary(self, pixel: FloatArray) -> dict[str, float]:
-        """Scale, cubic distortion and remaining residual rms of an image (2, N), attitudes fitted with them."""
+        """Scale, cubic distortion and remaining residual rms of an image (2, N), attitudes fitted
+        with them.
+        """
         frames = StarFrames(pixel, self.frames.r, None, self.frames.starts)
         likelihood = MarginalLikelihood(frames, self.camera.distortion)
         state, cost = likelihood.profile(self.camera.theta, self.rotations)

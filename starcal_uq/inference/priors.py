@@ -1,7 +1,7 @@
 """Priors, all proper: what was believed before the stars were seen.
 
-Normal on the camera parameters, log-normal on the noise. `Priors` is what every user of a prior relies on; the two
-kinds are `PhysicalPriors` (independent, in physical terms; the default) and
+Normal on the camera parameters, log-normal on the noise. `Priors` is what every user of a prior
+relies on; the two kinds are `PhysicalPriors` (independent, in physical terms; the default) and
 `GaussianPriors` (a full covariance, such as the posterior of an earlier run).
 """
 
@@ -126,7 +126,9 @@ class Priors(Shown, ABC):
         return np.array([moments[name][index] for name in names])
 
     def precision(self, names: Sequence[str]) -> FloatArray:
-        """Precision matrix (n, n) of the normal prior on the named camera parameters, the others left free."""
+        """Precision matrix (n, n) of the normal prior on the named camera parameters, the others
+        left free.
+        """
         sd = self.sd(names)
         known = parameter_names(self.distortion)
         rows = [known.index(name) for name in names]
@@ -144,7 +146,9 @@ class Priors(Shown, ABC):
 
     @cached_property
     def _normal(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Mean, standard deviation, whitening of the correlation and log volume of the camera's parameters."""
+        """Mean, standard deviation, whitening of the correlation and log volume of the camera's
+        parameters.
+        """
         names = parameter_names(self.distortion)
         sd = self.sd(names)
         factor = np.linalg.cholesky(self._correlation())
@@ -163,7 +167,8 @@ class Priors(Shown, ABC):
         """
         sigma = np.broadcast_to(np.asarray(sigma, dtype=float), np.atleast_2d(theta).shape[:1])
         log_sigma = np.log(np.where(sigma > 0.0, sigma, 1.0))
-        # The density per unit of sigma is the one per unit of log sigma times d(log sigma)/d(sigma) = 1 / sigma.
+        # The density per unit of sigma is the one per unit of log sigma times d(log sigma)/d(sigma)
+        # = 1 / sigma.
         density = self.log_density_theta(theta) + self.log_density_log_sigma(log_sigma) - log_sigma
         return np.where(sigma > 0.0, density, -np.inf)
 
@@ -175,7 +180,9 @@ class Priors(Shown, ABC):
             density = np.exp(self.log_density_log_sigma(np.log(positive))) / positive
             return np.where(values > 0.0, density, 0.0)
         mean, sd = float(self.mean([name])[0]), float(self.sd([name])[0])
-        return np.asarray(np.exp(-0.5 * ((values - mean) / sd) ** 2) / (sd * math.sqrt(2.0 * math.pi)))
+        return np.asarray(
+            np.exp(-0.5 * ((values - mean) / sd) ** 2) / (sd * math.sqrt(2.0 * math.pi))
+        )
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw (n, p+1) parameters from the prior, the noise in the last column."""
@@ -190,7 +197,9 @@ class Priors(Shown, ABC):
         fields = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]
         unknown = sorted(set(changes) - set(fields))
         if unknown:
-            raise PriorError(f"there is no prior named {unknown[0]!r}: use one of {', '.join(fields)}.")
+            raise PriorError(
+                f"there is no prior named {unknown[0]!r}: use one of {', '.join(fields)}."
+            )
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
     def to_dataframe(self) -> pd.DataFrame:
@@ -219,8 +228,9 @@ def positive_number(name: str, value: Any) -> float:
     return number
 
 
-# Wide on purpose: a tenth of the detector, 5 % of the focal length and a twentieth of the image radius cover any camera
-# whose data sheet is not wrong, and are hundreds of times wider than what a night of stars determines.
+# Wide on purpose: a tenth of the detector, 5 % of the focal length and a twentieth of the image
+# radius cover any camera whose data sheet is not wrong, and are hundreds of times wider than what a
+# night of stars determines.
 _PRINCIPAL_POINT_FRACTION = 0.1
 _FOCAL_FRACTION = 0.05
 _DISTORTION_FRACTION = 0.05
@@ -243,7 +253,8 @@ class PhysicalPriors(Priors):
     focal_px : float
         Mean of the focal length, px.
     distortion_corner_px : float
-        Standard deviation of the displacement by each distortion term alone at `corner_radius_px`, px.
+        Standard deviation of the displacement by each distortion term alone at `corner_radius_px`,
+        px.
     corner_radius_px : float
         Distance from the principal point at which the displacement is stated, px.
     sigma_median : float
@@ -271,7 +282,8 @@ class PhysicalPriors(Priors):
         centre = tuple(float(v) for v in self.principal_point_centre_px)
         if len(centre) != 2 or not all(math.isfinite(v) for v in centre):
             raise PriorError(
-                f"prior 'principal_point_centre_px' is {self.principal_point_centre_px}: give two finite numbers."
+                f"prior 'principal_point_centre_px' is {self.principal_point_centre_px}: give "
+                "two finite numbers."
             )
         object.__setattr__(self, "principal_point_centre_px", centre)
         for name in _POSITIVE:
@@ -281,8 +293,10 @@ class PhysicalPriors(Priors):
         if not (np.isfinite(variance).all() and (variance > 0.0).all()):
             raise PriorError(
                 "the prior's widths leave no number for a parameter: look at 'focal_px' "
-                f"({self.focal_px:g}), 'focal_fraction' ({self.focal_fraction:g}), 'distortion_corner_px' "
-                f"({self.distortion_corner_px:g}) and 'corner_radius_px' ({self.corner_radius_px:g})."
+                f"({self.focal_px:g}), 'focal_fraction' ({self.focal_fraction:g}), "
+                "'distortion_corner_px' "
+                f"({self.distortion_corner_px:g}) and 'corner_radius_px' "
+                f"({self.corner_radius_px:g})."
             )
 
     @classmethod
@@ -308,12 +322,20 @@ class PhysicalPriors(Priors):
         x0, y0 = self.principal_point_centre_px
         coefficients = get_model(self.distortion).coefficients
         sd = [self.principal_point_px, self.principal_point_px, self.focal_fraction * self.focal_px]
-        sd += [self.distortion_corner_px / np.float64(self.corner_radius_px) ** c.order for c in coefficients]
-        return np.array([x0, y0, self.focal_px, *(0.0 for _ in coefficients)]), np.diag(np.square(sd))
+        sd += [
+            self.distortion_corner_px / np.float64(self.corner_radius_px) ** c.order
+            for c in coefficients
+        ]
+        return np.array([x0, y0, self.focal_px, *(0.0 for _ in coefficients)]), np.diag(
+            np.square(sd)
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for files."""
-        return {**dataclasses.asdict(self), "principal_point_centre_px": list(self.principal_point_centre_px)}
+        return {
+            **dataclasses.asdict(self),
+            "principal_point_centre_px": list(self.principal_point_centre_px),
+        }
 
     def _statement(self, name: str) -> str:
         if name in ("x0", "y0"):
@@ -326,13 +348,19 @@ class PhysicalPriors(Priors):
 
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(PhysicalPriors))
-_POSITIVE = tuple(name for name in _FIELDS if name not in ("principal_point_centre_px", "distortion", "per_star_sigma"))
+_POSITIVE = tuple(
+    name
+    for name in _FIELDS
+    if name not in ("principal_point_centre_px", "distortion", "per_star_sigma")
+)
 _NUMBER = "a number above zero and below 1e12"
 
 PRIORS = Section(
     {
         "principal_point_px": Key(float, _NUMBER, gt=0.0, lt=1e12),
-        "principal_point_centre_px": Key(list[float], "two numbers in brackets", min_length=2, max_length=2),
+        "principal_point_centre_px": Key(
+            list[float], "two numbers in brackets", min_length=2, max_length=2
+        ),
         **{name: Key(float, _NUMBER, gt=0.0, lt=1e12) for name in _POSITIVE[1:]},
     },
     PriorError,
@@ -373,8 +401,8 @@ class GaussianPriors(Priors):
     per_star_sigma : bool
         True where the noise parameter is a common factor on stated noises.
     source : dict
-        Origin of the prior, as plain values: ``name``, ``data_sha256`` (list of hashes of the data that are in
-        it already) and what was added to it.
+        Origin of the prior, as plain values: ``name``, ``data_sha256`` (list of hashes of the data
+        that are in it already) and what was added to it.
     """
 
     theta_mean: FloatArray
@@ -391,19 +419,27 @@ class GaussianPriors(Priors):
         p = len(parameter_names(self.distortion))
         if mean.shape != (p,) or covariance.shape != (p, p):
             raise PriorError(
-                f"the prior has means of shape {mean.shape} and covariances of shape {covariance.shape}: the "
+                f"the prior has means of shape {mean.shape} and covariances of shape "
+                f"{covariance.shape}: the "
                 f"distortion model {self.distortion!r} has {p} parameters."
             )
         for name in ("sigma_median", "sigma_log_sd"):
             object.__setattr__(self, name, positive_number(name, getattr(self, name)))
         variance = np.diag(covariance)
-        if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(covariance)) and np.all(variance > 0.0)):
-            raise PriorError("the prior's mean and covariance must be finite, with variances above zero.")
+        if not (
+            np.all(np.isfinite(mean)) and np.all(np.isfinite(covariance)) and np.all(variance > 0.0)
+        ):
+            raise PriorError(
+                "the prior's mean and covariance must be finite, with variances above zero."
+            )
         correlation, _ = correlation_of(covariance)
         symmetric = np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9)
         if not symmetric or np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0] < 1e-12:
             raise PriorError("the prior's covariance must be symmetric and positive definite.")
-        for name, value in (("theta_mean", mean), ("theta_covariance", 0.5 * (covariance + covariance.T))):
+        for name, value in (
+            ("theta_mean", mean),
+            ("theta_covariance", 0.5 * (covariance + covariance.T)),
+        ):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
@@ -413,7 +449,10 @@ class GaussianPriors(Priors):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for files."""
-        arrays = {"theta_mean": self.theta_mean.tolist(), "theta_covariance": self.theta_covariance.tolist()}
+        arrays = {
+            "theta_mean": self.theta_mean.tolist(),
+            "theta_covariance": self.theta_covariance.tolist(),
+        }
         values = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
         return {"kind": KIND, **values, **arrays, "source": dict(self.source)}
 

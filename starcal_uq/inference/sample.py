@@ -23,7 +23,13 @@ from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.undetermined import open_parameters
-from starcal_uq.inference.checks import CompressionCheck, chain_order, check_compression, check_draws, measure
+from starcal_uq.inference.checks import (
+    CompressionCheck,
+    chain_order,
+    check_compression,
+    check_draws,
+    measure,
+)
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, run_ensembles
 from starcal_uq.inference.named import Source, check_names, find_source, label_of, resolved_dof
@@ -45,15 +51,15 @@ if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 
-# Starts are draws of the Laplace approximation, so the mixture, which forgets in two or three steps, needs a short
-# burn-in; the stretch move needs some autocorrelation times of about 60.
+# Starts are draws of the Laplace approximation, so the mixture, which forgets in two or three
+# steps, needs a short burn-in; the stretch move needs some autocorrelation times of about 60.
 _BURN = {"mixture": 20, "stretch": 300}
 _N_CHECKED = 300
 # An exact evaluation costs thousands of compressed ones.
 _N_IMPORTANCE = {"compressed": 20_000}
 _N_IMPORTANCE_SLOW = 2_000
-# Degrees of the polynomial that stands for a likelihood without a compressed form; the second is tried where the first
-# is not good enough, and where a compressed form is not.
+# Degrees of the polynomial that stands for a likelihood without a compressed form; the second is
+# tried where the first is not good enough, and where a compressed form is not.
 _DEGREES = (3, 4)
 
 
@@ -82,15 +88,17 @@ def sample(
     Parameters
     ----------
     obs : Observations, PartitionedObservations or None
-        The stars of the calibration. None leaves the compressed likelihood unchecked; of partitioned ones, the sample
-        of frames that the calibration has kept checks it, its error counted for all frames.
+        The stars of the calibration. None leaves the compressed likelihood unchecked; of
+        partitioned ones, the sample of frames that the calibration has kept checks it, its error
+        counted for all frames.
     cal : Calibration
-        Start, Fisher information and compressed likelihood. An inflation that it has accepted widens the likelihood as
-        much, priors and the given object of a likelihood are as they are.
+        Start, Fisher information and compressed likelihood. An inflation that it has accepted
+        widens the likelihood as much, priors and the given object of a likelihood are as they are.
     priors : Priors, optional
         ``Priors.default`` of the nominal camera otherwise.
     sigma : "sampled" or float
-        Sample the noise, or take it as given: px, or a factor where the stars state their own noise.
+        Sample the noise, or take it as given: px, or a factor where the stars state their own
+        noise.
     n_ensembles : int
         Separately seeded ensembles, at least 2.
     n_walkers, n_steps : int
@@ -98,29 +106,35 @@ def sample(
     n_burn : int, optional
         Steps before the kept ones; 20 for ``mixture`` and 300 for ``stretch``.
     moves : {"mixture", "stretch"}
-        ``mixture``: independence proposals (multivariate t at the Laplace approximation) with weight 0.7, differential
-        evolution with 0.3. ``stretch``: emcee's own default, about twenty times slower here.
+        ``mixture``: independence proposals (multivariate t at the Laplace approximation) with
+        weight 0.7, differential evolution with 0.3. ``stretch``: emcee's own default, about twenty
+        times slower here.
     seed : int, optional
-        The same seed gives the same draws; without one, a new one is taken and recorded in the provenance.
+        The same seed gives the same draws; without one, a new one is taken and recorded in the
+        provenance.
     likelihood : {"marginal", "pairs", "pairs_naive", "student_t"} or object
-        ``marginal``: Gaussian noise per pixel, attitudes marginalised. ``pairs``: the paper's interstar angles as a
-        composite likelihood with Godambe's curvature, around the pair estimate of the calibration; sigma comes from the
-        pixel residuals. ``pairs_naive`` takes pairs as independent, which is wrong: it warns, and its diagnostics are
-        never ok. ``student_t``: heavy tails, for wrong identifications. An object with a method
+        ``marginal``: Gaussian noise per pixel, attitudes marginalised. ``pairs``: the paper's
+        interstar angles as a composite likelihood with Godambe's curvature, around the pair
+        estimate of the calibration; sigma comes from the pixel residuals. ``pairs_naive`` takes
+        pairs as independent, which is wrong: it warns, and its diagnostics are never ok.
+        ``student_t``: heavy tails, for wrong identifications. An object with a method
         ``log_likelihood(theta (n, p), sigma (n,)) -> (n,)`` is used as it is.
     evaluation : {"auto", "compressed", "exact"}
-        ``auto`` samples the compressed form (for ``student_t``, a polynomial fitted to a few hundred exact values),
-        compares it with the exact one three standard deviations from the mode, and at 300 draws where they differ by
-        more than 0.005 nat there. It samples the exact one if they differ by more than 0.5 nat within three standard
-        deviations, or if the importance weights between them are not all within 0.1 nat and have k-hat above 0.7.
+        ``auto`` samples the compressed form (for ``student_t``, a polynomial fitted to a few
+        hundred exact values), compares it with the exact one three standard deviations from the
+        mode, and at 300 draws where they differ by more than 0.005 nat there. It samples the exact
+        one if they differ by more than 0.5 nat within three standard deviations, or if the
+        importance weights between them are not all within 0.1 nat and have k-hat above 0.7.
     dof : float or "free", optional
-        Degrees of freedom of ``student_t``: by default those of a calibration with that likelihood, otherwise 4; "free"
-        samples them, with the gamma prior of Juarez & Steel (2010) on what exceeds 2.
+        Degrees of freedom of ``student_t``: by default those of a calibration with that likelihood,
+        otherwise 4; "free" samples them, with the gamma prior of Juarez & Steel (2010) on what
+        exceeds 2.
     progress : callable, optional
-        Called as ``progress(steps_done, steps_total)``; starts again if the exact likelihood takes over.
+        Called as ``progress(steps_done, steps_total)``; starts again if the exact likelihood takes
+        over.
     checkpoint : path, optional
-        Written while sampling, read if it exists and is of the same data and settings, removed at the end. A resumed
-        run gives the draws of an uninterrupted one, bit for bit.
+        Written while sampling, read if it exists and is of the same data and settings, removed at
+        the end. A resumed run gives the draws of an uninterrupted one, bit for bit.
 
     Returns
     -------
@@ -141,7 +155,8 @@ def sample(
     priors = Priors.default(cal.nominal, per_star) if priors is None else priors
     if priors.names != (*cal.parameter_names, cal.sigma_name):
         raise SamplingError(
-            f"the priors are on {', '.join(priors.names)}, but the calibration has {', '.join(cal.parameter_names)} "
+            f"the priors are on {', '.join(priors.names)}, but the calibration has "
+            f"{', '.join(cal.parameter_names)} "
             f"and {cal.sigma_name}: make the priors with Priors.default of the calibrated camera."
         )
     _check_determined(cal, priors if stated else None)
@@ -169,7 +184,10 @@ def sample(
     if isinstance(likelihood, str):
         outcome, compression = _with_fallback(run, evaluation, checkpoint)
     else:
-        outcome, compression = run.sample(label, likelihood.log_likelihood, checkpoint), CompressionCheck()
+        outcome, compression = (
+            run.sample(label, likelihood.log_likelihood, checkpoint),
+            CompressionCheck(),
+        )
     return _assemble(run, outcome, compression)
 
 
@@ -188,11 +206,20 @@ class _Run:
         progress: Progress | None,
         provenance: AnyDict,
     ) -> None:
-        self.cal, self.source, self.priors, self.settings, self.progress = cal, source, priors, settings, progress
+        self.cal, self.source, self.priors, self.settings, self.progress = (
+            cal,
+            source,
+            priors,
+            settings,
+            progress,
+        )
         self.n_ensembles, self.provenance = n_ensembles, provenance
         self.given = None if sigma == "sampled" else float(sigma)
-        # The ensembles come last, so that their number changes neither the checks nor the ensembles before.
-        self.importance_seed, self.check_seed, *self.seeds = np.random.SeedSequence(seed).spawn(2 + n_ensembles)
+        # The ensembles come last, so that their number changes neither the checks nor the ensembles
+        # before.
+        self.importance_seed, self.check_seed, *self.seeds = np.random.SeedSequence(seed).spawn(
+            2 + n_ensembles
+        )
         (self.design_seed,) = self.check_seed.spawn(1)
         self._mode: Target | None = None
 
@@ -202,7 +229,14 @@ class _Run:
         information = source.information * (source.sigma / sigma) ** 2
         given = self.given is not None
         return start_target(
-            log_likelihood, self.priors, source.theta, information, sigma, source.dof, given, source.extra
+            log_likelihood,
+            self.priors,
+            source.theta,
+            information,
+            sigma,
+            source.dof,
+            given,
+            source.extra,
         )
 
     def polynomial(self, exact: LogLikelihood, degree: int) -> LogLikelihood | None:
@@ -221,7 +255,9 @@ class _Run:
         text = json.dumps(to_plain([identity, self.priors, name, target.centre, target.transform]))
         return hashlib.sha256(text.encode()).hexdigest()
 
-    def sample(self, name: str, log_likelihood: LogLikelihood, checkpoint: str | os.PathLike[str] | None) -> _Outcome:
+    def sample(
+        self, name: str, log_likelihood: LogLikelihood, checkpoint: str | os.PathLike[str] | None
+    ) -> _Outcome:
         target, laplace = laplace_approximation(self.start(log_likelihood))
         chains = run_ensembles(
             target.log_density,
@@ -246,7 +282,13 @@ class _Outcome:
         chains: Chains,
         checkpoint: str | os.PathLike[str] | None,
     ) -> None:
-        self.name, self.target, self.laplace, self.chains, self.checkpoint = name, target, laplace, chains, checkpoint
+        self.name, self.target, self.laplace, self.chains, self.checkpoint = (
+            name,
+            target,
+            laplace,
+            chains,
+            checkpoint,
+        )
         ordered = chain_order(chains.u)
         natural = target.natural(ordered.reshape(-1, target.dim))
         self.draws = natural.reshape(*ordered.shape[:2], natural.shape[1])
@@ -257,7 +299,8 @@ def _with_fallback(
 ) -> tuple[_Outcome, CompressionCheck]:
     exact, fast = run.source.exact, run.source.fast
     if exact is None:
-        # Without observations there is a compressed likelihood or nothing: names were checked before.
+        # Without observations there is a compressed likelihood or nothing: names were checked
+        # before.
         return run.sample("compressed", _present(fast), checkpoint), CompressionCheck()
     if evaluation == "exact":
         return run.sample("exact", exact, checkpoint), CompressionCheck()
@@ -267,7 +310,8 @@ def _with_fallback(
         compressed = fast if degree == 0 else run.polynomial(exact, degree)
         if compressed is None:
             continue
-        # Each attempt has its own file: on resuming, the finished ones must still be found complete.
+        # Each attempt has its own file: on resuming, the finished ones must still be found
+        # complete.
         outcome = run.sample("compressed", compressed, _attempt(checkpoint, files))
         compression = _compare(run, outcome, compressed, exact)
         if compression.good:
@@ -286,7 +330,8 @@ def _degrees(run: _Run, evaluation: Evaluation) -> tuple[int, ...]:
     if run.source.fast is None:
         return _DEGREES
     if evaluation == "auto" and run.source.sample is None:
-        # Of few stars with much noise the expansion misses little, and chains of the exact one take minutes.
+        # Of few stars with much noise the expansion misses little, and chains of the exact one take
+        # minutes.
         return (0, _DEGREES[-1])
     return (0,)
 
@@ -305,17 +350,23 @@ def _attempt(checkpoint: str | os.PathLike[str] | None, files: list[str]) -> str
     return files[-1]
 
 
-def _compare(run: _Run, outcome: _Outcome, compressed: LogLikelihood, exact: LogLikelihood) -> CompressionCheck:
+def _compare(
+    run: _Run, outcome: _Outcome, compressed: LogLikelihood, exact: LogLikelihood
+) -> CompressionCheck:
     rng = np.random.default_rng(run.check_seed)
     flat = outcome.draws.reshape(-1, outcome.draws.shape[-1])
     picks = flat[rng.choice(len(flat), min(_N_CHECKED, len(flat)), replace=False)]
-    return check_compression(compressed, exact, outcome.target, picks, outcome.laplace, run.source.sample)
+    return check_compression(
+        compressed, exact, outcome.target, picks, outcome.laplace, run.source.sample
+    )
 
 
 def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Posterior:
     cal, settings, target, source = run.cal, run.settings, outcome.target, run.source
     n = _N_IMPORTANCE.get(outcome.name, _N_IMPORTANCE_SLOW)
-    importance = importance_check(target, n, PROPOSAL_DF, np.random.default_rng(run.importance_seed))
+    importance = importance_check(
+        target, n, PROPOSAL_DF, np.random.default_rng(run.importance_seed)
+    )
     shown = (*parameters(cal.camera.distortion), sigma_parameter(cal.sigma_name == SIGMA_NAMES[1]))
     draws, chains, laplace, extra = outcome.draws, outcome.chains, outcome.laplace, None
     if target.extra is not None:
@@ -358,7 +409,9 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
 
 
 def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, FloatArray]:
-    """Draws, chains and Laplace approximation of camera and noise alone, and the further parameter's draws."""
+    """Draws, chains and Laplace approximation of camera and noise alone, and the further
+    parameter's draws.
+    """
     chains, laplace = outcome.chains, outcome.laplace
     # The factor is lower triangular, so that its leading block belongs to the leading coordinates.
     inner = replace(
@@ -368,11 +421,18 @@ def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, Floa
         covariance=laplace.covariance[:-1, :-1],
         transform=laplace.transform[:-1, :-1],
     )
-    return outcome.draws[..., :-1], replace(chains, u=chains.u[..., :-1]), inner, outcome.draws[..., -1]
+    return (
+        outcome.draws[..., :-1],
+        replace(chains, u=chains.u[..., :-1]),
+        inner,
+        outcome.draws[..., -1],
+    )
 
 
 def _check_determined(cal: Calibration, stated: Priors | None) -> None:
-    """Refuse a calibration that did not end well, unless it only leaves open what priors that were stated determine."""
+    """Refuse a calibration that did not end well, unless it only leaves open what priors that were
+    stated determine.
+    """
     if cal.status.ok:
         return
     if cal.status is Status.SINGULAR and cal.undetermined and stated is not None:
@@ -380,7 +440,9 @@ def _check_determined(cal: Calibration, stated: Priors | None) -> None:
         if not open_parameters(matrix, 1.0, cal.nominal):
             return
     asked = f", or priors that determine {join_words(cal.undetermined)}" if cal.undetermined else ""
-    raise SamplingError(f"the calibration did not converge ({cal.status.name}): {cal.remedy}{asked}.")
+    raise SamplingError(
+        f"the calibration did not converge ({cal.status.name}): {cal.remedy}{asked}."
+    )
 
 
 def _settings(
@@ -394,14 +456,28 @@ def _settings(
 ) -> EnsembleSettings:
     if moves not in _BURN:
         raise SamplingError(f"moves {moves!r} is unknown: use one of {', '.join(_BURN)}.")
-    if sigma != "sampled" and not (isinstance(sigma, int | float) and np.isfinite(sigma) and sigma > 0.0):
+    if sigma != "sampled" and not (
+        isinstance(sigma, int | float) and np.isfinite(sigma) and sigma > 0.0
+    ):
         raise SamplingError(f"sigma is {sigma!r}: use 'sampled' or a number above zero.")
     n_burn = _BURN[moves] if n_burn is None else n_burn
     dim = len(cal.theta) + 1
     for good, text in (
-        (n_ensembles >= 2, f"n_ensembles is {n_ensembles}: at least 2 are needed, because R-hat compares ensembles."),
-        (n_walkers >= 2 * dim, f"n_walkers is {n_walkers}: {dim} parameters need at least {2 * dim}."),
-        (n_steps >= 8 and n_steps % 2 == 0, f"n_steps is {n_steps}: give an even number of at least 8."),
+        (
+            n_ensembles >= 2,
+            (
+                f"n_ensembles is {n_ensembles}: at least 2 are needed, because R-hat compares "
+                "ensembles."
+            ),
+        ),
+        (
+            n_walkers >= 2 * dim,
+            f"n_walkers is {n_walkers}: {dim} parameters need at least {2 * dim}.",
+        ),
+        (
+            n_steps >= 8 and n_steps % 2 == 0,
+            f"n_steps is {n_steps}: give an even number of at least 8.",
+        ),
         (n_burn >= 0, f"n_burn is {n_burn}: give zero or more steps."),
     ):
         if not good:

@@ -1,9 +1,9 @@
 """A polynomial in place of a log likelihood that costs milliseconds.
 
-Many stars make a log likelihood nearly quadratic within the posterior's reach, whatever its form; the third order (and
-the fourth, where the data are few) is what remains. A few hundred exact evaluations around the mode determine it, after
-which an evaluation costs microseconds for any number of stars. Every run compares it with the exact likelihood at
-posterior draws.
+Many stars make a log likelihood nearly quadratic within the posterior's reach, whatever its form;
+the third order (and the fourth, where the data are few) is what remains. A few hundred exact
+evaluations around the mode determine it, after which an evaluation costs microseconds for any
+number of stars. Every run compares it with the exact likelihood at posterior draws.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from starcal_uq.inference.target import Target, curvature
 # Points per coefficient, and their spread against the posterior's.
 _OVERSAMPLING = 2.5
 _SPREAD = 1.25
-# Beyond this radius (standard deviations, plus the root of the dimension) the higher orders stay what they are there:
-# a cubic has no business far from its points.
+# Beyond this radius (standard deviations, plus the root of the dimension) the higher orders stay
+# what they are there: a cubic has no business far from its points.
 _REACH = 2.0
-# Negative curvature in every direction, the mode's own being one, of a posterior that the polynomial can stand for.
+# Negative curvature in every direction, the mode's own being one, of a posterior that the
+# polynomial can stand for.
 _LEAST_CURVATURE = 0.1
 _CHUNK = 4096
 
@@ -33,26 +34,36 @@ class PolynomialLikelihood:
     """Log likelihood as a polynomial in the whitened coordinates of a target."""
 
     target: Target  # Coordinates; its origin is the mode
-    exponents: tuple[IntArray, ...]  # (n_k, k): coordinates multiplied in every monomial, by degree from 0 on
+    exponents: tuple[
+        IntArray, ...
+    ]  # (n_k, k): coordinates multiplied in every monomial, by degree from 0 on
     coefficients: tuple[FloatArray, ...]  # (n_k,): coefficients of the monomials
     reach: float  # Radius up to which degrees above two vary
 
-    def log_likelihood(self, theta: FloatArray, sigma: FloatArray, *extra: FloatArray) -> FloatArray:
-        """Log likelihood (n,) at theta (n, p), sigma (n,) and a further parameter where there is one."""
+    def log_likelihood(
+        self, theta: FloatArray, sigma: FloatArray, *extra: FloatArray
+    ) -> FloatArray:
+        """Log likelihood (n,) at theta (n, p), sigma (n,) and a further parameter where there is
+        one.
+        """
         columns = [theta] if self.target.sigma is not None else [theta, np.log(sigma)]
         if self.target.extra is not None:
             columns.append(np.log(extra[0] - self.target.extra.bound))
         point = np.column_stack(columns)
         scale = np.diag(self.target.transform)
         shift = (point - self.target.centre) / scale
-        u: FloatArray = np.asarray(np.linalg.solve(self.target.transform / scale[:, None], shift.T).T, dtype=np.float64)
+        u: FloatArray = np.asarray(
+            np.linalg.solve(self.target.transform / scale[:, None], shift.T).T, dtype=np.float64
+        )
         return np.concatenate([self._at(u[i : i + _CHUNK]) for i in range(0, len(u), _CHUNK)])
 
     def _at(self, u: FloatArray) -> FloatArray:
         radius = np.linalg.norm(u, axis=1, keepdims=True)
         near = u * np.minimum(1.0, self.reach / np.maximum(radius, self.reach))
         value = np.zeros(len(u))
-        for degree, (exponents, coefficients) in enumerate(zip(self.exponents, self.coefficients, strict=True)):
+        for degree, (exponents, coefficients) in enumerate(
+            zip(self.exponents, self.coefficients, strict=True)
+        ):
             value += _monomials(u if degree <= 2 else near, exponents) @ coefficients
         return value
 
@@ -64,15 +75,19 @@ def _monomials(u: FloatArray, exponents: IntArray) -> FloatArray:
     return product
 
 
-def fit_polynomial(target: Target, degree: int, rng: np.random.Generator) -> PolynomialLikelihood | None:
-    """Fit a polynomial to the log likelihood of a target that `laplace_approximation` has centred and whitened.
+def fit_polynomial(
+    target: Target, degree: int, rng: np.random.Generator
+) -> PolynomialLikelihood | None:
+    """Fit a polynomial to the log likelihood of a target that `laplace_approximation` has centred
+    and whitened.
 
-    None where the posterior with it has no clear maximum there: a likelihood with several, of few stars with wrong ones
-    among them, is no polynomial, and draws would run away.
+    None where the posterior with it has no clear maximum there: a likelihood with several, of few
+    stars with wrong ones among them, is no polynomial, and draws would run away.
     """
     d = target.dim
     exponents = tuple(
-        np.array(list(combinations_with_replacement(range(d), k)), dtype=np.int64) for k in range(degree + 1)
+        np.array(list(combinations_with_replacement(range(d), k)), dtype=np.int64)
+        for k in range(degree + 1)
     )
     sizes = [len(e) for e in exponents]
     reach = float(np.sqrt(d)) + _REACH
@@ -82,7 +97,8 @@ def fit_polynomial(target: Target, degree: int, rng: np.random.Generator) -> Pol
     values = target.likelihood_at(u)
     if not np.isfinite(values).all():
         raise SamplingError(
-            "the likelihood is not finite around its maximum: use evaluation='exact', or check the identifications."
+            "the likelihood is not finite around its maximum: use evaluation='exact', or check "
+            "the identifications."
         )
     columns = np.concatenate([_monomials(u, e) for e in exponents], axis=1)
     # A large constant would cost digits of everything else.

@@ -1,7 +1,9 @@
-"""The posterior density in whitened coordinates, its Laplace approximation, and importance sampling around it.
+"""The posterior density in whitened coordinates, its Laplace approximation, and importance sampling
+around it.
 
-Coordinates are ``(theta, log sigma) = centre + transform @ u``, with u of unit covariance at the mode. A parameter of
-5000 px and one of 1e-15 px^-4 are then alike, and nothing below needs to know their scales.
+Coordinates are ``(theta, log sigma) = centre + transform @ u``, with u of unit covariance at the
+mode. A parameter of 5000 px and one of 1e-15 px^-4 are then alike, and nothing below needs to know
+their scales.
 """
 
 from __future__ import annotations
@@ -19,11 +21,12 @@ from starcal_uq.inference.posterior import Laplace
 from starcal_uq.inference.priors import Priors
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 
-# Half width of the finite differences in standard deviations: the density is so near to a parabola over it that
-# truncation is below 1e-3, while rounding of a log likelihood of 1e5 stays below 1e-8.
+# Half width of the finite differences in standard deviations: the density is so near to a parabola
+# over it that truncation is below 1e-3, while rounding of a log likelihood of 1e5 stays below 1e-8.
 _STEP = 0.05
 _NEWTON_STEPS = 20
-# Expected gain of a further Newton step, nat: the mode is then known to 1 % of a standard deviation.
+# Expected gain of a further Newton step, nat: the mode is then known to 1 % of a standard
+# deviation.
 _GAIN = 1e-4
 
 # From theta (n, p), sigma (n,) and, where the likelihood has one, its further parameter (n,).
@@ -40,7 +43,9 @@ class Likelihood(Protocol):
 
 @dataclass(frozen=True)
 class Extra:
-    """A parameter of the likelihood beyond theta and sigma, sampled as the logarithm of what exceeds its bound."""
+    """A parameter of the likelihood beyond theta and sigma, sampled as the logarithm of what
+    exceeds its bound.
+    """
 
     name: str  # Name of the parameter
     log_prior: Callable[[FloatArray], FloatArray]  # Log prior density of that logarithm
@@ -53,9 +58,11 @@ class Extra:
 class Target:
     """Posterior density over u."""
 
-    log_likelihood: LogLikelihood  # ``(theta (n, p), sigma (n,)) -> (n,)``, with `extra` ``(theta, sigma, extra (n,))``
+    # ``(theta (n, p), sigma (n,)) -> (n,)``, with `extra` ``(theta, sigma, extra (n,))``
+    log_likelihood: LogLikelihood
     priors: Priors  # Proper priors
-    # (d,): origin of u: theta, then log sigma if it is sampled, then that of `extra` if there is one.
+    # (d,): origin of u: theta, then log sigma if it is sampled, then that of `extra` if there is
+    # one.
     centre: FloatArray
     transform: FloatArray  # (d, d): square root of the covariance at the origin
     sigma: float | None  # The noise if it is given
@@ -67,7 +74,9 @@ class Target:
         return len(self.centre)
 
     def natural(self, u: FloatArray) -> FloatArray:
-        """Parameters at u (n, d): theta in px units, sigma, and `extra` if there is one: (n, p+1) or (n, p+2)."""
+        """Parameters at u (n, d): theta in px units, sigma, and `extra` if there is one: (n, p+1)
+        or (n, p+2).
+        """
         point = self.centre + u @ self.transform.T
         p = len(self.priors.names) - 1
         noise = np.exp(point[:, p]) if self.sigma is None else np.full(len(point), self.sigma)
@@ -86,11 +95,14 @@ class Target:
         return self.log_likelihood(*self.arguments(self.natural(u)))
 
     def log_density(self, u: FloatArray) -> FloatArray:
-        """Log posterior density (n,) per unit of theta and log sigma, up to a constant; -inf where undefined."""
+        """Log posterior density (n,) per unit of theta and log sigma, up to a constant; -inf where
+        undefined.
+        """
         theta, sigma, *extra = self.arguments(self.natural(u))
         value = self.log_likelihood(theta, sigma, *extra) + self.priors.log_density_theta(theta)
         if self.sigma is None:
-            # The prior of log sigma, not of sigma: the coordinate is log sigma, so no Jacobian is owed.
+            # The prior of log sigma, not of sigma: the coordinate is log sigma, so no Jacobian is
+            # owed.
             value = value + self.priors.log_density_log_sigma(np.log(sigma))
         if self.extra is not None:
             value = value + self.extra.log_prior(np.log(extra[0] - self.extra.bound))
@@ -109,8 +121,9 @@ def start_target(
 ) -> Target:
     """A target whitened by Fisher information plus prior precision at an estimate.
 
-    `information` (p, p) is that of the data at `sigma`; a Gaussian likelihood of `dof` independent residuals has the
-    curvature ``2 dof`` in log sigma. SamplingError if information and prior together do not determine every parameter.
+    `information` (p, p) is that of the data at `sigma`; a Gaussian likelihood of `dof` independent
+    residuals has the curvature ``2 dof`` in log sigma. SamplingError if information and prior
+    together do not determine every parameter.
     """
     p = len(theta)
     d = p + (not sigma_given) + (extra is not None)
@@ -128,7 +141,8 @@ def start_target(
         transform = np.full((d, d), np.nan)
     if not np.all(np.isfinite(transform)):
         raise SamplingError(
-            "the Fisher information of the calibration is not positive definite: repeat the calibration, with more "
+            "the Fisher information of the calibration is not positive definite: repeat the "
+            "calibration, with more "
             "stars or a distortion model with fewer coefficients."
         )
     return Target(log_likelihood, priors, centre, transform, sigma if sigma_given else None, extra)
@@ -137,8 +151,8 @@ def start_target(
 def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
     """Newton's method to the mode, re-whitened with the Hessian at every step.
 
-    The target that comes back has its origin at the mode and unit curvature there. SamplingError if the density is not
-    finite around the start.
+    The target that comes back has its origin at the mode and unit curvature there. SamplingError if
+    the density is not finite around the start.
     """
     target, converged, steps = start, False, 0
     while not converged and steps < _NEWTON_STEPS:
@@ -157,7 +171,9 @@ def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
     if target.extra is not None:
         names.append(f"log_{target.extra.name}")
     covariance = _outer(target.transform)
-    return target, Laplace(tuple(names), target.centre, covariance, target.transform, steps, converged)
+    return target, Laplace(
+        tuple(names), target.centre, covariance, target.transform, steps, converged
+    )
 
 
 def _outer(factor: FloatArray) -> FloatArray:
@@ -166,7 +182,9 @@ def _outer(factor: FloatArray) -> FloatArray:
 
 
 def curvature(target: Target) -> FloatArray:
-    """Negative second derivatives (d, d) of the log density at a target's origin, in its coordinates."""
+    """Negative second derivatives (d, d) of the log density at a target's origin, in its
+    coordinates.
+    """
     return -_derivatives(target.log_density, target.dim)[2]
 
 
@@ -179,7 +197,8 @@ def _derivatives(density: Density, d: int) -> tuple[float, FloatArray, FloatArra
     values = density(np.concatenate([np.zeros((1, d)), unit, -unit, both, -both, cross, -cross]))
     if not np.all(np.isfinite(values)):
         raise SamplingError(
-            "the posterior density is not finite around the calibrated camera: check that the calibration converged, "
+            "the posterior density is not finite around the calibrated camera: check that the "
+            "calibration converged, "
             "that the observations are its own and that the priors allow its estimate."
         )
     centre, plus, minus = values[0], values[1 : d + 1], values[d + 1 : 2 * d + 1]
@@ -217,10 +236,14 @@ class ImportanceCheck:
     ess: float  # ``1 / sum w^2``: equivalent number of independent draws
 
 
-def importance_check(target: Target, n: int, df: float, rng: np.random.Generator) -> ImportanceCheck:
-    """Estimate the moments from n multivariate t draws around the mode, with Pareto-smoothed weights.
+def importance_check(
+    target: Target, n: int, df: float, rng: np.random.Generator
+) -> ImportanceCheck:
+    """Estimate the moments from n multivariate t draws around the mode, with Pareto-smoothed
+    weights.
 
-    `target` is one that `laplace_approximation` has centred and whitened; `df` are the proposal's degrees of freedom.
+    `target` is one that `laplace_approximation` has centred and whitened; `df` are the proposal's
+    degrees of freedom.
     """
     from starcal_uq.inference.arviz import psis
 
@@ -228,8 +251,11 @@ def importance_check(target: Target, n: int, df: float, rng: np.random.Generator
     log_weights, khat = psis(target.log_density(u) - student_t_log_density(u, df))
     weights = np.exp(log_weights)
     natural = target.natural(u)
-    # Moments about a point among the draws: 5000 px with a sd of 0.03 px would lose digits in a raw second moment.
+    # Moments about a point among the draws: 5000 px with a sd of 0.03 px would lose digits in a raw
+    # second moment.
     origin = target.natural(np.zeros((1, target.dim)))[0]
     shift = weights @ (natural - origin)
     variance = weights @ (natural - origin - shift) ** 2
-    return ImportanceCheck(float(khat), origin + shift, np.sqrt(variance), float(1.0 / np.sum(weights**2)))
+    return ImportanceCheck(
+        float(khat), origin + shift, np.sqrt(variance), float(1.0 / np.sum(weights**2))
+    )

@@ -1,7 +1,8 @@
 """A posterior as the prior of the next run, and whether the camera changed between two runs.
 
-Ground calibration to orbit is the case in mind: what the ground determined is worth keeping, but the launch may have
-moved it. So the prior can be widened by an allowed shift in physical terms, and the shift that did happen is tested.
+Ground calibration to orbit is the case in mind: what the ground determined is worth keeping, but
+the launch may have moved it. So the prior can be widened by an allowed shift in physical terms, and
+the shift that did happen is tested.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ ALPHA = 1e-3
 
 @dataclass(frozen=True)
 class AllowedShift:
-    """Standard deviations of what may have changed between two runs, in physical terms; zero is no change.
+    """Standard deviations of what may have changed between two runs, in physical terms; zero is no
+    change.
 
     Attributes
     ----------
@@ -54,13 +56,23 @@ class AllowedShift:
         for name in SHIFT_KEYS:
             value = float(getattr(self, name))
             if not (np.isfinite(value) and value >= 0.0):
-                raise PriorError(f"the allowed shift {name!r} is {value:g}: it must be a finite number, zero or more.")
+                raise PriorError(
+                    f"the allowed shift {name!r} is {value:g}: it must be a finite number, zero "
+                    "or more."
+                )
 
     def covariance(self, camera: Camera) -> FloatArray:
         """Diagonal covariance (p, p) for the parameters of a camera, px units."""
         radius = float(camera.corner_radius_px)
-        sd = [self.principal_point_px, self.principal_point_px, self.focal_fraction * camera.focal_px]
-        sd += [self.distortion_corner_px / radius**c.order for c in get_model(camera.distortion).coefficients]
+        sd = [
+            self.principal_point_px,
+            self.principal_point_px,
+            self.focal_fraction * camera.focal_px,
+        ]
+        sd += [
+            self.distortion_corner_px / radius**c.order
+            for c in get_model(camera.distortion).coefficients
+        ]
         return np.diag(np.square(sd))
 
 
@@ -74,7 +86,8 @@ def prior_from(
     name: str = "an earlier posterior",
     data_sha256: Collection[str] = (),
 ) -> GaussianPriors:
-    """Turn a posterior into a prior: normal with its mean and full covariance, log-normal for the noise.
+    """Turn a posterior into a prior: normal with its mean and full covariance, log-normal for the
+    noise.
 
     Parameters
     ----------
@@ -85,8 +98,9 @@ def prior_from(
     shift : AllowedShift, optional
         Added to the covariance: what may have changed since.
     noise : {"default", "posterior"}
-        ``default``: the wide prior of `Priors.default`, because centroid noise belongs to the exposures and the sky and
-        not to the camera. ``posterior``: log-normal with the moments of the earlier noise's logarithm.
+        ``default``: the wide prior of `Priors.default`, because centroid noise belongs to the
+        exposures and the sky and not to the camera. ``posterior``: log-normal with the moments of
+        the earlier noise's logarithm.
     per_star_sigma : bool, optional
         Whether the next run's stars state their noise; as in the earlier run by default.
     name : str
@@ -103,13 +117,15 @@ def prior_from(
         raise PriorError(f"the prior's noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
     if positive_number("inflation", inflation) < 1.0:
         raise PriorError(
-            f"the prior's inflation is {inflation:g}: use 1 or more; less would claim what no data showed."
+            f"the prior's inflation is {inflation:g}: use 1 or more; less would claim what no "
+            "data showed."
         )
     stated = posterior.sigma_name == SIGMA_NAMES[1]
     per_star = stated if per_star_sigma is None else per_star_sigma
     if noise == "posterior" and (per_star != stated or not posterior.sigma_sampled):
         raise PriorError(
-            f"the noise of {name} cannot become a prior, because it was given or is of another kind: use noise "
+            f"the noise of {name} cannot become a prior, because it was given or is of another "
+            "kind: use noise "
             "'default'."
         )
     shift = AllowedShift() if shift is None else shift
@@ -144,14 +160,19 @@ def check_chain(priors: Priors, camera: Camera, data_sha256: Collection[str] = (
     name = source.get("name", "the prior")
     if priors.distortion != camera.distortion:
         raise PriorError(
-            f"{name} has the distortion model {priors.distortion!r}, this run {camera.distortion!r}: calibrate both "
+            f"{name} has the distortion model {priors.distortion!r}, this run "
+            f"{camera.distortion!r}: calibrate both "
             "with the same model."
         )
     if "detector" in source and list(source["detector"]) != _detector(camera):
-        raise PriorError(f"{name} is of another detector (width, height in px, pixel in um): {source['detector']}.")
+        raise PriorError(
+            f"{name} is of another detector (width, height in px, pixel in um): "
+            f"{source['detector']}."
+        )
     if set(data_sha256) & set(source.get("data_sha256", ())):
         raise PriorError(
-            f"{name} rests on the observations of this run already, which would count twice: use other data."
+            f"{name} rests on the observations of this run already, which would count twice: use "
+            "other data."
         )
 
 
@@ -178,7 +199,8 @@ class ShiftTest(Shown):
     statistic : float
         Squared Mahalanobis length of the shift; p on average if nothing changed.
     dof : float
-        Degrees of freedom of the noise estimates behind the covariance; infinite where they are in the posteriors.
+        Degrees of freedom of the noise estimates behind the covariance; infinite where they are in
+        the posteriors.
     p_value : float
         Probability of a larger statistic if nothing changed.
     """
@@ -213,18 +235,21 @@ class ShiftTest(Shown):
 
 
 def shift_test(
-    before: Calibration | Posterior, after: Calibration | Posterior, allowed: AllowedShift | None = None
+    before: Calibration | Posterior,
+    after: Calibration | Posterior,
+    allowed: AllowedShift | None = None,
 ) -> ShiftTest:
     """Compare two estimates from different data.
 
-    The statistic is ``d^T (C_before + C_after + C_allowed)^-1 d``. Calibrations know the degrees of freedom of their
-    noise, so that its p-value is taken from F; the effective number for the sum of two covariances is Welch's.
+    The statistic is ``d^T (C_before + C_after + C_allowed)^-1 d``. Calibrations know the degrees of
+    freedom of their noise, so that its p-value is taken from F; the effective number for the sum of
+    two covariances is Welch's.
 
     Parameters
     ----------
     before, after : Calibration or Posterior
-        Of the same kind of camera, from different observations. A posterior whose own prior came from another run does
-        not stand on its data alone: give its calibration.
+        Of the same kind of camera, from different observations. A posterior whose own prior came
+        from another run does not stand on its data alone: give its calibration.
     allowed : AllowedShift, optional
         Change that would be no surprise.
 
@@ -238,14 +263,21 @@ def shift_test(
     for result in (before, after):
         if isinstance(getattr(result, "priors", None), GaussianPriors):
             raise PriorError(
-                "a posterior whose prior came from another run does not stand on its own data: test its calibration."
+                "a posterior whose prior came from another run does not stand on its own data: "
+                "test its calibration."
             )
-    if before.camera.distortion != after.camera.distortion or _detector(before.camera) != _detector(after.camera):
+    if before.camera.distortion != after.camera.distortion or _detector(before.camera) != _detector(
+        after.camera
+    ):
         raise PriorError(
-            "the two runs are of different detectors or distortion models: their parameters do not compare."
+            "the two runs are of different detectors or distortion models: their parameters do "
+            "not compare."
         )
     if data_hashes(before.provenance) & data_hashes(after.provenance):
-        raise PriorError("the two runs rest on the same observations: a shift can only be seen between different data.")
+        raise PriorError(
+            "the two runs rest on the same observations: a shift can only be seen between "
+            "different data."
+        )
     specs = parameters(after.camera.distortion)
     shift = _estimate(after) - _estimate(before)
     extra = (AllowedShift() if allowed is None else allowed).covariance(after.camera)
@@ -260,7 +292,9 @@ def shift_test(
         share = float(np.trace(inverse @ (result.covariance / np.outer(sd, sd)))) / p
         loss += share**2 / float(getattr(result, "dof", np.inf))
     dof = 1.0 / loss if loss > 0.0 else float("inf")
-    p_value = float(fdtrc(p, dof, statistic / p)) if np.isfinite(dof) else float(chdtrc(p, statistic))
+    p_value = (
+        float(fdtrc(p, dof, statistic / p)) if np.isfinite(dof) else float(chdtrc(p, statistic))
+    )
     return ShiftTest(
         names=tuple(spec.name for spec in specs),
         units=tuple(spec.unit for spec in specs),

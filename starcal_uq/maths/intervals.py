@@ -1,7 +1,7 @@
 """Intervals for fractions and estimates, Holm's correction for many tests, and a quick median.
 
-The closed forms stand here because `scipy.stats.binomtest(...).proportion_ci` finds the exact interval by a search that
-ends at 5e-13, and SciPy has no correction of Holm's.
+The closed forms stand here because `scipy.stats.binomtest(...).proportion_ci` finds the exact
+interval by a search that ends at 5e-13, and SciPy has no correction of Holm's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ HALF_WIDTH_95, HALF_WIDTH_997 = 1.959963984540054, 2.9677379253417833
 
 
 def student_quantile(probability: float, dof: float) -> float:
-    """Half-width of an interval for a mean whose standard deviation was estimated, in those standard deviations."""
+    """Half-width of an interval for a mean whose standard deviation was estimated, in those
+    standard deviations.
+    """
     from scipy.special import stdtrit
 
     return float(stdtrit(max(dof, 1.0), 0.5 * (1.0 + probability)))
@@ -49,7 +51,9 @@ def wilson_interval(successes: int, n: int) -> tuple[float, float]:
 
 
 def holm(p_values: Sequence[float]) -> FloatArray:
-    """p-values (m,) of several tests after Holm's step-down correction (1979); NaN stands for no test."""
+    """p-values (m,) of several tests after Holm's step-down correction (1979); NaN stands for no
+    test.
+    """
     p = np.asarray(p_values, dtype=np.float64)
     order = np.argsort(p)[: np.count_nonzero(np.isfinite(p))]
     stepped = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))

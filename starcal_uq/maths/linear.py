@@ -1,4 +1,6 @@
-"""Linear algebra of covariances and information matrices, whose entries span thirty orders of magnitude."""
+"""Linear algebra of covariances and information matrices, whose entries span thirty orders of
+magnitude.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ _ROUNDING = 1e-9
 
 
 def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverses (3, 3, K) and determinants (K,) of symmetric matrices given by xx, xy, xz, yy, yz, zz (6, K).
+    """Inverses (3, 3, K) and determinants (K,) of symmetric matrices given by xx, xy, xz, yy, yz,
+    zz (6, K).
 
     Not finite where the matrix is singular.
     """
@@ -38,7 +41,8 @@ def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def unit_inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Inverse (p, p) of a symmetric matrix scaled to a unit diagonal, and the scale (p,) of its rows and columns.
+    """Inverse (p, p) of a symmetric matrix scaled to a unit diagonal, and the scale (p,) of its
+    rows and columns.
 
     The inverse of the matrix itself is ``inverse * np.outer(scale, scale)``.
     """
@@ -65,7 +69,9 @@ def correlation_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def symmetric_inverse(matrix: FloatArray) -> FloatArray:
-    """Exactly symmetric inverse (p, p) of a covariance or a precision matrix; LinAlgError for a singular one."""
+    """Exactly symmetric inverse (p, p) of a covariance or a precision matrix; LinAlgError for a
+    singular one.
+    """
     if not np.all(np.diag(matrix) > 0.0):
         raise np.linalg.LinAlgError("the diagonal is not positive")
     correlation, sd = correlation_of(matrix)
@@ -80,15 +86,21 @@ def scaled_cholesky(covariance: FloatArray) -> FloatArray:
 
 
 def is_positive(matrix: FloatArray, *, strictly: bool = True) -> bool:
-    """Whether a matrix (p, p) is symmetric to rounding, and positive definite, or else semidefinite."""
+    """Whether a matrix (p, p) is symmetric to rounding, and positive definite, or else
+    semidefinite.
+    """
     scale = np.sqrt(np.abs(np.diag(matrix)))
     unit = matrix / np.where(np.outer(scale, scale) > 0.0, np.outer(scale, scale), 1.0)
     least = float(np.linalg.eigvalsh(unit)[0])
-    return np.allclose(unit, unit.T, atol=_ROUNDING) and (least > 0.0 if strictly else least > -_ROUNDING)
+    return np.allclose(unit, unit.T, atol=_ROUNDING) and (
+        least > 0.0 if strictly else least > -_ROUNDING
+    )
 
 
 def inverses(information: FloatArray) -> FloatArray:
-    """Inverses (..., p, p) of matrices whose entries span many orders of magnitude; infinite where singular."""
+    """Inverses (..., p, p) of matrices whose entries span many orders of magnitude; infinite where
+    singular.
+    """
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1.0 / np.sqrt(diagonal)

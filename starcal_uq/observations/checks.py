@@ -41,11 +41,14 @@ class Problem:
 
 
 def check_mapping(names: Iterable[str]) -> None:
-    """Refuse a name of the package that is to be read from another column, and is no column of observations."""
+    """Refuse a name of the package that is to be read from another column, and is no column of
+    observations.
+    """
     for name in names:
         if name not in COLUMNS:
             raise ObservationError(
-                f"columns: {name!r} is no column of observations; use {', '.join(COLUMNS)}.", column=name
+                f"columns: {name!r} is no column of observations; use {', '.join(COLUMNS)}.",
+                column=name,
             )
 
 
@@ -84,7 +87,12 @@ def _iso_utc(text: str) -> str:
 
 
 def _parse(
-    name: str, cells: Iterable[str], convert: Callable[[str], Any], empty: Any, reason: str, remedy: str
+    name: str,
+    cells: Iterable[str],
+    convert: Callable[[str], Any],
+    empty: Any,
+    reason: str,
+    remedy: str,
 ) -> tuple[list[Any], list[Problem]]:
     """Convert cell by cell; a bad cell becomes `empty` and a problem."""
     values, problems = [], []
@@ -96,7 +104,9 @@ def _parse(
             except ValueError:
                 problems.append(Problem(row, name, f"{cell!r} {reason}", remedy))
         elif not COLUMNS[name].gaps:
-            problems.append(Problem(row, name, "the value is missing", "fill it in or remove the row"))
+            problems.append(
+                Problem(row, name, "the value is missing", "fill it in or remove the row")
+            )
         values.append(value)
     return values, problems
 
@@ -118,7 +128,9 @@ def parse_whole(name: str, cells: Sequence[str]) -> tuple[IntArray, list[Problem
 
 
 def parse_times(name: str, cells: Sequence[str]) -> tuple[StrArray, list[Problem]]:
-    """Times of a column of texts as YYYY-MM-DDTHH:MM:SS[.f], shape (N,); empty where a cell is bad."""
+    """Times of a column of texts as YYYY-MM-DDTHH:MM:SS[.f], shape (N,); empty where a cell is
+    bad.
+    """
     known: dict[str, str] = {}
 
     def convert(cell: str) -> str:
@@ -135,7 +147,8 @@ def parse_times(name: str, cells: Sequence[str]) -> tuple[StrArray, list[Problem
 def check_columns(
     columns: Mapping[str, Any], camera: Camera | None = None, unknown_frame: BoolArray | None = None
 ) -> list[Problem]:
-    """Everything that is wrong with the columns (N,) of a table, where a camera is given also for its detector.
+    """Everything that is wrong with the columns (N,) of a table, where a camera is given also for
+    its detector.
 
     `unknown_frame` (N,) are rows whose frame number could not be read.
     """
@@ -178,8 +191,13 @@ def _pixel_remedy(columns: Mapping[str, Any], camera: Camera) -> str:
     return "check the camera file, or " + _REPAIR
 
 
-def _each(name: str, values: Any, wrong: BoolArray, reason: str, remedy: str = _REPAIR) -> list[Problem]:
-    return [Problem(int(i), name, f"{values[i].item()!r} {reason}", remedy) for i in np.flatnonzero(wrong)]
+def _each(
+    name: str, values: Any, wrong: BoolArray, reason: str, remedy: str = _REPAIR
+) -> list[Problem]:
+    return [
+        Problem(int(i), name, f"{values[i].item()!r} {reason}", remedy)
+        for i in np.flatnonzero(wrong)
+    ]
 
 
 def _check_counts(frame: IntArray) -> list[Problem]:
@@ -188,7 +206,10 @@ def _check_counts(frame: IntArray) -> list[Problem]:
         Problem(
             int(first[i]),
             "frame",
-            f"frame {ids[i]} has {counts[i]} star{'s' if counts[i] > 1 else ''}, and {_MIN_STARS} are needed",
+            (
+                f"frame {ids[i]} has {counts[i]} star{'s' if counts[i] > 1 else ''}, and "
+                f"{_MIN_STARS} are needed"
+            ),
             "add stars or remove the frame",
         )
         for i in np.flatnonzero(counts < _MIN_STARS)
@@ -250,7 +271,8 @@ def mixed_bits(*keys: Any) -> NDArray[np.uint64]:
 
 
 def raise_problems(source: str, word: str, numbers: IntArray, problems: Sequence[Problem]) -> None:
-    """Report problems in a file, if there are any: the first bad row by its "line" or "row" number, and how many more.
+    """Report problems in a file, if there are any: the first bad row by its "line" or "row" number,
+    and how many more.
 
     Of several for one cell the first is kept; one for a whole row replaces those of its cells.
     """

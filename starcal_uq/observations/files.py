@@ -64,9 +64,10 @@ READ = (*WRITTEN, ".json")
 class RawTable:
     """A table as it stands in a file: texts, or numbers where the format has types.
 
-    Of `columns`, by name in the file, Parquet gives only the wanted ones; `names` are those of all. `numbers` (N,) are
-    lines (CSV, ECSV) or rows from 1 (Parquet), as `word` says. `problems` are rows that do not fit the header. Texts of
-    a `spreadsheet` are those of `starcal_uq.core.files.cell_text`; with `decimal_comma`, numbers are written as 0,5.
+    Of `columns`, by name in the file, Parquet gives only the wanted ones; `names` are those of all.
+    `numbers` (N,) are lines (CSV, ECSV) or rows from 1 (Parquet), as `word` says. `problems` are
+    rows that do not fit the header. Texts of a `spreadsheet` are those of
+    `starcal_uq.core.files.cell_text`; with `decimal_comma`, numbers are written as 0,5.
     """
 
     columns: dict[str, Any]
@@ -90,7 +91,9 @@ def _read_bytes(path: Path) -> bytes:
         raise ObservationError(f"{path}: the file does not exist; check the path.") from None
     except OSError as error:
         reason = error.strerror
-        raise ObservationError(f"{path}: cannot be read ({reason}); check its permissions.") from error
+        raise ObservationError(
+            f"{path}: cannot be read ({reason}); check its permissions."
+        ) from error
     if not data.strip():
         raise ObservationError(f"{path}: the file is empty; give a table of observations.")
     return data
@@ -104,16 +107,18 @@ def read_table(
     check: bool = True,
     frames: IntArray | None = None,
 ) -> tuple[dict[str, Any], AnyDict]:
-    """Checked columns and metadata of a file; see `starcal_uq.observations.table.load_observations`.
+    """Checked columns and metadata of a file; see
+    `starcal_uq.observations.table.load_observations`.
 
-    The columns are those of `only`; without `check`, rows are taken to have been checked before. Of a Parquet file,
-    the rows can be those of some `frames` alone.
+    The columns are those of `only`; without `check`, rows are taken to have been checked before. Of
+    a Parquet file, the rows can be those of some `frames` alone.
     """
     check_mapping(mapping)
     path = Path(path)
     if os.path.isdir(path):
         raise ObservationError(
-            f"{path}: is a directory; name a file of observations, or open a folder of partitions with "
+            f"{path}: is a directory; name a file of observations, or open a folder of "
+            "partitions with "
             "sc.observations.open_partitions."
         )
     ending = table_ending(path, READ)
@@ -121,13 +126,21 @@ def read_table(
     wanted = columns_for(names[name] for name in only)
     data = _read_bytes(path)
     with reading(path, WHAT, REMEDY, ObservationError):
-        raw = _read(path, data, ending, wanted) if frames is None else _read_frames(path, data, wanted, names, frames)
+        raw = (
+            _read(path, data, ending, wanted)
+            if frames is None
+            else _read_frames(path, data, wanted, names, frames)
+        )
         check_names(path, raw, names, mapping)
         if not len(raw.numbers):
-            raise ObservationError(f"{path}: the table has a header but no rows; give a table with observations.")
+            raise ObservationError(
+                f"{path}: the table has a header but no rows; give a table with observations."
+            )
         if frames is None and check:
             _number_frames(raw, names["frame"])
-        columns, problems, unknown_frame = convert_columns(path, raw, {name: names[name] for name in only})
+        columns, problems, unknown_frame = convert_columns(
+            path, raw, {name: names[name] for name in only}
+        )
         if check:
             problems += check_columns(columns, camera, unknown_frame)
         # A message names the column as it is called in this file.
@@ -142,7 +155,9 @@ _LINEAR = re.compile(
 
 
 def _linear(text: str, names: Sequence[str] = ()) -> tuple[str, float, float]:
-    """Column, factor and shift of a text such as ``RA [h] * 15`` or ``X - 1``; a column of that name goes before."""
+    """Column, factor and shift of a text such as ``RA [h] * 15`` or ``X - 1``; a column of that
+    name goes before.
+    """
     found = _LINEAR.fullmatch(text)
     if text in names or found is None:
         return text, 1.0, 0.0
@@ -169,7 +184,9 @@ def _number_frames(raw: RawTable, own: str) -> None:
     cells = raw.columns.get(own)
     if isinstance(cells, np.ndarray) and cells.dtype.kind == "U":
         cells = cells.tolist()
-    if isinstance(cells, list) and not any(re.match(r"\s*([-+.]?\d[\d.e+-]*)?\s*$", cell) for cell in cells):
+    if isinstance(cells, list) and not any(
+        re.match(r"\s*([-+.]?\d[\d.e+-]*)?\s*$", cell) for cell in cells
+    ):
         found = {cell: number for number, cell in enumerate(dict.fromkeys(cells))}
         raw.columns[own] = np.array([found[cell] for cell in cells], dtype=np.int64)
         names = list(found)
@@ -180,13 +197,17 @@ def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
     if ending == ".parquet":
         return _read_parquet(path, data, wanted)
     if ending in (".fits", ".corr", ".json"):
-        columns, meta, units = (*read_json(path, data), {}) if ending == ".json" else read_fits(path, data)
+        columns, meta, units = (
+            (*read_json(path, data), {}) if ending == ".json" else read_fits(path, data)
+        )
         n = len(next(iter(columns.values()), ()))
         return RawTable(columns, list(columns), np.arange(1, n + 1), "row", meta, units)
     return _read_text(path, data, ecsv=ending == ".ecsv")
 
 
-def check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> None:
+def check_names(
+    path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]
+) -> None:
     """Raise `ObservationError` where a column is missing that is required or was named."""
     there = {c: column_behind(own, raw.names) in raw.names for c, own in names.items()}
     missing = [c for c in names if not there[c] and (COLUMNS[c].required or c in mapping)]
@@ -200,12 +221,17 @@ def check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Ma
         )
     for name in names.values():
         if raw.names.count(name) > 1:
-            raise ObservationError(f"{path}: column {name} occurs twice; remove or rename one.", column=name)
+            raise ObservationError(
+                f"{path}: column {name} occurs twice; remove or rename one.", column=name
+            )
 
 
 def say_column(name: str, names: Sequence[str]) -> str:
     """How to say which of the `names` in a file is a column."""
-    return f'say which it is, as by --column "{name}=NAME" or columns={{...}}, of those in the file ({listed(names)})'
+    return (
+        f'say which it is, as by --column "{name}=NAME" or columns={{...}}, of those in the file '
+        f"({listed(names)})"
+    )
 
 
 def convert_columns(
@@ -224,7 +250,9 @@ def convert_columns(
         kind = COLUMNS[name].kind
         if (factor, shift) != (1.0, 0.0):
             if kind != "number":
-                raise ObservationError(f"{path}: column {name} holds no quantities; give the name of a column alone.")
+                raise ObservationError(
+                    f"{path}: column {name} holds no quantities; give the name of a column alone."
+                )
             converted[name] = factor, shift
         # Whoever states a factor has left the unit of the file behind.
         unit = raw.units.get(own, "") if factor == 1.0 else ""
@@ -251,7 +279,9 @@ def convert_columns(
             columns[name], bad = parse_times(name, cells)
         else:
             texts = [cell.strip() for cell in cells]
-            columns[name] = np.array(list(map(cell_content, texts)) if raw.spreadsheet else texts, dtype=np.str_)
+            columns[name] = np.array(
+                list(map(cell_content, texts)) if raw.spreadsheet else texts, dtype=np.str_
+            )
         problems += bad
     for name in converted.keys() & columns.keys():
         factor, shift = converted[name]
@@ -260,7 +290,9 @@ def convert_columns(
 
 
 def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray:
-    """`values` of a column that states its unit, as in ECSV and FITS, in the unit that its name stands for."""
+    """`values` of a column that states its unit, as in ECSV and FITS, in the unit that its name
+    stands for.
+    """
     wanted = COLUMNS[name].unit
     if unit in ("", wanted) or name == "mag":
         return values
@@ -281,8 +313,12 @@ def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray
     return converted
 
 
-def table_meta(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> AnyDict:
-    """The metadata of a table: what the file carries, where it came from, and which columns were ignored."""
+def table_meta(
+    path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]
+) -> AnyDict:
+    """The metadata of a table: what the file carries, where it came from, and which columns were
+    ignored.
+    """
     meta = {"source": str(path), **raw.meta}
     used = {column_behind(own, raw.names) for own in names.values()}
     ignored = [name for name in raw.names if name not in used]
@@ -294,7 +330,8 @@ def table_meta(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Map
         meta["directions"] = "undeclared"
     if meta.get("directions", "undeclared") not in ("apparent", "catalogue", "undeclared"):
         raise ObservationError(
-            f"{path}: its metadata say directions = {meta['directions']!r}; use apparent, catalogue or undeclared."
+            f"{path}: its metadata say directions = {meta['directions']!r}; use apparent, "
+            "catalogue or undeclared."
         )
     return meta
 
@@ -305,19 +342,24 @@ def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise ObservationError(
-            f"{path}, line {line}: the text is not UTF-8; save the file in the encoding UTF-8.", row=line
+            f"{path}, line {line}: the text is not UTF-8; save the file in the encoding UTF-8.",
+            row=line,
         ) from None
     header = _ecsv_header(path, text) if ecsv else {}
     delimiter = header.get("delimiter", " ") if ecsv else delimiter_of(io.StringIO(text))
     rows, numbers = _rows(path, text, delimiter)
     if not rows:
-        raise ObservationError(f"{path}: the file holds comments only; give a table of observations.")
+        raise ObservationError(
+            f"{path}: the file holds comments only; give a table of observations."
+        )
     names = [name.strip() for name in rows.pop(0)]
     width = len(names)
     problems = []
     for i, row in enumerate(rows):
         if len(row) != width:
-            reason = f"{len(row)} value{'s' if len(row) != 1 else ''} under a header of {width} columns"
+            reason = (
+                f"{len(row)} value{'s' if len(row) != 1 else ''} under a header of {width} columns"
+            )
             problems.append(Problem(i, None, reason))
             rows[i] = [""] * width
     return RawTable(
@@ -326,7 +368,11 @@ def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
         numbers=np.array(numbers[1:], dtype=np.int64),
         word="line",
         meta=_ecsv_meta(header),
-        units={column["name"]: column["unit"] for column in header.get("datatype", []) if column.get("unit")},
+        units={
+            column["name"]: column["unit"]
+            for column in header.get("datatype", [])
+            if column.get("unit")
+        },
         problems=problems,
         spreadsheet=not ecsv,
         decimal_comma=delimiter == ";",
@@ -334,15 +380,17 @@ def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
 
 
 def delimiter_of(lines: Iterable[str]) -> str:
-    """What stands between the columns: a comma, or, if the header has none, what else spreadsheets write."""
+    """What stands between the columns: a comma, or, if the header has none, what else spreadsheets
+    write.
+    """
     header = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     return next((other for other in (";", "\t") if other in header and "," not in header), ",")
 
 
 def _rows(path: Path, text: str, delimiter: str) -> tuple[list[list[str]], list[int]]:
     """Rows that are neither blank nor comments, header first, and the line of each."""
-    # Comments become blank lines before the parser sees them: a quote in one would swallow the lines after
-    # it, and dropping the line would shift the count.
+    # Comments become blank lines before the parser sees them: a quote in one would swallow the
+    # lines after it, and dropping the line would shift the count.
     lines = ("\n" if line.startswith("#") else line for line in io.StringIO(text, newline=""))
     reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
     rows, numbers = [], []
@@ -353,7 +401,10 @@ def _rows(path: Path, text: str, delimiter: str) -> tuple[list[list[str]], list[
                 numbers.append(reader.line_num)
     except csv.Error as error:
         raise ObservationError(
-            f"{path}, line {reader.line_num}: the row cannot be read ({error}); check its quotation marks.",
+            (
+                f"{path}, line {reader.line_num}: the row cannot be read ({error}); check its "
+                "quotation marks."
+            ),
             row=reader.line_num,
         ) from None
     return rows, numbers
@@ -363,7 +414,10 @@ def _ecsv_header(path: Path, text: str) -> AnyDict:
     """The YAML header of an ECSV file (Astropy Proposal for Enhancement 6)."""
     if not text.startswith("# %ECSV"):
         raise ObservationError(
-            f"{path}, line 1: '# %ECSV 1.0' is missing; name a plain table .csv, or write it with astropy.",
+            (
+                f"{path}, line 1: '# %ECSV 1.0' is missing; name a plain table .csv, or write it "
+                "with astropy."
+            ),
             row=1,
         )
     import yaml
@@ -384,8 +438,12 @@ def _ecsv_header(path: Path, text: str) -> AnyDict:
     except (yaml.YAMLError, ValueError, RecursionError):
         header = None
     columns = header.get("datatype") if isinstance(header, dict) else None
-    if not isinstance(columns, list) or not all(isinstance(column, dict) and "name" in column for column in columns):
-        raise ObservationError(f"{path}: the ECSV header is not valid YAML; write the file with astropy.") from None
+    if not isinstance(columns, list) or not all(
+        isinstance(column, dict) and "name" in column for column in columns
+    ):
+        raise ObservationError(
+            f"{path}: the ECSV header is not valid YAML; write the file with astropy."
+        ) from None
     return dict(header)
 
 
@@ -408,7 +466,9 @@ def _read_parquet(path: Path, data: bytes, wanted: set[str]) -> RawTable:
     return RawTable(columns, names, np.arange(1, table.num_rows + 1), "row", meta)
 
 
-def _read_frames(path: Path, data: bytes, wanted: set[str], own: Mapping[str, str], frames: IntArray) -> RawTable:
+def _read_frames(
+    path: Path, data: bytes, wanted: set[str], own: Mapping[str, str], frames: IntArray
+) -> RawTable:
     table, names, meta = _arrow_table(path, data, wanted)
     # Before anything becomes Python's: texts of all rows would take longer than the rest.
     rows = np.flatnonzero(np.isin(table.column(own["frame"]).to_numpy(), frames))
@@ -427,13 +487,17 @@ def _arrow_table(path: Path, data: bytes, wanted: set[str]) -> tuple[Any, list[s
 
 @contextmanager
 def open_parquet(path: Path, data: bytes | None = None) -> Iterator[ParquetFile]:
-    """A Parquet file that holds no more than it can; whatever is wrong with it is said in an `ObservationError`."""
+    """A Parquet file that holds no more than it can; whatever is wrong with it is said in an
+    `ObservationError`.
+    """
     import pyarrow as pa
     from pyarrow import parquet
 
     with (
         reading(path, WHAT, REMEDY, ObservationError),
-        parquet.ParquetFile(path if data is None else pa.BufferReader(data), pre_buffer=False) as file,
+        parquet.ParquetFile(
+            path if data is None else pa.BufferReader(data), pre_buffer=False
+        ) as file,
     ):
         check_parquet(file, path.stat().st_size if data is None else len(data))
         yield file
@@ -452,7 +516,8 @@ def own_meta(schema: Any) -> AnyDict:
 class ParquetSummary:
     """What a Parquet file says of itself without being read.
 
-    `first` and `last` are the smallest and largest value of the column asked for, where the file states them.
+    `first` and `last` are the smallest and largest value of the column asked for, where the file
+    states them.
     """
 
     n_rows: int
@@ -463,16 +528,22 @@ class ParquetSummary:
 
 
 def parquet_summary(path: Path, column: str) -> ParquetSummary:
-    """Rows, columns, metadata and the range of one column of whole numbers, from the end of the file."""
+    """Rows, columns, metadata and the range of one column of whole numbers, from the end of the
+    file.
+    """
     with open_parquet(path) as file:
         schema, rows = file.schema_arrow, file.metadata
         names = tuple(schema.names)
         ranges = []
         if column in names:
             place = rows.schema.names.index(column)
-            groups = [rows.row_group(i).column(place).statistics for i in range(rows.num_row_groups)]
+            groups = [
+                rows.row_group(i).column(place).statistics for i in range(rows.num_row_groups)
+            ]
             ranges = [(s.min, s.max) for s in groups if s is not None and s.has_min_max]
-        whole = len(ranges) == rows.num_row_groups > 0 and all(isinstance(value, int) for r in ranges for value in r)
+        whole = len(ranges) == rows.num_row_groups > 0 and all(
+            isinstance(value, int) for r in ranges for value in r
+        )
         ends = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if whole else (None, None)
         return ParquetSummary(rows.num_rows, names, own_meta(schema), *ends)
 
@@ -482,7 +553,9 @@ def parquet_column(path: Path, column: str) -> IntArray:
     with open_parquet(path) as file:
         values = file.read(columns=[column], use_threads=False).column(column).to_numpy()
     if values.dtype.kind not in "iu":
-        raise ObservationError(f"{path}: column {column} holds no whole numbers; write it again.", column=column)
+        raise ObservationError(
+            f"{path}: column {column} holds no whole numbers; write it again.", column=column
+        )
     return np.asarray(values, dtype=np.int64)
 
 
@@ -512,7 +585,11 @@ def astropy_table(columns: Mapping[str, Any], meta: AnyDict) -> Any:
 
 
 def write_table(
-    columns: Mapping[str, Any], meta: AnyDict, path: str | os.PathLike[str], force: bool, camera: Camera | None = None
+    columns: Mapping[str, Any],
+    meta: AnyDict,
+    path: str | os.PathLike[str],
+    force: bool,
+    camera: Camera | None = None,
 ) -> None:
     """Write columns and metadata; see `starcal_uq.observations.table.Observations.save`."""
     ending = table_ending(Path(path), WRITTEN)
@@ -521,7 +598,9 @@ def write_table(
         # That format knows one frame.
         rows = {int(frame): columns["frame"] == frame for frame in frames}
         files = {
-            Path(path).with_name(f"{Path(path).stem}_{frame}.corr"): {name: v[own] for name, v in columns.items()}
+            Path(path).with_name(f"{Path(path).stem}_{frame}.corr"): {
+                name: v[own] for name, v in columns.items()
+            }
             for frame, own in rows.items()
         }
     for name in files:
@@ -532,7 +611,11 @@ def write_table(
     plain = json.loads(json.dumps(meta, default=as_plain))
     if ending in (".fits", ".corr"):
         for name, part in files.items():
-            content = fits_content(part, plain) if ending == ".fits" else corr_content(part, plain, camera)
+            content = (
+                fits_content(part, plain)
+                if ending == ".fits"
+                else corr_content(part, plain, camera)
+            )
             atomic_write_bytes(name, content)
         return
     with atomic_path(path) as temporary:
@@ -558,11 +641,15 @@ def _csv_text(columns: Mapping[str, Any]) -> str:
 
 
 def write_partition(
-    columns: Mapping[str, Any], named: Mapping[str, tuple[IntArray, StrArray]], meta: AnyDict, path: Path
+    columns: Mapping[str, Any],
+    named: Mapping[str, tuple[IntArray, StrArray]],
+    meta: AnyDict,
+    path: Path,
 ) -> None:
     """Write one Parquet file of a folder of partitions, atomically and quickly; overwritten.
 
-    `columns` (N,) are numbers; of texts, `named` has for each row its place (N,) in a list of different ones.
+    `columns` (N,) are numbers; of texts, `named` has for each row its place (N,) in a list of
+    different ones.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -570,10 +657,13 @@ def write_partition(
     arrays = {name: pa.array(values) for name, values in columns.items()}
     for name, (place, texts) in named.items():
         used, place = np.unique(place, return_inverse=True)
-        arrays[name] = pa.DictionaryArray.from_arrays(pa.array(place.astype(np.int32)), pa.array(texts[used].tolist()))
+        arrays[name] = pa.DictionaryArray.from_arrays(
+            pa.array(place.astype(np.int32)), pa.array(texts[used].tolist())
+        )
     table = pa.table({name: arrays[name] for name in COLUMNS if name in arrays})
     table = table.replace_schema_metadata({_META_KEY: json.dumps(meta, default=as_plain).encode()})
-    # Pixels repeat nowhere: looking for repeats in them, or compressing them, would take longer than all the rest.
+    # Pixels repeat nowhere: looking for repeats in them, or compressing them, would take longer
+    # than all the rest.
     pixels = {"x_px", "y_px"}
     with atomic_path(path) as temporary:
         parquet.write_table(
@@ -589,7 +679,8 @@ def _write_parquet(columns: Mapping[str, Any], path: Path, meta: AnyDict) -> Non
     from pyarrow import parquet
 
     arrays = {
-        name: pa.array(values.tolist() if values.dtype.kind == "U" else values) for name, values in columns.items()
+        name: pa.array(values.tolist() if values.dtype.kind == "U" else values)
+        for name, values in columns.items()
     }
     table = pa.table(arrays).replace_schema_metadata({_META_KEY: json.dumps(meta).encode()})
     parquet.write_table(table, path, compression="zstd")

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 class StarFrames:
     """Measured pixels (2, N), px, and unit vectors `r` (3, N), ICRS, contiguous by frame.
 
-    `weight` (N,) is the inverse of the stated noise of each star, 1/px; None when all stars are alike. Frame k holds
-    the stars ``starts[k]:starts[k + 1]``. `axes` (2, 2) is the covariance of the noise of x and y in units of the
-    stated variance, of determinant one; None where the axes are alike.
+    `weight` (N,) is the inverse of the stated noise of each star, 1/px; None when all stars are
+    alike. Frame k holds the stars ``starts[k]:starts[k + 1]``. `axes` (2, 2) is the covariance of
+    the noise of x and y in units of the stated variance, of determinant one; None where the axes
+    are alike.
     """
 
     pixel: FloatArray
@@ -31,11 +32,18 @@ class StarFrames:
     starts: IntArray
     axes: FloatArray | None = None
 
-    SHAPES: ClassVar[Shapes] = {"pixel": (2, "n"), "r": (3, "n"), "weight": ("n",), "starts": ("k+1",)}
+    SHAPES: ClassVar[Shapes] = {
+        "pixel": (2, "n"),
+        "r": (3, "n"),
+        "weight": ("n",),
+        "starts": ("k+1",),
+    }
 
     @classmethod
     def from_observations(cls, obs: Observations, axes: bool = False) -> StarFrames:
-        """Take the arrays that estimators need; with `axes`, the noise of x and y is what a noise model found."""
+        """Take the arrays that estimators need; with `axes`, the noise of x and y is what a noise
+        model found.
+        """
         return cls(
             pixel=np.ascontiguousarray(obs.xy.T),
             r=np.ascontiguousarray(obs.directions_icrs.T),
@@ -51,7 +59,9 @@ class StarFrames:
             return pieces[0]
         offsets = np.cumsum([0, *(piece.n_stars for piece in pieces)])
         weights = [piece.weight for piece in pieces if piece.weight is not None]
-        starts = [piece.starts[:-1] + offset for piece, offset in zip(pieces, offsets[:-1], strict=True)]
+        starts = [
+            piece.starts[:-1] + offset for piece, offset in zip(pieces, offsets[:-1], strict=True)
+        ]
         return cls(
             pixel=np.concatenate([piece.pixel for piece in pieces], axis=1),
             r=np.concatenate([piece.r for piece in pieces], axis=1),
@@ -95,7 +105,9 @@ class StarFrames:
         return None if self.axes is None else np.linalg.inv(np.linalg.cholesky(self.axes))
 
     def whiten(self, columns: FloatArray) -> None:
-        """Whiten columns (..., 2, N) of pixels in place: over the stated noise, its axes alike and apart."""
+        """Whiten columns (..., 2, N) of pixels in place: over the stated noise, its axes alike and
+        apart.
+        """
         w = self.whitening
         if w is not None:
             x, y = columns[..., 0, :], columns[..., 1, :]
@@ -136,7 +148,9 @@ class StarFrames:
         return [(int(a), int(b)) for a, b in pairwise(edges)]
 
     def rotated(self, rotations: FloatArray) -> FloatArray:
-        """Catalogue directions in the camera frame: ``b = R r`` with R_cam_icrs (K, 3, 3); (3, N)."""
+        """Catalogue directions in the camera frame: ``b = R r`` with R_cam_icrs (K, 3, 3); (3,
+        N).
+        """
         columns = self.spread(rotations.reshape(-1, 9).T).reshape(3, 3, -1)
         x, y, z = self.r
         turned: FloatArray = columns[:, 0] * x + columns[:, 1] * y + columns[:, 2] * z

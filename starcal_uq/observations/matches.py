@@ -1,8 +1,9 @@
-"""Matched stars as other solvers have them: FITS tables, astrometry.net's ``.corr``, matches of tetra3 and tetra3rs.
+"""Matched stars as other solvers have them: FITS tables, astrometry.net's ``.corr``, matches of
+tetra3 and tetra3rs.
 
-Pixels are counted differently everywhere: ours have (0, 0) in the centre of the first pixel; astrometry.net counts it
-(1, 1), as FITS does; tetra3 and cedar-solve have rows before columns, from the corner of the image, so that it is
-(0.5, 0.5); tetra3rs counts from the middle of the image.
+Pixels are counted differently everywhere: ours have (0, 0) in the centre of the first pixel;
+astrometry.net counts it (1, 1), as FITS does; tetra3 and cedar-solve have rows before columns, from
+the corner of the image, so that it is (0.5, 0.5); tetra3rs counts from the middle of the image.
 """
 
 from __future__ import annotations
@@ -34,7 +35,16 @@ _HEADERS, _END = 100 * 2880, b"END".ljust(80)
 _UNITS = {"pix": "pixel", "deg_C": ""}
 # Ours to those of a .corr file, which has no column for the others.
 _CORR = {"x_px": "field_x", "y_px": "field_y", "ra_deg": "index_ra", "dec_deg": "index_dec"}
-_CORR_NAMES = (*_CORR.values(), "field_ra", "field_dec", "index_x", "index_y", "index_id", "field_id", "match_weight")
+_CORR_NAMES = (
+    *_CORR.values(),
+    "field_ra",
+    "field_dec",
+    "index_x",
+    "index_y",
+    "index_id",
+    "field_id",
+    "match_weight",
+)
 _OTHERS = tuple(name for name in COLUMNS if name not in _CORR and name != "frame")
 
 
@@ -47,8 +57,9 @@ def fits_content(columns: Mapping[str, Any], meta: AnyDict) -> bytes:
 def corr_content(columns: Mapping[str, Any], meta: AnyDict, camera: Camera | None) -> bytes:
     """One frame as astrometry.net writes its ``.corr`` files, pixels counted from (1, 1).
 
-    ``field_ra``, ``field_dec`` and ``index_x``, ``index_y``, the star where the camera saw it and where it should have,
-    follow from the frame's best attitude; without a camera they are NaN. ``index_id`` numbers the stars of this file.
+    ``field_ra``, ``field_dec`` and ``index_x``, ``index_y``, the star where the camera saw it and
+    where it should have, follow from the frame's best attitude; without a camera they are NaN.
+    ``index_id`` numbers the stars of this file.
     """
     n = len(columns["frame"])
     seen_deg, expected_px = (np.full((n, 2), np.nan) for _ in range(2))
@@ -107,7 +118,9 @@ def _written(columns: Mapping[str, tuple[Any, str]], meta: AnyDict, **cards: Any
 
 
 def is_fits_table(path: Path) -> bool:
-    """Whether a file is a FITS binary table without an image before it, be it compressed in a table."""
+    """Whether a file is a FITS binary table without an image before it, be it compressed in a
+    table.
+    """
     try:
         with open(path, "rb") as file:
             head = file.read(_HEADERS)
@@ -116,9 +129,13 @@ def is_fits_table(path: Path) -> bool:
     cards = [head[place : place + 80] for place in range(0, len(head), 80)]
     if not head.startswith(b"SIMPLE") or _END not in cards or _value(cards, b"NAXIS") != b"0":
         return False
-    # A file starts without data of its own, in blocks of 36 cards; the next header is that of the table.
+    # A file starts without data of its own, in blocks of 36 cards; the next header is that of the
+    # table.
     second = cards[36 * (cards.index(_END) // 36 + 1) :]
-    return _value(second, b"XTENSION").strip(b"' ") == b"BINTABLE" and _value(second, b"ZIMAGE") != b"T"
+    return (
+        _value(second, b"XTENSION").strip(b"' ") == b"BINTABLE"
+        and _value(second, b"ZIMAGE") != b"T"
+    )
 
 
 def _value(cards: Sequence[bytes], key: bytes) -> bytes:
@@ -132,7 +149,9 @@ def _value(cards: Sequence[bytes], key: bytes) -> bytes:
 
 
 def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict, dict[str, str]]:
-    """Columns under our names, metadata and units of a FITS table or ``.corr`` file; texts as lists, or else arrays."""
+    """Columns under our names, metadata and units of a FITS table or ``.corr`` file; texts as
+    lists, or else arrays.
+    """
     with extra("images", "FITS tables"):
         from astropy.io import fits
 
@@ -140,7 +159,9 @@ def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict, dict[st
     with fits.open(io.BytesIO(data), memmap=False) as hdus:
         tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
         if not tables:
-            raise ObservationError(f"{path}: the file holds no table; give one of observations, or a .corr file.")
+            raise ObservationError(
+                f"{path}: the file holds no table; give one of observations, or a .corr file."
+            )
         header, rows = tables[0].header, tables[0].data
         check_size(int(header["NAXIS1"]) * int(header["NAXIS2"]), len(data))
         columns: dict[str, Any] = {}
@@ -148,7 +169,9 @@ def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict, dict[st
         for name in rows.names:
             values = np.asarray(rows[name])
             plain = values.dtype.newbyteorder("=")
-            columns[name.lower()] = values.astype(plain) if plain.kind in "fiub" else [str(v).strip() for v in values]
+            columns[name.lower()] = (
+                values.astype(plain) if plain.kind in "fiub" else [str(v).strip() for v in values]
+            )
         meta: Any = json.loads(header[_META]) if _META in header else {}
         frame = int(header.get("FRAME", 0))
     if not isinstance(meta, dict):
@@ -164,7 +187,9 @@ def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict, dict[st
 
 
 def read_json(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
-    """Columns and metadata of matches of tetra3 or tetra3rs: a solution, a list of them, or a list named "frames"."""
+    """Columns and metadata of matches of tetra3 or tetra3rs: a solution, a list of them, or a list
+    named "frames".
+    """
     document: Any = json.loads(data)
     if isinstance(document, dict) and "frames" in document:
         document = document["frames"]
@@ -177,9 +202,13 @@ def read_json(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
 def matched_columns(
     solutions: Any, size_px: tuple[int, int] | None, times: Sequence[str] | None = None
 ) -> tuple[dict[str, Any], AnyDict]:
-    """Columns and metadata of solutions; see `starcal_uq.observations.table.Observations.from_matches`."""
+    """Columns and metadata of solutions; see
+    `starcal_uq.observations.table.Observations.from_matches`.
+    """
     given = [solutions] if isinstance(solutions, Mapping | tuple) else list(solutions)
-    parts: dict[str, list[Any]] = {name: [] for name in ("frame", "xy", "sky", "mag", "star_id", "time_utc")}
+    parts: dict[str, list[Any]] = {
+        name: [] for name in ("frame", "xy", "sky", "mag", "star_id", "time_utc")
+    }
     unsolved = []
     for number, solution in enumerate(given):
         found = _matches(number, solution, size_px)
@@ -187,7 +216,13 @@ def matched_columns(
             unsolved.append(number)
             continue
         xy, sky, mag, names = found
-        time = times[number] if times is not None else solution.get("time_utc") if isinstance(solution, Mapping) else ""
+        time = (
+            times[number]
+            if times is not None
+            else solution.get("time_utc")
+            if isinstance(solution, Mapping)
+            else ""
+        )
         parts["frame"] += [number] * len(xy)
         parts["xy"].append(xy)
         parts["sky"].append(sky)
@@ -195,7 +230,9 @@ def matched_columns(
         parts["star_id"] += names
         parts["time_utc"] += [str(time or "")] * len(xy)
     if not parts["frame"]:
-        raise ObservationError("matches: no solution has matched stars; give solutions that were found.")
+        raise ObservationError(
+            "matches: no solution has matched stars; give solutions that were found."
+        )
     xy, sky = np.concatenate(parts["xy"]), np.concatenate(parts["sky"])
     columns = {
         "frame": np.array(parts["frame"], dtype=np.int64),
@@ -213,7 +250,8 @@ def matched_columns(
 
 _HOW = {
     "tetra3": "call solve_from_centroids or solve_from_image with return_matches=True",
-    "tetra3rs": "give centroids (x, y), matched_centroids (their places), matched_stars (ra, dec in degrees), "
+    "tetra3rs": "give centroids (x, y), matched_centroids (their places), matched_stars (ra, dec in "
+    "degrees), "
     "image_width and image_height",
 }
 
@@ -221,7 +259,9 @@ _HOW = {
 def _matches(
     number: int, solution: Any, size_px: tuple[int, int] | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, list[str]] | None:
-    """Pixels (n, 2), directions (n, 2) in degrees, magnitudes and names (n,) of a solution; None for a failed one."""
+    """Pixels (n, 2), directions (n, 2) in degrees, magnitudes and names (n,) of a solution; None
+    for a failed one.
+    """
     if isinstance(solution, tuple):
         solution = _of_tetra3rs(*solution)
     if not solution:
@@ -232,10 +272,14 @@ def _matches(
     how = _HOW["tetra3rs" if by_place else "tetra3"]
     if solution.get("RA", 0.0) is None:
         return None
-    if missing := [key for key in ("matched_centroids", "matched_stars") if solution.get(key) is None]:
+    if missing := [
+        key for key in ("matched_centroids", "matched_stars") if solution.get(key) is None
+    ]:
         raise ObservationError(f"matches: solution {number} has no {missing[0]}; {how}.")
     try:
-        stars = np.array([[*map(float, star), np.nan][:3] for star in solution["matched_stars"]]).reshape(-1, 3)
+        stars = np.array(
+            [[*map(float, star), np.nan][:3] for star in solution["matched_stars"]]
+        ).reshape(-1, 3)
         if by_place:
             width, height = size_px or (int(solution["image_width"]), int(solution["image_height"]))
             places = np.array(solution["matched_centroids"], dtype=np.int64)
@@ -245,17 +289,29 @@ def _matches(
             rows_first = np.array(solution["matched_centroids"], dtype=np.float64).reshape(-1, 2)
             xy = rows_first[:, ::-1] - _CORNER_PIXEL
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        what = f"has no {error.args[0]}" if isinstance(error, KeyError) else "has matches of another form"
+        what = (
+            f"has no {error.args[0]}"
+            if isinstance(error, KeyError)
+            else "has matches of another form"
+        )
         raise ObservationError(f"matches: solution {number} {what}; {how}.") from None
     ids = solution.get("matched_catID", solution.get("matched_catalog_ids"))
     if len(xy) != len(stars) or (ids is not None and len(ids) != len(stars)):
-        raise ObservationError(f"matches: solution {number} pairs {len(xy)} centroids with {len(stars)} stars; {how}.")
-    names = [""] * len(xy) if ids is None else ["-".join(map(str, np.ravel(name).tolist())) for name in ids]
+        raise ObservationError(
+            f"matches: solution {number} pairs {len(xy)} centroids with {len(stars)} stars; {how}."
+        )
+    names = (
+        [""] * len(xy)
+        if ids is None
+        else ["-".join(map(str, np.ravel(name).tolist())) for name in ids]
+    )
     return xy, stars[:, :2], stars[:, 2], names
 
 
 def _of_tetra3rs(result: Any, centroids: Any, database: Any) -> AnyDict | None:
-    """What a result of tetra3rs says, with its centroids, and the directions that its database knows."""
+    """What a result of tetra3rs says, with its centroids, and the directions that its database
+    knows.
+    """
     if not result:
         return None
     stars = [database.get_star_by_id(int(number)) for number in result.matched_catalog_ids]

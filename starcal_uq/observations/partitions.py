@@ -1,7 +1,7 @@
 """A folder of Parquet files of whole frames: a table of observations that need not fit into memory.
 
-Nothing but the files' metadata is read until a partition is asked for; whoever works on the table reads the partitions
-one by one, where he is, and keeps sums of them.
+Nothing but the files' metadata is read until a partition is asked for; whoever works on the table
+reads the partitions one by one, where he is, and keeps sums of them.
 """
 
 from __future__ import annotations
@@ -35,15 +35,19 @@ from starcal_uq.observations.table import Observations, joined_columns
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
-# What estimates are made of; the other columns are for diagnoses, and read for the sample of frames alone.
+# What estimates are made of; the other columns are for diagnoses, and read for the sample of frames
+# alone.
 STREAMED = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "sigma_px")
-# Frames that stand for all of them where stars are looked at one by one, and files that they are taken from.
+# Frames that stand for all of them where stars are looked at one by one, and files that they are
+# taken from.
 SAMPLE_FRAMES, _SAMPLE_PARTS = 2000, 16
 
 
 @dataclass(frozen=True)
 class Partition:
-    """One file, by its absolute path, so that other processes find it: rows, range of frame numbers, columns."""
+    """One file, by its absolute path, so that other processes find it: rows, range of frame
+    numbers, columns.
+    """
 
     path: Path
     n_stars: int
@@ -56,9 +60,10 @@ class Partition:
 class PartitionReader:
     """How a partition becomes observations; small, and sent to the processes that read.
 
-    Every centroid must lie on the detector of the camera. `columns` are names in the files of columns that are called
-    otherwise, `meta` entries that are declared for all partitions, and every table goes through the picklable function
-    `prepare`, such as one that makes directions apparent.
+    Every centroid must lie on the detector of the camera. `columns` are names in the files of
+    columns that are called otherwise, `meta` entries that are declared for all partitions, and
+    every table goes through the picklable function `prepare`, such as one that makes directions
+    apparent.
     """
 
     camera: Camera | None = None
@@ -66,22 +71,34 @@ class PartitionReader:
     meta: AnyDict = field(default_factory=dict)
     prepare: Callable[[Observations], Observations] | None = None
 
-    def load(self, part: Partition, *, check: bool = False, frames: IntArray | None = None) -> Observations:
-        """The table of a partition with the columns that estimates are made of; of some `frames`, with all columns."""
+    def load(
+        self, part: Partition, *, check: bool = False, frames: IntArray | None = None
+    ) -> Observations:
+        """The table of a partition with the columns that estimates are made of; of some `frames`,
+        with all columns.
+        """
         only = STREAMED if self.prepare is None else (*STREAMED, "time_utc")
         columns, meta = read_table(
-            part.path, self.camera, self.columns, only if frames is None else tuple(COLUMNS), check, frames
+            part.path,
+            self.camera,
+            self.columns,
+            only if frames is None else tuple(COLUMNS),
+            check,
+            frames,
         )
         obs = Observations(**columns, meta={**meta, **self.meta})
         try:
             return obs if self.prepare is None else self.prepare(obs)
         except ObservationError as error:
-            raise ObservationError(f"{part.path}: {error}", row=error.row, column=error.column) from error
+            raise ObservationError(
+                f"{part.path}: {error}", row=error.row, column=error.column
+            ) from error
 
 
 @dataclass(frozen=True)
 class PartitionedObservations:
-    """Observations in a folder of files, which are read when they are needed; see `open_partitions`.
+    """Observations in a folder of files, which are read when they are needed; see
+    `open_partitions`.
 
     Iterated over, it gives the partitions one after the other.
 
@@ -109,7 +126,10 @@ class PartitionedObservations:
         return self.n_stars
 
     def __repr__(self) -> str:
-        return f"PartitionedObservations({self.n_stars} stars in {len(self.parts)} files of {str(self.folder)!r})"
+        return (
+            f"PartitionedObservations({self.n_stars} stars in {len(self.parts)} files of "
+            f"{str(self.folder)!r})"
+        )
 
     @property
     def n_stars(self) -> int:
@@ -125,7 +145,8 @@ class PartitionedObservations:
     def data_hash(self) -> str:
         """SHA-256 (hex) of the data, whatever the files are called; all of them are read for it.
 
-        It is that of the sorted `Observations.data_hash` of the partitions' columns that estimates are made of.
+        It is that of the sorted `Observations.data_hash` of the partitions' columns that estimates
+        are made of.
         """
         return joined_hash([observations.data_hash for observations in self])
 
@@ -134,23 +155,32 @@ class PartitionedObservations:
         """Whether the files say if their directions are apparent or straight from a catalogue."""
         return bool(self.meta["directions"] != "undeclared")
 
-    def prepared(self, function: Callable[[Observations], Observations], **entries: Any) -> PartitionedObservations:
-        """The same table, each partition of which goes through a picklable function when it is read.
+    def prepared(
+        self, function: Callable[[Observations], Observations], **entries: Any
+    ) -> PartitionedObservations:
+        """The same table, each partition of which goes through a picklable function when it is
+        read.
 
         The entries are those of `meta` that the function changes, for whoever asks the whole.
         """
-        return replace(self, reader=replace(self.reader, prepare=function), meta={**self.meta, **entries})
+        return replace(
+            self, reader=replace(self.reader, prepare=function), meta={**self.meta, **entries}
+        )
 
     def with_meta(self, **entries: Any) -> PartitionedObservations:
-        """The same table with entries of `meta` added or changed, such as ``directions="apparent"``."""
+        """The same table with entries of `meta` added or changed, such as
+        ``directions="apparent"``.
+        """
         reader = replace(self.reader, meta={**self.reader.meta, **entries})
         return replace(self, reader=reader, meta={**self.meta, **entries})
 
     @bounded
     def sample(self, n_frames: int = SAMPLE_FRAMES) -> Observations:
-        """About `n_frames` frames with all of their columns: evenly spaced ones of at most 16 files, evenly spaced too.
+        """About `n_frames` frames with all of their columns: evenly spaced ones of at most 16
+        files, evenly spaced too.
 
-        The same files give the same frames. All of a smaller table is taken. The sample of the usual size is kept.
+        The same files give the same frames. All of a smaller table is taken. The sample of the
+        usual size is kept.
         """
         return self._usual_sample if n_frames == SAMPLE_FRAMES else self._sampled(n_frames)
 
@@ -159,14 +189,22 @@ class PartitionedObservations:
         return self._sampled(SAMPLE_FRAMES)
 
     def _sampled(self, n_frames: int) -> Observations:
-        place = np.linspace(0, len(self.parts) - 1, min(len(self.parts), _SAMPLE_PARTS)).round().astype(int)
+        place = (
+            np.linspace(0, len(self.parts) - 1, min(len(self.parts), _SAMPLE_PARTS))
+            .round()
+            .astype(int)
+        )
         chosen = [self.parts[i] for i in place]
         numbers = [frame_numbers(part, self.reader) for part in chosen]
         n = sum(map(len, numbers))
         tables = []
         for part, own in zip(chosen, numbers, strict=True):
             share = max(1, round(n_frames * len(own) / n))
-            kept = own if share >= len(own) else own[((np.arange(share) + 0.5) * len(own) / share).astype(int)]
+            kept = (
+                own
+                if share >= len(own)
+                else own[((np.arange(share) + 0.5) * len(own) / share).astype(int)]
+            )
             tables.append(self.reader.load(part, check=True, frames=kept))
         return Observations(**joined_columns(tables), meta=tables[0].meta)
 
@@ -179,8 +217,8 @@ def open_partitions(
     Parameters
     ----------
     folder
-        Folder of ``.parquet`` files with the columns of `load_observations`. All rows of a frame stand in one file, and
-        no two files hold frames of the same number.
+        Folder of ``.parquet`` files with the columns of `load_observations`. All rows of a frame
+        stand in one file, and no two files hold frames of the same number.
     camera
         If given, every centroid must lie on its detector.
     columns
@@ -189,8 +227,8 @@ def open_partitions(
     Raises
     ------
     ObservationError
-        If a file is damaged, does not fit to the others, or repeats a frame number of another. Rows are checked when
-        they are first worked on.
+        If a file is damaged, does not fit to the others, or repeats a frame number of another. Rows
+        are checked when they are first worked on.
     """
     check_mapping(columns or {})
     folder = Path(folder)
@@ -199,18 +237,23 @@ def open_partitions(
     # Files of a simulation that was stopped while they took their places do so now.
     manifest = read_manifest(folder)
     if manifest is not None and "calibrate" in manifest.steps:
-        raise ObservationError(f"{folder}: is the folder of a run; name its table, {folder / 'observations.parquet'}.")
+        raise ObservationError(
+            f"{folder}: is the folder of a run; name its table, {folder / 'observations.parquet'}."
+        )
     paths = sorted(path.resolve() for path in folder.iterdir() if path.suffix.lower() == ".parquet")
     if not paths:
         raise ObservationError(
-            f"{folder}: is a directory that holds no .parquet file; name a table of observations, or a folder of them."
+            f"{folder}: is a directory that holds no .parquet file; name a table of "
+            "observations, or a folder of them."
         )
     reader = PartitionReader(camera, dict(columns or {}))
     frame = reader.columns.get("frame", "frame")
     summaries = [parquet_summary(path, frame) for path in paths]
     for path, summary in zip(paths, summaries, strict=True):
         _check_alike(path, summary, paths[0], summaries[0], reader)
-    parts = [_partition(path, summary, frame) for path, summary in zip(paths, summaries, strict=True)]
+    parts = [
+        _partition(path, summary, frame) for path, summary in zip(paths, summaries, strict=True)
+    ]
     parts.sort(key=lambda part: (part.first_frame, part.path))
     _check_frames(parts, reader)
     meta = {"directions": "undeclared", **summaries[0].meta, "source": str(folder)}
@@ -236,9 +279,15 @@ def _partition(path: Path, summary: ParquetSummary, frame: str) -> Partition:
 
 
 def _check_alike(
-    path: Path, summary: ParquetSummary, first_path: Path, first: ParquetSummary, reader: PartitionReader
+    path: Path,
+    summary: ParquetSummary,
+    first_path: Path,
+    first: ParquetSummary,
+    reader: PartitionReader,
 ) -> None:
-    """Columns that estimates are made of must be in all files or in none, and directions of one kind."""
+    """Columns that estimates are made of must be in all files or in none, and directions of one
+    kind.
+    """
     for name in STREAMED:
         own = reader.columns.get(name, name)
         # Frame numbers are read as they are.
@@ -251,7 +300,11 @@ def _check_alike(
         if (own in summary.names) != (own in first.names):
             there, missing = (path, first_path) if own in summary.names else (first_path, path)
             raise ObservationError(
-                f"{missing}: column {own} is missing, and {there} has it; write it to all files, or to none.",
+                (
+                    f"{missing}: column {own} is missing, and {there} has it; write it to all "
+                    "files, "
+                    "or to none."
+                ),
                 column=own,
             )
     if not summary.n_rows:
@@ -259,7 +312,8 @@ def _check_alike(
     kinds = [s.meta.get("directions", "undeclared") for s in (first, summary)]
     if kinds[0] != kinds[1]:
         raise ObservationError(
-            f"{path}: its directions are {kinds[1]}, those of {first_path} {kinds[0]}; keep them in folders of their "
+            f"{path}: its directions are {kinds[1]}, those of {first_path} {kinds[0]}; keep them "
+            "in folders of their "
             "own."
         )
 
@@ -280,7 +334,8 @@ def _check_frames(parts: Sequence[Partition], reader: PartitionReader) -> None:
             shared = np.intersect1d(numbers(earlier), numbers(part), assume_unique=True)
             if len(shared):
                 raise ObservationError(
-                    f"{part.path}: frame {shared[0]} is in {earlier.path.name} too; keep all rows of a frame in one "
+                    f"{part.path}: frame {shared[0]} is in {earlier.path.name} too; keep all "
+                    "rows of a frame in one "
                     "file, and give every frame its own number.",
                     column="frame",
                 )

@@ -1,4 +1,6 @@
-"""What every table with one row per star and frame has in common, and how such tables are written."""
+"""What every table with one row per star and frame has in common, and how such tables are
+written.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ _Array = TypeVar("_Array", bound="np.ndarray[Any, Any]")
 class FrameRows:
     """Rows sorted by frame; a class that has these columns gets the rest from here.
 
-    `frame` (N,) is the frame number of each row and `frame_ids` (K,) are all of them, both ascending; `x_px` and `y_px`
-    (N,) are centroids, px.
+    `frame` (N,) is the frame number of each row and `frame_ids` (K,) are all of them, both
+    ascending; `x_px` and `y_px` (N,) are centroids, px.
     """
 
     frame: IntArray
@@ -36,7 +38,9 @@ class FrameRows:
 
     @cached_property
     def frame_starts(self) -> IntArray:
-        """First row of each frame, and N, shape (K + 1,): frame k has rows ``starts[k]:starts[k + 1]``."""
+        """First row of each frame, and N, shape (K + 1,): frame k has rows ``starts[k]:starts[k +
+        1]``.
+        """
         starts = np.searchsorted(self.frame, self.frame_ids).astype(np.int64)
         return locked(np.append(starts, np.int64(len(self.frame))))
 
@@ -65,7 +69,9 @@ class FrameRows:
         wanted = np.asarray(ids).ravel()
         missing = np.setdiff1d(wanted, self.frame_ids)
         if missing.size:
-            raise ObservationError(f"{table}: there is no frame {missing[0]}; choose among frame_ids.")
+            raise ObservationError(
+                f"{table}: there is no frame {missing[0]}; choose among frame_ids."
+            )
         return wanted
 
 

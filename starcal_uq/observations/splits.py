@@ -22,7 +22,9 @@ _LABELS = {
 
 
 @bounded
-def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> tuple[Observations, Observations]:
+def split_frames(
+    obs: Observations, how: str = "odd-even", *, seed: int = 0
+) -> tuple[Observations, Observations]:
     """Two tables that share no frame and together are the whole.
 
     Parameters
@@ -30,8 +32,8 @@ def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> 
     obs : Observations
         At least two frames.
     how : {"odd-even", "halves", "random"}
-        Every other frame in their order (the first, third... are the odd ones, whatever their numbers); the first and
-        the second half; or a random half.
+        Every other frame in their order (the first, third... are the odd ones, whatever their
+        numbers); the first and the second half; or a random half.
     seed : int
         Seed of the random half.
 
@@ -42,7 +44,9 @@ def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> 
     """
     labels = split_labels(how)
     if obs.n_frames < 2:
-        raise ComparisonError(f"observations: {obs.n_frames} frame cannot be split in two; give at least two frames.")
+        raise ComparisonError(
+            f"observations: {obs.n_frames} frame cannot be split in two; give at least two frames."
+        )
     place = np.arange(obs.n_frames)
     if how == "odd-even":
         first = place % 2 == 0
@@ -55,7 +59,8 @@ def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> 
 
 
 def one_of_each(n: int, limit: int, seed: int = 0) -> IntArray:
-    """Places of at most `limit` out of n in ascending order: one at random of each of `limit` equal stretches.
+    """Places of at most `limit` out of n in ascending order: one at random of each of `limit` equal
+    stretches.
 
     A stratified sample: it follows whatever changes along a run, and meets no pattern of its own.
     """
@@ -66,9 +71,13 @@ def one_of_each(n: int, limit: int, seed: int = 0) -> IntArray:
 
 
 def frame_sample(obs: Observations, limit: int, seed: int = 0) -> tuple[Observations, IntArray]:
-    """At most `limit` frames as a table, all if there are no more, and their places among the frames."""
+    """At most `limit` frames as a table, all if there are no more, and their places among the
+    frames.
+    """
     chosen = one_of_each(obs.n_frames, limit, seed)
-    return (obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])), chosen
+    return (
+        obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
+    ), chosen
 
 
 def split_labels(how: str) -> tuple[str, str]:
@@ -79,7 +88,9 @@ def split_labels(how: str) -> tuple[str, str]:
 
 
 def shared_frames(a: Observations, b: Observations) -> int:
-    """Number of frames of `a` that `b` holds as well, whatever their numbers: the same pixels and directions."""
+    """Number of frames of `a` that `b` holds as well, whatever their numbers: the same pixels and
+    directions.
+    """
     theirs = set(_frames(b))
     return sum(frame in theirs for frame in _frames(a))
 

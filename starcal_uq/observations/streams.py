@@ -1,4 +1,6 @@
-"""Frames from a file larger than memory, one after the other, with the checks of `load_observations`."""
+"""Frames from a file larger than memory, one after the other, with the checks of
+`load_observations`.
+"""
 
 from __future__ import annotations
 
@@ -44,8 +46,9 @@ _BATCH_ROWS = 16_384
 class FrameStream:
     """The frames of a file or of a folder of files; can be iterated over again and again.
 
-    Every centroid must lie on the detector of the camera. `columns` are names in the files of columns that are called
-    otherwise. Of `batch_rows` in memory at a time, a frame that is cut by the end of a batch is put together again.
+    Every centroid must lie on the detector of the camera. `columns` are names in the files of
+    columns that are called otherwise. Of `batch_rows` in memory at a time, a frame that is cut by
+    the end of a batch is put together again.
     """
 
     paths: tuple[Path, ...]
@@ -72,8 +75,8 @@ def stream_frames(
     Parameters
     ----------
     path
-        A ``.parquet`` or ``.csv`` file, or a folder of them, which are read in the order of their names. The rows of a
-        frame must follow each other, in one file.
+        A ``.parquet`` or ``.csv`` file, or a folder of them, which are read in the order of their
+        names. The rows of a frame must follow each other, in one file.
     camera
         If given, every centroid must lie on its detector.
     columns
@@ -84,14 +87,15 @@ def stream_frames(
     Returns
     -------
     FrameStream
-        An iterable of Observations of one frame each, with the columns frame, x_px, y_px, ra_deg, dec_deg and, where
-        the file has it, sigma_px. Each iteration reads from the start.
+        An iterable of Observations of one frame each, with the columns frame, x_px, y_px, ra_deg,
+        dec_deg and, where the file has it, sigma_px. Each iteration reads from the start.
 
     Raises
     ------
     ObservationError
-        Here, if there is no such file or its ending cannot be streamed; during iteration, as `load_observations`, and
-        when the rows of a frame do not follow each other. The frames before have been given out by then.
+        Here, if there is no such file or its ending cannot be streamed; during iteration, as
+        `load_observations`, and when the rows of a frame do not follow each other. The frames
+        before have been given out by then.
     """
     check_mapping(columns or {})
     if batch_rows < 1:
@@ -103,17 +107,22 @@ def stream_frames(
     if path.is_dir():
         paths = tuple(sorted(p for p in path.iterdir() if p.suffix.lower() in (".parquet", ".csv")))
         if not paths:
-            raise ObservationError(f"{path}: the folder holds no .parquet or .csv file; name another.")
+            raise ObservationError(
+                f"{path}: the folder holds no .parquet or .csv file; name another."
+            )
     elif path.suffix.lower() not in (".parquet", ".csv"):
         raise ObservationError(
-            f"{path}: the ending {path.suffix or '(none)'} cannot be streamed; save the table as .parquet or .csv."
+            f"{path}: the ending {path.suffix or '(none)'} cannot be streamed; save the table as "
+            ".parquet or .csv."
         )
     return FrameStream(paths, camera, dict(columns or {}), batch_rows)
 
 
 @dataclass
 class _Seen:
-    """Frame numbers that went by, as disjoint intervals, so that consecutive numbers take no memory."""
+    """Frame numbers that went by, as disjoint intervals, so that consecutive numbers take no
+    memory.
+    """
 
     first: list[int] = field(default_factory=list)
     last: list[int] = field(default_factory=list)
@@ -147,10 +156,16 @@ class _Rows:
 
     def part(self, start: int, stop: int | None) -> _Rows:
         rows = slice(start, stop)
-        return _Rows({name: values[rows].copy() for name, values in self.columns.items()}, self.numbers[rows].copy())
+        return _Rows(
+            {name: values[rows].copy() for name, values in self.columns.items()},
+            self.numbers[rows].copy(),
+        )
 
     def followed_by(self, other: _Rows) -> _Rows:
-        columns = {name: np.concatenate([values, other.columns[name]]) for name, values in self.columns.items()}
+        columns = {
+            name: np.concatenate([values, other.columns[name]])
+            for name, values in self.columns.items()
+        }
         return _Rows(columns, np.concatenate([self.numbers, other.numbers]))
 
 
@@ -186,7 +201,8 @@ def _typed(path: Path, raw: RawTable, wanted: Mapping[str, str], known: set[str]
     raise_problems(str(path), raw.word, raw.numbers, problems)
     if known is not None and set(columns) != known:
         raise ObservationError(
-            f"{path}, {raw.word} {raw.numbers[0]}: column {wanted['sigma_px']} has values in some rows only; "
+            f"{path}, {raw.word} {raw.numbers[0]}: column {wanted['sigma_px']} has values in "
+            "some rows only; "
             "fill it in everywhere or remove it.",
             row=int(raw.numbers[0]),
             column=wanted["sigma_px"],
@@ -195,14 +211,23 @@ def _typed(path: Path, raw: RawTable, wanted: Mapping[str, str], known: set[str]
 
 
 def _given_out(
-    path: Path, word: str, rows: _Rows, starts: IntArray, camera: Camera | None, seen: _Seen, meta: AnyDict
+    path: Path,
+    word: str,
+    rows: _Rows,
+    starts: IntArray,
+    camera: Camera | None,
+    seen: _Seen,
+    meta: AnyDict,
 ) -> Iterator[Observations]:
-    """Check the frames between `starts`, all together because that is faster, and give them out one by one."""
+    """Check the frames between `starts`, all together because that is faster, and give them out one
+    by one.
+    """
     frame = rows.columns["frame"]
     for start in starts[:-1].tolist():
         if not seen.add(int(frame[start])):
             raise ObservationError(
-                f"{path}, {word} {rows.numbers[start]}: frame {frame[start]} comes back after other frames; "
+                f"{path}, {word} {rows.numbers[start]}: frame {frame[start]} comes back after "
+                "other frames; "
                 "sort the table by frame, and give every frame of a folder its own number.",
                 row=int(rows.numbers[start]),
                 column="frame",
@@ -225,7 +250,9 @@ def _parquet_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[
             numbers = np.arange(first, first + batch.num_rows)
             first += batch.num_rows
             if batch.num_rows:
-                arrays = {name: arrow_values(pa.chunked_array([batch.column(name)])) for name in columns}
+                arrays = {
+                    name: arrow_values(pa.chunked_array([batch.column(name)])) for name in columns
+                }
                 yield RawTable(arrays, names, numbers, "row", meta)
 
 
@@ -246,17 +273,27 @@ def _csv_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawT
                 for number, row in batch:
                     if len(row) != len(names):
                         raise ObservationError(
-                            f"{path}, line {number}: {len(row)} values under a header of {len(names)} columns; "
+                            f"{path}, line {number}: {len(row)} values under a header of "
+                            f"{len(names)} columns; "
                             "correct or remove the row.",
                             row=number,
                         )
-                columns = {name: [row[i] for _, row in batch] for i, name in enumerate(names) if name in wanted}
+                columns = {
+                    name: [row[i] for _, row in batch]
+                    for i, name in enumerate(names)
+                    if name in wanted
+                }
                 numbers = np.array([number for number, _ in batch])
                 yield RawTable(columns, names, numbers, "line", decimal_comma=delimiter == ";")
     except UnicodeDecodeError:
-        raise ObservationError(f"{path}: the text is not UTF-8; save the file in the encoding UTF-8.") from None
+        raise ObservationError(
+            f"{path}: the text is not UTF-8; save the file in the encoding UTF-8."
+        ) from None
     except csv.Error as error:
         raise ObservationError(
-            f"{path}, line {reader.line_num}: the row cannot be read ({error}); check its quotation marks.",
+            (
+                f"{path}, line {reader.line_num}: the row cannot be read ({error}); check its "
+                "quotation marks."
+            ),
             row=reader.line_num,
         ) from None

@@ -1,4 +1,5 @@
-"""The observations table: measured star positions with the directions they belong to, frame by frame.
+"""The observations table: measured star positions with the directions they belong to, frame by
+frame.
 
 It is the only thing that passes from images, or a simulation, to the estimators.
 """
@@ -28,15 +29,20 @@ if TYPE_CHECKING:
 
 # Rows of a column that are hashed at once.
 _ROWS_AT_ONCE = 100_000
-_DTYPES: dict[str, type] = {"whole": np.int64, "number": np.float64, "text": np.str_, "time": np.str_}
+_DTYPES: dict[str, type] = {
+    "whole": np.int64,
+    "number": np.float64,
+    "text": np.str_,
+    "time": np.str_,
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Observations(FrameRows, Shown):
     """Stars measured in pixels, with their directions; one row per star and frame, sorted by frame.
 
-    Rows given in another order are sorted by frame; within a frame they keep their order. The arrays are
-    copies and cannot be written to.
+    Rows given in another order are sorted by frame; within a frame they keep their order. The
+    arrays are copies and cannot be written to.
 
     Attributes
     ----------
@@ -53,21 +59,22 @@ class Observations(FrameRows, Shown):
     mag : array, shape (N,), or None
         Magnitude; NaN where unknown.
     direction_mas : array, shape (N,), or None
-        Error of the direction per axis that its catalogue states, milliarcseconds; NaN where unknown. Used where star
-        errors are asked for.
+        Error of the direction per axis that its catalogue states, milliarcseconds; NaN where
+        unknown. Used where star errors are asked for.
     time_utc : array of str, shape (N,), or None
         Middle of the exposure, UTC, such as ``2026-11-21T01:02:03.5``.
     temperature_c : array, shape (N,), or None
         Temperature of the optics, Celsius; NaN where unknown.
     meta : dict
         Plain values about the table: ``directions`` ("apparent", "catalogue" or "undeclared"),
-        ``observer_velocity_km_s`` (three numbers or None), ``source``, ``ignored_columns``, ``seed`` and more.
+        ``observer_velocity_km_s`` (three numbers or None), ``source``, ``ignored_columns``,
+        ``seed`` and more.
     stated_px : array, shape (N,), or None
-        Noise that the stars state, px, NaN where they state none, of a table whose `sigma_px` comes from a fitted noise
-        model (see `weighted`); None for all other tables.
+        Noise that the stars state, px, NaN where they state none, of a table whose `sigma_px` comes
+        from a fitted noise model (see `weighted`); None for all other tables.
     noise_axes : array, shape (2, 2), or None
-        Covariance of the noise of x and y in units of `sigma_px` squared, of determinant one, of a fitted noise model
-        whose axes differ; None where they are alike.
+        Covariance of the noise of x and y in units of `sigma_px` squared, of determinant one, of a
+        fitted noise model whose axes differ; None where they are alike.
 
     Raises
     ------
@@ -96,7 +103,11 @@ class Observations(FrameRows, Shown):
         for name, values in columns.items():
             if len(values) != n:
                 raise ObservationError(
-                    f"observations: {name} has {len(values)} rows and frame has {n}; give equal lengths.",
+                    (
+                        f"observations: {name} has {len(values)} rows and frame has {n}; give "
+                        "equal "
+                        "lengths."
+                    ),
                     column=name,
                 )
         frame = columns["frame"]
@@ -106,13 +117,15 @@ class Observations(FrameRows, Shown):
             if self.stated_px is not None:
                 object.__setattr__(self, "stated_px", locked(self.stated_px[order]))
         for name, values in columns.items():
-            # A column without a single value is as good as absent, and files do not tell the two apart.
+            # A column without a single value is as good as absent, and files do not tell the two
+            # apart.
             absent = COLUMNS[name].gaps and n > 0 and _all_missing(values)
             object.__setattr__(self, name, None if absent else locked(values))
         directions = self.meta.get("directions", "undeclared")
         if directions not in ("apparent", "catalogue", "undeclared"):
             raise ObservationError(
-                f"observations: meta directions is {directions!r}; use apparent, catalogue or undeclared."
+                f"observations: meta directions is {directions!r}; use apparent, catalogue or "
+                "undeclared."
             )
         object.__setattr__(self, "meta", {**self.meta, "directions": directions})
 
@@ -146,7 +159,8 @@ class Observations(FrameRows, Shown):
 
     @cached_property
     def data_hash(self) -> str:
-        """SHA-256 (hex) of the columns that are present; the same for the same table from any file format.
+        """SHA-256 (hex) of the columns that are present; the same for the same table from any file
+        format.
 
         A noise model changes nothing in it: the data are what was measured and stated.
         """
@@ -168,13 +182,19 @@ class Observations(FrameRows, Shown):
         """The rows where `mask` (bool, shape (N,)) is true."""
         chosen = self._mask(mask, "observations")
         columns = {name: values[chosen] for name, values in self.columns.items()}
-        return replace(self, **columns, stated_px=None if self.stated_px is None else self.stated_px[chosen])
+        return replace(
+            self, **columns, stated_px=None if self.stated_px is None else self.stated_px[chosen]
+        )
 
     def weighted(self, sigma_px: FloatArray, noise_axes: FloatArray | None = None) -> Observations:
-        """The same data with another noise, (N,) px, in `sigma_px`, and its axes: those of a fitted noise model."""
+        """The same data with another noise, (N,) px, in `sigma_px`, and its axes: those of a fitted
+        noise model.
+        """
         stated = self.unweighted.sigma_px
         kept = np.full(len(self), np.nan) if stated is None else stated
-        return replace(self, sigma_px=sigma_px, stated_px=locked(np.array(kept)), noise_axes=noise_axes)
+        return replace(
+            self, sigma_px=sigma_px, stated_px=locked(np.array(kept)), noise_axes=noise_axes
+        )
 
     @property
     def unweighted(self) -> Observations:
@@ -208,11 +228,15 @@ class Observations(FrameRows, Shown):
         for (first, last), found in zip(ranges, inside, strict=True):
             if not len(found):
                 asked = str(first) if first == last else f"{first}-{last}"
-                raise ObservationError(f"there is no frame {asked}: the table has {ids[0]} to {ids[-1]}.")
+                raise ObservationError(
+                    f"there is no frame {asked}: the table has {ids[0]} to {ids[-1]}."
+                )
         return self.select_frames(np.unique(np.concatenate(inside)))
 
     def with_meta(self, **entries: Any) -> Observations:
-        """The same table with entries of `meta` added or changed, such as ``directions="apparent"``."""
+        """The same table with entries of `meta` added or changed, such as
+        ``directions="apparent"``.
+        """
         return replace(self, meta={**self.meta, **entries})
 
     def check(self, camera: Camera | None = None) -> None:
@@ -235,19 +259,24 @@ class Observations(FrameRows, Shown):
         return frame
 
     def to_table(self) -> Any:
-        """The columns as an astropy Table with units and descriptions; `meta` is in its ``meta``."""
+        """The columns as an astropy Table with units and descriptions; `meta` is in its
+        ``meta``.
+        """
         return astropy_table(self.columns, self.meta)
 
     def head(self, n: int = 5) -> Any:
         """The first `n` rows as a pandas DataFrame."""
         return self.to_dataframe().head(n)
 
-    def save(self, path: str | os.PathLike[str], force: bool = False, camera: Camera | None = None) -> None:
+    def save(
+        self, path: str | os.PathLike[str], force: bool = False, camera: Camera | None = None
+    ) -> None:
         """Write the table without loss of digits; the ending decides what as.
 
-        ECSV, Parquet and FITS (``.ecsv``, ``.parquet``, ``.fits``) carry `meta`; CSV is plain, so that every
-        spreadsheet opens it, and loses `meta`. A ``.corr`` file is astrometry.net's, with its pixels counted from
-        (1, 1): one for each frame, named after it (``night_3.corr``) where there are several.
+        ECSV, Parquet and FITS (``.ecsv``, ``.parquet``, ``.fits``) carry `meta`; CSV is plain, so
+        that every spreadsheet opens it, and loses `meta`. A ``.corr`` file is astrometry.net's,
+        with its pixels counted from (1, 1): one for each frame, named after it (``night_3.corr``)
+        where there are several.
 
         Parameters
         ----------
@@ -256,7 +285,8 @@ class Observations(FrameRows, Shown):
         force
             Whether a file may be replaced.
         camera
-            For ``.corr``: says where each star was expected, ``index_x``, and which direction was seen, ``field_ra``.
+            For ``.corr``: says where each star was expected, ``index_x``, and which direction was
+            seen, ``field_ra``.
 
         Raises
         ------
@@ -276,12 +306,13 @@ class Observations(FrameRows, Shown):
         Parameters
         ----------
         solutions
-            A solution or a list of them, in which those that failed keep their frame number and have no rows. Of tetra3
-            and cedar-solve, what ``solve_from_centroids(..., return_matches=True)`` returned (rows before columns, from
-            the corner of the image); of tetra3rs a tuple (result, centroids, database).
+            A solution or a list of them, in which those that failed keep their frame number and
+            have no rows. Of tetra3 and cedar-solve, what ``solve_from_centroids(...,
+            return_matches=True)`` returned (rows before columns, from the corner of the image); of
+            tetra3rs a tuple (result, centroids, database).
         camera
-            The size of its detector says where the middle of the image is, from which tetra3rs counts; by default what
-            the result says.
+            The size of its detector says where the middle of the image is, from which tetra3rs
+            counts; by default what the result says.
         times
             Middle of the exposure of each frame, UTC.
 
@@ -299,7 +330,9 @@ class Observations(FrameRows, Shown):
         return obs
 
     def __repr__(self) -> str:
-        return f"Observations({self.n_stars} stars, {self.n_frames} frames; {', '.join(self.columns)})"
+        return (
+            f"Observations({self.n_stars} stars, {self.n_frames} frames; {', '.join(self.columns)})"
+        )
 
 
 def load_observations(
@@ -309,26 +342,28 @@ def load_observations(
 ) -> Observations:
     """Read and check a table of observations.
 
-    It is one that `Observations.save` wrote (``.csv``, ``.ecsv``, ``.parquet``, ``.fits``), a ``.corr`` file of
-    astrometry.net, or matches of tetra3 or tetra3rs as JSON (see `Observations.from_matches`). ``index_id`` and
-    ``match_weight`` of astrometry.net are not used: the first counts stars within one of its indexes and names none.
+    It is one that `Observations.save` wrote (``.csv``, ``.ecsv``, ``.parquet``, ``.fits``), a
+    ``.corr`` file of astrometry.net, or matches of tetra3 or tetra3rs as JSON (see
+    `Observations.from_matches`). ``index_id`` and ``match_weight`` of astrometry.net are not used:
+    the first counts stars within one of its indexes and names none.
 
     Parameters
     ----------
     path
-        The file, or several, whose frames are then numbered one after the other. In CSV and ECSV, lines that start with
-        ``#`` are comments.
+        The file, or several, whose frames are then numbered one after the other. In CSV and ECSV,
+        lines that start with ``#`` are comments.
     camera
         If given, every centroid must lie on its detector.
     columns
-        Names in the file of columns that are called otherwise, such as ``{"ra_deg": "ra_apparent_deg"}``.
-        Columns that are not needed are ignored and listed in ``meta["ignored_columns"]``.
+        Names in the file of columns that are called otherwise, such as ``{"ra_deg":
+        "ra_apparent_deg"}``. Columns that are not needed are ignored and listed in
+        ``meta["ignored_columns"]``.
 
     Raises
     ------
     ObservationError
-        If the file cannot be read or a row is bad; the message names the first bad row and counts the
-        others, and ``problems`` of the error lists them all.
+        If the file cannot be read or a row is bad; the message names the first bad row and counts
+        the others, and ``problems`` of the error lists them all.
     """
     if isinstance(path, str | os.PathLike):
         values, meta = read_table(path, camera, columns or {})
@@ -338,8 +373,13 @@ def load_observations(
         raise ObservationError("observations: there is no file; give at least one.")
     common = [name for name in tables[0].columns if all(name in table.columns for table in tables)]
     first = np.cumsum([0, *(table.n_frames for table in tables)])
-    frames = [np.searchsorted(t.frame_ids, t.frame) + start for t, start in zip(tables, first, strict=False)]
-    joined: AnyDict = {name: np.concatenate([table.columns[name] for table in tables]) for name in common}
+    frames = [
+        np.searchsorted(t.frame_ids, t.frame) + start
+        for t, start in zip(tables, first, strict=False)
+    ]
+    joined: AnyDict = {
+        name: np.concatenate([table.columns[name] for table in tables]) for name in common
+    }
     kinds = {str(table.meta["directions"]) for table in tables}
     meta = {**tables[0].meta, "source": [str(one) for one in path]}
     meta["directions"] = kinds.pop() if len(kinds) == 1 else "undeclared"
@@ -352,18 +392,28 @@ def _array(name: str, values: Any) -> Any:
     array = np.asarray(values)
     if kind in ("text", "time") and array.dtype.kind == "O":
         # pandas marks a missing text by None or NaN, which would become the words "None" and "nan".
-        array = np.array(["" if v is None or v != v else str(v) for v in array.tolist()], dtype=np.str_)
-    if kind == "whole" and array.dtype.kind == "f" and not all(v.is_integer() for v in array.tolist()):
-        raise ObservationError(f"observations: {name} holds fractions; give whole numbers.", column=name)
+        array = np.array(
+            ["" if v is None or v != v else str(v) for v in array.tolist()], dtype=np.str_
+        )
+    if (
+        kind == "whole"
+        and array.dtype.kind == "f"
+        and not all(v.is_integer() for v in array.tolist())
+    ):
+        raise ObservationError(
+            f"observations: {name} holds fractions; give whole numbers.", column=name
+        )
     try:
         array = np.array(array, dtype=_DTYPES[kind])
     except (TypeError, ValueError) as error:
         raise ObservationError(
-            f"observations: column {name} is not of kind {kind!r} ({error}); convert it first.", column=name
+            f"observations: column {name} is not of kind {kind!r} ({error}); convert it first.",
+            column=name,
         ) from None
     if array.ndim != 1:
         raise ObservationError(
-            f"observations: column {name} has shape {array.shape}; give one value per row.", column=name
+            f"observations: column {name} has shape {array.shape}; give one value per row.",
+            column=name,
         )
     return array
 
@@ -391,7 +441,9 @@ def _all_missing(values: Any) -> bool:
 
 
 def joined_columns(tables: Sequence[Observations], **instead: Sequence[FloatArray]) -> AnyDict:
-    """All rows of several tables; a column that only some have is filled, or left out where it may have no gaps."""
+    """All rows of several tables; a column that only some have is filled, or left out where it may
+    have no gaps.
+    """
     columns: AnyDict = {}
     for name, column in COLUMNS.items():
         values: Sequence[Any] = instead.get(name) or [getattr(table, name) for table in tables]
@@ -400,6 +452,9 @@ def joined_columns(tables: Sequence[Observations], **instead: Sequence[FloatArra
             continue
         gap: Any = "" if column.kind == "text" else np.nan
         columns[name] = np.concatenate(
-            [np.full(len(table), gap) if v is None else v for table, v in zip(tables, values, strict=True)]
+            [
+                np.full(len(table), gap) if v is None else v
+                for table, v in zip(tables, values, strict=True)
+            ]
         )
     return columns

@@ -22,7 +22,8 @@ from starcal_uq.paper.published import (
     printed,
 )
 
-# Where the stars were is not printed; it moves a root mean square over the field by about one per cent.
+# Where the stars were is not printed; it moves a root mean square over the field by about one per
+# cent.
 _AGREES = 0.05
 # Two runs differ by less than this many standard deviations of their difference.
 _NOISE = 3.0
@@ -31,7 +32,8 @@ YES, WITHIN_NOISE, NO = "yes", "within noise", "no"
 
 @dataclass(frozen=True)
 class PaperCheck:
-    """A printed statement, its place and text, what follows from the paper's other numbers, and whether it agrees.
+    """A printed statement, its place and text, what follows from the paper's other numbers, and
+    whether it agrees.
 
     `agrees` is ``yes``, ``within noise`` or ``no``.
     """
@@ -44,7 +46,9 @@ class PaperCheck:
 
 
 def printed_camera(truth: Camera, method: str, coefficients_from: str = "Table 2") -> Camera:
-    """The camera that the paper prints for a method; `coefficients_from` is a place (Table 2 or section 3.3)."""
+    """The camera that the paper prints for a method; `coefficients_from` is a place (Table 2 or
+    section 3.3).
+    """
     f, x0, y0 = (printed(method, name).value for name in ("f_mm", "x0_px", "y0_px"))
     changes: dict[str, object] = {"focal_mm": f, "x0_px": x0, "y0_px": y0}
     if method == LEAST_SQUARES:
@@ -53,11 +57,13 @@ def printed_camera(truth: Camera, method: str, coefficients_from: str = "Table 2
     return truth.replace(**changes, coefficients=k)
 
 
-def paper_checks(truth: Camera, xy_px: FloatArray, sigmas: Mapping[str, Mapping[str, float]]) -> tuple[PaperCheck, ...]:
+def paper_checks(
+    truth: Camera, xy_px: FloatArray, sigmas: Mapping[str, Mapping[str, float]]
+) -> tuple[PaperCheck, ...]:
     """Every printed error and claim against the paper's own numbers.
 
-    `xy_px` (N, 2) is where stars are seen, for errors that are means over stars; `sigmas` are the standard deviations
-    of one run, px units, by method and parameter: what two runs may differ by.
+    `xy_px` (N, 2) is where stars are seen, for errors that are means over stars; `sigmas` are the
+    standard deviations of one run, px units, by method and parameter: what two runs may differ by.
     """
     return (
         *(_reprojection(truth, xy_px, method) for method in PAPER_METHODS),
@@ -70,7 +76,11 @@ def paper_checks(truth: Camera, xy_px: FloatArray, sigmas: Mapping[str, Mapping[
 
 
 def _values(
-    readings: tuple[ErrorReading, ...], truth: Camera, camera: Camera, xy_px: FloatArray, largest: bool
+    readings: tuple[ErrorReading, ...],
+    truth: Camera,
+    camera: Camera,
+    xy_px: FloatArray,
+    largest: bool,
 ) -> dict[str, float]:
     """Each reading without noise, by its words; the main one first."""
     found = {}
@@ -87,13 +97,17 @@ def _compare(number: Printed, statement: str, values: dict[str, float]) -> Paper
     follows = f"{significant(values[main])} ({main})"
     if best != main:
         follows += f"; nearest reading {significant(values[best])} ({best})"
-    return PaperCheck(statement, number.place, number.text, follows, YES if distance[best] <= _AGREES else NO)
+    return PaperCheck(
+        statement, number.place, number.text, follows, YES if distance[best] <= _AGREES else NO
+    )
 
 
 def _reprojection(truth: Camera, xy_px: FloatArray, method: str) -> PaperCheck:
     values = _values(REPROJECTION, truth, printed_camera(truth, method), xy_px, largest=False)
     row = PAPER_METHODS.index(method) + 1
-    return _compare(printed(method, "reprojection_px"), f"Reprojection error of row {row}, px", values)
+    return _compare(
+        printed(method, "reprojection_px"), f"Reprojection error of row {row}, px", values
+    )
 
 
 def _largest(truth: Camera, xy_px: FloatArray, method: str) -> PaperCheck:
@@ -102,9 +116,14 @@ def _largest(truth: Camera, xy_px: FloatArray, method: str) -> PaperCheck:
     for place in places:
         camera = printed_camera(truth, method, place)
         some = _values(MAXIMUM, truth, camera, xy_px, largest=True)
-        values |= {words if len(places) == 1 else f"{words}, k of {place}": value for words, value in some.items()}
+        values |= {
+            words if len(places) == 1 else f"{words}, k of {place}": value
+            for words, value in some.items()
+        }
     figure = 4 + PAPER_METHODS.index(method)
-    return _compare(printed(method, "max_residual_px"), f"Largest residual of Fig. {figure}, px", values)
+    return _compare(
+        printed(method, "max_residual_px"), f"Largest residual of Fig. {figure}, px", values
+    )
 
 
 def _twice(first: Printed, second: Printed, sigma: float) -> str:
@@ -122,11 +141,15 @@ def _y0_error(truth: Camera, sigmas: Mapping[str, Mapping[str, float]]) -> Paper
     text = f"{fixed(error, 2)} ({y0.place}: {y0.text})"
     other = Printed(PROPOSED, "y0_error_px", fixed(error, 2), y0.place)
     agrees = _twice(number, other, sigmas[PROPOSED]["y0"])
-    return PaperCheck("Error of the proposed method in y₀, px", number.place, number.text, text, agrees)
+    return PaperCheck(
+        "Error of the proposed method in y₀, px", number.place, number.text, text, agrees
+    )
 
 
 def _others_y0(truth: Camera) -> PaperCheck:
-    errors = [abs(printed(method, "y0_px").value - truth.y0_px) for method in (LEAST_SQUARES, SAMAAN)]
+    errors = [
+        abs(printed(method, "y0_px").value - truth.y0_px) for method in (LEAST_SQUARES, SAMAAN)
+    ]
     low, high = CLAIMED_Y0_ERROR_PX
     return PaperCheck(
         "Error of both other methods in y₀, px",
@@ -139,7 +162,10 @@ def _others_y0(truth: Camera) -> PaperCheck:
 
 def _ratios() -> tuple[PaperCheck, ...]:
     checks = []
-    for quantity, what in (("max_residual_px", "largest residuals"), ("reprojection_px", "reprojection errors")):
+    for quantity, what in (
+        ("max_residual_px", "largest residuals"),
+        ("reprojection_px", "reprojection errors"),
+    ):
         best = printed(PROPOSED, quantity).value
         ratios = [printed(method, quantity).value / best for method in (LEAST_SQUARES, SAMAAN)]
         statement = f"“Two orders of magnitude” better than both other methods: ratio of the {what}"
@@ -154,8 +180,13 @@ def _coefficients(sigmas: Mapping[str, Mapping[str, float]]) -> tuple[PaperCheck
     """One experiment, printed twice."""
     checks = []
     for method, name in ((SAMAAN, "Samaan’s"), (PROPOSED, "the proposed")):
-        table, section = ([printed(method, k, place) for k in ("k1", "k2")] for place in ("Table 2", "section 3.3"))
-        found = [_twice(a, b, sigmas[method][a.quantity]) for a, b in zip(table, section, strict=True)]
+        table, section = (
+            [printed(method, k, place) for k in ("k1", "k2")]
+            for place in ("Table 2", "section 3.3")
+        )
+        found = [
+            _twice(a, b, sigmas[method][a.quantity]) for a, b in zip(table, section, strict=True)
+        ]
         same = next(answer for answer in (NO, WITHIN_NOISE, YES) if answer in found)
         checks.append(
             PaperCheck(

@@ -1,4 +1,6 @@
-"""What the paper's commands share: one progress bar for several parts, tasks, and the folder that they write."""
+"""What the paper's commands share: one progress bar for several parts, tasks, and the folder that
+they write.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ T = TypeVar("T")
 
 
 class Bar:
-    """One progress bar for several parts, which come in their order; `shares` are their work in common units."""
+    """One progress bar for several parts, which come in their order; `shares` are their work in
+    common units.
+    """
 
     def __init__(self, progress: Progress | None, shares: Mapping[str, int]) -> None:
         self.progress, self.shares = progress, shares
@@ -59,7 +63,9 @@ def run_or_stop(
     return found
 
 
-def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, bytes]) -> None:
+def write_tables(
+    folder: Path, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, bytes]
+) -> None:
     """Tables as CSV with all digits, figures as PNG in a folder of their own."""
     pictures = new_folder(new_folder(folder) / "figures")
     for name, png in figures.items():

@@ -2,11 +2,13 @@
 
 Two measures, both of which need a truth and therefore a simulation:
 
-- `reprojection_error_px` is eq. 16 of Ye & Yang 2017: undistorted measured points against ideal ones. Ideal points of
-  the true camera (their eq. 15 with their Table 1) make it blind to a wrong focal length; those of the estimated one
-  under the true attitude make it a measure of the principal point.
-- `map_error` compares the directions that two cameras give to the same pixels, after the best common rotation, which
-  every attitude takes up, is removed. It is blind to nothing that angles between stars can see.
+- `reprojection_error_px` is eq. 16 of Ye & Yang 2017: undistorted measured points against ideal
+  ones. Ideal points of the true camera (their eq. 15 with their Table 1) make it blind to a wrong
+  focal length; those of the estimated one under the true attitude make it a measure of the
+  principal point.
+- `map_error` compares the directions that two cameras give to the same pixels, after the best
+  common rotation, which every attitude takes up, is removed. It is blind to nothing that angles
+  between stars can see.
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ class PointErrors:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square length, px: eq. 16, whose sum runs over points and not over coordinates."""
+        """Root mean square length, px: eq. 16, whose sum runs over points and not over
+        coordinates.
+        """
         return float(np.sqrt(np.mean(np.sum(self.error_px**2, axis=1))))
 
     @property
@@ -53,11 +57,13 @@ class PointErrors:
 
 @dataclass(frozen=True)
 class MapError(PointErrors):
-    """Difference of the direction maps of two cameras at places (N, 2) px, the best common rotation removed.
+    """Difference of the direction maps of two cameras at places (N, 2) px, the best common rotation
+    removed.
 
-    `error_px` (N, 2) is what the true camera would have to displace the point by to give the estimated direction,
-    `error_arcsec` (N,) the angle between the two; `weight` (N,) sums to one; `rotation_arcsec` (3,) is the pitch, yaw
-    and roll that were removed, and that the wrong camera adds to every attitude.
+    `error_px` (N, 2) is what the true camera would have to displace the point by to give the
+    estimated direction, `error_arcsec` (N,) the angle between the two; `weight` (N,) sums to one;
+    `rotation_arcsec` (3,) is the pitch, yaw and roll that were removed, and that the wrong camera
+    adds to every attitude.
     """
 
     xy_px: FloatArray
@@ -82,13 +88,15 @@ class MapError(PointErrors):
 
 
 def detector_grid(camera: Camera, n: int = _GRID) -> tuple[FloatArray, FloatArray]:
-    """Points (n^2, 2) from edge to edge of the detector, and weights (n^2,) that make a mean over its area.
+    """Points (n^2, 2) from edge to edge of the detector, and weights (n^2,) that make a mean over
+    its area.
 
     Raises ValueError for fewer than two points along a side.
     """
     if n < 2:
         raise ValueError(f"a grid needs at least 2 points along each side, not {n}.")
-    # Simpson's rule where it applies: the squared distortion grows as the tenth power of the radius.
+    # Simpson's rule where it applies: the squared distortion grows as the tenth power of the
+    # radius.
     side = np.ones(n)
     side[[0, -1]] = 0.5
     if n % 2 == 1:
@@ -98,11 +106,15 @@ def detector_grid(camera: Camera, n: int = _GRID) -> tuple[FloatArray, FloatArra
     return grid_points(*detector_axes(camera, n)), weight / weight.sum()
 
 
-def map_error(truth: Camera, estimate: Camera, xy_px: FloatArray | None = None, *, n: int = _GRID) -> MapError:
-    """Compare the directions that two cameras give to the same pixels, the best common rotation removed.
+def map_error(
+    truth: Camera, estimate: Camera, xy_px: FloatArray | None = None, *, n: int = _GRID
+) -> MapError:
+    """Compare the directions that two cameras give to the same pixels, the best common rotation
+    removed.
 
-    At places `xy_px` (N, 2), such as those of stars, with equal weights; without them on a grid of `n` points along
-    each side of the detector, weighted by area. DistortionError when a distortion folds over within these points.
+    At places `xy_px` (N, 2), such as those of stars, with equal weights; without them on a grid of
+    `n` points along each side of the detector, weighted by area. DistortionError when a distortion
+    folds over within these points.
     """
     if xy_px is None:
         xy, weight = detector_grid(truth, n)
@@ -121,21 +133,27 @@ def map_error(truth: Camera, estimate: Camera, xy_px: FloatArray | None = None, 
     )
 
 
-def aligned(estimated: FloatArray, true: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Turn directions (N, 3) by the rotation that brings them closest to others, in weighted least squares.
+def aligned(
+    estimated: FloatArray, true: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Turn directions (N, 3) by the rotation that brings them closest to others, in weighted least
+    squares.
 
     Returns the turned directions, and the rotation (3, 3) taken off.
     """
-    rotation = quest(estimated, true, np.array([0, len(true)]), weight, covariance=False).rotations[0]
+    rotation = quest(estimated, true, np.array([0, len(true)]), weight, covariance=False).rotations[
+        0
+    ]
     return estimated @ rotation, rotation
 
 
 def undistorted(camera: Camera, xy_px: FloatArray, how: Undistortion = "model") -> FloatArray:
     """Points (N, 2) freed of distortion; a camera without coefficients leaves them where they are.
 
-    With `how` ``model`` as the camera's own distortion model says. The others take its first two coefficients as those
-    of one equation of the paper: eq. 14 with r of the ideal point, which makes it implicit; eq. 14 with r of the
-    measured point; eq. 6. DistortionError when the camera's own distortion folds over within these points.
+    With `how` ``model`` as the camera's own distortion model says. The others take its first two
+    coefficients as those of one equation of the paper: eq. 14 with r of the ideal point, which
+    makes it implicit; eq. 14 with r of the measured point; eq. 6. DistortionError when the camera's
+    own distortion folds over within these points.
     """
     xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
     if how not in UNDISTORTIONS:
@@ -170,10 +188,11 @@ def reprojection_error_px(
 ) -> PointErrors:
     """The paper's reprojection error (eq. 16) under one of its readings.
 
-    The true camera sees the stars at `xy_px` (N, 2), to which `noise_px` (N, 2) is added before they are undistorted
-    (`undistorted`) by the estimated coefficients. `optics` are the origin of the ideal points of eq. 15, under the true
-    attitude: f and principal point of Table 1, the estimated f ("focal") with the principal point of Table 1, or both
-    estimated. DistortionError when a distortion folds over within these points.
+    The true camera sees the stars at `xy_px` (N, 2), to which `noise_px` (N, 2) is added before
+    they are undistorted (`undistorted`) by the estimated coefficients. `optics` are the origin of
+    the ideal points of eq. 15, under the true attitude: f and principal point of Table 1, the
+    estimated f ("focal") with the principal point of Table 1, or both estimated. DistortionError
+    when a distortion folds over within these points.
     """
     if optics not in OPTICS:
         raise ValueError(f"optics {optics!r} is unknown: use one of {', '.join(OPTICS)}.")
@@ -189,9 +208,10 @@ def reprojection_error_px(
 class ErrorReading(NamedTuple):
     """One way to compute an error of a calibrated camera in pixels.
 
-    `faithful` says whether the paper's text allows it; undistortion and optics are as in `reprojection_error_px`, and
-    the undistortion ``crossed`` puts the coefficients into the other equation. Errors may be taken with centroid noise,
-    after the best rotation of the field, per coordinate instead of per star, or over the whole detector.
+    `faithful` says whether the paper's text allows it; undistortion and optics are as in
+    `reprojection_error_px`, and the undistortion ``crossed`` puts the coefficients into the other
+    equation. Errors may be taken with centroid noise, after the best rotation of the field, per
+    coordinate instead of per star, or over the whole detector.
     """
 
     key: str
@@ -208,30 +228,68 @@ class ErrorReading(NamedTuple):
 # Table 2, last column. The first is the main reading.
 REPROJECTION = (
     ErrorReading("eq16", "eq. 16 without noise", True),
-    ErrorReading("eq16 r measured", "eq. 16, r of the measured point", True, undistortion="eq14_measured"),
-    ErrorReading("eq16 crossed", "eq. 16, coefficients put into the other equation", True, undistortion="crossed"),
+    ErrorReading(
+        "eq16 r measured", "eq. 16, r of the measured point", True, undistortion="eq14_measured"
+    ),
+    ErrorReading(
+        "eq16 crossed",
+        "eq. 16, coefficients put into the other equation",
+        True,
+        undistortion="crossed",
+    ),
     ErrorReading("eq16 noisy", "eq. 16 with centroid noise", True, noisy=True),
     ErrorReading("eq16 per axis", "eq. 16 per coordinate", False, per_axis=True),
     ErrorReading("eq16 own f", "eq. 16, ideal points with the estimated f", False, optics="focal"),
-    ErrorReading("eq16 own optics", "eq. 16, ideal points with all estimated optics", False, optics="estimate"),
+    ErrorReading(
+        "eq16 own optics",
+        "eq. 16, ideal points with all estimated optics",
+        False,
+        optics="estimate",
+    ),
     ErrorReading("map", "best rotation removed", False, rotated=True),
-    ErrorReading("map per axis", "best rotation removed, per coordinate", False, rotated=True, per_axis=True),
+    ErrorReading(
+        "map per axis", "best rotation removed, per coordinate", False, rotated=True, per_axis=True
+    ),
 )
 # Figs. 4 to 6: the largest. The text allows all of them.
 MAXIMUM = (
     ErrorReading("eq16 field", "eq. 16 over the detector", True, whole_field=True),
     ErrorReading("eq16 stars", "eq. 16 at the stars", True),
     ErrorReading("eq16 noisy", "eq. 16 at the stars, with noise", True, noisy=True),
-    ErrorReading("eq16 crossed", "eq. 16, coefficients put into the other equation", True, "crossed", whole_field=True),
-    ErrorReading("eq16 own f", "eq. 16, ideal points with the estimated f", True, optics="focal", whole_field=True),
-    ErrorReading("eq16 own optics", "eq. 16, all estimated optics", True, optics="estimate", whole_field=True),
-    ErrorReading("map field", "best rotation removed, over the detector", True, rotated=True, whole_field=True),
+    ErrorReading(
+        "eq16 crossed",
+        "eq. 16, coefficients put into the other equation",
+        True,
+        "crossed",
+        whole_field=True,
+    ),
+    ErrorReading(
+        "eq16 own f",
+        "eq. 16, ideal points with the estimated f",
+        True,
+        optics="focal",
+        whole_field=True,
+    ),
+    ErrorReading(
+        "eq16 own optics", "eq. 16, all estimated optics", True, optics="estimate", whole_field=True
+    ),
+    ErrorReading(
+        "map field",
+        "best rotation removed, over the detector",
+        True,
+        rotated=True,
+        whole_field=True,
+    ),
     ErrorReading("map stars", "best rotation removed, at the stars", True, rotated=True),
 )
 
 
 def point_errors(
-    reading: ErrorReading, truth: Camera, estimate: Camera, xy_px: FloatArray, noise_px: FloatArray | None = None
+    reading: ErrorReading,
+    truth: Camera,
+    estimate: Camera,
+    xy_px: FloatArray,
+    noise_px: FloatArray | None = None,
 ) -> tuple[PointErrors, FloatArray]:
     """Errors of one reading, and the weights (n,) of the points, which sum to one.
 
@@ -248,22 +306,32 @@ def point_errors(
     elif reading.undistortion == "eq14_measured" and truth.distortion == "brown":
         how = "eq14_measured"
     noise = noise_px if reading.noisy else None
-    found = reprojection_error_px(truth, estimate, points, noise_px=noise, undistortion=how, optics=reading.optics)
+    found = reprojection_error_px(
+        truth, estimate, points, noise_px=noise, undistortion=how, optics=reading.optics
+    )
     return found, weight
 
 
 def error_sizes(
     truth: Camera, estimate: Camera, xy_px: FloatArray, noise_px: FloatArray
 ) -> Iterator[tuple[str, ErrorReading, float]]:
-    """Every reading of the reprojection error and of the largest residual: quantity, reading and value in px.
+    """Every reading of the reprojection error and of the largest residual: quantity, reading and
+    value in px.
 
-    Readings that an estimate does not have, because its distortion folds over within the field, are left out.
+    Readings that an estimate does not have, because its distortion folds over within the field, are
+    left out.
     """
     found: dict[tuple[object, ...], tuple[PointErrors, FloatArray] | None] = {}
     for quantity, readings in (("reprojection_px", REPROJECTION), ("max_residual_px", MAXIMUM)):
         for reading in readings:
             # Several readings look at the same points.
-            key = (reading.undistortion, reading.optics, reading.noisy, reading.rotated, reading.whole_field)
+            key = (
+                reading.undistortion,
+                reading.optics,
+                reading.noisy,
+                reading.rotated,
+                reading.whole_field,
+            )
             if key not in found:
                 try:
                     found[key] = point_errors(reading, truth, estimate, xy_px, noise_px)
@@ -271,7 +339,9 @@ def error_sizes(
                     found[key] = None
             errors = found[key]
             if errors is not None:
-                value = rms_px(reading, *errors) if quantity == "reprojection_px" else errors[0].max_px
+                value = (
+                    rms_px(reading, *errors) if quantity == "reprojection_px" else errors[0].max_px
+                )
                 yield quantity, reading, value
 
 

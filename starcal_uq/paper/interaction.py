@@ -1,14 +1,18 @@
-"""Optics against distortion (section 3.1 of Ye & Yang 2017): what it costs to ignore, decouple or couple the two.
+"""Optics against distortion (section 3.1 of Ye & Yang 2017): what it costs to ignore, decouple or
+couple the two.
 
-The paper's experiment is varied along four axes, one at a time: size of the distortion, field of view, number of
-frames, stars in a frame. Each data set is simulated twice with the same attitudes and stars:
+The paper's experiment is varied along four axes, one at a time: size of the distortion, field of
+view, number of frames, stars in a frame. Each data set is simulated twice with the same attitudes
+and stars:
 
-- without noise, where an estimate is the method's pseudo-true value: its error is the *bias*, known almost without
-  scatter, and averaged over designs;
-- with noise, by Monte Carlo: the standard deviation of these estimates is the *spread*, and that of their difference to
-  those without noise is what *noise* alone does. The two differ where the bias depends on where the stars are.
+- without noise, where an estimate is the method's pseudo-true value: its error is the *bias*, known
+  almost without scatter, and averaged over designs;
+- with noise, by Monte Carlo: the standard deviation of these estimates is the *spread*, and that of
+  their difference to those without noise is what *noise* alone does. The two differ where the bias
+  depends on where the stars are.
 
-All methods see the same data, and so, as far as the axis allows, do all points of an axis (common random numbers).
+All methods see the same data, and so, as far as the axis allows, do all points of an axis (common
+random numbers).
 """
 
 from __future__ import annotations
@@ -50,12 +54,23 @@ if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 # Methods of the study, and what they do about the distortion while they estimate the optics.
-HANDLING = {"least squares": "ignores", "samaan": "decouples", "three stages": "couples", "efficient": "couples"}
+HANDLING = {
+    "least squares": "ignores",
+    "samaan": "decouples",
+    "three stages": "couples",
+    "efficient": "couples",
+}
 REFERENCE = "efficient"
 OPTICS = ("x0", "y0", "f")
 # Axes, and the column that each is drawn and judged against.
-AXES = {"distortion": "corner_size_px", "field": "field_deg", "frames": "n_frames", "stars": "stars_per_frame"}
-# Times the paper's 0.7 px at the corner; the largest is 6 % of the radius there, as for a wide-angle lens.
+AXES = {
+    "distortion": "corner_size_px",
+    "field": "field_deg",
+    "frames": "n_frames",
+    "stars": "stars_per_frame",
+}
+# Times the paper's 0.7 px at the corner; the largest is 6 % of the radius there, as for a
+# wide-angle lens.
 DISTORTION_SCALES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 4.0, 15.0, 60.0)
 FIELDS_DEG = (5.0, 7.0, 10.0, 15.0, 25.0, 40.0)
 FRAMES = (10, 30, 100, 300, 1000)
@@ -65,17 +80,29 @@ LEAST_STARS = 4
 _TEXT = ("axis", "method", "handling", "parameter", "unit")
 _WHOLE = ("n_frames", "min_stars", "seed", "n", "failed")
 _STATISTICS = (
-    *("bias", "bias_se", "design_spread", "noise", "noise_se", "spread", "spread_se", "noise_shift", "noise_shift_se"),
+    *(
+        "bias",
+        "bias_se",
+        "design_spread",
+        "noise",
+        "noise_se",
+        "spread",
+        "spread_se",
+        "noise_shift",
+        "noise_shift_se",
+    ),
     *("rmse", "bias_over_noise", "bias_over_noise_low", "bias_over_noise_high"),
 )
 
 
 class Threshold(NamedTuple):
-    """Where along an axis a ratio of a method passes one: |bias| over noise, or the error over the efficient method's.
+    """Where along an axis a ratio of a method passes one: |bias| over noise, or the error over the
+    efficient method's.
 
-    The kind is ``bias`` or ``rmse``; the side says where the ratio exceeds one (``above`` or ``below`` the value,
-    ``always``, ``never``). The value is in the unit of the axis (px at the corner, deg, frames, stars in a frame),
-    interpolated, with an interval from the 95 % interval of the noise; NaN where there is none.
+    The kind is ``bias`` or ``rmse``; the side says where the ratio exceeds one (``above`` or
+    ``below`` the value, ``always``, ``never``). The value is in the unit of the axis (px at the
+    corner, deg, frames, stars in a frame), interpolated, with an interval from the 95 % interval of
+    the noise; NaN where there is none.
     """
 
     kind: str
@@ -90,14 +117,17 @@ class Threshold(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class InteractionStudy(Shown):
-    """Bias and spread of the optics along four axes; `interrupted` if the user stopped it before the last data set.
+    """Bias and spread of the optics along four axes; `interrupted` if the user stopped it before
+    the last data set.
 
-    The table has a row per point, method and parameter. The provenance is empty when it was read from a file.
+    The table has a row per point, method and parameter. The provenance is empty when it was read
+    from a file.
 
     Columns
     -------
     axis, value
-        ``distortion`` (factor on the coefficients), ``field`` (deg), ``frames``, ``stars`` (magnitude limit).
+        ``distortion`` (factor on the coefficients), ``field`` (deg), ``frames``, ``stars``
+        (magnitude limit).
     corner_px, corner_size_px
         What the distortion displaces at the farthest corner, px outwards, and its size.
     field_deg, n_frames, stars_per_frame, max_mag, min_stars, sigma_px, seed
@@ -105,13 +135,14 @@ class InteractionStudy(Shown):
     method, handling, parameter, unit, n, failed
         Who, what it does about the distortion, of what, and replicates with and without a result.
     bias, bias_se, design_spread
-        Mean error without noise with its standard error, and the standard deviation of that error over designs.
+        Mean error without noise with its standard error, and the standard deviation of that error
+        over designs.
     noise, noise_se, noise_shift, noise_shift_se
-        Standard deviation and mean of the difference between the estimates with and without noise: what noise alone
-        does, with their standard errors.
+        Standard deviation and mean of the difference between the estimates with and without noise:
+        what noise alone does, with their standard errors.
     spread, spread_se, rmse, crlb
-        Standard deviation of the estimates with noise, over designs and noise, with its standard error; root mean
-        square error; Cramer-Rao bound with all parameters unknown.
+        Standard deviation of the estimates with noise, over designs and noise, with its standard
+        error; root mean square error; Cramer-Rao bound with all parameters unknown.
     bias_over_noise, bias_over_noise_low, bias_over_noise_high
         Size of the bias over `noise`, with the 95 % interval that comes from the latter.
     """
@@ -128,7 +159,9 @@ class InteractionStudy(Shown):
 
     @cached_property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Where the bias is one standard deviation of the noise, and where a method falls behind the efficient one."""
+        """Where the bias is one standard deviation of the noise, and where a method falls behind
+        the efficient one.
+        """
         found = []
         for axis, method, parameter in product(AXES, HANDLING, OPTICS):
             rows = self.points(axis, method, parameter)
@@ -136,7 +169,9 @@ class InteractionStudy(Shown):
             if len(rows) < 2:
                 continue
             ratios = (rows[f"bias_over_noise{end}"].to_numpy() for end in ("", "_low", "_high"))
-            (side, value), *ends = (crossing(rows[AXES[axis]].to_numpy(), ratio) for ratio in ratios)
+            (side, value), *ends = (
+                crossing(rows[AXES[axis]].to_numpy(), ratio) for ratio in ratios
+            )
             low, high = (np.nan, np.nan) if np.isnan(value) else sorted(place for _, place in ends)
             found.append(Threshold("bias", axis, method, parameter, side, value, low, high))
             if method != REFERENCE:
@@ -144,7 +179,9 @@ class InteractionStudy(Shown):
                 both = rows.merge(reference, on="value", suffixes=("", "_reference"))
                 ratio = (both["rmse"] / both["rmse_reference"]).to_numpy()
                 side, value = crossing(both[AXES[axis]].to_numpy(), ratio)
-                found.append(Threshold("rmse", axis, method, parameter, side, value, np.nan, np.nan))
+                found.append(
+                    Threshold("rmse", axis, method, parameter, side, value, np.nan, np.nan)
+                )
         return tuple(found)
 
     def threshold(self, axis: str, method: str, parameter: str, kind: str = "bias") -> Threshold:
@@ -152,7 +189,9 @@ class InteractionStudy(Shown):
         for one in self.thresholds:
             if (one.axis, one.method, one.parameter, one.kind) == (axis, method, parameter, kind):
                 return one
-        raise ValueError(f"the study has no {kind!r} threshold of {parameter!r} by {method!r} along {axis!r}.")
+        raise ValueError(
+            f"the study has no {kind!r} threshold of {parameter!r} by {method!r} along {axis!r}."
+        )
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
         """Write the table, atomically; overwritten. Numbers keep all digits."""
@@ -175,17 +214,22 @@ class InteractionStudy(Shown):
             missing = sorted({*_TEXT, "bias", "spread"} - set(text.columns))
             if missing:
                 raise ValueError(f"it lacks the column {missing[0]!r}")
-            return cls(pd.DataFrame({name: _column(name, text[name].tolist()) for name in text.columns}))
+            return cls(
+                pd.DataFrame({name: _column(name, text[name].tolist()) for name in text.columns})
+            )
 
 
 def _column(name: str, values: list[str]) -> list[str] | list[int] | list[float]:
     if name in _TEXT:
         return list(map(cell_content, values))
-    return [int(v) for v in values] if name in _WHOLE else [float(v) if v else np.nan for v in values]
+    return (
+        [int(v) for v in values] if name in _WHOLE else [float(v) if v else np.nan for v in values]
+    )
 
 
 def crossing(at: FloatArray, ratio: FloatArray) -> tuple[str, float]:
-    """Where a ratio passes one for good: ``above``, ``below``, ``always`` or ``never``, and the place.
+    """Where a ratio passes one for good: ``above``, ``below``, ``always`` or ``never``, and the
+    place.
 
     Interpolated between logarithms, linearly in `at` next to zero.
     """
@@ -217,13 +261,17 @@ class Condition:
 
     @property
     def corner_px(self) -> float:
-        """What the distortion displaces at the corner farthest from the principal point, px outwards."""
+        """What the distortion displaces at the corner farthest from the principal point, px
+        outwards.
+        """
         model, radius = get_model(self.truth.distortion), self.truth.corner_radius_px
         return float(model.displacement(radius, 0.0, self.truth.coefficients)[0])
 
 
 class Point(NamedTuple):
-    """A point of an axis; `value` is a factor on the distortion, a field in deg, frames, or a limiting magnitude."""
+    """A point of an axis; `value` is a factor on the distortion, a field in deg, frames, or a
+    limiting magnitude.
+    """
 
     axis: str
     value: float
@@ -240,7 +288,10 @@ def study_points(
 ) -> tuple[Point, ...]:
     """All points; `sky` as from `deep_catalogue`."""
     return (
-        *(Point("distortion", float(scale), _distorted(base, scale)) for scale in distortion_scales),
+        *(
+            Point("distortion", float(scale), _distorted(base, scale))
+            for scale in distortion_scales
+        ),
         *(Point("field", float(field), _with_field(base, field, sky)) for field in fields_deg),
         *(Point("frames", float(k), _with_campaign(base, n_frames=int(k))) for k in frames),
         *(Point("stars", float(mag), _with_mag(base, mag, sky)) for mag in max_mags),
@@ -262,19 +313,27 @@ def _with_field(base: Condition, field_deg: float, sky: StarCatalogue) -> Condit
     if np.isclose(truth.focal_px, base.truth.focal_px, rtol=1e-6):
         return base
     start = base.start.replace(focal_px=truth.focal_px * base.start.focal_px / base.truth.focal_px)
-    n_stars = _count(sky, base.campaign.max_mag) * solid_angle_sr(base.truth) / solid_angle_sr(truth)
+    n_stars = (
+        _count(sky, base.campaign.max_mag) * solid_angle_sr(base.truth) / solid_angle_sr(truth)
+    )
     limit = float(np.sort(sky.mag)[round(n_stars) - 1])
     return _with_campaign(dataclasses.replace(base, truth=truth, start=start), max_mag=limit)
 
 
 def _with_mag(base: Condition, max_mag: float, sky: StarCatalogue) -> Condition:
-    """Another magnitude limit; frames hold at least the same fraction of the mean number of stars."""
-    least = round(base.campaign.min_stars * _count(sky, max_mag) / _count(sky, base.campaign.max_mag))
+    """Another magnitude limit; frames hold at least the same fraction of the mean number of
+    stars.
+    """
+    least = round(
+        base.campaign.min_stars * _count(sky, max_mag) / _count(sky, base.campaign.max_mag)
+    )
     return _with_campaign(base, max_mag=float(max_mag), min_stars=max(LEAST_STARS, least))
 
 
 def _focal_for(camera: Camera, field_deg: float) -> Camera:
-    return camera.replace(focal_px=float(0.5 * camera.width_px / np.tan(np.radians(0.5 * field_deg))))
+    return camera.replace(
+        focal_px=float(0.5 * camera.width_px / np.tan(np.radians(0.5 * field_deg)))
+    )
 
 
 def solid_angle_sr(camera: Camera) -> float:
@@ -287,17 +346,22 @@ def _count(sky: StarCatalogue, max_mag: float) -> int:
     return int(np.sum(sky.mag <= max_mag))
 
 
-def deep_catalogue(truth: Camera, max_mag: float, base_mag: float, fields_deg: Sequence[float]) -> StarCatalogue:
+def deep_catalogue(
+    truth: Camera, max_mag: float, base_mag: float, fields_deg: Sequence[float]
+) -> StarCatalogue:
     """One catalogue of which every condition takes the bright part."""
     sky = load_catalogue(max_mag=max_mag)
-    smallest = min([solid_angle_sr(truth), *(solid_angle_sr(_focal_for(truth, field)) for field in fields_deg)])
+    smallest = min(
+        [solid_angle_sr(truth), *(solid_angle_sr(_focal_for(truth, field)) for field in fields_deg)]
+    )
     needed = _count(sky, base_mag) * solid_angle_sr(truth) / smallest
     while len(sky) < needed:
         max_mag += 0.5
         deeper = load_catalogue(max_mag=max_mag)
         if len(deeper) == len(sky):
             raise SamplingError(
-                f"the catalogue has {len(sky)} stars, too few for a field of {min(fields_deg):g} deg with as many "
+                f"the catalogue has {len(sky)} stars, too few for a field of {min(fields_deg):g} "
+                "deg with as many "
                 "stars as the others: leave the narrowest fields out, or give a smaller max_mag."
             )
         sky = deeper
@@ -313,7 +377,9 @@ class Plan(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """One replicate of one condition: estimates minus truth (methods, 3), bound (3,), px; NaN where a method failed."""
+    """One replicate of one condition: estimates minus truth (methods, 3), bound (3,), px; NaN where
+    a method failed.
+    """
 
     condition: int
     noise_free: FloatArray
@@ -341,17 +407,19 @@ def interaction_study(
     progress: Progress | None = None,
     keep: PathLike | None = None,
 ) -> InteractionStudy:
-    """Bias and spread of x0, y0 and f for methods that ignore, decouple or couple optics and distortion.
+    """Bias and spread of x0, y0 and f for methods that ignore, decouple or couple optics and
+    distortion.
 
     Parameters
     ----------
     truth, start : Camera, optional
-        The camera around which the study is made, and the start of every method; the paper's by default.
+        The camera around which the study is made, and the start of every method; the paper's by
+        default.
     distortion_scales : sequence of float
         Factors on all distortion coefficients.
     fields_deg : sequence of float
-        Full fields of view: the same detector behind another focal length. The distortion keeps its displacement in px,
-        and the magnitude limit is moved so that a frame holds as many stars.
+        Full fields of view: the same detector behind another focal length. The distortion keeps its
+        displacement in px, and the magnitude limit is moved so that a frame holds as many stars.
     frames : sequence of int
         Numbers of frames.
     max_mags : sequence of float
@@ -381,7 +449,10 @@ def interaction_study(
     start = paper_start() if start is None else start
     campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
     check_settings(
-        (bool(truth.coefficients), "the truth has no distortion: give both the same model, with coefficients."),
+        (
+            bool(truth.coefficients),
+            "the truth has no distortion: give both the same model, with coefficients.",
+        ),
         (min_stars >= LEAST_STARS, f"min_stars is {min_stars}: give at least {LEAST_STARS}."),
         cameras=(truth, start),
         n_replicates=n_replicates,
@@ -419,7 +490,8 @@ def interaction_study(
 def run_one(plan: Plan, index: int) -> Outcome:
     """Task number `index`: condition ``index % n`` of n, replicate ``index // n``.
 
-    All conditions of one replicate come before the next replicate, so that a study that is interrupted has every point.
+    All conditions of one replicate come before the next replicate, so that a study that is
+    interrupted has every point.
     """
     replicate, number = divmod(index, len(plan.conditions))
     condition = plan.conditions[number]
@@ -481,9 +553,16 @@ def summary_rows(head: AnyDict, outcomes: Sequence[Outcome]) -> list[AnyDict]:
     for (method, handling), clean, full in zip(HANDLING.items(), noise_free, noisy, strict=True):
         good = np.isfinite(clean[:, 0]) & np.isfinite(full[:, 0])
         for j, parameter in enumerate(OPTICS):
-            body: AnyDict = {"method": method, "handling": handling, "parameter": parameter, "unit": "px"}
+            body: AnyDict = {
+                "method": method,
+                "handling": handling,
+                "parameter": parameter,
+                "unit": "px",
+            }
             body |= {"n": int(np.sum(good)), "failed": int(np.sum(~good))}
-            rows.append(head | body | _summary(clean[good, j], full[good, j]) | {"crlb": float(bound[j])})
+            rows.append(
+                head | body | _summary(clean[good, j], full[good, j]) | {"crlb": float(bound[j])}
+            )
     return rows
 
 

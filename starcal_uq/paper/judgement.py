@@ -1,12 +1,13 @@
-"""Does a printed number come out? Its distance from what an experiment gives over seeds, reading by reading.
+"""Does a printed number come out? Its distance from what an experiment gives over seeds, reading by
+reading.
 
-A printed number is one draw of an experiment. Under a reading that is right it lies among our own draws: its distance
-from their mean, over the spread that a new draw has around an estimated mean, is a z of order one. Error sizes are
-compared on a logarithmic scale, since they cannot be negative. Rounding adds its own variance, a twelfth of the last
-place squared.
+A printed number is one draw of an experiment. Under a reading that is right it lies among our own
+draws: its distance from their mean, over the spread that a new draw has around an estimated mean,
+is a z of order one. Error sizes are compared on a logarithmic scale, since they cannot be negative.
+Rounding adds its own variance, a twelfth of the last place squared.
 
-A printed digit is noise when 95 % of the draws cover all ten values that it can have: whoever ran the experiment again
-would find another digit there.
+A printed digit is noise when 95 % of the draws cover all ten values that it can have: whoever ran
+the experiment again would find another digit there.
 """
 
 from __future__ import annotations
@@ -43,9 +44,10 @@ class Outcome(Enum):
 class Trial(NamedTuple):
     """A printed number under one reading, which the paper's text allows (`faithful`) or not.
 
-    `mean` and `spread` are of the n draws; of error sizes, the geometric mean and the spread of the logarithm times it.
-    `z` is the distance of the printed number from `middle` over `scale`, the standard deviation of a new draw with
-    rounding; these are of the logarithm for error sizes. `noise_digits` of the printed digits are noise.
+    `mean` and `spread` are of the n draws; of error sizes, the geometric mean and the spread of the
+    logarithm times it. `z` is the distance of the printed number from `middle` over `scale`, the
+    standard deviation of a new draw with rounding; these are of the logarithm for error sizes.
+    `noise_digits` of the printed digits are noise.
     """
 
     reading: str
@@ -78,7 +80,8 @@ class Judged:
 
     @property
     def best(self) -> Trial:
-        """The main reading if it accepts the number, else the closest of those that do, faithful ones first.
+        """The main reading if it accepts the number, else the closest of those that do, faithful
+        ones first.
 
         Where none does, the closest of all.
         """
@@ -87,13 +90,16 @@ class Judged:
         accepted = [t for t in self.trials if t.accepted]
         faithful = [t for t in accepted if t.faithful]
         if accepted:
-            # Of those that differ by less than a standard deviation, the first: it departs least from the main one.
+            # Of those that differ by less than a standard deviation, the first: it departs least
+            # from the main one.
             return min(faithful or accepted, key=lambda t: int(abs(t.z)))
         return min(self.trials, key=lambda t: abs(t.z))
 
     @property
     def noise_digits(self) -> int:
-        """Printed digits that are noise: under the best reading if it accepts the number, else under the main one."""
+        """Printed digits that are noise: under the best reading if it accepts the number, else
+        under the main one.
+        """
         return self.best.noise_digits if self.best.accepted else self.main.noise_digits
 
     @property
@@ -110,32 +116,46 @@ class Judged:
 
     @property
     def by_chance(self) -> float:
-        """How easily some reading accepts a number that the main one does not: a guard against trying too many.
+        """How easily some reading accepts a number that the main one does not: a guard against
+        trying too many.
 
-        The share of numbers no farther from the main reading than the printed one that are accepted by a reading as
-        sharp as the best one, and as faithful. NaN where the main reading accepts the number, or none does.
+        The share of numbers no farther from the main reading than the printed one that are accepted
+        by a reading as sharp as the best one, and as faithful. NaN where the main reading accepts
+        the number, or none does.
         """
         best, main = self.best, self.main
         if main.accepted or not best.accepted:
             return float("nan")
         reach = abs(main.z) * main.scale
         low, high = main.middle - reach, main.middle + reach
-        rivals = [t for t in self.trials if t.scale <= best.scale and (t.faithful or not best.faithful)]
+        rivals = [
+            t for t in self.trials if t.scale <= best.scale and (t.faithful or not best.faithful)
+        ]
         covered, edge = 0.0, low
         for t in sorted(rivals, key=lambda t: t.middle - MAX_Z * t.scale):
-            first, last = max(t.middle - MAX_Z * t.scale, edge), min(t.middle + MAX_Z * t.scale, high)
+            first, last = (
+                max(t.middle - MAX_Z * t.scale, edge),
+                min(t.middle + MAX_Z * t.scale, high),
+            )
             covered += max(last - first, 0.0)
             edge = max(edge, last)
         return covered / (high - low)
 
 
-def trial(number: Printed, reading: str, faithful: bool, draws: FloatArray | Sequence[float]) -> Trial:
-    """Compare a printed number with draws (n,) of a reading, of which two must be finite (else ValueError)."""
+def trial(
+    number: Printed, reading: str, faithful: bool, draws: FloatArray | Sequence[float]
+) -> Trial:
+    """Compare a printed number with draws (n,) of a reading, of which two must be finite (else
+    ValueError).
+    """
     values = np.asarray(draws, dtype=np.float64)
     values = values[np.isfinite(values)]
     n = len(values)
     if n < 2:
-        raise ValueError(f"the reading {reading!r} has {n} finite draws of {number.quantity}; a spread needs two.")
+        raise ValueError(
+            f"the reading {reading!r} has {n} finite draws of {number.quantity}; a spread needs "
+            "two."
+        )
     step = number.unit_in_last_place
     if number.is_error_size:
         logs = np.log(np.maximum(values, np.finfo(float).tiny))
@@ -153,7 +173,17 @@ def trial(number: Printed, reading: str, faithful: bool, draws: FloatArray | Seq
         # What does not depend on the seed has no spread, whatever the last bits say.
         width, spread, covered = 0.0, 0.0, 0.0
     scale = float(np.sqrt(width**2 * (1.0 + 1.0 / n) + rounding**2 / 12.0))
-    return Trial(reading, faithful, n, mean, spread, middle, scale, distance / scale, _noise_digits(number, covered))
+    return Trial(
+        reading,
+        faithful,
+        n,
+        mean,
+        spread,
+        middle,
+        scale,
+        distance / scale,
+        _noise_digits(number, covered),
+    )
 
 
 def _noise_digits(number: Printed, covered: float) -> int:

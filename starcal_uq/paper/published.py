@@ -1,8 +1,9 @@
-"""What Ye & Yang (2017) print about their simulated experiment, each number once and with its place.
+"""What Ye & Yang (2017) print about their simulated experiment, each number once and with its
+place.
 
-Ye Tao, Yang Fei: "Autonomous calibration of star sensors based on nonlinear optimization algorithm", Optics and
-Precision Engineering 25(9), 2483-2489, doi 10.3788/OPE.20172509.2483. Numbers are kept as printed: how many digits an
-author gives is part of what is claimed.
+Ye Tao, Yang Fei: "Autonomous calibration of star sensors based on nonlinear optimization
+algorithm", Optics and Precision Engineering 25(9), 2483-2489, doi 10.3788/OPE.20172509.2483.
+Numbers are kept as printed: how many digits an author gives is part of what is claimed.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ PAPER_METHODS = (LEAST_SQUARES, SAMAAN, PROPOSED)
 class Printed:
     """A number of the paper, as text, with its place.
 
-    The method is a name in `calibrate`; the quantity is ``f_mm``, ``x0_px``, ``y0_px``, ``k1``, ``k2`` (px^-2, px^-4),
-    ``reprojection_px``, ``max_residual_px`` or ``y0_error_px``.
+    The method is a name in `calibrate`; the quantity is ``f_mm``, ``x0_px``, ``y0_px``, ``k1``,
+    ``k2`` (px^-2, px^-4), ``reprojection_px``, ``max_residual_px`` or ``y0_error_px``.
     """
 
     method: str
@@ -40,7 +41,9 @@ class Printed:
 
     @property
     def is_error_size(self) -> bool:
-        """Whether it is the size of an error: never negative, and compared on a logarithmic scale."""
+        """Whether it is the size of an error: never negative, and compared on a logarithmic
+        scale.
+        """
         return self.quantity in ("reprojection_px", "max_residual_px", "y0_error_px")
 
 
@@ -77,8 +80,12 @@ CLAIMED_Y0_ERROR_PX = (2.0, 3.0)
 
 
 def printed(method: str, quantity: str, place: str = "") -> Printed:
-    """The printed number of a method and quantity; the first whose place starts as given. A KeyError where none is."""
+    """The printed number of a method and quantity; the first whose place starts as given. A
+    KeyError where none is.
+    """
     for number in PUBLISHED:
-        if (number.method, number.quantity) == (method, quantity) and number.place.startswith(place):
+        if (number.method, number.quantity) == (method, quantity) and number.place.startswith(
+            place
+        ):
             return number
     raise KeyError(f"the paper prints no {quantity} of {method}{' in ' + place if place else ''}.")

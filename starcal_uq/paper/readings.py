@@ -1,8 +1,9 @@
 """The readings of the experiment itself, each repeated over seeds with the paper's three methods.
 
-The paper contradicts itself about the direction of its distortion (eq. 6 against eq. 14), its catalogue is not the
-embedded one, and its baselines are described in a sentence each. Every reading here is one such choice; those that
-contradict the text are marked, and can at most explain a number, not confirm it.
+The paper contradicts itself about the direction of its distortion (eq. 6 against eq. 14), its
+catalogue is not the embedded one, and its baselines are described in a sentence each. Every reading
+here is one such choice; those that contradict the text are marked, and can at most explain a
+number, not confirm it.
 """
 
 from __future__ import annotations
@@ -32,7 +33,15 @@ from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
 from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.errors import MAXIMUM, REPROJECTION, error_sizes, undistorted
-from starcal_uq.paper.published import LEAST_SQUARES, MAX_MAG, N_FRAMES, N_STARS, PROPOSED, SAMAAN, Printed
+from starcal_uq.paper.published import (
+    LEAST_SQUARES,
+    MAX_MAG,
+    N_FRAMES,
+    N_STARS,
+    PROPOSED,
+    SAMAAN,
+    Printed,
+)
 from starcal_uq.paper.replicates import pinhole
 from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue
@@ -44,7 +53,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Draws (keys, n) of every reading over seeds, in the units of `Printed.quantity`; NaN where a method failed."""
+    """Draws (keys, n) of every reading over seeds, in the units of `Printed.quantity`; NaN where a
+    method failed.
+    """
 
     keys: tuple[Key, ...]
     draws: FloatArray
@@ -61,14 +72,20 @@ class Readings:
         return values[np.isfinite(values)]
 
     def trials_of(self, number: Printed) -> Iterator[tuple[str, bool, FloatArray]]:
-        """Words, faithfulness and draws of every reading that gives this number's quantity, the main one first."""
-        sizes = {"reprojection_px": REPROJECTION, "max_residual_px": MAXIMUM}.get(number.quantity, ())
+        """Words, faithfulness and draws of every reading that gives this number's quantity, the
+        main one first.
+        """
+        sizes = {"reprojection_px": REPROJECTION, "max_residual_px": MAXIMUM}.get(
+            number.quantity, ()
+        )
         errors = {one.key: (one.words, one.faithful) for one in sizes} or {"": ("", True)}
         for reading in READINGS:
             for error, (words, allowed) in errors.items():
                 draws = self.of(reading.key, number.method, number.quantity, error)
                 if len(draws) > 1:
-                    text = "; ".join(part for part in (reading.words, words) if part) or "as printed"
+                    text = (
+                        "; ".join(part for part in (reading.words, words) if part) or "as printed"
+                    )
                     yield text, reading.faithful and allowed, draws
 
 
@@ -84,16 +101,22 @@ def run_readings(
 ) -> Readings:
     """Repeat the experiment over seeds under every reading; parameters as in `replicate`.
 
-    `convention` is the main reading of the distortion. Draw i depends on the seed and on i alone, and is none of the
-    replicates of the same seed.
+    `convention` is the main reading of the distortion. Draw i depends on the seed and on i alone,
+    and is none of the replicates of the same seed.
     """
     stars = load_catalogue(max_mag=MAX_MAG)
     # As many as the paper's, by the embedded catalogue's band.
     sparse = stars.select(np.sort(np.argsort(stars.mag, kind="stable")[:N_STARS]))
     plan = Plan(stars, sparse, convention, Campaign(n_frames), seed)
     task = partial(draw, plan)
-    kept = None if keep is None else Kept(keep, ["readings", convention, n_frames, seed, stars.source], (Key,))
-    found = run_or_stop(task, n_draws, caller="reproduce", chunk=1, workers=workers, progress=progress, kept=kept)
+    kept = (
+        None
+        if keep is None
+        else Kept(keep, ["readings", convention, n_frames, seed, stars.source], (Key,))
+    )
+    found = run_or_stop(
+        task, n_draws, caller="reproduce", chunk=1, workers=workers, progress=progress, kept=kept
+    )
     keys = tuple(found[0])
     return Readings(keys, np.array([[one.get(key, np.nan) for one in found] for key in keys]))
 
@@ -109,7 +132,9 @@ Estimates = Mapping[str, Camera | None]
 
 
 class Reading(NamedTuple):
-    """A reading of the experiment: in words (empty for what is printed), and whether the paper's text allows it."""
+    """A reading of the experiment: in words (empty for what is printed), and whether the paper's
+    text allows it.
+    """
 
     key: str
     words: str
@@ -133,7 +158,9 @@ READINGS = (
 
 
 class Key(NamedTuple):
-    """What a draw is of: a reading of the experiment, a method, a quantity, and the reading of an error size."""
+    """What a draw is of: a reading of the experiment, a method, a quantity, and the reading of an
+    error size.
+    """
 
     reading: str
     method: str
@@ -154,8 +181,8 @@ class Plan(NamedTuple):
 class Scene(NamedTuple):
     """One simulated data set.
 
-    `noise_px` (N, 2) is for the measures of error, which take the observed places for noise-free ones: it must not be
-    the noise of the observations, which moved these places already.
+    `noise_px` (N, 2) is for the measures of error, which take the observed places for noise-free
+    ones: it must not be the noise of the observations, which moved these places already.
     """
 
     truth: Camera
@@ -179,10 +206,14 @@ def draw(plan: Plan, index: int) -> dict[Key, float]:
     ):
         truth, start = paper_camera(convention), paper_start(convention)
         obs = plan.campaign.simulate(stars, truth, seed)
-        scene = Scene(truth, start, obs, plan.campaign.sigma_px * rng.standard_normal((obs.n_stars, 2)))
+        scene = Scene(
+            truth, start, obs, plan.campaign.sigma_px * rng.standard_normal((obs.n_stars, 2))
+        )
         readings = {reading: paper_methods(obs, start)}
         if reading == AS_PRINTED:
-            readings["few frames"] = paper_methods(obs.select_frames(obs.frame_ids[:FEW_FRAMES]), start)
+            readings["few frames"] = paper_methods(
+                obs.select_frames(obs.frame_ids[:FEW_FRAMES]), start
+            )
             readings |= alternatives(scene, readings[AS_PRINTED])
         for key, estimates in readings.items():
             found |= measured(scene, key, estimates)
@@ -203,7 +234,9 @@ def paper_methods(obs: Observations, start: Camera) -> Estimates:
     }
 
 
-def _recursive(obs: Observations, start: Camera, method: str, options: RecursionOptions | None = None) -> Camera | None:
+def _recursive(
+    obs: Observations, start: Camera, method: str, options: RecursionOptions | None = None
+) -> Camera | None:
     try:
         # As a stream: the same estimate, without the time that residuals take.
         found = calibrate([obs], start, method=method, recursion=options, throw=False)
@@ -214,18 +247,25 @@ def _recursive(obs: Observations, start: Camera, method: str, options: Recursion
 
 
 def alternatives(scene: Scene, printed: Estimates) -> dict[str, Estimates]:
-    """The readings that need no other data set, by name; `printed` are the estimates of `paper_methods`."""
+    """The readings that need no other data set, by name; `printed` are the estimates of
+    `paper_methods`.
+    """
     obs, start = scene.obs, scene.start
     found: dict[str, Estimates] = {
         name: {SAMAAN: _recursive(obs, start, "samaan", options)}
         for name, options in (
             ("plain filter", RecursionOptions(iterations=1)),
-            ("process noise", RecursionOptions(process_noise=_PROCESS_NOISE_PX, sigma_px=obs.meta["sigma_px"])),
+            (
+                "process noise",
+                RecursionOptions(process_noise=_PROCESS_NOISE_PX, sigma_px=obs.meta["sigma_px"]),
+            ),
         )
     }
     filtered = printed[SAMAAN]
     if filtered is not None:
-        found |= {name: {SAMAAN: camera} for name, camera in _other_coefficients(scene, filtered).items()}
+        found |= {
+            name: {SAMAAN: camera} for name, camera in _other_coefficients(scene, filtered).items()
+        }
         # The filter's optics are those of one least-squares problem over all frames.
         found["weighted pairs"] = {LEAST_SQUARES: pinhole(start, filtered.theta)}
     optics_camera, joint_camera = printed[LEAST_SQUARES], printed[PROPOSED]
@@ -238,7 +278,9 @@ def alternatives(scene: Scene, printed: Estimates) -> dict[str, Estimates]:
 
 
 def _other_coefficients(scene: Scene, filtered: Camera) -> dict[str, Camera]:
-    """Coefficients by linear least squares at the filter's optics, from other ideal points or with other signs."""
+    """Coefficients by linear least squares at the filter's optics, from other ideal points or with
+    other signs.
+    """
     truth, obs = scene.truth, scene.obs
     centre = filtered.theta[:2]
     ideal = undistorted(truth, obs.xy)
@@ -261,7 +303,9 @@ def _with_coefficients(camera: Camera, ideal: FloatArray, seen: FloatArray) -> C
     forward = model.direction == "forward"
     at, target = (ideal, seen - ideal) if forward else (seen, ideal - seen)
     units = np.eye(len(model.coefficients))
-    columns = [np.concatenate(model.displacement(at[:, 0], at[:, 1], tuple(unit))) for unit in units]
+    columns = [
+        np.concatenate(model.displacement(at[:, 0], at[:, 1], tuple(unit))) for unit in units
+    ]
     design = np.stack(columns, axis=1)
     scale = np.linalg.norm(design, axis=0)
     k = np.linalg.lstsq(design / scale, target.T.ravel(), rcond=None)[0] / scale
@@ -274,22 +318,31 @@ def measured(scene: Scene, reading: str, estimates: Estimates) -> dict[Key, floa
     for method, camera in estimates.items():
         if camera is None:
             continue
-        values = {"x0_px": camera.x0_px, "y0_px": camera.y0_px, "f_mm": camera.length_mm(camera.focal_px)}
+        values = {
+            "x0_px": camera.x0_px,
+            "y0_px": camera.y0_px,
+            "f_mm": camera.length_mm(camera.focal_px),
+        }
         values |= dict(zip(("k1", "k2"), camera.coefficients, strict=False))
         values["y0_error_px"] = abs(camera.y0_px - scene.truth.y0_px)
-        found |= {Key(reading, method, quantity, ""): float(value) for quantity, value in values.items()}
-        for quantity, choice, value in error_sizes(scene.truth, camera, scene.obs.xy, scene.noise_px):
+        found |= {
+            Key(reading, method, quantity, ""): float(value) for quantity, value in values.items()
+        }
+        for quantity, choice, value in error_sizes(
+            scene.truth, camera, scene.obs.xy, scene.noise_px
+        ):
             found[Key(reading, method, quantity, choice.key)] = value
     return found
 
 
 def fit_angles(obs: Observations, model: str, start: FloatArray) -> FloatArray:
-    """Gauss-Newton on the differences of all angles between stars of a frame, all pairs alike; (p,) px units.
+    """Gauss-Newton on the differences of all angles between stars of a frame, all pairs alike; (p,)
+    px units.
 
-    The paper's objective (its eqs. 5 and 13) compares cosines, whose errors are those of the angles times their sine:
-    wide pairs count most. An implementation that compares angles weighs all pairs alike, and, where distortion is
-    ignored, ends at another focal length. `start` (p,) is near enough for full steps, such as the solution for the
-    cosines.
+    The paper's objective (its eqs. 5 and 13) compares cosines, whose errors are those of the angles
+    times their sine: wide pairs count most. An implementation that compares angles weighs all pairs
+    alike, and, where distortion is ignored, ends at another focal length. `start` (p,) is near
+    enough for full steps, such as the solution for the cosines.
     """
     i, j = _pairs(obs.frame_starts)
     r = obs.directions_icrs
@@ -298,7 +351,10 @@ def fit_angles(obs: Observations, model: str, start: FloatArray) -> FloatArray:
     for _ in range(_MAX_STEPS):
         b, db = unproject_jacobian(model, theta, obs.xy)
         angle, sine = _angle(b[i], b[j])
-        slope = -(np.einsum("ni,nip->np", b[j], db[i]) + np.einsum("ni,nip->np", b[i], db[j])) / sine[:, None]
+        slope = (
+            -(np.einsum("ni,nip->np", b[j], db[i]) + np.einsum("ni,nip->np", b[i], db[j]))
+            / sine[:, None]
+        )
         scale = np.linalg.norm(slope, axis=0)
         slope /= scale
         step = np.linalg.solve(slope.T @ slope, slope.T @ (given - angle)) / scale

@@ -1,7 +1,9 @@
-"""The paper's experiment over seeds: every method on the same data, again and again, against what it claims.
+"""The paper's experiment over seeds: every method on the same data, again and again, against what
+it claims.
 
-A replicate draws new attitudes and new noise, and all methods calibrate the same stars. What is stored is raw:
-estimates, the sigmas that each method gives, and the Cramer-Rao bound of the design at the truth.
+A replicate draws new attitudes and new noise, and all methods calibrate the same stars. What is
+stored is raw: estimates, the sigmas that each method gives, and the Cramer-Rao bound of the design
+at the truth.
 """
 
 from __future__ import annotations
@@ -48,7 +50,8 @@ if TYPE_CHECKING:
 _CHUNK = 2
 # Methods whose textbook claim takes pairs as independent.
 _OF_PAIRS = ("least_squares", "three_stage")
-# A slow option of a method, which is there to show what it claims, takes part in one of so many replicates.
+# A slow option of a method, which is there to show what it claims, takes part in one of so many
+# replicates.
 SHARE = 4
 _LEAST = 8
 _TESTS = ("bias_p", "claimed_p", "coverage95_p", "claimed_classical_p")
@@ -59,7 +62,9 @@ _ARRAYS = ("replicate", "crlb", *_BY_METHOD)
 
 @dataclass(frozen=True)
 class Method:
-    """A way to calibrate: its label in tables and figures, what it does in one line, and arguments of `calibrate`."""
+    """A way to calibrate: its label in tables and figures, what it does in one line, and arguments
+    of `calibrate`.
+    """
 
     label: str
     description: str
@@ -69,17 +74,25 @@ class Method:
     def calibrate(self, obs: Observations, start: Camera) -> Calibration:
         """Calibrate observations; recursive methods as a stream.
 
-        A stream gives them the same estimate and covariance, and no residuals and attitudes, which take time.
+        A stream gives them the same estimate and covariance, and no residuals and attitudes, which
+        take time.
         """
         source = [obs] if self.method in RECURSIVE_METHODS else obs
         return calibrate(source, start, method=self.method, recursion=self.recursion)
 
 
 METHODS = (
-    Method("least squares", "optics by least squares on interstar angles, distortion ignored", "least_squares"),
+    Method(
+        "least squares",
+        "optics by least squares on interstar angles, distortion ignored",
+        "least_squares",
+    ),
     Method(
         "samaan",
-        "optics by a Kalman filter on interstar angles with their full covariance, distortion linearly afterwards",
+        (
+            "optics by a Kalman filter on interstar angles with their full covariance, distortion "
+            "linearly afterwards"
+        ),
         "samaan",
     ),
     Method(
@@ -90,11 +103,18 @@ METHODS = (
     ),
     Method(
         "griffith",
-        "optics by recursive least squares on interstar angles, one frame at a time, distortion ignored",
+        (
+            "optics by recursive least squares on interstar angles, one frame at a time, "
+            "distortion "
+            "ignored"
+        ),
         "griffith",
     ),
     Method(
-        "griffith, all", "the same for optics and distortion together", "griffith", RecursionOptions(parameters="all")
+        "griffith, all",
+        "the same for optics and distortion together",
+        "griffith",
+        RecursionOptions(parameters="all"),
     ),
     Method(
         "three stages",
@@ -126,14 +146,16 @@ class Replicates(Shown, Saved):
     claimed : (M, n, p) array
         The standard deviation that the method gives with each.
     classical : (M, n, p) array
-        Standard deviations by the formula of the textbooks: ``(J^T J)^-1 s^2`` with pairs taken as independent for
-        least squares over pairs, and a filter's own for filters. NaN where there is none.
+        Standard deviations by the formula of the textbooks: ``(J^T J)^-1 s^2`` with pairs taken as
+        independent for least squares over pairs, and a filter's own for filters. NaN where there is
+        none.
     crlb : (n, p) array
-        Cramer-Rao bound on the standard deviations for each design, at the truth, all p parameters and the attitudes
-        unknown.
+        Cramer-Rao bound on the standard deviations for each design, at the truth, all p parameters
+        and the attitudes unknown.
     map_px, map_arcsec : (M, n) arrays
-        Root mean square error over the detector of the directions that an estimated camera gives, the best common
-        rotation removed (`starcal_uq.paper.errors.map_error`); NaN where the estimated distortion folds over.
+        Root mean square error over the detector of the directions that an estimated camera gives,
+        the best common rotation removed (`starcal_uq.paper.errors.map_error`); NaN where the
+        estimated distortion folds over.
     reprojection_px : (M, n) array
         Eq. 16 of the paper over the detector, without noise
         (`starcal_uq.paper.errors.reprojection_error_px`): blind to a wrong focal length.
@@ -183,7 +205,9 @@ class Replicates(Shown, Saved):
 
     @property
     def bound(self) -> FloatArray:
-        """Cramer-Rao bound (p,) on the spread over replicates: root mean square over the designs."""
+        """Cramer-Rao bound (p,) on the spread over replicates: root mean square over the
+        designs.
+        """
         return np.asarray(np.sqrt(np.mean(self.crlb**2, axis=0)))
 
     def _at(self, label: str) -> int:
@@ -201,11 +225,18 @@ class Replicates(Shown, Saved):
                 error = self.estimates[i, good, j] - self.truth.theta[j]
                 if not np.isfinite(error).all():
                     continue
-                found = summarise(error, self.claimed[i, good, j], self.classical[i, good, j], float(self.bound[j]))
+                found = summarise(
+                    error,
+                    self.claimed[i, good, j],
+                    self.classical[i, good, j],
+                    float(self.bound[j]),
+                )
                 head = {"method": method.label, "parameter": parameter.name, "unit": parameter.unit}
                 rows.append(head | {"truth": float(self.truth.theta[j])} | found)
         # One family: whoever reads the table looks at every test in it.
-        rejected = (holm([row[test] for row in rows for test in _TESTS]) <= FAMILY_LEVEL).reshape(-1, len(_TESTS))
+        rejected = (holm([row[test] for row in rows for test in _TESTS]) <= FAMILY_LEVEL).reshape(
+            -1, len(_TESTS)
+        )
         for row, (bias, claim, coverage, classical) in zip(rows, rejected.tolist(), strict=True):
             row["biased"], row["claim_wrong"], row["classical_wrong"] = bias, claim, classical
             row["verdict"] = words(row, bias, claim, coverage)
@@ -220,22 +251,24 @@ class Replicates(Shown, Saved):
         method, parameter, unit, truth, n
             What, and over how many replicates.
         bias, spread, rmse
-            Mean error, standard deviation and root mean square error, ``_se``, ``_over_spread``, ``_over_crlb``.
+            Mean error, standard deviation and root mean square error, ``_se``, ``_over_spread``,
+            ``_over_crlb``.
         crlb, efficiency
-            Cramer-Rao bound on the spread, and its variance over that of the estimates, with 95 % interval. It can
-            exceed one for methods that are biased, or that leave parameters out.
+            Cramer-Rao bound on the spread, and its variance over that of the estimates, with 95 %
+            interval. It can exceed one for methods that are biased, or that leave parameters out.
         claimed, claimed_over_spread, claimed_over_rmse
-            Root mean square of the method's own standard deviations; over the spread, with 95 % interval, and over the
-            root mean square error, bias included.
+            Root mean square of the method's own standard deviations; over the spread, with 95 %
+            interval, and over the root mean square error, bias included.
         coverage95
             How often the claimed 95 % interval holds the truth, with Wilson interval.
         claimed_classical, ...
-            The same eight for the formula of the textbooks: pairs taken as independent, or a filter's own covariance.
+            The same eight for the formula of the textbooks: pairs taken as independent, or a
+            filter's own covariance.
         bias_p, claimed_p, coverage95_p, claimed_classical_p, coverage95_classical_p
             p-values of single tests.
         biased, claim_wrong, classical_wrong, verdict, verdict_classical
-            What Holm's procedure over all of them rejects at 1 %: that the mean error is zero, that the spread is as
-            claimed, and that it is as the textbooks claim; and in words.
+            What Holm's procedure over all of them rejects at 1 %: that the mean error is zero, that
+            the spread is as claimed, and that it is as the textbooks claim; and in words.
         """
         import pandas as pd
 
@@ -254,7 +287,9 @@ class Replicates(Shown, Saved):
 
 
 class Experiment(NamedTuple):
-    """What all replicates share, as in `replicate`, and in how many slow methods take part; sent to every process."""
+    """What all replicates share, as in `replicate`, and in how many slow methods take part; sent to
+    every process.
+    """
 
     stars: StarCatalogue
     methods: tuple[Method, ...]
@@ -288,7 +323,8 @@ def replicate(
     share_slow: bool = False,
     keep: PathLike | None = None,
 ) -> Replicates:
-    """Calibrate many simulated data sets with every method, and set their errors against their claims.
+    """Calibrate many simulated data sets with every method, and set their errors against their
+    claims.
 
     Parameters
     ----------
@@ -299,20 +335,21 @@ def replicate(
     n_replicates : int
         Data sets; 200 know a spread to 5 % and a coverage of 95 % to 1.5 %.
     n_frames, min_stars, sigma_px, max_mag
-        Data of one calibration: frames, least stars in each, centroid noise in px per axis, and limiting magnitude.
+        Data of one calibration: frames, least stars in each, centroid noise in px per axis, and
+        limiting magnitude.
     seed : int
-        The same seed gives the same result, bit for bit, for any number of processes; the first replicates of a longer
-        run are those of a shorter one.
+        The same seed gives the same result, bit for bit, for any number of processes; the first
+        replicates of a longer run are those of a shorter one.
     workers : int, optional
-        Processes; as many as there are processors by default. With 0, everything happens in this process, where a BLAS
-        with several threads can change the last digits.
+        Processes; as many as there are processors by default. With 0, everything happens in this
+        process, where a BLAS with several threads can change the last digits.
     progress : callable, optional
         Called as ``progress(done, total)``.
     stars : StarCatalogue, optional
         The sky, instead of the embedded catalogue to `max_mag`.
     share_slow : bool
-        Run the filter that forms every pair in the first quarter of the replicates only, at least 8; the others hold
-        NaN for it.
+        Run the filter that forms every pair in the first quarter of the replicates only, at least
+        8; the others hold NaN for it.
     keep : path, optional
         Folder in which replicates are kept as they are made; a later call goes on from them.
 
@@ -338,7 +375,10 @@ def replicate(
     campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
     check_settings(
         (bool(methods), "there are no methods to compare: give at least one."),
-        (not twice, f"several methods have the label {' and '.join(map(repr, twice))}: give each its own."),
+        (
+            not twice,
+            f"several methods have the label {' and '.join(map(repr, twice))}: give each its own.",
+        ),
         cameras=(truth, start),
         n_replicates=n_replicates,
         campaign=campaign,
@@ -349,7 +389,16 @@ def replicate(
     experiment = Experiment(sky, methods, truth, start, campaign, seed, n_slow)
     kept = None
     if keep is not None:
-        identity = ["replicates", methods, truth, start, campaign.settings(stars), seed, n_slow, sky.source]
+        identity = [
+            "replicates",
+            methods,
+            truth,
+            start,
+            campaign.settings(stars),
+            seed,
+            n_slow,
+            sky.source,
+        ]
         kept = Kept(keep, identity)
     outcomes, interrupted = run_tasks(
         partial(run_replicate, experiment),
@@ -360,11 +409,16 @@ def replicate(
         progress=progress,
         kept=kept,
     )
-    arrays = {name: np.stack([one[name] for one in outcomes], axis=int(name in _BY_METHOD)) for name in _ARRAYS}
+    arrays = {
+        name: np.stack([one[name] for one in outcomes], axis=int(name in _BY_METHOD))
+        for name in _ARRAYS
+    }
     failures = tuple(zip(*(outcome["failures"] for outcome in outcomes), strict=True))
     for method, values, reasons in zip(methods, arrays["estimates"], failures, strict=True):
         if not np.isfinite(values[:, 0]).any():
-            raise CalibrationError(f"the method {method.label!r} never gave a result; first reason: {reasons[0]}")
+            raise CalibrationError(
+                f"the method {method.label!r} never gave a result; first reason: {reasons[0]}"
+            )
     settings: AnyDict = {"n_replicates": n_replicates, **campaign.settings(stars)}
     return Replicates(
         methods=methods,
@@ -385,16 +439,25 @@ def check_settings(
     campaign: Campaign,
     workers: int | None,
 ) -> None:
-    """Refuse settings of a study over seeds that cannot work; `others` are conditions and what to say without them."""
+    """Refuse settings of a study over seeds that cannot work; `others` are conditions and what to
+    say without them.
+    """
     models = [camera.distortion for camera in cameras]
     for good, text in (
         *others,
         (
             models[0] == models[1],
-            f"the truth has distortion {models[0]!r} and the start {models[1]!r}: give both the same model.",
+            (
+                f"the truth has distortion {models[0]!r} and the start {models[1]!r}: give both "
+                "the "
+                "same model."
+            ),
         ),
         (n_replicates >= 2, f"n_replicates is {n_replicates}: a spread needs at least 2."),
-        (workers is None or workers >= 0, f"workers is {workers}: give at least 1, or 0 for this process."),
+        (
+            workers is None or workers >= 0,
+            f"workers is {workers}: give at least 1, or 0 for this process.",
+        ),
     ):
         if not good:
             raise SamplingError(text)
@@ -408,13 +471,19 @@ def run_replicate(experiment: Experiment, index: int) -> AnyDict:
     """
     noise = np.random.SeedSequence(experiment.seed, spawn_key=(index,))
     truth = experiment.truth
-    obs = experiment.campaign.simulate(experiment.stars, truth, noise.generate_state(1, np.uint64)[0])
+    obs = experiment.campaign.simulate(
+        experiment.stars, truth, noise.generate_state(1, np.uint64)[0]
+    )
     frames = StarFrames.from_observations(obs)
     p, m = len(truth.theta), len(experiment.methods)
     estimates, claimed, classical = (np.full((m, p), np.nan) for _ in range(3))
     errors = np.full((3, m), np.nan)
     failures = [""] * m
-    chosen = [i for i, method in enumerate(experiment.methods) if index < experiment.n_slow or not is_slow(method)]
+    chosen = [
+        i
+        for i, method in enumerate(experiment.methods)
+        if index < experiment.n_slow or not is_slow(method)
+    ]
     methods = [experiment.methods[i] for i in chosen]
     for i, solved in zip(chosen, solve_all(methods, obs, frames, experiment.start), strict=True):
         if isinstance(solved, StarcalError):
@@ -422,7 +491,11 @@ def run_replicate(experiment: Experiment, index: int) -> AnyDict:
             continue
         # Methods that leave the distortion out have the optics only.
         q = len(solved.sigmas)
-        estimates[i, :q], claimed[i, :q], classical[i, :q] = solved.theta, solved.sigmas, solved.classical
+        estimates[i, :q], claimed[i, :q], classical[i, :q] = (
+            solved.theta,
+            solved.sigmas,
+            solved.classical,
+        )
         errors[:, i] = field_errors(truth, solved.camera)
     crlb = crlb_sigmas(frames, truth, experiment.campaign.sigma_px)
     arrays = (estimates, claimed, classical, *errors)
@@ -431,9 +504,11 @@ def run_replicate(experiment: Experiment, index: int) -> AnyDict:
 
 
 def field_errors(truth: Camera, estimate: Camera) -> tuple[float, float, float]:
-    """Root mean square errors over the detector without noise; NaN where the estimated distortion folds over.
+    """Root mean square errors over the detector without noise; NaN where the estimated distortion
+    folds over.
 
-    Of the directions in px and arcsec, best common rotation removed (`map_error`), and by eq. 16 of the paper.
+    Of the directions in px and arcsec, best common rotation removed (`map_error`), and by eq. 16 of
+    the paper.
     """
     try:
         directions = map_error(truth, estimate)
@@ -445,16 +520,20 @@ def field_errors(truth: Camera, estimate: Camera) -> tuple[float, float, float]:
 
 
 def crlb_sigmas(frames: StarFrames, truth: Camera, sigma_px: float) -> FloatArray:
-    """Cramer-Rao bound (p,) on the standard deviations: all parameters unknown, and the attitude of every frame."""
+    """Cramer-Rao bound (p,) on the standard deviations: all parameters unknown, and the attitude of
+    every frame.
+    """
     likelihood = MarginalLikelihood(frames, truth.distortion)
     return np.sqrt(inverse_diagonal(likelihood.evaluate(truth.theta).matrix)) * sigma_px
 
 
 class Solved(NamedTuple):
-    """What a method found: camera, parameters, and standard deviations as claimed and by textbooks, (p,) px units.
+    """What a method found: camera, parameters, and standard deviations as claimed and by textbooks,
+    (p,) px units.
 
-    Least squares over pairs presumes there that pairs are independent, although the m (m - 1) / 2 pairs of m stars hold
-    2 m - 3 independent numbers; a filter that its model holds. NaN where there is none, or none but the claim.
+    Least squares over pairs presumes there that pairs are independent, although the m (m - 1) / 2
+    pairs of m stars hold 2 m - 3 independent numbers; a filter that its model holds. NaN where
+    there is none, or none but the claim.
     """
 
     camera: Camera
@@ -468,8 +547,8 @@ def solve_all(
 ) -> list[Solved | StarcalError]:
     """Every method's result, or why it has none; `frames` are those of `obs`.
 
-    The stages of the efficient method on interstar angles end in the paper's estimate: where it is among the methods
-    and converges, that is taken from it.
+    The stages of the efficient method on interstar angles end in the paper's estimate: where it is
+    among the methods and converges, that is taken from it.
     """
     found: dict[Method, Solved | StarcalError] = {}
     efficient = [method for method in methods if method.method == "efficient"]
@@ -510,7 +589,9 @@ def pinhole(camera: Camera, theta: FloatArray) -> Camera:
 
 
 def textbook_sigmas(pairs: PairObjective, theta: FloatArray) -> FloatArray:
-    """Standard deviations (p,) of least squares over pairs, ``(J^T J)^-1 s^2``, as if pairs were independent."""
+    """Standard deviations (p,) of least squares over pairs, ``(J^T J)^-1 s^2``, as if pairs were
+    independent.
+    """
     normal = pairs.evaluate(theta)
     variance = normal.cost / (pairs.n_pairs - len(theta))
     return np.sqrt(inverse_diagonal(normal.matrix) * variance)

@@ -21,7 +21,8 @@ from starcal_uq.paper.replicates import replicate
 from starcal_uq.paper.result import REPORT, Reproduction, judge_all, run_paper
 from starcal_uq.paper.show.pages import reproduction_figures, reproduction_page
 
-# Replicates of every reading, and of the study: enough for z-values to ten per cent, and for the figure.
+# Replicates of every reading, and of the study: enough for z-values to ten per cent, and for the
+# figure.
 N_READING_DRAWS = 12
 N_STUDY_REPLICATES = 8
 # Work of each part in common units, for the progress bar.
@@ -46,13 +47,14 @@ def reproduce(
     Parameters
     ----------
     out : path
-        Folder to write: ``reproduction.html`` (self-contained), ``table_2.csv``, ``rows.csv``, ``published.csv``,
-        ``trials.csv``, ``checks.csv``, ``errors.csv``, ``replicates.csv``, ``replicates.npz``, ``interaction.csv``, and
-        the figures as PNG in ``figures``. They are written when everything is computed; until then data sets that are
-        done are kept in the folder, and an interrupted call goes on from them.
+        Folder to write: ``reproduction.html`` (self-contained), ``table_2.csv``, ``rows.csv``,
+        ``published.csv``, ``trials.csv``, ``checks.csv``, ``errors.csv``, ``replicates.csv``,
+        ``replicates.npz``, ``interaction.csv``, and the figures as PNG in ``figures``. They are
+        written when everything is computed; until then data sets that are done are kept in the
+        folder, and an interrupted call goes on from them.
     n_replicates : int
-        Data sets over which every method is repeated, at least 8; the filter that takes pairs as independent, a slow
-        option, has a quarter of them.
+        Data sets over which every method is repeated, at least 8; the filter that takes pairs as
+        independent, a slow option, has a quarter of them.
     n_frames : int
         Frames in each; at least 20. The paper has 1000.
     seed : int
@@ -66,7 +68,8 @@ def reproduce(
     study : bool
         Also vary the experiment along four axes (`interaction_study`).
     force : bool
-        Replace results of before, when those of this call are complete; other files in the folder stay.
+        Replace results of before, when those of this call are complete; other files in the folder
+        stay.
 
     Raises
     ------
@@ -82,12 +85,18 @@ def reproduce(
         After Ctrl-C; the same call then goes on.
     """
     if n_replicates < 8:
-        raise CalibrationError(f"n_replicates is {n_replicates}: a comparison over seeds needs at least 8.")
+        raise CalibrationError(
+            f"n_replicates is {n_replicates}: a comparison over seeds needs at least 8."
+        )
     if n_frames < 20:
         raise CalibrationError(f"n_frames is {n_frames}: the experiment needs at least 20.")
-    bar = Bar(progress, {name: share for name, share in _SHARES.items() if study or name != "study"})
+    bar = Bar(
+        progress, {name: share for name, share in _SHARES.items() if study or name != "study"}
+    )
     with making(out, "reproduce", REPORT, force=force) as stage:
-        found = _reproduced(Path(out), n_replicates, n_frames, seed, convention, workers, study, bar)
+        found = _reproduced(
+            Path(out), n_replicates, n_frames, seed, convention, workers, study, bar
+        )
         figures = reproduction_figures(found)
         page = reproduction_page(found, figures)
         write_tables(stage, found.tables(), figures)
@@ -144,10 +153,17 @@ def _reproduced(
             keep=folder,
         )
         _stop_if(varied.interrupted)
-    settings: AnyDict = {"convention": convention, "n_replicates": n_replicates, "n_frames": n_frames}
+    settings: AnyDict = {
+        "convention": convention,
+        "n_replicates": n_replicates,
+        "n_frames": n_frames,
+    }
     settings |= {"n_reading_draws": readings.n_draws, "study": study}
     calibrations = {name: run.of(name) for name in PAPER_METHODS}
-    sigmas = {name: dict(zip(c.parameter_names, c.sigmas.tolist(), strict=True)) for name, c in calibrations.items()}
+    sigmas = {
+        name: dict(zip(c.parameter_names, c.sigmas.tolist(), strict=True))
+        for name, c in calibrations.items()
+    }
     return Reproduction(
         path=folder,
         run=run,

@@ -1,10 +1,12 @@
-"""Estimates of many replicates against the truth, the Cramer-Rao bound, and what their method claims.
+"""Estimates of many replicates against the truth, the Cramer-Rao bound, and what their method
+claims.
 
-The spread of n Gaussian estimates follows a chi distribution, ``(n - 1) s^2 / sigma^2 ~ chi-square(n - 1)``: from it
-come the intervals of claimed over spread and of the efficiency. Three things are tested of every method and parameter:
-is the mean error zero (t test), is the spread what is claimed (chi-square test; another for the textbook's claim), and
-does the claimed 95 % interval hold the truth 95 times in a hundred (binomial test). All p-values of a table go through
-Holm's procedure together, so that chance is called a finding in one of a hundred such tables.
+The spread of n Gaussian estimates follows a chi distribution, ``(n - 1) s^2 / sigma^2 ~
+chi-square(n - 1)``: from it come the intervals of claimed over spread and of the efficiency. Three
+things are tested of every method and parameter: is the mean error zero (t test), is the spread what
+is claimed (chi-square test; another for the textbook's claim), and does the claimed 95 % interval
+hold the truth 95 times in a hundred (binomial test). All p-values of a table go through Holm's
+procedure together, so that chance is called a finding in one of a hundred such tables.
 """
 
 from __future__ import annotations
@@ -28,11 +30,13 @@ HONEST = "honest"
 TOO_FEW = "too few replicates to judge"
 
 
-def summarise(error: FloatArray, claimed: FloatArray, classical: FloatArray, crlb: float) -> AnyDict:
+def summarise(
+    error: FloatArray, claimed: FloatArray, classical: FloatArray, crlb: float
+) -> AnyDict:
     """Statistics of one parameter of one method, as the columns of `Replicates.table`.
 
-    From errors, the standard deviations that the method gives, those by the formula of the textbooks (NaN where there
-    is none), each (n,), and the bound. Keys of p-values end in ``_p``.
+    From errors, the standard deviations that the method gives, those by the formula of the
+    textbooks (NaN where there is none), each (n,), and the bound. Keys of p-values end in ``_p``.
     """
     from scipy.stats import binomtest, t
 
@@ -52,7 +56,9 @@ def summarise(error: FloatArray, claimed: FloatArray, classical: FloatArray, crl
             "spread": spread,
             "spread_se": spread / np.sqrt(2.0 * max(n - 1, 1)),
             "crlb": crlb,
-            **_with_ends("efficiency", *((crlb / spread * factor) ** 2 for factor in (1.0, low, high))),
+            **_with_ends(
+                "efficiency", *((crlb / spread * factor) ** 2 for factor in (1.0, low, high))
+            ),
             "rmse": rmse,
             "rmse_over_crlb": rmse / crlb,
             "bias_p": float(2.0 * t.sf(abs(bias / bias_se), n - 1)),
@@ -64,11 +70,16 @@ def summarise(error: FloatArray, claimed: FloatArray, classical: FloatArray, crl
             wilson = wilson_interval(held, n) if known else (np.nan, np.nan)
             values |= {
                 f"claimed{suffix}": size,
-                **_with_ends(f"claimed{suffix}_over_spread", *(size / spread * factor for factor in (1.0, low, high))),
+                **_with_ends(
+                    f"claimed{suffix}_over_spread",
+                    *(size / spread * factor for factor in (1.0, low, high)),
+                ),
                 f"claimed{suffix}_over_rmse": size / rmse,
                 **_with_ends(f"coverage95{suffix}", held / n if known else np.nan, *wilson),
                 f"claimed{suffix}_p": chi_p_value(spread / size, n) if known else np.nan,
-                f"coverage95{suffix}_p": float(binomtest(held, n, _INTERVAL).pvalue) if known else np.nan,
+                f"coverage95{suffix}_p": float(binomtest(held, n, _INTERVAL).pvalue)
+                if known
+                else np.nan,
             }
     return values
 
@@ -78,7 +89,9 @@ def _with_ends(name: str, value: Any, low: Any, high: Any) -> AnyDict:
 
 
 def chi_interval(n: int) -> tuple[float, float]:
-    """Factors (low, high) on ``1 / s`` that give the 95 % interval of ``1 / sigma`` for n Gaussian values."""
+    """Factors (low, high) on ``1 / s`` that give the 95 % interval of ``1 / sigma`` for n Gaussian
+    values.
+    """
     from scipy.stats import chi2
 
     if n < 2:
@@ -89,7 +102,9 @@ def chi_interval(n: int) -> tuple[float, float]:
 
 
 def chi_p_value(ratio: float, n: int) -> float:
-    """Two-sided p-value of ``s / sigma`` when sigma is the true standard deviation of n Gaussian values."""
+    """Two-sided p-value of ``s / sigma`` when sigma is the true standard deviation of n Gaussian
+    values.
+    """
     from scipy.stats import chi2
 
     if n < 2 or not np.isfinite(ratio):
@@ -109,7 +124,9 @@ def words(row: AnyDict, bias: bool, claim: bool, coverage: bool) -> str:
             parts.append(f"slightly biased by {significant(sigmas)} of its sigmas")
         else:
             share = significant(row["claimed_over_rmse"])
-            parts.append(f"biased by {significant(sigmas)} of its sigmas, claims {share} of its error")
+            parts.append(
+                f"biased by {significant(sigmas)} of its sigmas, claims {share} of its error"
+            )
     if claim:
         parts.append(claim_words(row["claimed_over_spread"]))
     if coverage and not parts:

@@ -1,4 +1,6 @@
-"""Frames of another camera among those of a folder: another size of the image, or another focal length of the stars."""
+"""Frames of another camera among those of a folder: another size of the image, or another focal
+length of the stars.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,16 @@ if TYPE_CHECKING:
 
 # A focal length that differs by more is another camera's; what frames scatter by is less.
 _APART = 0.003
-# Frames that no star is found for are asked for another camera when they have so many centroids, the richest first.
+# Frames that no star is found for are asked for another camera when they have so many centroids,
+# the richest first.
 _CENTROIDS, _ASKED = 12, 3
 
 
 @dataclass(frozen=True)
 class OtherCamera:
-    """Frames of a camera that is not the one of most frames: what it is, in a few words, and their numbers."""
+    """Frames of a camera that is not the one of most frames: what it is, in a few words, and their
+    numbers.
+    """
 
     words: str
     frames: tuple[int, ...]
@@ -83,22 +88,38 @@ def of_one_camera(
     others = [group for group in groups if group is not most]
     odd = {number: group for group in others for number in group.frames}
     problem = [
-        f"another camera took it: f = {odd[number].focal_px:.4g} px, and {most.focal_px:.4g} px in most frames"
+        (
+            f"another camera took it: f = {odd[number].focal_px:.4g} px, and {most.focal_px:.4g} "
+            "px "
+            "in most frames"
+        )
         if number in odd
         else why
-        for number, why in zip(centroids.frame_ids.tolist(), centroids.problem.tolist(), strict=True)
+        for number, why in zip(
+            centroids.frame_ids.tolist(), centroids.problem.tolist(), strict=True
+        )
     ]
     kept = centroids.select(~np.isin(centroids.frame, list(odd)))
     focals = [[group.focal_px, list(group.frames)] for group in others]
-    return replace(kept, problem=np.array(problem, dtype=np.str_), meta={**kept.meta, "other_focals": focals})
+    return replace(
+        kept, problem=np.array(problem, dtype=np.str_), meta={**kept.meta, "other_focals": focals}
+    )
 
 
-def _groups(centroids: Centroids, first: Identification, search: Callable[[Centroids], Identification]) -> list[_Group]:
-    """The frames by their focal lengths: those that were identified, and those that another lens explains."""
+def _groups(
+    centroids: Centroids, first: Identification, search: Callable[[Centroids], Identification]
+) -> list[_Group]:
+    """The frames by their focal lengths: those that were identified, and those that another lens
+    explains.
+    """
     if not first.n_identified:
         return []
     groups = _by_focal(first)
-    left = [frame for frame in first.frames if frame.status != "identified" and frame.n_centroids >= _CENTROIDS]
+    left = [
+        frame
+        for frame in first.frames
+        if frame.status != "identified" and frame.n_centroids >= _CENTROIDS
+    ]
     while left:
         left.sort(key=lambda frame: -frame.n_centroids)
         try:
@@ -109,7 +130,11 @@ def _groups(centroids: Centroids, first: Identification, search: Callable[[Centr
             # Centroids that do not say the size of their images.
             break
         known = [group.focal_px for group in groups]
-        new = [group for group in _by_focal(found) if all(abs(group.focal_px / f - 1.0) > _APART for f in known)]
+        new = [
+            group
+            for group in _by_focal(found)
+            if all(abs(group.focal_px / f - 1.0) > _APART for f in known)
+        ]
         if not new:
             break
         groups += new
@@ -129,5 +154,7 @@ def _by_focal(found: Identification) -> list[_Group]:
     groups = []
     for k in range(focals.n_groups):
         mine = focals.group == k
-        groups.append(_Group(float(np.median(focals.focal_px[mine])), tuple(focals.frame_ids[mine].tolist())))
+        groups.append(
+            _Group(float(np.median(focals.focal_px[mine])), tuple(focals.frame_ids[mine].tolist()))
+        )
     return groups

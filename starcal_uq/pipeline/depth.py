@@ -1,4 +1,6 @@
-"""How faint the stars must be that frames are compared with: as many in a field as the frames show, or enough."""
+"""How faint the stars must be that frames are compared with: as many in a field as the frames show,
+or enough.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ if TYPE_CHECKING:
 
 # Stars of the embedded catalogue to magnitudes G: the whole sky.
 COUNTS = {7.0: 21399, 7.5: 36733, 8.0: 62793, 8.5: 106434, 9.0: 177496, 9.5: 294317, 10.0: 482176}
-# To the first magnitude the catalogue has proper motions; more stars than these in a field are not asked for.
+# To the first magnitude the catalogue has proper motions; more stars than these in a field are not
+# asked for.
 _LIMITS = tuple(COUNTS)
 _ENOUGH = 25
 # Frames show other stars than the brightest of the catalogue's band, and fields differ.
@@ -34,21 +37,31 @@ def stars_in_field(camera: Camera, max_mag: float) -> float:
 
 
 def depth_for(centroids: Centroids, camera: Camera) -> float:
-    """The magnitude limit for these frames: 7, or what gives a field as many stars as are seen, or enough of them."""
+    """The magnitude limit for these frames: 7, or what gives a field as many stars as are seen, or
+    enough of them.
+    """
     seen = centroids.stars_per_frame
     seen = seen[seen >= _LEAST_STARS]
     wanted = min(_MARGIN * float(np.median(seen)), _ENOUGH) if len(seen) else 0.0
-    return next((limit for limit in _LIMITS if stars_in_field(camera, limit) >= wanted), _LIMITS[-1])
+    return next(
+        (limit for limit in _LIMITS if stars_in_field(camera, limit) >= wanted), _LIMITS[-1]
+    )
 
 
 def identify_to_depth(
-    centroids: Centroids, camera: Camera | None, year: float, max_mag: float | None = None, **options: Any
+    centroids: Centroids,
+    camera: Camera | None,
+    year: float,
+    max_mag: float | None = None,
+    **options: Any,
 ) -> tuple[StarCatalogue, Identification]:
-    """Identify with the embedded catalogue to the depth that the frames need; the stars searched for, and the result.
+    """Identify with the embedded catalogue to the depth that the frames need; the stars searched
+    for, and the result.
 
-    A search at any focal length looks at each level of brightness once, and loads fainter stars only where brighter
-    ones are no answer. `year` is the Julian year of the star positions, `max_mag` the limit in Gaia G, which is chosen
-    by default, and the options are those of `identify`.
+    A search at any focal length looks at each level of brightness once, and loads fainter stars
+    only where brighter ones are no answer. `year` is the Julian year of the star positions,
+    `max_mag` the limit in Gaia G, which is chosen by default, and the options are those of
+    `identify`.
     """
     from starcal_uq.identification.engine import identify
     from starcal_uq.sky.catalogue import load_catalogue

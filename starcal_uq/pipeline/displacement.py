@@ -1,9 +1,10 @@
 """Centroids where they would be if aberration and refraction did not displace the stars.
 
-A catalogue knows neither, and while the attitude takes up what is common to a frame, the rest stretches it: by some
-tenths of a pixel near the edge of a wide field, differently at every altitude. Stars are identified by their places, so
-that once attitude and camera are known roughly, the centroids are moved by what the sky did to each frame, and compared
-with the catalogue like with like. What is calibrated afterwards are the centroids as they were measured.
+A catalogue knows neither, and while the attitude takes up what is common to a frame, the rest
+stretches it: by some tenths of a pixel near the edge of a wide field, differently at every
+altitude. Stars are identified by their places, so that once attitude and camera are known roughly,
+the centroids are moved by what the sky did to each frame, and compared with the catalogue like with
+like. What is calibrated afterwards are the centroids as they were measured.
 """
 
 from __future__ import annotations
@@ -26,12 +27,15 @@ if TYPE_CHECKING:
 ToCatalogue: TypeAlias = Callable[[FloatArray, StrArray], FloatArray]
 
 
-def undisplaced(centroids: Centroids, obs: Observations, camera: Camera, to_catalogue: ToCatalogue) -> Centroids:
-    """The same table with the centroids of identified frames moved to where the catalogue would have them.
+def undisplaced(
+    centroids: Centroids, obs: Observations, camera: Camera, to_catalogue: ToCatalogue
+) -> Centroids:
+    """The same table with the centroids of identified frames moved to where the catalogue would
+    have them.
 
-    `obs` are identified stars with apparent directions and times, counted as the centroids are, and `to_catalogue`
-    makes catalogue directions (n, 3) of apparent ones (n, 3) and their times (n,). A frame's mean displacement stays in
-    its attitude; frames that are not in `obs` are as they were.
+    `obs` are identified stars with apparent directions and times, counted as the centroids are, and
+    `to_catalogue` makes catalogue directions (n, 3) of apparent ones (n, 3) and their times (n,). A
+    frame's mean displacement stays in its attitude; frames that are not in `obs` are as they were.
     """
     if obs.time_utc is None or not obs.n_stars:
         return centroids
@@ -54,7 +58,9 @@ def undisplaced(centroids: Centroids, obs: Observations, camera: Camera, to_cata
 
 
 def as_measured(obs: Observations, moved: Centroids, measured: Centroids) -> Observations:
-    """Observations that were identified among moved centroids, with the places that were measured, row by row."""
+    """Observations that were identified among moved centroids, with the places that were measured,
+    row by row.
+    """
     from scipy.spatial import cKDTree
 
     far = 10.0 * float(np.abs(np.concatenate([moved.x_px, moved.y_px, [1.0]])).max())

@@ -47,7 +47,8 @@ class ExampleData(Shown):
     notice: str
 
     def save(self, folder: str | os.PathLike[str], force: bool = False) -> list[Path]:
-        """Write ``stars.ecsv``, ``camera.toml``, ``site.toml`` and ``NOTICE`` into a folder, which is made.
+        """Write ``stars.ecsv``, ``camera.toml``, ``site.toml`` and ``NOTICE`` into a folder, which
+        is made.
 
         Parameters
         ----------
@@ -66,7 +67,10 @@ class ExampleData(Shown):
         RunFolderError
             If a file exists, or cannot be written.
         """
-        contents = {Path(folder) / path.name: path.read_bytes() for path in sorted((_DATA / self.name).iterdir())}
+        contents = {
+            Path(folder) / path.name: path.read_bytes()
+            for path in sorted((_DATA / self.name).iterdir())
+        }
         for path in contents:
             ensure_new(path, force)
         new_folder(folder)
@@ -81,7 +85,8 @@ def example_data(name: ExampleName = "esa") -> ExampleData:
     Parameters
     ----------
     name : {"esa"}
-        ``esa``: eight frames of the night sky by the European Space Agency, 402 stars, a lens of 35 mm on the ground.
+        ``esa``: eight frames of the night sky by the European Space Agency, 402 stars, a lens of 35
+        mm on the ground.
 
     Returns
     -------

@@ -47,7 +47,9 @@ def are_images(paths: Sequence[Path]) -> bool:
         name = path.name.lower()
         if name.endswith(".fits") and is_fits_table(path):
             return False
-        return name.endswith(IMAGE_ENDINGS) or (path.is_dir() and not name.endswith((".csv", ".ecsv", ".parquet")))
+        return name.endswith(IMAGE_ENDINGS) or (
+            path.is_dir() and not name.endswith((".csv", ".ecsv", ".parquet"))
+        )
 
     return any(is_image(path) for path in paths)
 
@@ -65,7 +67,9 @@ def counted(messages: Sequence[str]) -> list[str]:
     """
     alike: dict[str, list[str]] = {}
     for message in messages:
-        alike.setdefault(_NUMBER.sub("#", message.partition(": ")[2] or message), []).append(message)
+        alike.setdefault(_NUMBER.sub("#", message.partition(": ")[2] or message), []).append(
+            message
+        )
     return [group[0] if len(group) == 1 else _together(group) for group in alike.values()]
 
 
@@ -102,14 +106,16 @@ def observations_from_images(
     progress: Progress | None = None,
     keep: Path | None = None,
 ) -> tuple[Observations, Centroids, ImageCalibration]:
-    """Find, identify and calibrate with the nominal camera, then identify again with what was learnt.
+    """Find, identify and calibrate with the nominal camera, then identify again with what was
+    learnt.
 
     Parameters
     ----------
     images : sequence of Path
         Image files or folders of them.
     camera : Camera or None
-        The nominal camera. Without one, it is what the images say of it, and the focal length is found from the stars.
+        The nominal camera. Without one, it is what the images say of it, and the focal length is
+        found from the stars.
     max_mag : float, optional
         Magnitude limit of the embedded catalogue, Gaia G; chosen by default (`depth_for`).
     focal_tolerance : float
@@ -119,15 +125,17 @@ def observations_from_images(
     gain_e_per_count : float, optional
         Electrons per count, where the files do not say it.
     directions : {"apparent", "undeclared", "catalogue"}, optional
-        By default annual aberration is applied where every image has a time, and nothing is declared where not.
-        ``apparent`` takes the catalogue's directions for what the camera saw, as in rendered images.
+        By default annual aberration is applied where every image has a time, and nothing is
+        declared where not. ``apparent`` takes the catalogue's directions for what the camera saw,
+        as in rendered images.
     site : Site, optional
-        Where on the ground the camera stood: diurnal aberration and refraction are applied too, and stars lower than
-        ten degrees left out.
+        Where on the ground the camera stood: diurnal aberration and refraction are applied too, and
+        stars lower than ten degrees left out.
     in_space : bool
         Whether the camera was above the air, so that nothing need be said of refraction.
     time_utc : str, optional
-        Middle of the exposure of all images whose files do not say it; it goes before a time in a file's name.
+        Middle of the exposure of all images whose files do not say it; it goes before a time in a
+        file's name.
     bayer : {"RGGB", "BGGR", "GRBG", "GBRG", "none"}, optional
         Mosaic of colours of the images, as in `extract_centroids`.
     engine : {"pyramid", "tetra3rs"}
@@ -137,10 +145,11 @@ def observations_from_images(
     workers : int, optional
         Processes that measure the images, as in `extract_centroids`.
     tell : callable, optional
-        Gets what a user should know of the images, one sentence each, before anything is made of them.
+        Gets what a user should know of the images, one sentence each, before anything is made of
+        them.
     seen : callable, optional
-        Gets the centroids when they are measured, and once more with the first identification: what is there to be
-        looked at if an error follows.
+        Gets the centroids when they are measured, and once more with the first identification: what
+        is there to be looked at if an error follows.
     progress : callable, optional
         Called with (images done, images in all).
     keep : path, optional
@@ -151,7 +160,8 @@ def observations_from_images(
     ImageError, IdentificationError, CalibrationError
         When nothing can be made of the images.
     ObservationError
-        When a site is given and an image has no time, or shows stars that were below the horizon there.
+        When a site is given and an image has no time, or shows stars that were below the horizon
+        there.
     CatalogueError
         When the time is not readable.
     """
@@ -224,9 +234,10 @@ def observations_from_centroids(
 ) -> tuple[Observations | None, Identification, ImageCalibration | None]:
     """What `observations_from_images` does with the centroids of its images.
 
-    With what is `known` of this camera the stars are identified once. If `lenient`, stars that do not determine the
-    camera are taken as they were identified first, and none is no error. The last identification is returned; the
-    observations are None where no star was identified, the calibration where they were identified once.
+    With what is `known` of this camera the stars are identified once. If `lenient`, stars that do
+    not determine the camera are taken as they were identified first, and none is no error. The last
+    identification is returned; the observations are None where no star was identified, the
+    calibration where they were identified once.
     """
     from starcal_uq.pipeline.cameras import of_one_camera
     from starcal_uq.pipeline.depth import depth_text, identify_to_depth
@@ -243,23 +254,31 @@ def observations_from_centroids(
     year = epoch_of(centroids) if epoch is None else epoch
     options = dict(identification or {})
     progress = options.pop("progress", None)
-    stars, first = identify_to_depth(centroids, camera, year, max_mag, calibration=known, progress=progress, **options)
+    stars, first = identify_to_depth(
+        centroids, camera, year, max_mag, calibration=known, progress=progress, **options
+    )
     if known is None:
 
         def search(table: Centroids) -> Identification:
-            return identify_to_depth(table, None, year, max_mag, engine=options.get("engine", "pyramid"))[1]
+            return identify_to_depth(
+                table, None, year, max_mag, engine=options.get("engine", "pyramid")
+            )[1]
 
         kept = of_one_camera(centroids, first, camera, options.get("focal_tolerance", 0.03), search)
         if kept is not centroids:
             centroids = kept
-            stars, first = identify_to_depth(centroids, camera, year, max_mag, progress=progress, **options)
+            stars, first = identify_to_depth(
+                centroids, camera, year, max_mag, progress=progress, **options
+            )
     if seen is not None:
         seen(centroids, first)
     if tell is not None and max_mag is None:
         tell(depth_text(stars, first))
     limit = float(stars.mag.max())
     # A neighbour need not be bright enough to be identified to displace a star.
-    neighbours = load_catalogue(max_mag=max(limit, min(limit + FAINTER_NEIGHBOURS, FAINTEST)), epoch=year)
+    neighbours = load_catalogue(
+        max_mag=max(limit, min(limit + FAINTER_NEIGHBOURS, FAINTEST)), epoch=year
+    )
     motion = directions in (None, "catalogue")
     width = centroids.psf_sigma_px[np.isfinite(centroids.psf_sigma_px)]
     psf_sigma_px = float(np.median(width)) if len(width) else 1.0
@@ -275,7 +294,8 @@ def observations_from_centroids(
             return obs.with_meta(directions=directions or "undeclared")
         obs = obs.with_meta(directions="catalogue")
         if stated is not None:
-            # What a header says of the place is believed as long as the stars are above its horizon.
+            # What a header says of the place is believed as long as the stars are above its
+            # horizon.
             said, stated = stated, None
             try:
                 low = without_low_stars(obs, said)
@@ -284,11 +304,18 @@ def observations_from_centroids(
             else:
                 site, words = (
                     said,
-                    f"was used for refraction; {plural(int(low.meta['low_stars']), 'low star')} left out.",
+                    (
+                        "was used for refraction; "
+                        f"{plural(int(low.meta['low_stars']), 'low star')} "
+                        "left out."
+                    ),
                 )
             if tell is not None:
                 keys = centroids.meta["place"]["keys"]
-                tell(f"note: The site in the headers ({keys}: {said}) {words} Another: --site SITE, none: --in-space.")
+                tell(
+                    f"note: The site in the headers ({keys}: {said}) {words} Another: --site "
+                    "SITE, none: --in-space."
+                )
         return make_apparent(obs if site is None else without_low_stars(obs, site), site=site)
 
     def to_catalogue(apparent: FloatArray, times: StrArray) -> FloatArray:
@@ -330,7 +357,8 @@ def stated_site(centroids: Centroids) -> Site | None:
 
 
 def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
-    """Centroids with a time (UTC) for all frames whose images do not say it in their header; none for None.
+    """Centroids with a time (UTC) for all frames whose images do not say it in their header; none
+    for None.
 
     Times from the names of files give way. An offset such as "+02:00" is taken out.
     """
@@ -357,13 +385,18 @@ def of_one_size(centroids: Centroids) -> Centroids:
     common = centroids.meta["optics"]
     most = f"most are {common['width_px']} x {common['height_px']} px"
     problem = [
-        f"the image is {sizes[str(k)][0]} x {sizes[str(k)][1]} px and {most}" if str(k) in sizes and not why else why
+        f"the image is {sizes[str(k)][0]} x {sizes[str(k)][1]} px and {most}"
+        if str(k) in sizes and not why
+        else why
         for k, why in zip(centroids.frame_ids.tolist(), centroids.problem.tolist(), strict=True)
     ]
     odd = [int(k) for k in sizes]
     kept = centroids.select(~np.isin(centroids.frame, odd))
     names = centroids.image[np.isin(centroids.frame_ids, odd)]
-    said = [f"{n}: the image was left out, because it is not of the size of most; run it by itself." for n in names]
+    said = [
+        f"{n}: the image was left out, because it is not of the size of most; run it by itself."
+        for n in names
+    ]
     return replace(kept, problem=np.array(problem, dtype=np.str_), messages=(*kept.messages, *said))
 
 
@@ -373,7 +406,8 @@ def _check_times(centroids: Centroids) -> None:
     if len(untimed):
         others = f" (and {plural(len(untimed) - 1, 'other')})" if len(untimed) > 1 else ""
         raise ObservationError(
-            f"{untimed[0]}{others}: the image has no time, without which the site does not say where the stars stood; "
+            f"{untimed[0]}{others}: the image has no time, without which the site does not say "
+            "where the stars stood; "
             f"give the time (--time, UTC, such as 2026-11-21T03:04:05), or {TIMES_IN_NAMES}.",
             column="time_utc",
         )

@@ -1,9 +1,9 @@
 """What became of every detection of a frame, and of every star that it should show.
 
-A detection is *identified* when it has a star of the catalogue and takes part in the calibration, *left out* when it
-has a star and takes no part, and *not matched* otherwise. A star is *expected* when it stands in the frame and is
-brighter than the frame's limit, the magnitude that parts best the stars that were detected from those that were not; it
-is *missed* when no detection is near it.
+A detection is *identified* when it has a star of the catalogue and takes part in the calibration,
+*left out* when it has a star and takes no part, and *not matched* otherwise. A star is *expected*
+when it stands in the frame and is brighter than the frame's limit, the magnitude that parts best
+the stars that were detected from those that were not; it is *missed* when no detection is near it.
 """
 
 from __future__ import annotations
@@ -39,8 +39,12 @@ if TYPE_CHECKING:
 IDENTIFIED, LEFT_OUT, NOT_MATCHED = "identified", "left out", "not matched"
 NO_STAR, FAINTER = "at no star of the catalogue", "fainter than the stars searched for"
 # What leaves a star out, if it is not screening.
-_LEFT_OUT, _WHOLE = "displaced by a neighbour, or low above the horizon", "in a frame that keeps too few"
-# A detection so near to a star's place is that star's, px, widths of a star image, and scatter of the frame's stars.
+_LEFT_OUT, _WHOLE = (
+    "displaced by a neighbour, or low above the horizon",
+    "in a frame that keeps too few",
+)
+# A detection so near to a star's place is that star's, px, widths of a star image, and scatter of
+# the frame's stars.
 _NEAR_PX, _NEAR_PSF, _NEAR_RMS = 3.0, 2.5, 5.0
 # Frames of a gallery that are shown because nothing is known of them, or because they fit worst.
 _SHARE = 3
@@ -59,12 +63,12 @@ class InspectedFrame(Shown):
     width_px, height_px : int
         Size of the image.
     detections : DataFrame
-        A row for each detection, brightest first: `x_px`, `y_px`, `snr`, `kind` ("identified", "left out" or "not
-        matched"), `reason` (why it is not identified), `star_id`, `mag`, and for identified ones `dx_px`, `dy_px`:
-        measured minus predicted.
+        A row for each detection, brightest first: `x_px`, `y_px`, `snr`, `kind` ("identified",
+        "left out" or "not matched"), `reason` (why it is not identified), `star_id`, `mag`, and for
+        identified ones `dx_px`, `dy_px`: measured minus predicted.
     stars : DataFrame
-        A row for each expected star, brightest first: `x_px`, `y_px` (where it is predicted), `star_id`, `mag`,
-        `missed`.
+        A row for each expected star, brightest first: `x_px`, `y_px` (where it is predicted),
+        `star_id`, `mag`, `missed`.
     ra_deg, dec_deg : float
         Direction of the centre of the image, ICRS, degrees; NaN without an attitude.
     roll_deg : float
@@ -111,7 +115,9 @@ class InspectedFrame(Shown):
         """Number of detections of a kind, or of "expected" or "missed" stars."""
         if kind == "expected":
             return len(self.stars)
-        return int((self.stars["missed"] if kind == "missed" else self.detections["kind"] == kind).sum())
+        return int(
+            (self.stars["missed"] if kind == "missed" else self.detections["kind"] == kind).sum()
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -127,7 +133,8 @@ class Frames(Shown):
     centroids : Centroids
         All detections.
     matched : Observations
-        The stars that the last identification found, with catalogue directions; counted as `used` is.
+        The stars that the last identification found, with catalogue directions; counted as `used`
+        is.
     used : Observations
         Those that were calibrated.
     residuals_px : (N, 2) array
@@ -192,7 +199,11 @@ class Frames(Shown):
         """Root mean square of the residuals of each calibrated frame, px per axis."""
         squares = 0.5 * (self.residuals_px**2).sum(axis=1)
         starts = self.used.frame_starts[:-1]
-        mean = np.add.reduceat(squares, starts) / self.used.stars_per_frame if len(starts) else squares[:0]
+        mean = (
+            np.add.reduceat(squares, starts) / self.used.stars_per_frame
+            if len(starts)
+            else squares[:0]
+        )
         return dict(zip(self.used.frame_ids.tolist(), np.sqrt(mean).tolist(), strict=True))
 
     def select(self, *which: int | str, large: bool | None = None) -> Frames:
@@ -219,7 +230,8 @@ class Frames(Shown):
         )
 
     def telling(self, most: int) -> Frames:
-        """At most so many frames: a third that failed, a third that fit worst, and others spread over the run.
+        """At most so many frames: a third that failed, a third that fit worst, and others spread
+        over the run.
 
         All in the order of the run.
         """
@@ -240,7 +252,9 @@ class Frames(Shown):
         """A row for each frame: number, name, time, outcome, counts, residual, seconds."""
         import pandas as pd
 
-        used = dict(zip(self.used.frame_ids.tolist(), self.used.stars_per_frame.tolist(), strict=True))
+        used = dict(
+            zip(self.used.frame_ids.tolist(), self.used.stars_per_frame.tolist(), strict=True)
+        )
         return pd.DataFrame(
             [
                 {
@@ -260,20 +274,26 @@ class Frames(Shown):
 
     def _row(self, which: int | str) -> ImageRow:
         text = str(which)
-        found = [row for row in self.record.rows if text == row.image or text == Path(row.image).stem]
+        found = [
+            row for row in self.record.rows if text == row.image or text == Path(row.image).stem
+        ]
         found = found or [row for row in self.record.rows if text == str(row.frame)]
         if len(found) == 1:
             return found[0]
         if found:
             numbers = ", ".join(str(row.frame) for row in found[:5])
-            raise ImageError(f"{text}: {len(found)} frames have this name; take one by its number ({numbers}).")
+            raise ImageError(
+                f"{text}: {len(found)} frames have this name; take one by its number ({numbers})."
+            )
         last = self.record.rows[-1] if self.record.rows else None
         known = "it has none" if last is None else f"the last one is {last.frame}, {last.image}"
         raise ImageError(f"{text}: the run has no frame of this number or name; {known}.")
 
     @cached_property
     def paths(self) -> dict[int, Path]:
-        """The image of each frame, where it is still found, by the name that the run knows it by."""
+        """The image of each frame, where it is still found, by the name that the run knows it
+        by.
+        """
         found: dict[str, list[Path]] = {}
         for source in self.images:
             for path in sorted(source.iterdir()) if source.is_dir() else [source]:
@@ -298,7 +318,9 @@ class Frames(Shown):
 
     @property
     def _catalogue(self) -> StarCatalogue | None:
-        """Stars to some magnitudes beyond those that were searched for; None where the run names no stars."""
+        """Stars to some magnitudes beyond those that were searched for; None where the run names no
+        stars.
+        """
         if not np.isfinite(self.searched_mag) or self.used.star_id is None:
             return None
         limit = max(self.searched_mag, min(self.searched_mag + FAINTER_NEIGHBOURS, FAINTEST))
@@ -307,7 +329,11 @@ class Frames(Shown):
     def _apparent(self, directions: FloatArray, row: ImageRow) -> FloatArray:
         """Catalogue directions as the run took them for this frame."""
         meta = self.used.meta
-        if meta.get("directions") != "apparent" or "observer_velocity_km_s" not in meta or not row.time_utc:
+        if (
+            meta.get("directions") != "apparent"
+            or "observer_velocity_km_s" not in meta
+            or not row.time_utc
+        ):
             return directions
         site = Site.from_dict(meta["site"]) if "site" in meta else None
         return apparent_directions(directions, row.time_utc, site=site)
@@ -317,7 +343,9 @@ class Frames(Shown):
 
         camera, number = self.camera, row.frame
         table = self.centroids.select(self.centroids.frame == number)
-        xy = np.column_stack([camera.width_px - 1 - table.x_px if self.mirrored else table.x_px, table.y_px])
+        xy = np.column_stack(
+            [camera.width_px - 1 - table.x_px if self.mirrored else table.x_px, table.y_px]
+        )
         used = np.flatnonzero(self.used.frame == number)
         matched = self.matched.select(self.matched.frame == number)
         kind = np.full(len(xy), NOT_MATCHED, dtype=object)
@@ -343,13 +371,20 @@ class Frames(Shown):
         limit = _limit(star_mag, seen)
         if quaternion is not None:
             free = np.flatnonzero(kind == NOT_MATCHED)
-            who, far = _nearest(xy[free], places) if len(places) else (free * 0, np.full(len(free), np.inf))
+            who, far = (
+                _nearest(xy[free], places)
+                if len(places)
+                else (free * 0, np.full(len(free), np.inf))
+            )
             for k, one, d in zip(free.tolist(), who.tolist(), far.tolist(), strict=True):
                 reason[k] = self._why(float(star_mag[one]) if d < near else None)
         expected = star_mag <= limit
         flip = np.array([-1.0, 1.0]) if self.mirrored else np.ones(2)
         if self.mirrored:
-            xy[:, 0], places[:, 0] = camera.width_px - 1 - xy[:, 0], camera.width_px - 1 - places[:, 0]
+            xy[:, 0], places[:, 0] = (
+                camera.width_px - 1 - xy[:, 0],
+                camera.width_px - 1 - places[:, 0],
+            )
         detections = pd.DataFrame(
             {
                 "x_px": xy[:, 0],
@@ -392,29 +427,41 @@ class Frames(Shown):
         )
 
     def _why(self, mag: float | None) -> str:
-        """Why a detection of an identified frame is not matched: by the magnitude of the star that is there, if any."""
+        """Why a detection of an identified frame is not matched: by the magnitude of the star that
+        is there, if any.
+        """
         if mag is None:
             return NO_STAR
         return FAINTER if mag > self.searched_mag else "not sure which star"
 
     def _attitude(self, row: ImageRow, matched: Observations) -> FloatArray | None:
-        """R_cam_icrs (3, 3); of a frame that was identified and not calibrated that of its stars."""
+        """R_cam_icrs (3, 3); of a frame that was identified and not calibrated that of its
+        stars.
+        """
         if row.frame in self.quaternions:
             return quaternion_to_rotation(self.quaternions[row.frame])
         if len(matched) < 2:
             return None
         b, r = unproject(self.camera, matched.xy), self._apparent(matched.directions_icrs, row)
-        rotation: FloatArray = quest(b, r, np.array([0, len(matched)]), covariance=False).rotations[0]
+        rotation: FloatArray = quest(b, r, np.array([0, len(matched)]), covariance=False).rotations[
+            0
+        ]
         return rotation
 
-    def _seen(self, row: ImageRow, rotation: FloatArray | None) -> tuple[FloatArray, FloatArray, Any]:
-        """Places (n, 2), magnitudes and names of the catalogue's stars within a frame, brightest first."""
+    def _seen(
+        self, row: ImageRow, rotation: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, Any]:
+        """Places (n, 2), magnitudes and names of the catalogue's stars within a frame, brightest
+        first.
+        """
         none = np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.str_)
         stars = None if rotation is None else self._catalogue
         if stars is None or rotation is None:
             return none
         right, low = self.camera.width_px - 0.5, self.camera.height_px - 0.5
-        corners = unproject(self.camera, np.array([[-0.5, -0.5], [right, -0.5], [-0.5, low], [right, low]]))
+        corners = unproject(
+            self.camera, np.array([[-0.5, -0.5], [right, -0.5], [-0.5, low], [right, low]])
+        )
         # Half a degree wider, for what the sky displaces.
         reach = np.cos(min(np.arccos(corners[:, 2].min()) + 0.01, 0.5 * np.pi))
         inside = np.flatnonzero(stars.directions_icrs @ rotation[2] > reach)
@@ -441,7 +488,8 @@ class Frames(Shown):
         east /= np.linalg.norm(east)
         up = above - middle
         roll = float(np.degrees(np.arctan2(up @ east, up @ np.cross(middle, east))))
-        # On an image as the sky is seen, east is left of north, so that up is left of north by the roll.
+        # On an image as the sky is seen, east is left of north, so that up is left of north by the
+        # roll.
         return float(ra[0]), float(dec[0]), roll % 360.0, -roll if self.mirrored else roll
 
 
@@ -463,7 +511,9 @@ def _nearest(points: FloatArray, among: FloatArray) -> tuple[IntArray, FloatArra
 
 
 def _limit(mag: FloatArray, seen: Any) -> float:
-    """The magnitude that parts seen stars from others with the fewest exceptions; stars are brightest first."""
+    """The magnitude that parts seen stars from others with the fewest exceptions; stars are
+    brightest first.
+    """
     if not len(mag) or not np.any(seen):
         return float("nan")
     return float(mag[int(np.argmax(np.cumsum(np.where(seen, 1, -1))))])
@@ -473,4 +523,7 @@ def _spread(items: Sequence[int], most: int) -> list[int]:
     """At most so many items, evenly spread."""
     if len(items) <= most:
         return list(items)
-    return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, max(most, 0)).astype(int)).tolist()]
+    return [
+        items[k]
+        for k in np.unique(np.linspace(0, len(items) - 1, max(most, 0)).astype(int)).tolist()
+    ]

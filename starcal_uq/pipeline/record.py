@@ -1,4 +1,6 @@
-"""What became of every image of a run, and what identifying twice changed: kept in the run folder for the report."""
+"""What became of every image of a run, and what identifying twice changed: kept in the run folder
+for the report.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,9 @@ IMAGES = "images.json"
 class RoundRecord:
     """One round of identification and calibration: frames identified, stars calibrated.
 
-    Stars are `new` or `given_up` against the round before; zero in the first. `parameters` are estimates with standard
-    deviations, px units, and `sigma` is that noise which was estimated, as `sigma_name` says.
+    Stars are `new` or `given_up` against the round before; zero in the first. `parameters` are
+    estimates with standard deviations, px units, and `sigma` is that noise which was estimated, as
+    `sigma_name` says.
     """
 
     n_frames: int
@@ -42,7 +45,9 @@ class RoundRecord:
 
 @dataclass(frozen=True)
 class ImageRow:
-    """One image: its name, time, centroids, outcome in words, and stars identified in the first and the last round."""
+    """One image: its name, time, centroids, outcome in words, and stars identified in the first and
+    the last round.
+    """
 
     frame: int
     image: str
@@ -57,7 +62,9 @@ class ImageRow:
 class ImageRecord(Shown, Saved):
     """The images of a run."""
 
-    rounds: tuple[RoundRecord, ...]  # The first with the nominal camera, the last with what was learnt
+    rounds: tuple[
+        RoundRecord, ...
+    ]  # The first with the nominal camera, the last with what was learnt
     rows: tuple[ImageRow, ...]  # Every image, used or not
     n_disturbed: int  # Stars left out because the light of a neighbour displaces them
     parity: str  # "normal" or "mirrored"
@@ -77,16 +84,21 @@ class ImageRecord(Shown, Saved):
 
 
 def record_images(
-    centroids: Centroids, images: ImageCalibration | Identification | None, sources: Sequence[PathLike] = ()
+    centroids: Centroids,
+    images: ImageCalibration | Identification | None,
+    sources: Sequence[PathLike] = (),
 ) -> ImageRecord:
-    """The record of images with their last identification and the rounds to it, as far as there are any.
+    """The record of images with their last identification and the rounds to it, as far as there are
+    any.
 
     `sources` are the files and folders that the images came from.
     """
     calibrated = images if isinstance(images, ImageCalibration) else None
     last = images.identification if isinstance(images, ImageCalibration) else images
     first = last if calibrated is None else calibrated.rounds[0][0]
-    counted = {frame.frame: frame.n_identified for frame in first.frames} if first is not None else {}
+    counted = (
+        {frame.frame: frame.n_identified for frame in first.frames} if first is not None else {}
+    )
     by_frame = {frame.frame: frame for frame in last.frames} if last is not None else {}
     rows = []
     for k, number in enumerate(centroids.frame_ids.tolist()):
@@ -109,12 +121,19 @@ def record_images(
         before = identification
     disturbed = 0 if calibrated is None else calibrated.observations.meta.get("disturbed_stars", 0)
     places = tuple(os.path.abspath(source) for source in sources)
-    parity, limit = ("normal", None) if last is None else (last.parity, last.observations.meta.get("max_mag"))
-    return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), parity, places, limit, other_cameras(centroids))
+    parity, limit = (
+        ("normal", None) if last is None else (last.parity, last.observations.meta.get("max_mag"))
+    )
+    return ImageRecord(
+        tuple(rounds), tuple(rows), int(disturbed), parity, places, limit, other_cameras(centroids)
+    )
 
 
 def _recorded(
-    identification: Identification, obs: Observations, cal: Calibration, before: Identification | None
+    identification: Identification,
+    obs: Observations,
+    cal: Calibration,
+    before: Identification | None,
 ) -> RoundRecord:
     now = identified_pairs(identification.observations)
     old = now if before is None else identified_pairs(before.observations)

@@ -1,8 +1,9 @@
-"""From centroids and a data sheet to a calibration: identify, calibrate, identify better, calibrate again.
+"""From centroids and a data sheet to a calibration: identify, calibrate, identify better, calibrate
+again.
 
-A nominal camera is some per cent off, so that the first identification must tolerate much and may miss faint stars and
-poor frames. The calibration of what it found leaves tolerances of a fraction of a pixel, and a second identification
-finds more stars and refuses what fitted by luck.
+A nominal camera is some per cent off, so that the first identification must tolerate much and may
+miss faint stars and poor frames. The calibration of what it found leaves tolerances of a fraction
+of a pixel, and a second identification finds more stars and refuses what fitted by luck.
 """
 
 from __future__ import annotations
@@ -79,15 +80,17 @@ def identify_and_calibrate(
     first : Identification, optional
         The first identification, where it was made before.
     prepare : callable, optional
-        Function that observations pass before they are calibrated, such as making directions apparent.
+        Function that observations pass before they are calibrated, such as making directions
+        apparent.
     to_catalogue : callable, optional
-        Inverse of `prepare`, where that makes directions apparent: apparent directions (n, 3) and their times (n,) to
-        catalogue directions (n, 3). The second identification then looks for stars where they are seen. It is not
-        used where `prepare` leaves the directions as they are.
+        Inverse of `prepare`, where that makes directions apparent: apparent directions (n, 3) and
+        their times (n,) to catalogue directions (n, 3). The second identification then looks for
+        stars where they are seen. It is not used where `prepare` leaves the directions as they are.
     method : dict, optional
         Options of `calibrate`.
     model : str, optional
-        Distortion model for stars that determine neither that of the camera nor a simpler one as good.
+        Distortion model for stars that determine neither that of the camera nor a simpler one as
+        good.
     identification : dict, optional
         Options of `identify`.
 
@@ -108,13 +111,19 @@ def identify_and_calibrate(
         try:
             # Which frames repeat others is asked once, at the end.
             asked = {**(method or {}), **({"duplicates": "keep"} if number == 0 else {})}
-            known = _calibrated(obs, found.nominal if number == 0 else rounds[0][0].nominal, model, asked)
+            known = _calibrated(
+                obs, found.nominal if number == 0 else rounds[0][0].nominal, model, asked
+            )
         except RepeatedFramesError:
             raise
         except CalibrationError as error:
-            stars_words, frames_words = plural(obs.n_stars, "star"), plural(found.n_identified, "frame")
+            stars_words, frames_words = (
+                plural(obs.n_stars, "star"),
+                plural(found.n_identified, "frame"),
+            )
             raise CalibrationError(
-                f"{stars_words} in {frames_words} were identified, but they do not determine the camera ({error}) Give "
+                f"{stars_words} in {frames_words} were identified, but they do not determine the "
+                f"camera ({error}) Give "
                 "more frames, or fainter stars (max_mag, --max-mag).",
                 error.status,
             ) from error
@@ -124,8 +133,12 @@ def identify_and_calibrate(
     return ImageCalibration(tuple(rounds))
 
 
-def _calibrated(obs: Observations, camera: Camera, model: str | None, options: dict[str, Any]) -> Calibration:
-    """The calibration with the lens of a camera; with the model that was asked for where that is of no avail."""
+def _calibrated(
+    obs: Observations, camera: Camera, model: str | None, options: dict[str, Any]
+) -> Calibration:
+    """The calibration with the lens of a camera; with the model that was asked for where that is of
+    no avail.
+    """
     from starcal_uq.estimation.calibrate import calibrate
 
     try:
@@ -147,7 +160,9 @@ def _again(
     to_catalogue: ToCatalogue | None,
     options: dict[str, Any],
 ) -> Identification:
-    """The second identification, with the calibrated camera and centroids freed from what displaces the stars."""
+    """The second identification, with the calibrated camera and centroids freed from what displaces
+    the stars.
+    """
     flipped = first.parity == "mirrored"
     table = mirrored(centroids, known.camera.width_px) if flipped else centroids
     moved = table

@@ -36,11 +36,12 @@ def observations_from_table(
 ) -> Observations:
     """Read a table and make its directions apparent as far as the user has declared how.
 
-    With directions ``catalogue`` (by default the file's own metadata say what they are), or with an observer velocity
-    relative to the Earth's centre (ICRS axes), annual aberration is applied at each row's ``time_utc``. With a `site`
-    on the ground, refraction and daily aberration are applied too, and stars lower than ten degrees left out;
-    `in_space`, nothing need be said of refraction. Rows without a time are of `time_utc`. Paths and columns are as
-    `load_observations` takes them.
+    With directions ``catalogue`` (by default the file's own metadata say what they are), or with an
+    observer velocity relative to the Earth's centre (ICRS axes), annual aberration is applied at
+    each row's ``time_utc``. With a `site` on the ground, refraction and daily aberration are
+    applied too, and stars lower than ten degrees left out; `in_space`, nothing need be said of
+    refraction. Rows without a time are of `time_utc`. Paths and columns are as `load_observations`
+    takes them.
     """
     obs = load_observations(path, camera=camera, columns=columns)
     path = path if isinstance(path, Path) else path[0]
@@ -60,7 +61,9 @@ def partitions_from_folder(
     in_space: bool = False,
     time_utc: str | None = None,
 ) -> PartitionedObservations:
-    """Open a folder of partitions, whose directions are made apparent as `observations_from_table` does, when read."""
+    """Open a folder of partitions, whose directions are made apparent as `observations_from_table`
+    does, when read.
+    """
     obs = open_partitions(path, camera, columns)
     if directions is not None:
         obs = obs.with_meta(directions=directions)
@@ -77,7 +80,11 @@ def partitions_from_folder(
         in_space=in_space,
         time_utc=time_utc,
     )
-    made = obs.meta["directions"] == "catalogue" or observer_velocity_km_s is not None or site is not None
+    made = (
+        obs.meta["directions"] == "catalogue"
+        or observer_velocity_km_s is not None
+        or site is not None
+    )
     if obs.meta["directions"] == "apparent":
         # Nothing is left to be done to them but to refuse what contradicts it.
         prepare(obs.reader.load(obs.parts[0]))
@@ -88,9 +95,13 @@ def partitions_from_folder(
 
 
 def _refuse_timed(path: Path, tables: Iterable[Observations]) -> None:
-    """Refuse a time for rows all of which have one; no table is asked for beyond the first that lacks some."""
+    """Refuse a time for rows all of which have one; no table is asked for beyond the first that
+    lacks some.
+    """
     if all(table.time_utc is not None and (table.time_utc != "").all() for table in tables):
-        raise ObservationError(f"{path}: every row has a time (column time_utc): leave out --time.", column="time_utc")
+        raise ObservationError(
+            f"{path}: every row has a time (column time_utc): leave out --time.", column="time_utc"
+        )
 
 
 def _apparent(
@@ -115,17 +126,26 @@ def _apparent(
     if obs.meta.get("directions") == "apparent":
         if observer_velocity_km_s is not None:
             raise ObservationError(
-                f"{path}: the directions are declared apparent already, so that an observer velocity would be applied "
+                f"{path}: the directions are declared apparent already, so that an observer "
+                "velocity would be applied "
                 "twice: leave out --observer-velocity, or declare --directions catalogue."
             )
         return obs
-    if obs.meta.get("directions") == "catalogue" or observer_velocity_km_s is not None or site is not None:
+    if (
+        obs.meta.get("directions") == "catalogue"
+        or observer_velocity_km_s is not None
+        or site is not None
+    ):
         from starcal_uq.sky.apparent import make_apparent, without_low_stars
 
         try:
             return make_apparent(
-                obs if site is None else without_low_stars(obs, site), observer_velocity_km_s, site=site
+                obs if site is None else without_low_stars(obs, site),
+                observer_velocity_km_s,
+                site=site,
             )
         except ObservationError as error:
-            raise ObservationError(f"{path}: {error}", row=error.row, column=error.column) from error
+            raise ObservationError(
+                f"{path}: {error}", row=error.row, column=error.column
+            ) from error
     return obs

@@ -1,4 +1,6 @@
-"""Is a forecast right? Campaigns simulated and calibrated in full, against what was forecast of them."""
+"""Is a forecast right? Campaigns simulated and calibrated in full, against what was forecast of
+them.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ _TOLERANCE, _FAMILY_LEVEL = 0.05, 0.01
 
 @dataclass(frozen=True, eq=False)
 class ForecastCheck(Shown):
-    """Forecast and simulation, for G numbers of frames, C campaigns of each, Q quantities and p parameters.
+    """Forecast and simulation, for G numbers of frames, C campaigns of each, Q quantities and p
+    parameters.
 
     Attributes
     ----------
@@ -78,11 +81,14 @@ class ForecastCheck(Shown):
     def ratio_se(self) -> FloatArray:
         """Standard error of `ratio` from the scatter of the campaigns, (G, Q)."""
         n = np.sum(np.isfinite(self.nees), axis=1)[:, None]
-        error: FloatArray = np.nanstd(self.stated, axis=1, ddof=1) / np.sqrt(n) / self.forecast.sigma
+        error: FloatArray = (
+            np.nanstd(self.stated, axis=1, ddof=1) / np.sqrt(n) / self.forecast.sigma
+        )
         return error
 
     def nees_ratio(self, of_forecast: bool = False) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Pooled squared z: mean squared error over its expectation (G,), 1 if the covariance is right.
+        """Pooled squared z: mean squared error over its expectation (G,), 1 if the covariance is
+        right.
 
         Also the interval that holds 95 % of such ratios if it is.
         """
@@ -97,7 +103,9 @@ class ForecastCheck(Shown):
 
     @property
     def nees_rejected(self) -> BoolArray:
-        """Numbers of frames (G,) whose squared errors are not what they should be: Bonferroni over all, at 1 %."""
+        """Numbers of frames (G,) whose squared errors are not what they should be: Bonferroni over
+        all, at 1 %.
+        """
         from scipy.stats import chi2
 
         ratio, _, _ = self.nees_ratio()
@@ -118,9 +126,9 @@ class ForecastCheck(Shown):
     def to_dataframe(self) -> pd.DataFrame:
         """One row per number of frames and quantity.
 
-        Columns are ``n_frames``, ``quantity``, ``forecast`` and ``stated`` (mean over campaigns), ``ratio`` with its
-        standard error ``ratio_se``; and, the same for all quantities of a number of frames, ``nees_ratio`` with the
-        interval ``nees_low`` to ``nees_high``.
+        Columns are ``n_frames``, ``quantity``, ``forecast`` and ``stated`` (mean over campaigns),
+        ``ratio`` with its standard error ``ratio_se``; and, the same for all quantities of a number
+        of frames, ``nees_ratio`` with the interval ``nees_low`` to ``nees_high``.
         """
         import pandas as pd
 
@@ -159,10 +167,11 @@ def check_forecast(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> ForecastCheck:
-    """Simulate and calibrate campaigns, and compare what they state and how far they err with the forecast of `plan`.
+    """Simulate and calibrate campaigns, and compare what they state and how far they err with the
+    forecast of `plan`.
 
-    The attitudes of the simulation are not those of the forecast, and every calibration starts from a data sheet:
-    principal point in the centre, no distortion.
+    The attitudes of the simulation are not those of the forecast, and every calibration starts from
+    a data sheet: principal point in the centre, no distortion.
 
     Parameters
     ----------
@@ -184,11 +193,16 @@ def check_forecast(
     CatalogueError
         When the field is too narrow for the catalogue to show `min_stars`.
     CalibrationError
-        When no campaign of some number of frames gave a result, or after Ctrl-C before the last one.
+        When no campaign of some number of frames gave a result, or after Ctrl-C before the last
+        one.
     """
     if n_campaigns < 2 or not n_frames:
-        raise PlanningError(f"n_campaigns is {n_campaigns}: give at least 2, and at least one number of frames.")
-    mission = random_frames(stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed)
+        raise PlanningError(
+            f"n_campaigns is {n_campaigns}: give at least 2, and at least one number of frames."
+        )
+    mission = random_frames(
+        stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed
+    )
     forecaster = Forecaster(mission.information, mission.mean_stars, mission, seed=seed)
     campaigns = [Campaign(n, min_stars, sigma_px) for n in n_frames]
     task = partial(_campaign, _Campaigns(camera, stars, campaigns, n_campaigns, seed))
@@ -201,7 +215,9 @@ def check_forecast(
         progress=progress,
     )
     if interrupted:
-        raise CalibrationError("the check of the forecast was interrupted: run it again with fewer campaigns.")
+        raise CalibrationError(
+            "the check of the forecast was interrupted: run it again with fewer campaigns."
+        )
     shape = (len(n_frames), n_campaigns)
     p = len(camera.theta)
     error = np.array([o.error for o in outcomes]).reshape(*shape, p)
@@ -233,7 +249,9 @@ class _Campaigns(NamedTuple):
 
 
 class _Calibrated(NamedTuple):
-    """One campaign: why it has no result (or nothing), error (p,), covariance (p, p), degrees of freedom."""
+    """One campaign: why it has no result (or nothing), error (p,), covariance (p, p), degrees of
+    freedom.
+    """
 
     failure: str
     error: FloatArray
@@ -245,7 +263,9 @@ def _campaign(study: _Campaigns, index: int) -> _Calibrated:
     """Simulate and calibrate campaign number `index`."""
     camera = study.camera
     # Other streams than those of the forecast.
-    seed = np.random.SeedSequence([study.seed, 4], spawn_key=(index,)).generate_state(1, np.uint64)[0]
+    seed = np.random.SeedSequence([study.seed, 4], spawn_key=(index,)).generate_state(1, np.uint64)[
+        0
+    ]
     try:
         obs = study.campaigns[index // study.n_campaigns].simulate(study.stars, camera, seed)
         cal = calibrate(obs, camera.data_sheet(), model=camera.distortion)

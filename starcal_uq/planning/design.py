@@ -1,13 +1,16 @@
 """Which frames to take next: a choice among candidate attitudes by optimal design.
 
-Frames are added one by one, each the one that helps most (greedy), and then exchanged as long as another candidate is
-better (Fedorov 1972, *Theory of Optimal Experiments*). What "helps" means is the criterion:
+Frames are added one by one, each the one that helps most (greedy), and then exchanged as long as
+another candidate is better (Fedorov 1972, *Theory of Optimal Experiments*). What "helps" means is
+the criterion:
 
-- ``D``: the determinant of the information on the parameters, i.e. the volume of their joint uncertainty;
-- ``A``: the mean variance, per axis across the boresight, of a part of the attitude error over the mission's attitudes.
+- ``D``: the determinant of the information on the parameters, i.e. the volume of their joint
+  uncertainty;
+- ``A``: the mean variance, per axis across the boresight, of a part of the attitude error over the
+  mission's attitudes.
 
-Candidates are ranked by the derivative of the criterion, which costs one product of matrices; the best of them are then
-evaluated exactly.
+Candidates are ranked by the derivative of the criterion, which costs one product of matrices; the
+best of them are then evaluated exactly.
 """
 
 from __future__ import annotations
@@ -70,7 +73,8 @@ def choose_frames(
     n_frames : int
         Frames to take.
     candidates : (M, 3, 3) array or int
-        Attitudes (R_cam_icrs) that could be taken; or how many random ones to choose from. Each is taken at most once.
+        Attitudes (R_cam_icrs) that could be taken; or how many random ones to choose from. Each is
+        taken at most once.
     sigma_px : float or callable
         Centroid noise, as for `plan`.
     min_stars : int
@@ -94,11 +98,14 @@ def choose_frames(
         When the field is too narrow for the catalogue to show `min_stars`.
     """
     _check(n_frames, min_stars, criterion, scope)
-    mission = random_frames(stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed)
+    mission = random_frames(
+        stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed
+    )
     pool = _pool(stars, camera, candidates, sigma_px, min_stars, seed)
     if pool.n_frames < n_frames:
         raise PlanningError(
-            f"{pool.n_frames} candidate attitudes show {min_stars} stars, fewer than the {n_frames} frames asked for: "
+            f"{pool.n_frames} candidate attitudes show {min_stars} stars, fewer than the "
+            f"{n_frames} frames asked for: "
             "give more candidates or ask for fewer frames."
         )
     start = start_information(after, camera)
@@ -127,7 +134,9 @@ def choose_frames(
         before=spreads(forms, inverses(none)),
         **{name: spreads(forms, inverses(total)) for name, total in sums.items()},
         score_path=design.path(chosen, reference),
-        random_path=np.mean([design.path(some, reference) for some in random_sets[:_RANDOM_PATHS]], axis=0),
+        random_path=np.mean(
+            [design.path(some, reference) for some in random_sets[:_RANDOM_PATHS]], axis=0
+        ),
         n_candidates=pool.n_frames,
         n_refused=n_given - pool.n_frames,
         exchanges=exchanges,
@@ -136,7 +145,12 @@ def choose_frames(
 
 
 def _pool(
-    stars: StarCatalogue, camera: Camera, candidates: FloatArray | int, noise: Noise, min_stars: int, seed: int
+    stars: StarCatalogue,
+    camera: Camera,
+    candidates: FloatArray | int,
+    noise: Noise,
+    min_stars: int,
+    seed: int,
 ) -> FrameSet:
     if isinstance(candidates, int):
         rotations = random_rotations(max(candidates, 1), np.random.default_rng([seed, 3]))
@@ -144,14 +158,21 @@ def _pool(
         rotations = np.asarray(candidates, dtype=np.float64)
         if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
             raise PlanningError(
-                f"candidates have the shape {rotations.shape}: give rotation matrices R_cam_icrs (M, 3, 3)."
+                f"candidates have the shape {rotations.shape}: give rotation matrices R_cam_icrs "
+                "(M, 3, 3)."
             )
     return look_at(stars, camera, rotations, noise, min_stars)
 
 
 def _weights(mission: FrameSet, scope: str) -> FloatArray:
-    """Matrix (p, p) whose product with a covariance is the mean variance per axis across the boresight, arcsec^2."""
-    response = {"common": mission.common[None], "rest": mission.rest, "calibration": mission.response}[scope]
+    """Matrix (p, p) whose product with a covariance is the mean variance per axis across the
+    boresight, arcsec^2.
+    """
+    response = {
+        "common": mission.common[None],
+        "rest": mission.rest,
+        "calibration": mission.response,
+    }[scope]
     rows = ARCSEC * response[:, :2].reshape(-1, response.shape[-1]) / np.sqrt(2.0 * len(response))
     weights: FloatArray = rows.T @ rows
     return weights
@@ -160,7 +181,9 @@ def _weights(mission: FrameSet, scope: str) -> FloatArray:
 class _Design:
     """A greedy choice with exchanges, in parameters scaled to order one."""
 
-    def __init__(self, information: FloatArray, criterion: str, weights: FloatArray, start: FloatArray | None) -> None:
+    def __init__(
+        self, information: FloatArray, criterion: str, weights: FloatArray, start: FloatArray | None
+    ) -> None:
         mean = information.mean(axis=0)
         self._scale = 1.0 / np.sqrt(np.diag(mean))
         both = np.outer(self._scale, self._scale)
@@ -236,17 +259,27 @@ class _Design:
         return self._value(total * np.outer(self._scale, self._scale))
 
     def path(self, frames: IntArray, reference: float) -> FloatArray:
-        """Criterion after each frame as 1 sigma; for ``D`` per parameter, relative to a `reference` value."""
+        """Criterion after each frame as 1 sigma; for ``D`` per parameter, relative to a `reference`
+        value.
+        """
         values = self._values(self._start + np.cumsum(self._information[frames], axis=0))
-        return np.exp(0.5 * (values - reference) / len(self._scale)) if self._is_d else np.sqrt(values)
+        return (
+            np.exp(0.5 * (values - reference) / len(self._scale)) if self._is_d else np.sqrt(values)
+        )
 
 
 def _check(n_frames: int, min_stars: int, criterion: str, scope: str) -> None:
     for good, text in (
         (n_frames >= 1, f"n_frames is {n_frames}: give at least 1."),
         (min_stars >= 3, f"min_stars is {min_stars}: an attitude needs at least 3."),
-        (criterion in CRITERIA, f"the criterion {criterion!r} is unknown: use one of {', '.join(CRITERIA)}."),
-        (scope in CHOICE_SCOPES, f"the scope {scope!r} cannot be optimised: use one of {', '.join(CHOICE_SCOPES)}."),
+        (
+            criterion in CRITERIA,
+            f"the criterion {criterion!r} is unknown: use one of {', '.join(CRITERIA)}.",
+        ),
+        (
+            scope in CHOICE_SCOPES,
+            f"the scope {scope!r} cannot be optimised: use one of {', '.join(CHOICE_SCOPES)}.",
+        ),
     ):
         if not good:
             raise PlanningError(text)
@@ -254,7 +287,8 @@ def _check(n_frames: int, min_stars: int, criterion: str, scope: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class FrameChoice(Shown):
-    """Frames to take, in the order of their value, and what they are worth. n frames, Q quantities, S random sets.
+    """Frames to take, in the order of their value, and what they are worth. n frames, Q quantities,
+    S random sets.
 
     Attributes
     ----------
@@ -275,8 +309,8 @@ class FrameChoice(Shown):
     richest : (Q,) array
         1 sigma with the candidates that show most stars instead.
     score_path : (n,) array
-        Criterion after 1, 2, ... n frames in this order, as 1 sigma: arcsec for ``A``, relative to the whole choice for
-        ``D`` (per parameter).
+        Criterion after 1, 2, ... n frames in this order, as 1 sigma: arcsec for ``A``, relative to
+        the whole choice for ``D`` (per parameter).
     random_path : (n,) array
         Values for random frames, on average.
     n_candidates : int
@@ -313,7 +347,9 @@ class FrameChoice(Shown):
 
     @property
     def factors(self) -> FloatArray:
-        """1 sigma with random frames over that with the chosen ones, (S, Q): above 1 where the choice is better."""
+        """1 sigma with random frames over that with the chosen ones, (S, Q): above 1 where the
+        choice is better.
+        """
         factors: FloatArray = self.random / self.after
         return factors
 
@@ -326,9 +362,9 @@ class FrameChoice(Shown):
     def to_dataframe(self) -> pd.DataFrame:
         """One row per frame, most valuable first.
 
-        Columns are ``order``, the boresight as ``ra_deg`` and ``dec_deg``, ``roll_deg`` (position angle of the camera's
-        +Y axis, from north through east), the quaternion ``qx qy qz qw``, ``n_stars``, ``score`` (see `score_path`)
-        and ``candidate``.
+        Columns are ``order``, the boresight as ``ra_deg`` and ``dec_deg``, ``roll_deg`` (position
+        angle of the camera's +Y axis, from north through east), the quaternion ``qx qy qz qw``,
+        ``n_stars``, ``score`` (see `score_path`) and ``candidate``.
         """
         import pandas as pd
 
@@ -350,8 +386,9 @@ class FrameChoice(Shown):
     def worth(self) -> pd.DataFrame:
         """What the choice is worth, one row per quantity.
 
-        Columns are 1 sigma ``before``, ``chosen``, with ``random`` frames (mean) and with the ``richest`` in stars, and
-        ``factor``, random over chosen, with the range of 90 % of the random sets.
+        Columns are 1 sigma ``before``, ``chosen``, with ``random`` frames (mean) and with the
+        ``richest`` in stars, and ``factor``, random over chosen, with the range of 90 % of the
+        random sets.
         """
         import pandas as pd
 
@@ -371,10 +408,14 @@ class FrameChoice(Shown):
 
 
 def _position_angle(rotations: FloatArray) -> FloatArray:
-    """Position angle (n,) of the camera's +Y axis on the sky at the boresight, deg, from north through east."""
+    """Position angle (n,) of the camera's +Y axis on the sky at the boresight, deg, from north
+    through east.
+    """
     boresight, up = rotations[:, 2], rotations[:, 1]
     east = np.cross([0.0, 0.0, 1.0], boresight)
     east /= np.maximum(np.linalg.norm(east, axis=1, keepdims=True), 1e-12)
     north = np.cross(boresight, east)
-    angle: FloatArray = np.degrees(np.arctan2(np.sum(up * east, axis=1), np.sum(up * north, axis=1)))
+    angle: FloatArray = np.degrees(
+        np.arctan2(np.sum(up * east, axis=1), np.sum(up * north, axis=1))
+    )
     return angle % 360.0

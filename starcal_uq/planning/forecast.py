@@ -1,12 +1,14 @@
 """Forecast of a calibration from the information of its frames, before any data.
 
-The covariance of the parameters after n frames is the inverse of the sum of their information. Few frames make a
-calibration that depends on which they are: the forecast is therefore the mean over campaigns of n frames drawn from a
-set of random ones, with the range of 90 % of the campaigns beside it.
+The covariance of the parameters after n frames is the inverse of the sum of their information. Few
+frames make a calibration that depends on which they are: the forecast is therefore the mean over
+campaigns of n frames drawn from a set of random ones, with the range of 90 % of the campaigns
+beside it.
 
-Everything else is linear in the parameters, so that its variance is the sum over entries of a matrix times that
-covariance: parameters in other units, the displacement at the corner of the detector, and per axis of the attitude the
-common rotation and the rest, root mean square over the attitudes of the mission.
+Everything else is linear in the parameters, so that its variance is the sum over entries of a
+matrix times that covariance: parameters in other units, the displacement at the corner of the
+detector, and per axis of the attitude the common rotation and the rest, root mean square over the
+attitudes of the mission.
 """
 
 from __future__ import annotations
@@ -40,14 +42,17 @@ BAND = (0.05, 0.95)
 N_FRAMES = (10, 30, 100, 300, 1000, 3000)
 N_CAMPAIGNS = 200
 MAX_FRAMES = 10_000_000
-# Attitudes of the mission that quantiles are taken over, and scales of the covariance that they are interpolated from.
+# Attitudes of the mission that quantiles are taken over, and scales of the covariance that they are
+# interpolated from.
 _MISSION_FRAMES, _SCALES = 200, 9
 _TOLERANCE, _GUESS_FRAMES = 0.002, 1000
 
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """Something linear in the parameters, whose variance is the sum of ``form * covariance``; its name has the unit."""
+    """Something linear in the parameters, whose variance is the sum of ``form * covariance``; its
+    name has the unit.
+    """
 
     name: str
     form: FloatArray
@@ -59,13 +64,13 @@ class Forecast:
 
     n_frames: IntArray  # (G,): frames of a campaign
     names: tuple[str, ...]  # The quantities, with their units
-    # `sigma`, `low`, `high`, (G, Q): standard deviation that a calibration will state: mean over campaigns, and the
-    # range of 90 % of them.
+    # `sigma`, `low`, `high`, (G, Q): standard deviation that a calibration will state: mean over
+    # campaigns, and the range of 90 % of them.
     sigma: FloatArray
     low: FloatArray
     high: FloatArray
-    # `radius`, `radius_low`, `radius_high`, (G,): two-axis error across the boresight at the confidence asked for,
-    # arcsec: mean and range of 90 %.
+    # `radius`, `radius_low`, `radius_high`, (G,): two-axis error across the boresight at the
+    # confidence asked for, arcsec: mean and range of 90 %.
     radius: FloatArray
     radius_low: FloatArray
     radius_high: FloatArray
@@ -97,7 +102,9 @@ def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
     known = parameters(camera.distortion)
     p = len(known)
     unit = np.eye(p)
-    chosen = [_quantity(f"{k.name}_{_suffix(k.unit)}", unit[i : i + 1]) for i, k in enumerate(known)]
+    chosen = [
+        _quantity(f"{k.name}_{_suffix(k.unit)}", unit[i : i + 1]) for i, k in enumerate(known)
+    ]
     if camera.pixel_um is not None:
         chosen.append(_quantity("f_mm", unit[2:3] * camera.pixel_um / 1000.0))
     if p > 3:
@@ -105,7 +112,11 @@ def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
     for axis, name in enumerate(AXES):
         chosen.append(_quantity(f"common_{name}_arcsec", ARCSEC * mission.common[axis : axis + 1]))
     for axis, name in enumerate(AXES):
-        chosen.append(_quantity(f"rest_{name}_arcsec", ARCSEC * mission.rest[:, axis] / np.sqrt(mission.n_frames)))
+        chosen.append(
+            _quantity(
+                f"rest_{name}_arcsec", ARCSEC * mission.rest[:, axis] / np.sqrt(mission.n_frames)
+            )
+        )
     return tuple(chosen)
 
 
@@ -121,12 +132,15 @@ def _quantity(name: str, rows: FloatArray) -> Quantity:
 
 
 def _corner_displacement(mission: FrameSet) -> FloatArray:
-    """Displacement (2, p) px by the distortion at the corner that is farthest from the principal point."""
+    """Displacement (2, p) px by the distortion at the corner that is farthest from the principal
+    point.
+    """
     camera = mission.camera
     model = get_model(camera.distortion)
     corners = np.array([-0.5, camera.width_px - 0.5]), np.array([-0.5, camera.height_px - 0.5])
     u, v = (
-        side[np.argmax(np.abs(side - point))] - point for side, point in zip(corners, camera.theta[:2], strict=True)
+        side[np.argmax(np.abs(side - point))] - point
+        for side, point in zip(corners, camera.theta[:2], strict=True)
     )
     columns = np.zeros((2, len(camera.theta)))
     for j, one in enumerate(np.eye(len(model.coefficients)).tolist()):
@@ -135,7 +149,9 @@ def _corner_displacement(mission: FrameSet) -> FloatArray:
 
 
 def nea_arcsec(mission: FrameSet) -> FloatArray:
-    """Noise-equivalent angle (3,): standard deviation by centroid noise, root mean square over frames."""
+    """Noise-equivalent angle (3,): standard deviation by centroid noise, root mean square over
+    frames.
+    """
     nea: FloatArray = ARCSEC * np.sqrt(np.diagonal(mission.noise, axis1=1, axis2=2).mean(axis=0))
     return nea
 
@@ -143,9 +159,11 @@ def nea_arcsec(mission: FrameSet) -> FloatArray:
 def campaigns(
     information: FloatArray, n_frames: int, n_campaigns: int, seed: int, start: FloatArray | None
 ) -> FloatArray:
-    """Covariances (C, p, p) after campaigns of n frames drawn, with replacement, from those of `information` (M, p, p).
+    """Covariances (C, p, p) after campaigns of n frames drawn, with replacement, from those of
+    `information` (M, p, p).
 
-    `start` (p, p) is information that is there already. What a campaign does not determine is infinite.
+    `start` (p, p) is information that is there already. What a campaign does not determine is
+    infinite.
     """
     m, p = information.shape[:2]
     rng = np.random.default_rng([seed, n_frames])
@@ -155,7 +173,9 @@ def campaigns(
 
 
 def spreads(forms: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Standard deviations (..., Q) of quantities with forms (Q, p, p) under covariances (..., p, p)."""
+    """Standard deviations (..., Q) of quantities with forms (Q, p, p) under covariances (..., p,
+    p).
+    """
     flat = covariances.reshape(*covariances.shape[:-2], -1)
     known = np.isfinite(flat).all(axis=-1, keepdims=True)
     variances = np.where(known, flat, 0.0) @ forms.reshape(len(forms), -1).T
@@ -165,10 +185,10 @@ def spreads(forms: FloatArray, covariances: FloatArray) -> FloatArray:
 class Forecaster:
     """Forecasts for one set of frames, one mission and one target.
 
-    `information` (M, p, p): information of each frame that a campaign may take.
-    `n_stars`: stars per frame on average.
-    `confidence`, `scope`: probability of the two-axis radius, and one of `SCOPES`.
-    `start` (p, p), `start_dof`: information that is there already, and the degrees of freedom of those data.
+    `information` (M, p, p): information of each frame that a campaign may take. `n_stars`: stars
+    per frame on average.
+    `confidence`, `scope`: probability of the two-axis radius, and one of `SCOPES`. `start` (p, p),
+    `start_dof`: information that is there already, and the degrees of freedom of those data.
     """
 
     def __init__(
@@ -187,7 +207,9 @@ class Forecaster:
         if scope not in SCOPES:
             raise PlanningError(f"the scope {scope!r} is unknown: use one of {', '.join(SCOPES)}.")
         if not 0.0 < confidence < 1.0:
-            raise PlanningError(f"the confidence {confidence!r} is no probability: give one such as 0.997.")
+            raise PlanningError(
+                f"the confidence {confidence!r} is no probability: give one such as 0.997."
+            )
         self.information, self.n_stars, self.mission = information, n_stars, mission
         self.confidence, self.scope, self.start = confidence, scope, start
         self.start_dof, self.n_campaigns, self.seed = start_dof, n_campaigns, seed
@@ -200,7 +222,9 @@ class Forecaster:
         if scope != "rest":
             response = response + mission.common
         self._response = ARCSEC * response[:, :2]
-        self._noise = ARCSEC**2 * mission.noise[some, :2, :2] if scope == "total" else np.zeros((1, 2, 2))
+        self._noise = (
+            ARCSEC**2 * mission.noise[some, :2, :2] if scope == "total" else np.zeros((1, 2, 2))
+        )
         self._size = np.einsum("kap,kaq->pq", self._response, self._response) / len(self._response)
 
     @property
@@ -214,7 +238,15 @@ class Forecaster:
         for n in n_frames:
             covariances = self.covariances(n)
             sigma, radius = spreads(self._forms, covariances), self.radii(covariances, n)
-            rows.append((sigma.mean(axis=0), *_band(sigma), radius.mean(), *_band(radius), self.noise_sigma(n)))
+            rows.append(
+                (
+                    sigma.mean(axis=0),
+                    *_band(sigma),
+                    radius.mean(),
+                    *_band(radius),
+                    self.noise_sigma(n),
+                )
+            )
         columns = [np.array(column) for column in zip(*rows, strict=True)]
         return Forecast(np.array(n_frames, dtype=np.int64), self.names, *columns)
 
@@ -223,7 +255,9 @@ class Forecaster:
         return campaigns(self.information, n_frames, self.n_campaigns, self.seed, self.start)
 
     def dof(self, n_frames: int) -> float:
-        """Independent numbers beyond the parameters, with those of the data that are there already."""
+        """Independent numbers beyond the parameters, with those of the data that are there
+        already.
+        """
         own = n_frames * (2.0 * self.n_stars - 3.0) - len(self._size)
         return float(max(1.0, own + self.start_dof))
 
@@ -232,10 +266,12 @@ class Forecaster:
         return float(1.0 / np.sqrt(2.0 * self.dof(n_frames)))
 
     def radii(self, covariances: FloatArray, n_frames: int) -> FloatArray:
-        """Two-axis errors (C,) across the boresight at the confidence, arcsec, after some campaigns.
+        """Two-axis errors (C,) across the boresight at the confidence, arcsec, after some
+        campaigns.
 
-        Their size differs from campaign to campaign, their shape hardly: the radius is that of the mean covariance,
-        interpolated to the size of each. The noise is estimated, too: quantiles are those of Student's distribution.
+        Their size differs from campaign to campaign, their shape hardly: the radius is that of the
+        mean covariance, interpolated to the size of each. The noise is estimated, too: quantiles
+        are those of Student's distribution.
         """
         sizes = spreads(self._size[None], covariances)[:, 0] ** 2
         known = np.isfinite(sizes)
@@ -247,24 +283,32 @@ class Forecaster:
         ratios = np.where(known, sizes, size) / size
         grid = np.linspace(np.sqrt(ratios.min()) * 0.999, np.sqrt(ratios.max()) * 1.001, _SCALES)
         at_grid = [mixture_radius(g**2 * shape + self._noise, self.confidence) for g in grid]
-        radii = student_factor(self.confidence, self.dof(n_frames)) * np.interp(np.sqrt(ratios), grid, at_grid)
+        radii = student_factor(self.confidence, self.dof(n_frames)) * np.interp(
+            np.sqrt(ratios), grid, at_grid
+        )
         return np.where(known, radii, np.inf)
 
     def floor_arcsec(self) -> float:
-        """Radius that no number of frames goes below: that of the centroid noise, where the scope has it."""
+        """Radius that no number of frames goes below: that of the centroid noise, where the scope
+        has it.
+        """
         return mixture_radius(self._noise, self.confidence)
 
     def frames_needed(self, target_arcsec: float, share: float | None = None) -> int | None:
-        """Fewest frames whose radius (arcsec) is within a target; None where no number up to ten million is enough.
+        """Fewest frames whose radius (arcsec) is within a target; None where no number up to ten
+        million is enough.
 
-        `share` is the part of the campaigns that keep it, such as 0.95; by default campaigns keep it on average.
+        `share` is the part of the campaigns that keep it, such as 0.95; by default campaigns keep
+        it on average.
         """
         if self.floor_arcsec() >= target_arcsec:
             return None
 
         def kept(n: int) -> bool:
             radii = self.radii(self.covariances(n), n)
-            return bool((radii.mean() if share is None else np.quantile(radii, share)) <= target_arcsec)
+            return bool(
+                (radii.mean() if share is None else np.quantile(radii, share)) <= target_arcsec
+            )
 
         low, high = self._bracket(target_arcsec, kept)
         while high - low > max(1, int(_TOLERANCE * high)):
@@ -273,7 +317,9 @@ class Forecaster:
         return high if high <= MAX_FRAMES else None
 
     def _bracket(self, target_arcsec: float, kept: Callable[[int], bool]) -> tuple[int, int]:
-        """Numbers of frames that do not keep a target and that do; the second is beyond ten million where none does."""
+        """Numbers of frames that do not keep a target and that do; the second is beyond ten million
+        where none does.
+        """
         square = float(np.mean(self.radii(self.covariances(_GUESS_FRAMES), _GUESS_FRAMES))) ** 2
         floor = self.floor_arcsec() ** 2
         guess = _GUESS_FRAMES * (square - floor) / (target_arcsec**2 - floor)
@@ -294,8 +340,11 @@ class Forecaster:
 
 
 def student_factor(confidence: float, dof: float) -> float:
-    """How much wider a two-axis interval is because the noise is estimated, with that many degrees of freedom."""
-    # Fisher's quantile with 2 and d degrees of freedom is d/2 ((1 - P)^(-2/d) - 1), Rayleigh's the limit of many.
+    """How much wider a two-axis interval is because the noise is estimated, with that many degrees
+    of freedom.
+    """
+    # Fisher's quantile with 2 and d degrees of freedom is d/2 ((1 - P)^(-2/d) - 1), Rayleigh's the
+    # limit of many.
     exponent = -2.0 * float(np.log1p(-confidence)) / dof
     return float(np.sqrt(np.expm1(exponent) / exponent))
 

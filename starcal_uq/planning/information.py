@@ -1,8 +1,10 @@
-"""What frames will say about the camera before they are taken: the information of each, from geometry alone.
+"""What frames will say about the camera before they are taken: the information of each, from
+geometry alone.
 
-Of a frame, a calibration needs to know where its stars will fall and how well each will be located. The information on
-the parameters with the frame's attitude eliminated, the response of the attitude to the parameters, and the attitude's
-own noise then follow from the likelihood that calibrates, at the camera's own parameters and without noise.
+Of a frame, a calibration needs to know where its stars will fall and how well each will be located.
+The information on the parameters with the frame's attitude eliminated, the response of the attitude
+to the parameters, and the attitude's own noise then follow from the likelihood that calibrates, at
+the camera's own parameters and without noise.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.sky.catalogue import StarCatalogue
 
-# Centroid noise, px per axis: one number, a function from magnitudes (n,) to (n,), or the model of a calibration.
+# Centroid noise, px per axis: one number, a function from magnitudes (n,) to (n,), or the model of
+# a calibration.
 Noise = float | Callable[[FloatArray], FloatArray] | NoiseModel
 
 # An attitude needs this many stars before it says anything about the camera.
@@ -35,12 +38,14 @@ _STARS_AT_ONCE = 20_000
 
 @dataclass(frozen=True, eq=False)
 class FrameSet:
-    """Frames that could be taken, without noise, and what each says. M frames, N stars, p parameters.
+    """Frames that could be taken, without noise, and what each says. M frames, N stars, p
+    parameters.
 
-    `frames` are noise-free pixels, directions and the inverse of each star's noise, with magnitudes `mag` (N,);
-    `information` (M, p, p) is that of each frame on the parameters, its attitude eliminated (px units), `response`
-    (M, 3, p) the derivative of its attitude (pitch, yaw, roll; rad) with respect to them, and `noise` (M, 3, 3) the
-    covariance of its attitude due to centroid noise, rad^2.
+    `frames` are noise-free pixels, directions and the inverse of each star's noise, with magnitudes
+    `mag` (N,); `information` (M, p, p) is that of each frame on the parameters, its attitude
+    eliminated (px units), `response` (M, 3, p) the derivative of its attitude (pitch, yaw, roll;
+    rad) with respect to them, and `noise` (M, 3, 3) the covariance of its attitude due to centroid
+    noise, rad^2.
     """
 
     camera: Camera
@@ -79,7 +84,8 @@ class FrameSet:
         return rest
 
     def seen_within(self, fraction: float) -> FloatArray:
-        """Information (M, p, p) of the stars in a middle part of the detector's area, a window of the detector's shape.
+        """Information (M, p, p) of the stars in a middle part of the detector's area, a window of
+        the detector's shape.
 
         A frame with fewer than three stars in it has none.
         """
@@ -90,48 +96,74 @@ class FrameSet:
         kept = inside & np.repeat(enough, self.frames.sizes)
         information = np.zeros_like(self.information)
         if enough.any():
-            some, _, _ = frame_matrices(self.camera, self.frames.select(kept), self.rotations[enough])
+            some, _, _ = frame_matrices(
+                self.camera, self.frames.select(kept), self.rotations[enough]
+            )
             information[enough] = some
         return information
 
 
-def look_at(stars: StarCatalogue, camera: Camera, rotations: FloatArray, noise: Noise, min_stars: int) -> FrameSet:
-    """The frames at given attitudes that show enough stars; the others are left out, and none is an error."""
-    views = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera)).views(rotations)
+def look_at(
+    stars: StarCatalogue, camera: Camera, rotations: FloatArray, noise: Noise, min_stars: int
+) -> FrameSet:
+    """The frames at given attitudes that show enough stars; the others are left out, and none is an
+    error.
+    """
+    views = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera)).views(
+        rotations
+    )
     enough = np.array([len(seen) >= min_stars for seen, _ in views], dtype=np.bool_)
     if not enough.any():
         raise PlanningError(
-            f"none of the {len(rotations)} candidate attitudes shows {min_stars} stars: give others, lower min_stars "
+            f"none of the {len(rotations)} candidate attitudes shows {min_stars} stars: give "
+            "others, lower min_stars "
             "or use a deeper catalogue."
         )
     return _frame_set(
-        stars, camera, rotations[enough], [v for v, good in zip(views, enough, strict=True) if good], noise
+        stars,
+        camera,
+        rotations[enough],
+        [v for v, good in zip(views, enough, strict=True) if good],
+        noise,
     )
 
 
 def random_frames(
     stars: StarCatalogue, camera: Camera, noise: Noise, *, n_frames: int, min_stars: int, seed: int
 ) -> FrameSet:
-    """Frames at uniformly random attitudes that show at least `min_stars` stars, as `simulate` takes them."""
+    """Frames at uniformly random attitudes that show at least `min_stars` stars, as `simulate`
+    takes them.
+    """
     sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera))
     rng = np.random.default_rng(seed)
-    return _frame_set(stars, camera, *choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars), noise)
+    return _frame_set(
+        stars, camera, *choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars), noise
+    )
 
 
 def noise_of(noise: Noise, mag: FloatArray, pixel: FloatArray) -> FloatArray:
-    """Noise of stars with magnitudes (n,) at pixels (2, n), px per axis, (n,); refused unless positive and finite."""
+    """Noise of stars with magnitudes (n,) at pixels (2, n), px per axis, (n,); refused unless
+    positive and finite.
+    """
     if isinstance(noise, NoiseModel):
         return noise.at(pixel[0], pixel[1], mag)
-    values = np.asarray(noise(mag), dtype=np.float64) if callable(noise) else np.full(mag.shape, float(noise))
+    values = (
+        np.asarray(noise(mag), dtype=np.float64)
+        if callable(noise)
+        else np.full(mag.shape, float(noise))
+    )
     if values.shape != mag.shape or not np.all((values > 0.0) & np.isfinite(values)):
         raise PlanningError(
-            "sigma_px must be a noise above zero in px, or a function that gives one for every magnitude of an array."
+            "sigma_px must be a noise above zero in px, or a function that gives one for every "
+            "magnitude of an array."
         )
     return values
 
 
 def largest_noise(noise: Noise, mag: FloatArray, camera: Camera) -> float:
-    """The noise of the faintest star at the edge, px per axis: stars this near to the edge are left out."""
+    """The noise of the faintest star at the edge, px per axis: stars this near to the edge are left
+    out.
+    """
     edge = np.array([[camera.width_px - 1.0], camera.centre_px[1:]]) * np.ones(len(mag))
     return float(np.max(noise_of(noise, mag, edge), initial=0.0))
 
@@ -159,14 +191,18 @@ def _frame_set(
 def frame_matrices(
     camera: Camera, frames: StarFrames, rotations: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Information (M, p, p), attitude response (M, 3, p) and attitude noise (M, 3, 3) of noise-free frames."""
+    """Information (M, p, p), attitude response (M, 3, p) and attitude noise (M, 3, 3) of noise-free
+    frames.
+    """
     information, response, noise = [], [], []
     for first, last in frames.parts(_STARS_AT_ONCE):
         likelihood = MarginalLikelihood(frames.part(first, last), camera.distortion)
         state, _ = likelihood.profile(camera.theta, rotations[first:last])
         derivatives = likelihood.derivatives(camera.theta, state)
         h = likelihood.project_out(state, derivatives)
-        information.append(np.moveaxis(likelihood.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0))
+        information.append(
+            np.moveaxis(likelihood.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
+        )
         # A parameter too large turns the attitude the other way: the stars are where they are.
         response.append(-likelihood.attitude_response(state, derivatives).transpose(2, 1, 0))
         noise.append(np.moveaxis(state.inverse, 2, 0))

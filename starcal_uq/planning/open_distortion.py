@@ -1,13 +1,15 @@
 """Distortion that a sheet leaves open: what a plan gives over a range of it.
 
-A principal point is told from a rotation of the camera by second order alone. A turn by a small angle delta moves
-stars by ``f delta`` times one and a pattern of the size (r / f)^2. With radial distortion k1 and kappa = k1 f^2 it is
+A principal point is told from a rotation of the camera by second order alone. A turn by a small
+angle delta moves stars by ``f delta`` times one and a pattern of the size (r / f)^2. With radial
+distortion k1 and kappa = k1 f^2 it is
 
     (x^2 + kappa (3 x^2 + y^2), (1 + 2 kappa) x y) / f^2,
 
-while a shift of the principal point moves all stars alike. Near kappa = -1/3, the cubic term of an f-theta lens
-(r = f theta), little of the pattern is left: that takes half a per cent of barrel distortion at the corner of a field
-of 10 degrees, two per cent in one of 20. Pincushion distortion makes the pattern larger.
+while a shift of the principal point moves all stars alike. Near kappa = -1/3, the cubic term of an
+f-theta lens (r = f theta), little of the pattern is left: that takes half a per cent of barrel
+distortion at the corner of a field of 10 degrees, two per cent in one of 20. Pincushion distortion
+makes the pattern larger.
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ class DistortionRange:
     Attributes
     ----------
     percent : (D,) array
-        Displacement of the corner of the detector, per cent of its distance from the centre; barrel is negative.
+        Displacement of the corner of the detector, per cent of its distance from the centre; barrel
+        is negative.
     scopes : tuple of str
         Parts of the attitude error that `frames` has a column for; empty without a target.
     frames : (D, S) array
@@ -55,7 +58,8 @@ class DistortionRange:
     radius_after_arcsec : (D,) array
         Two-axis error after 1000 frames, arcsec.
     principal_point_px, focal_px : (D,) array
-        Standard deviations of the principal point (per axis) and of the focal length after 1000 frames, px.
+        Standard deviations of the principal point (per axis) and of the focal length after 1000
+        frames, px.
     f_theta_percent : float
         Displacement of the corner in an f-theta lens, per cent.
     """
@@ -80,11 +84,15 @@ class DistortionRange:
         return float(column.min()), float(column.max())
 
 
-def open_range(camera: Camera, given: tuple[float, float] | None, calibrated: bool) -> tuple[float, float] | None:
-    """Range of the displacement of the corner that is open, per cent; None where the distortion is known.
+def open_range(
+    camera: Camera, given: tuple[float, float] | None, calibrated: bool
+) -> tuple[float, float] | None:
+    """Range of the displacement of the corner that is open, per cent; None where the distortion is
+    known.
 
-    It is known of a calibrated camera and from coefficients that are not all zero. Unless a range is given, it is
-    barrel distortion up to that of an f-theta lens, and as much pincushion, as far as neither folds on the detector.
+    It is known of a calibrated camera and from coefficients that are not all zero. Unless a range
+    is given, it is barrel distortion up to that of an f-theta lens, and as much pincushion, as far
+    as neither folds on the detector.
     """
     stated = calibrated or not camera.coefficients or any(camera.coefficients)
     if given is None:
@@ -95,25 +103,30 @@ def open_range(camera: Camera, given: tuple[float, float] | None, calibrated: bo
     low, high = given
     if stated:
         raise PlanningError(
-            "the distortion is known from the coefficients of the camera, or the model has none: leave "
+            "the distortion is known from the coefficients of the camera, or the model has none: "
+            "leave "
             "distortion_percent out, or set the coefficients to zero."
         )
     if not -_LARGEST_PERCENT <= low <= high <= _LARGEST_PERCENT:
         raise PlanningError(
-            f"distortion_percent is {low:g} to {high:g}: give the least and the largest displacement of the corner in "
+            f"distortion_percent is {low:g} to {high:g}: give the least and the largest "
+            "displacement of the corner in "
             f"per cent, within {_LARGEST_PERCENT:g} either way."
         )
     for end in (low, high):
         if (most := _unfolded(camera, end)) != end:
             raise PlanningError(
-                f"distortion_percent is {low:g} to {high:g}: one coefficient that displaces the corner by {end:g} per "
+                f"distortion_percent is {low:g} to {high:g}: one coefficient that displaces the "
+                f"corner by {end:g} per "
                 f"cent folds inside this detector; stay within {most:.3g}."
             )
     return low, high
 
 
 def _unfolded(camera: Camera, percent: float) -> float:
-    """As much of a displacement of the corner as one coefficient can give without a fold on the detector, per cent."""
+    """As much of a displacement of the corner as one coefficient can give without a fold on the
+    detector, per cent.
+    """
     x, y = np.array([-0.5, camera.width_px - 0.5]), np.array([-0.5, camera.height_px - 0.5])
     corners = np.array([(a, b) for a in x for b in y])
     for share in np.linspace(1.0, 0.02, 50):
@@ -126,7 +139,9 @@ def _unfolded(camera: Camera, percent: float) -> float:
 
 
 def f_theta_percent(camera: Camera) -> float:
-    """Displacement of the corner in an f-theta lens, to third order, per cent of its distance from the centre."""
+    """Displacement of the corner in an f-theta lens, to third order, per cent of its distance from
+    the centre.
+    """
     return 100.0 * F_THETA * (camera.half_diagonal_px / camera.focal_px) ** 2
 
 
@@ -139,7 +154,9 @@ def with_distortion(camera: Camera, percent: float) -> Camera:
 
 
 def nodes(camera: Camera, bounds: tuple[float, float]) -> FloatArray:
-    """Distortions to forecast at, per cent: the ends, none, evenly between, and around the worst of them."""
+    """Distortions to forecast at, per cent: the ends, none, evenly between, and around the worst of
+    them.
+    """
     low, high = bounds
     worst = [share * f_theta_percent(camera) for share in _BARREL]
     inside = [value for value in (0.0, *worst) if low < value < high]
@@ -162,7 +179,8 @@ def distortion_range(
 ) -> DistortionRange:
     """Forecast over a range of distortions, `bounds` on the displacement of the corner, per cent.
 
-    `base` are frames of the plan, of a camera whose distortion lies in the range; `options` are those of `Forecaster`.
+    `base` are frames of the plan, of a camera whose distortion lies in the range; `options` are
+    those of `Forecaster`.
     """
     camera = base.camera
     percent = nodes(camera, bounds)
@@ -173,8 +191,13 @@ def distortion_range(
         other = with_distortion(camera, value)
         seen = base
         if other.coefficients != camera.coefficients:
-            seen = random_frames(stars, other, noise, n_frames=_GEOMETRIES, min_stars=min_stars, seed=seed)
-        needed = (_forecaster(seen, name, settings).frames_needed(target_arcsec or np.nan) for name in scopes)
+            seen = random_frames(
+                stars, other, noise, n_frames=_GEOMETRIES, min_stars=min_stars, seed=seed
+            )
+        needed = (
+            _forecaster(seen, name, settings).frames_needed(target_arcsec or np.nan)
+            for name in scopes
+        )
         frames.append([np.inf if n is None else float(n) for n in needed])
         forecaster = _forecaster(seen, scope, settings)
         radius.append(forecaster.forecast(n_frames).radius)

@@ -1,8 +1,8 @@
 """How many frames does a calibration need? From the camera sheet alone, before any data.
 
-Frames are drawn at random attitudes as `simulate` draws them, each one's information is that of the likelihood that
-calibrates (`starcal_uq.planning.information`), and campaigns of any number of frames are forecast from them
-(`starcal_uq.planning.forecast`). No data are simulated.
+Frames are drawn at random attitudes as `simulate` draws them, each one's information is that of the
+likelihood that calibrates (`starcal_uq.planning.information`), and campaigns of any number of
+frames are forecast from them (`starcal_uq.planning.forecast`). No data are simulated.
 """
 
 from __future__ import annotations
@@ -24,9 +24,21 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.linear import scaled_inverse
-from starcal_uq.planning.forecast import N_CAMPAIGNS, N_FRAMES, SCOPES, Forecast, Forecaster, nea_arcsec
+from starcal_uq.planning.forecast import (
+    N_CAMPAIGNS,
+    N_FRAMES,
+    SCOPES,
+    Forecast,
+    Forecaster,
+    nea_arcsec,
+)
 from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
-from starcal_uq.planning.open_distortion import DistortionRange, distortion_range, open_range, with_distortion
+from starcal_uq.planning.open_distortion import (
+    DistortionRange,
+    distortion_range,
+    open_range,
+    with_distortion,
+)
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
 
 if TYPE_CHECKING:
@@ -84,8 +96,9 @@ def plan(
     stars : StarCatalogue
         The sky.
     sigma_px : float, callable or NoiseModel
-        Centroid noise, px per axis; a function from magnitudes (n,) to noise (n,) where it depends on them; the noise
-        model of a calibration where it depends on the place in the field as well.
+        Centroid noise, px per axis; a function from magnitudes (n,) to noise (n,) where it depends
+        on them; the noise model of a calibration where it depends on the place in the field as
+        well.
     n_frames : sequence of int
         Sizes of campaigns to forecast.
     min_stars : int
@@ -97,19 +110,21 @@ def plan(
     confidence : float
         Probability of that.
     scope : {"common", "rest", "calibration", "total"}
-        Part of the attitude error that the target is for: the common rotation, the rest after alignment, both, or both
-        with the centroid noise of a frame.
+        Part of the attitude error that the target is for: the common rotation, the rest after
+        alignment, both, or both with the centroid noise of a frame.
     after : Calibration or Posterior, optional
         Data that are there already, whose information counts.
     distortion_percent : (float, float), optional
-        Least and largest displacement of the corner by the distortion, per cent of its distance from the centre (barrel
-        is negative), that a sheet with zero coefficients leaves open: frames and errors are forecast over this range.
-        By default from the barrel distortion of an f-theta lens to as much pincushion distortion, at most 30 % and
-        short of a fold; coefficients that are not zero are known, and nothing is open.
+        Least and largest displacement of the corner by the distortion, per cent of its distance
+        from the centre (barrel is negative), that a sheet with zero coefficients leaves open:
+        frames and errors are forecast over this range. By default from the barrel distortion of an
+        f-theta lens to as much pincushion distortion, at most 30 % and short of a fold;
+        coefficients that are not zero are known, and nothing is open.
     sweeps : bool
         Also forecast 1000 frames with other magnitude limits, noise, and parts of the detector.
     n_geometries : int
-        Random attitudes that campaigns are drawn from, and that the errors of attitude are taken over.
+        Random attitudes that campaigns are drawn from, and that the errors of attitude are taken
+        over.
     n_campaigns : int
         Campaigns to average over.
     seed : int
@@ -127,7 +142,8 @@ def plan(
     _check(n_frames, min_stars, target_arcsec, n_geometries, n_campaigns)
     if isinstance(sigma_px, (int, float)) and not 0.0 < sigma_px <= _WORST_NOISE_PX:
         raise PlanningError(
-            f"the centroid noise is {sigma_px:g} px: give a number above zero, at most {_WORST_NOISE_PX:g} px per axis."
+            f"the centroid noise is {sigma_px:g} px: give a number above zero, at most "
+            f"{_WORST_NOISE_PX:g} px per axis."
         )
     bounds = open_range(camera, distortion_percent, after is not None)
     if bounds is not None:
@@ -136,9 +152,14 @@ def plan(
     limit = float(np.max(stars.mag, initial=-np.inf)) if max_mag is None else float(max_mag)
     seen = stars.select(stars.mag <= limit)
     if len(seen) == 0:
-        raise PlanningError(f"no star is brighter than max_mag={limit:g}: raise it or use another catalogue.")
-    frames = random_frames(seen, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed)
-    # A posterior does not say how many data it rests on; its noise is then as uncertain as the new frames make it.
+        raise PlanningError(
+            f"no star is brighter than max_mag={limit:g}: raise it or use another catalogue."
+        )
+    frames = random_frames(
+        seen, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed
+    )
+    # A posterior does not say how many data it rests on; its noise is then as uncertain as the new
+    # frames make it.
     options = {
         "confidence": confidence,
         "start": start,
@@ -173,7 +194,15 @@ def plan(
     table = None
     if sweeps:
         base = _Base(stars, camera, sigma_px, limit, min_stars, seed)
-        table = _sweep(base, frames, noise, scope, options | {"n_campaigns": _SWEEP_CAMPAIGNS}, target_arcsec, progress)
+        table = _sweep(
+            base,
+            frames,
+            noise,
+            scope,
+            options | {"n_campaigns": _SWEEP_CAMPAIGNS},
+            target_arcsec,
+            progress,
+        )
     return Plan(
         camera=camera,
         sigma_px=noise,
@@ -256,7 +285,9 @@ def _sweep(
     return table.astype({"n_frames": np.int64})
 
 
-def _points(base: _Base, frames: FrameSet, noise_px: float) -> Iterator[tuple[str, float, FloatArray, FrameSet, float]]:
+def _points(
+    base: _Base, frames: FrameSet, noise_px: float
+) -> Iterator[tuple[str, float, FloatArray, FrameSet, float]]:
     """Name, value, information, mission and part of the sky of every point of the sweeps."""
     deepest = float(np.max(base.stars.mag))
     for step in _MAG_STEPS:
@@ -280,13 +311,17 @@ def _points(base: _Base, frames: FrameSet, noise_px: float) -> Iterator[tuple[st
     seen = base.stars.select(base.stars.mag <= base.max_mag)
     sky = _sky_fraction(seen, base.camera, base.noise, base.min_stars, base.seed)
     for factor in _NOISE_FACTORS:
-        scaled = replace(frames, information=frames.information / factor**2, noise=frames.noise * factor**2)
+        scaled = replace(
+            frames, information=frames.information / factor**2, noise=frames.noise * factor**2
+        )
         yield "noise", factor * noise_px, scaled.information, scaled, sky
     for part in _FIELD_PARTS:
         yield "part of the detector", part, frames.seen_within(part), frames, sky
 
 
-def _sky_fraction(stars: StarCatalogue, camera: Camera, noise: Noise, min_stars: int, seed: int) -> float:
+def _sky_fraction(
+    stars: StarCatalogue, camera: Camera, noise: Noise, min_stars: int, seed: int
+) -> float:
     """Part of random attitudes that show enough stars."""
     if len(stars) == 0:
         return 0.0
@@ -296,20 +331,27 @@ def _sky_fraction(stars: StarCatalogue, camera: Camera, noise: Noise, min_stars:
 
 
 def start_information(after: HasInformation | None, camera: Camera) -> FloatArray | None:
-    """Information (p, p) of data that are there already; None without. Refused if about other parameters."""
+    """Information (p, p) of data that are there already; None without. Refused if about other
+    parameters.
+    """
     if after is None:
         return None
     start = np.asarray(after.information, dtype=np.float64)
     if start.shape != (len(camera.theta),) * 2:
         raise PlanningError(
-            f"the data that are there already are about {len(start)} parameters, but the camera has "
+            f"the data that are there already are about {len(start)} parameters, but the camera "
+            "has "
             f"{len(camera.theta)}: plan for the camera of that calibration."
         )
     return start
 
 
 def _check(
-    n_frames: Sequence[int], min_stars: int, target_arcsec: float | None, n_geometries: int, n_campaigns: int
+    n_frames: Sequence[int],
+    min_stars: int,
+    target_arcsec: float | None,
+    n_geometries: int,
+    n_campaigns: int,
 ) -> None:
     for good, text in (
         (len(n_frames) > 0, "n_frames is empty: give some numbers of frames."),
@@ -349,10 +391,11 @@ class Need(Shown):
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """A calibration that is planned, for `coupling`, or for `after` of another plan; px units, attitudes in rad.
+    """A calibration that is planned, for `coupling`, or for `after` of another plan; px units,
+    attitudes in rad.
 
-    `rotation_per_theta` (3, p) is the common rotation that a parameter causes, `attitude_noise` (3, 3) the covariance
-    of one frame's attitude due to centroid noise.
+    `rotation_per_theta` (3, p) is the common rotation that a parameter causes, `attitude_noise` (3,
+    3) the covariance of one frame's attitude due to centroid noise.
     """
 
     camera: Camera
@@ -438,7 +481,12 @@ class Plan(Shown):
         total = n_frames * self.frame_information
         total = total if self.start_information is None else total + self.start_information
         return Expected(
-            self.camera, n_frames, scaled_inverse(total), total, self.rotation_per_theta, self.attitude_noise
+            self.camera,
+            n_frames,
+            scaled_inverse(total),
+            total,
+            self.rotation_per_theta,
+            self.attitude_noise,
         )
 
     @cached_property
@@ -448,7 +496,9 @@ class Plan(Shown):
 
     @property
     def information(self) -> FloatArray:
-        """Information (p, p) after the frames that the target takes, or 1000 where there is none."""
+        """Information (p, p) after the frames that the target takes, or 1000 where there is
+        none.
+        """
         return self._expected.information
 
     @property
@@ -458,7 +508,8 @@ class Plan(Shown):
 
     @property
     def frames_range(self) -> tuple[float, float] | None:
-        """Least and most frames for the target over the distortion that is open, in the scope asked for.
+        """Least and most frames for the target over the distortion that is open, in the scope asked
+        for.
 
         Infinite where no number does; None without a target, or where the distortion is known.
         """
@@ -468,7 +519,9 @@ class Plan(Shown):
 
     @property
     def frames_needed(self) -> int | None:
-        """Fewest frames that keep the target on average, in the scope asked for; None without one."""
+        """Fewest frames that keep the target on average, in the scope asked for; None without
+        one.
+        """
         return None if self.need is None else self.need.frames
 
     @property
@@ -479,15 +532,18 @@ class Plan(Shown):
     def to_dataframe(self) -> pd.DataFrame:
         """One row per number of frames.
 
-        Columns are ``n_frames``; 1 sigma of every parameter, of the displacement that its distortion error causes in
-        the farthest corner, and per axis of common rotation, rest and NEA; ``noise_relative``, the relative standard
-        error of the noise; and ``radius_arcsec``, the two-axis error at the confidence, with the range of 90 % of the
-        campaigns, and its range over the distortion that is open (``radius_least_arcsec``, ``radius_most_arcsec``).
+        Columns are ``n_frames``; 1 sigma of every parameter, of the displacement that its
+        distortion error causes in the farthest corner, and per axis of common rotation, rest and
+        NEA; ``noise_relative``, the relative standard error of the noise; and ``radius_arcsec``,
+        the two-axis error at the confidence, with the range of 90 % of the campaigns, and its range
+        over the distortion that is open (``radius_least_arcsec``, ``radius_most_arcsec``).
         """
         table = self.forecast.to_dataframe()
         if self.distortion is not None:
             radii = self.distortion.radius_arcsec
-            table = table.assign(radius_least_arcsec=radii.min(axis=0), radius_most_arcsec=radii.max(axis=0))
+            table = table.assign(
+                radius_least_arcsec=radii.min(axis=0), radius_most_arcsec=radii.max(axis=0)
+            )
         place = int(table.columns.get_loc("noise_relative"))
         for axis, value in zip(AXES, self.nea_arcsec, strict=True):
             table.insert(place, f"nea_{axis}_arcsec", float(value))

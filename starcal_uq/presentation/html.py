@@ -44,7 +44,9 @@ def symbol(name: str) -> Markup:
 
 
 def on_page(table: TextTable, caption: str = "", kind: str = "") -> Markup:
-    """A table of a page, which may scroll: first column bold; under an empty head, names of parameters as symbols."""
+    """A table of a page, which may scroll: first column bold; under an empty head, names of
+    parameters as symbols.
+    """
     from markupsafe import Markup
 
     shown = escape if table.heads[0] else symbol
@@ -53,7 +55,9 @@ def on_page(table: TextTable, caption: str = "", kind: str = "") -> Markup:
 
 
 def template_environment() -> Environment:
-    """Jinja's environment for the templates of the package: everything is escaped, and a missing name is an error."""
+    """Jinja's environment for the templates of the package: everything is escaped, and a missing
+    name is an error.
+    """
     import jinja2
 
     environment = jinja2.Environment(
@@ -68,7 +72,9 @@ def template_environment() -> Environment:
 
 
 def picture(images: Mapping[str, bytes], name: str, alt: str) -> Markup:
-    """A figure (SVG or PNG) inside the page, an inch of it 100 px wide; nothing where there is none of that name."""
+    """A figure (SVG or PNG) inside the page, an inch of it 100 px wide; nothing where there is none
+    of that name.
+    """
     from markupsafe import Markup
 
     if name not in images:
@@ -84,5 +90,9 @@ def picture(images: Mapping[str, bytes], name: str, alt: str) -> Markup:
         points = re.match(r'<svg[^>]*? width="([\d.]+)pt"', text)
         width = 0.0 if points is None else float(points[1]) * 100.0 / 72.0
         # What an attribute in quotation marks, and an address, cannot hold.
-        data = "image/svg+xml," + text.replace("%", "%25").replace("#", "%23").replace('"', "'").replace("&", "%26")
-    return Markup(f'<img class="drawn" src="data:{data}" alt="{escape(alt)}" width="{round(width)}">')
+        data = "image/svg+xml," + text.replace("%", "%25").replace("#", "%23").replace(
+            '"', "'"
+        ).replace("&", "%26")
+    return Markup(
+        f'<img class="drawn" src="data:{data}" alt="{escape(alt)}" width="{round(width)}">'
+    )

@@ -1,7 +1,8 @@
 """One table of finished text, for the notebook, the terminal, the page, LaTeX and the workbook.
 
-A table is composed once, where the digits are chosen; the outputs differ in their marks only. The terminal's own
-drawing stands in `starcal_uq.cli.console`, which is the only place that knows the terminal.
+A table is composed once, where the digits are chosen; the outputs differ in their marks only. The
+terminal's own drawing stands in `starcal_uq.cli.console`, which is the only place that knows the
+terminal.
 """
 
 from __future__ import annotations
@@ -35,8 +36,13 @@ class TextTable:
     def __post_init__(self) -> None:
         if not self.align:
             object.__setattr__(self, "align", "l" + "r" * (len(self.heads) - 1))
-        if {len(row) for row in self.rows} - {len(self.heads)} or len(self.align) != len(self.heads):
-            raise ValueError(f"table {self.title!r}: every row, and the alignment, needs {len(self.heads)} entries")
+        if {len(row) for row in self.rows} - {len(self.heads)} or len(self.align) != len(
+            self.heads
+        ):
+            raise ValueError(
+                f"table {self.title!r}: every row, and the alignment, needs {len(self.heads)} "
+                "entries"
+            )
 
     @classmethod
     def of(
@@ -47,7 +53,9 @@ class TextTable:
         formats: Mapping[str, Callable[[Any], str]] | None = None,
         missing: str = "–",
     ) -> TextTable:
-        """Chosen columns of a data frame; numbers with three digits unless `formats` says otherwise."""
+        """Chosen columns of a data frame; numbers with three digits unless `formats` says
+        otherwise.
+        """
         import numpy as np
 
         frame = frame if columns is None else frame[list(columns)]
@@ -67,21 +75,36 @@ class TextTable:
             tuple(cell(name, value) for name, value in zip(names, row, strict=True))
             for row in frame.itertuples(index=False, name=None)
         )
-        numbers = [np.issubdtype(np.asarray(frame[name]).dtype, np.number) for name in frame.columns]
+        numbers = [
+            np.issubdtype(np.asarray(frame[name]).dtype, np.number) for name in frame.columns
+        ]
         return cls(
-            tuple(name.replace("_", " ") for name in names), rows, title, "".join("r" if n else "l" for n in numbers)
+            tuple(name.replace("_", " ") for name in names),
+            rows,
+            title,
+            "".join("r" if n else "l" for n in numbers),
         )
 
-    def html(self, caption: str | None = None, kind: str = "", name: Callable[[str], str] = html.escape) -> str:
-        """A ``<table>`` of a class; everything is escaped, but the first column is left to `name`."""
+    def html(
+        self, caption: str | None = None, kind: str = "", name: Callable[[str], str] = html.escape
+    ) -> str:
+        """A ``<table>`` of a class; everything is escaped, but the first column is left to
+        `name`.
+        """
         classes = [
             'class="n"' if side == "r" else 'class="unit"' if head.lower() == "unit" else ""
             for head, side in zip(self.heads, self.align, strict=True)
         ]
-        styles = ['style="text-align:right"' if side == "r" else 'style="text-align:left"' for side in self.align]
+        styles = [
+            'style="text-align:right"' if side == "r" else 'style="text-align:left"'
+            for side in self.align
+        ]
 
         def line(tag: str, cells: Sequence[str], mark: str = "") -> str:
-            shown = [name(cells[0]) if tag == "td" else html.escape(cells[0]), *map(html.escape, cells[1:])]
+            shown = [
+                name(cells[0]) if tag == "td" else html.escape(cells[0]),
+                *map(html.escape, cells[1:]),
+            ]
             parts = (
                 f"<{tag} {' '.join(filter(None, (k, s)))}>{cell}</{tag}>"
                 for cell, k, s in zip(shown, classes, styles, strict=True)
@@ -93,7 +116,9 @@ class TextTable:
         opening = f'<table class="{kind}">' if kind else "<table>"
         marks = self.marks or ("",) * len(self.rows)
         body = "".join(line("td", row, mark) for row, mark in zip(self.rows, marks, strict=True))
-        return f"{opening}{above}<thead>{line('th', self.heads)}</thead><tbody>{body}</tbody></table>"
+        return (
+            f"{opening}{above}<thead>{line('th', self.heads)}</thead><tbody>{body}</tbody></table>"
+        )
 
     def markdown(self) -> str:
         """A table of Markdown with pipes, aligned as the columns are."""
@@ -119,7 +144,9 @@ class TextTable:
 
 def with_units(table: TextTable, specs: Sequence[Parameter]) -> TextTable:
     """The table with a last column: the unit in which each parameter is printed."""
-    rows = tuple((*row, pretty_unit(spec.scaled_unit)) for row, spec in zip(table.rows, specs, strict=True))
+    rows = tuple(
+        (*row, pretty_unit(spec.scaled_unit)) for row, spec in zip(table.rows, specs, strict=True)
+    )
     return TextTable((*table.heads, "Unit"), rows, table.title, table.align + "l", table.marks)
 
 
@@ -160,6 +187,8 @@ def tex(value: Any) -> str:
     """Text with everything escaped that LaTeX would read as a command."""
     parts = re.split(f"([{_SUPERSCRIPTS}]+)", str(value))
     return "".join(
-        f"$^{{{part.translate(_PLAIN)}}}$" if index % 2 else "".join(_TEX.get(sign, sign) for sign in part)
+        f"$^{{{part.translate(_PLAIN)}}}$"
+        if index % 2
+        else "".join(_TEX.get(sign, sign) for sign in part)
         for index, part in enumerate(parts)
     )

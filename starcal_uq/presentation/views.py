@@ -39,7 +39,11 @@ from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.plan import Need, Plan
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
-from starcal_uq.presentation.figures.coupling import plot_correlation, plot_correlations, plot_couplings
+from starcal_uq.presentation.figures.coupling import (
+    plot_correlation,
+    plot_correlations,
+    plot_couplings,
+)
 from starcal_uq.presentation.figures.diagnostics import (
     plot_comparison,
     plot_diagnosis,
@@ -132,12 +136,16 @@ def _messages(result: Any) -> Iterable[str]:
 
 VIEWS: Mapping[type, View] = {
     Camera: _view("Camera", inputs.camera_text, inputs.camera_table),
-    AttitudeProfile: _view("Attitude profile", inputs.profile_text, lambda profile: None, _messages),
+    AttitudeProfile: _view(
+        "Attitude profile", inputs.profile_text, lambda profile: None, _messages
+    ),
     Observations: _view("Observations", inputs.observations_text, inputs.observations_table),
     ExampleData: _view("Example data", inputs.example_text, lambda example: None),
     StarCatalogue: _view("Star catalogue", inputs.catalogue_text, inputs.catalogue_table),
     Centroids: _view("Centroids", images.centroids_text, images.centroids_table, _messages),
-    Identification: _view("Identification", images.identification_text, images.identification_table),
+    Identification: _view(
+        "Identification", images.identification_text, images.identification_table
+    ),
     ImageCalibration: View(images.image_calibration_text),
     ImageRecord: View(images.image_record_text),
     Frames: View(images.frames_text, frames_html),
@@ -150,7 +158,9 @@ VIEWS: Mapping[type, View] = {
         residuals=plot_residuals,
     ),
     Screening: _view("Screening", estimation.screening_text, estimation.screening_table),
-    Consistency: _view("Consistency", estimation.consistency_text, estimation.consistency_table, _messages),
+    Consistency: _view(
+        "Consistency", estimation.consistency_text, estimation.consistency_table, _messages
+    ),
     Priors: _view("Priors", inference.priors_text, _rows),
     PriorPredictive: _view("Prior predictive check", inference.predictive_text, _rows),
     PriorSensitivity: _view("Prior sensitivity", inference.sensitivity_text, _rows),
@@ -163,26 +173,59 @@ VIEWS: Mapping[type, View] = {
         corner=plot_corner,
         prior_posterior=plot_prior_posterior,
     ),
-    Misfit: _view("Misfit", diagnostics.misfit_text, diagnostics.misfit_table, p_values=plot_misfit),
-    Jackknife: _view("Jackknife", diagnostics.jackknife_text, diagnostics.jackknife_table, ratios=plot_jackknife),
+    Misfit: _view(
+        "Misfit", diagnostics.misfit_text, diagnostics.misfit_table, p_values=plot_misfit
+    ),
+    Jackknife: _view(
+        "Jackknife", diagnostics.jackknife_text, diagnostics.jackknife_table, ratios=plot_jackknife
+    ),
     StarTest: _view("Errors of the stars", star_sentence, diagnostics.star_table),
-    ModelComparison: _view("Models", models_sentence, diagnostics.models_table, models=plot_comparison),
-    PredictiveCheck: _view("Posterior predictive check", diagnostics.predictive_text, diagnostics.predictive_table),
-    Diagnosis: View(diagnostics.diagnosis_text, diagnostics.diagnosis_html, {"diagnosis": plot_diagnosis}),
-    Verdict: _view("Verdict", diagnostics.verdict_text, lambda verdict: None, diagnostics.verdict_notes),
-    Validation: _view("Validation", diagnostics.validation_text, diagnostics.validation_table, ranks=plot_validation),
+    ModelComparison: _view(
+        "Models", models_sentence, diagnostics.models_table, models=plot_comparison
+    ),
+    PredictiveCheck: _view(
+        "Posterior predictive check", diagnostics.predictive_text, diagnostics.predictive_table
+    ),
+    Diagnosis: View(
+        diagnostics.diagnosis_text, diagnostics.diagnosis_html, {"diagnosis": plot_diagnosis}
+    ),
+    Verdict: _view(
+        "Verdict", diagnostics.verdict_text, lambda verdict: None, diagnostics.verdict_notes
+    ),
+    Validation: _view(
+        "Validation",
+        diagnostics.validation_text,
+        diagnostics.validation_table,
+        ranks=plot_validation,
+    ),
     CameraComparison: _view(
-        "Comparison", comparison.comparison_text, comparison.comparison_table, difference=plot_camera_comparison
+        "Comparison",
+        comparison.comparison_text,
+        comparison.comparison_table,
+        difference=plot_camera_comparison,
     ),
     Need: View(planning.need_text),
-    Plan: _view("Plan", planning.plan_text, planning.plan_table, forecast=plot_forecast, sweeps=plot_plan_sweeps),
-    FrameChoice: _view(
-        "Frames to take", planning.choice_text, lambda choice: TextTable.of(choice.worth()), choice=plot_frame_choice
+    Plan: _view(
+        "Plan",
+        planning.plan_text,
+        planning.plan_table,
+        forecast=plot_forecast,
+        sweeps=plot_plan_sweeps,
     ),
-    ForecastCheck: _view("Forecast against simulation", planning.check_text, _rows, check=plot_forecast_check),
+    FrameChoice: _view(
+        "Frames to take",
+        planning.choice_text,
+        lambda choice: TextTable.of(choice.worth()),
+        choice=plot_frame_choice,
+    ),
+    ForecastCheck: _view(
+        "Forecast against simulation", planning.check_text, _rows, check=plot_forecast_check
+    ),
     Outcome: View(budgeting.outcome_text),
     Budget: View(budgeting.headline, section_html, {"contributors": plot_budget}),
-    Agreement: _view("Sampled over first order", propagation.agreement_text, propagation.agreement_table),
+    Agreement: _view(
+        "Sampled over first order", propagation.agreement_text, propagation.agreement_table
+    ),
     AttitudeError: _view(
         "Attitude error",
         propagation.attitude_text,
@@ -199,10 +242,17 @@ VIEWS: Mapping[type, View] = {
         couplings=plot_couplings,
     ),
     FieldMap: _view(
-        "Direction uncertainty over the detector", propagation.field_text, propagation.field_table, maps=plot_field_map
+        "Direction uncertainty over the detector",
+        propagation.field_text,
+        propagation.field_table,
+        maps=plot_field_map,
     ),
     DistortionCurve: _view(
-        "Distortion", propagation.distortion_text, lambda curve: None, _draws, curve=plot_distortion_curve
+        "Distortion",
+        propagation.distortion_text,
+        lambda curve: None,
+        _draws,
+        curve=plot_distortion_curve,
     ),
     ErrorSpectrum: _view(
         "Error spectrum",

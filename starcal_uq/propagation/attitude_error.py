@@ -1,8 +1,10 @@
-"""The attitude error of single frames by contributor: the result of `starcal_uq.propagation.propagate.propagate`.
+"""The attitude error of single frames by contributor: the result of
+`starcal_uq.propagation.propagate.propagate`.
 
-Every error has two figures, under the same two names wherever it is shown: *if the model holds*, by the posterior
-alone, and *with the misfit found*, with what the tests of the model add. The second is the headline, and it is not
-assessed, never equal to the first, until the model has been tested. Both are computed here and nowhere else.
+Every error has two figures, under the same two names wherever it is shown: *if the model holds*, by
+the posterior alone, and *with the misfit found*, with what the tests of the model add. The second
+is the headline, and it is not assessed, never equal to the first, until the model has been tested.
+Both are computed here and nowhere else.
 """
 
 from __future__ import annotations
@@ -60,15 +62,16 @@ _GAUSSIAN = (HALF_WIDTH_95, HALF_WIDTH_997)
 class Agreement(Shown):
     """Sampled over first-order standard deviations.
 
-    Noise, draws and first-order propagation share the same realisations, so that the ratios depart from one by what is
-    not linear, and hardly by chance.
+    Noise, draws and first-order propagation share the same realisations, so that the ratios depart
+    from one by what is not linear, and hardly by chance.
 
     Attributes
     ----------
     contributors : tuple of str
         Rows: centroid noise, common rotation and rest.
     ratio : (3, 3) array
-        Sampled over first order; columns are pitch, yaw and roll. NaN where both are below a microarcsecond.
+        Sampled over first order; columns are pitch, yaw and roll. NaN where both are below a
+        microarcsecond.
     """
 
     contributors: tuple[str, ...]
@@ -81,7 +84,9 @@ class Agreement(Shown):
         return float(np.max(np.abs(real - 1.0), initial=0.0))
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per contributor and axis: ``contributor``, ``axis``, ``sampled_over_first_order``."""
+        """One row per contributor and axis: ``contributor``, ``axis``,
+        ``sampled_over_first_order``.
+        """
         import pandas as pd
 
         return pd.DataFrame(
@@ -100,7 +105,8 @@ class MisfitFound:
     Attributes
     ----------
     factor : float
-        Factor on the standard deviations of common rotation and rest, from the jackknife over frames; 1 if they agree.
+        Factor on the standard deviations of common rotation and rest, from the jackknife over
+        frames; 1 if they agree.
     common_arcsec, rest_arcsec : (3,) array
         Errors added in squares to the common rotation and to the rest, arcsec.
     common_reasons, rest_reasons : tuple of str
@@ -108,10 +114,11 @@ class MisfitFound:
     notes : tuple of str
         Further sentences for the reader.
     choice_models : tuple of str
-        Distortion models that the data do not prefer but do not reject either, and that move either by more than its
-        standard deviation.
+        Distortion models that the data do not prefer but do not reject either, and that move either
+        by more than its standard deviation.
     choice_common_arcsec, choice_rest_arcsec : (3,) array
-        How far these models move the common rotation and the rest, arcsec: a choice, which no error here holds.
+        How far these models move the common rotation and the rest, arcsec: a choice, which no error
+        here holds.
     """
 
     factor: float
@@ -134,7 +141,8 @@ class MisfitFound:
 class AttitudeError(Shown):
     """Attitude error of single frames by contributor, arcsec.
 
-    Axes are ``("pitch", "yaw", "roll")``: left rotation vectors about camera +X, +Y and the boresight +Z.
+    Axes are ``("pitch", "yaw", "roll")``: left rotation vectors about camera +X, +Y and the
+    boresight +Z.
 
     Attributes
     ----------
@@ -145,38 +153,43 @@ class AttitudeError(Shown):
     rest_arcsec : (3,) array
         Standard deviation of the rest over the posterior, root mean square over frames.
     p95_arcsec, p997_arcsec : (5, 4) array
-        Half-widths that hold 95 % and 99.7 % of the absolute errors: rows are `CONTRIBUTORS`, columns the three axes
-        and the angle across the boresight, the root of pitch^2 + yaw^2 (2.45 and 3.41 sigma per axis if Gaussian).
+        Half-widths that hold 95 % and 99.7 % of the absolute errors: rows are `CONTRIBUTORS`,
+        columns the three axes and the angle across the boresight, the root of pitch^2 + yaw^2 (2.45
+        and 3.41 sigma per axis if Gaussian).
     analytic_nea_arcsec, analytic_common_arcsec, analytic_rest_arcsec : (3,) array
         Standard deviations by first-order propagation on the same frames, arcsec.
     n_draws, n_frames : int
         Numbers of draws and frames behind the result.
     n_sampled_frames : int
-        Frames on which the draws went through QUEST; on the others the result is that of first order, and what the
-        sample shows beyond it. 0 in files of a version that took all.
+        Frames on which the draws went through QUEST; on the others the result is that of first
+        order, and what the sample shows beyond it. 0 in files of a version that took all.
     common_draws_arcsec : (D, 3) array or None
         Common rotation of every draw; None when read from a file.
     rest_rms_per_frame_arcsec : (K, 3) array or None
         Standard deviation of the rest in each frame; None when read from a file.
     nea_per_frame_arcsec : (K, 3) array or None
-        Standard deviation from centroid noise in each frame, first order; None when read from a file.
+        Standard deviation from centroid noise in each frame, first order; None when read from a
+        file.
     interaction_arcsec : (3,) array
-        Root mean square of what noise and a wrong calibration do together beyond the sum of what each does alone. To
-        first order there is nothing. NaN when read from a file of a version that did not sample it.
+        Root mean square of what noise and a wrong calibration do together beyond the sum of what
+        each does alone. To first order there is nothing. NaN when read from a file of a version
+        that did not sample it.
     frames : str
         Which frames these are, such as ``observed frames``.
     total_arcsec, analytic_total_arcsec : (3,) array or None
-        Standard deviation of common rotation and rest together, which may be correlated, sampled and by first order;
-        None in files of a version where they were not.
+        Standard deviation of common rotation and rest together, which may be correlated, sampled
+        and by first order; None in files of a version where they were not.
     rest_constant_arcsec : (3,) array
-        Standard deviation of the part of the rest that all of the mission's frames share: a bias after alignment.
+        Standard deviation of the part of the rest that all of the mission's frames share: a bias
+        after alignment.
     covariance_arcsec2 : (5, 3, 3) array
-        Covariances of pitch, yaw and roll, arcsec^2, mean over frames; rows are `CONTRIBUTORS`. Their diagonals are the
-        squares of the standard deviations.
+        Covariances of pitch, yaw and roll, arcsec^2, mean over frames; rows are `CONTRIBUTORS`.
+        Their diagonals are the squares of the standard deviations.
     alignment : str
         Frames on which alignment is calibrated, which decide what is common.
     alignment_covariance_arcsec2 : (3, 3) array
-        Covariance of the alignment itself from the noise of its frames, arcsec^2; NaN in files of a version without.
+        Covariance of the alignment itself from the noise of its frames, arcsec^2; NaN in files of a
+        version without.
     aligned : Observations or None
         Frames of the alignment; None when read from a file.
     misfit : MisfitFound or None
@@ -209,9 +222,13 @@ class AttitudeError(Shown):
     total_arcsec: FloatArray | None = None
     analytic_total_arcsec: FloatArray | None = None
     rest_constant_arcsec: FloatArray = field(default_factory=lambda: np.zeros(3))
-    covariance_arcsec2: FloatArray = field(default_factory=lambda: np.full((len(CONTRIBUTORS), 3, 3), np.nan))
+    covariance_arcsec2: FloatArray = field(
+        default_factory=lambda: np.full((len(CONTRIBUTORS), 3, 3), np.nan)
+    )
     alignment: str = SAME_FRAMES
-    alignment_covariance_arcsec2: FloatArray = field(default_factory=lambda: np.full((3, 3), np.nan))
+    alignment_covariance_arcsec2: FloatArray = field(
+        default_factory=lambda: np.full((3, 3), np.nan)
+    )
     aligned: Observations | None = None
     n_sampled_frames: int = 0
 
@@ -224,13 +241,17 @@ class AttitudeError(Shown):
 
     @property
     def alignment_arcsec(self) -> FloatArray:
-        """Standard deviation (3,) of the alignment itself, which stands in place of the common rotation afterwards."""
+        """Standard deviation (3,) of the alignment itself, which stands in place of the common
+        rotation afterwards.
+        """
         sigma: FloatArray = np.sqrt(np.diag(self.alignment_covariance_arcsec2))
         return sigma
 
     @property
     def stays(self) -> BoolArray:
-        """True (3,) where most of the rest is one constant of the mission, as for frames that stare at one field."""
+        """True (3,) where most of the rest is one constant of the mission, as for frames that stare
+        at one field.
+        """
         return np.asarray(self.rest_constant_arcsec**2 > 0.5 * self.rest_arcsec**2)
 
     @property
@@ -241,13 +262,19 @@ class AttitudeError(Shown):
     @property
     def calibration_total_arcsec(self) -> FloatArray:
         """Common rotation and rest together (3,)."""
-        return np.hypot(self.common_arcsec, self.rest_arcsec) if self.total_arcsec is None else self.total_arcsec
+        return (
+            np.hypot(self.common_arcsec, self.rest_arcsec)
+            if self.total_arcsec is None
+            else self.total_arcsec
+        )
 
     @property
     def agreement(self) -> Agreement:
         """Sampled beside first-order propagation."""
         sampled = np.stack((self.nea_arcsec, self.common_arcsec, self.rest_arcsec))
-        first = np.stack((self.analytic_nea_arcsec, self.analytic_common_arcsec, self.analytic_rest_arcsec))
+        first = np.stack(
+            (self.analytic_nea_arcsec, self.analytic_common_arcsec, self.analytic_rest_arcsec)
+        )
         real = np.maximum(sampled, first) > _SMALLEST_ARCSEC
         ratio = np.where(real, sampled / np.where(first > 0.0, first, np.nan), np.nan)
         return Agreement(CONTRIBUTORS[:3], ratio)
@@ -256,7 +283,8 @@ class AttitudeError(Shown):
     def if_model_holds_arcsec(self) -> FloatArray:
         """Standard deviations (5, 4) by the posterior alone.
 
-        Rows are `CONTRIBUTORS`, columns the three axes and the root mean square of the two across the boresight.
+        Rows are `CONTRIBUTORS`, columns the three axes and the root mean square of the two across
+        the boresight.
         """
         rows = (
             self.nea_arcsec,
@@ -269,21 +297,28 @@ class AttitudeError(Shown):
 
     @property
     def with_misfit_found_arcsec(self) -> FloatArray:
-        """Standard deviations (5, 4) with what the tests of the model found; NaN as long as it was not tested."""
+        """Standard deviations (5, 4) with what the tests of the model found; NaN as long as it was
+        not tested.
+        """
         found, held = self.misfit, self.if_model_holds_arcsec
         if found is None:
             return np.full_like(held, np.nan)
         common = np.hypot(found.factor * self.common_arcsec, found.common_arcsec)
         rest = np.hypot(found.factor * self.rest_arcsec, found.rest_arcsec)
-        both = np.hypot(found.factor * self.calibration_total_arcsec, np.hypot(found.common_arcsec, found.rest_arcsec))
+        both = np.hypot(
+            found.factor * self.calibration_total_arcsec,
+            np.hypot(found.common_arcsec, found.rest_arcsec),
+        )
         calibration = [with_cross(values) for values in (common, rest, both)]
         return np.stack([held[0], *calibration, held[4]])
 
     @property
     def choice_of_model_arcsec(self) -> FloatArray:
-        """How far models move attitudes that the data neither prefer nor reject (5, 4); in no other figure.
+        """How far models move attitudes that the data neither prefer nor reject (5, 4); in no other
+        figure.
 
-        0 where no model moves them by more than the standard deviation; NaN as long as the model was not tested.
+        0 where no model moves them by more than the standard deviation; NaN as long as the model
+        was not tested.
         """
         made = np.full((len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
         if (found := self.misfit) is not None:
@@ -295,14 +330,18 @@ class AttitudeError(Shown):
 
     @property
     def headline_arcsec(self) -> FloatArray:
-        """Standard deviations (5, 4) with the misfit found; those if the model holds where that is not assessed."""
+        """Standard deviations (5, 4) with the misfit found; those if the model holds where that is
+        not assessed.
+        """
         return self.if_model_holds_arcsec if self.misfit is None else self.with_misfit_found_arcsec
 
     @property
     def half_widths_with_misfit_found_arcsec(self) -> FloatArray:
-        """Half-widths (2, 5, 4) that hold 95 % and 99.7 % of the errors with the misfit found; NaN if not assessed.
+        """Half-widths (2, 5, 4) that hold 95 % and 99.7 % of the errors with the misfit found; NaN
+        if not assessed.
 
-        What the misfit adds is taken as Gaussian: the excess of the tails over Gaussian ones shrinks with its share.
+        What the misfit adds is taken as Gaussian: the excess of the tails over Gaussian ones
+        shrinks with its share.
         """
         held, found = self.if_model_holds_arcsec, self.with_misfit_found_arcsec
         factor = 1.0 if self.misfit is None else self.misfit.factor
@@ -310,9 +349,13 @@ class AttitudeError(Shown):
         share = np.where(found > 0.0, scale * held / np.where(found > 0.0, found, 1.0), 1.0) ** 2
         widths = np.stack((self.p95_arcsec, self.p997_arcsec))
         tails = widths / np.where(held > 0.0, held, np.nan)
-        gaussian = np.stack([_gaussian_tails(held, *pair) for pair in zip(_CONFIDENCES, _GAUSSIAN, strict=True)])
+        gaussian = np.stack(
+            [_gaussian_tails(held, *pair) for pair in zip(_CONFIDENCES, _GAUSSIAN, strict=True)]
+        )
         excess = np.nan_to_num(tails - gaussian)
-        wanted = np.stack([_gaussian_tails(found, *pair) for pair in zip(_CONFIDENCES, _GAUSSIAN, strict=True)])
+        wanted = np.stack(
+            [_gaussian_tails(found, *pair) for pair in zip(_CONFIDENCES, _GAUSSIAN, strict=True)]
+        )
         made: FloatArray = (wanted + share * excess) * found
         return made
 
@@ -320,11 +363,11 @@ class AttitudeError(Shown):
         """One row per contributor and axis.
 
         Columns are ``contributor``, ``axis``, the standard deviations ``if_model_holds_arcsec`` and
-        ``with_misfit_found_arcsec`` (NaN: not assessed), the half-widths ``p95_if_model_holds_arcsec``,
-        ``p95_with_misfit_found_arcsec`` and the same for ``p997``, ``first_order_arcsec`` (sigma by first-order
-        propagation), ``choice_of_model_arcsec`` (in no other column) and ``absorbed_by_alignment`` (yes, no, in part).
-        The cross-boresight rows hold the root mean
-        square of the sigmas of pitch and yaw.
+        ``with_misfit_found_arcsec`` (NaN: not assessed), the half-widths
+        ``p95_if_model_holds_arcsec``, ``p95_with_misfit_found_arcsec`` and the same for ``p997``,
+        ``first_order_arcsec`` (sigma by first-order propagation), ``choice_of_model_arcsec`` (in no
+        other column) and ``absorbed_by_alignment`` (yes, no, in part). The cross-boresight rows
+        hold the root mean square of the sigmas of pitch and yaw.
         """
         import pandas as pd
 
@@ -355,14 +398,20 @@ class AttitudeError(Shown):
         )
 
     def to_written(self) -> pd.DataFrame:
-        """The table as files and JSON have it: ``not assessed`` in words where the model was not tested."""
+        """The table as files and JSON have it: ``not assessed`` in words where the model was not
+        tested.
+        """
         table = self.to_dataframe()
         if self.misfit is None:
-            table = table.assign(**{name: NOT_ASSESSED for name in table.columns if "with_misfit_found" in name})
+            table = table.assign(
+                **{name: NOT_ASSESSED for name in table.columns if "with_misfit_found" in name}
+            )
         return table
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are not kept."""
+        """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are
+        not kept.
+        """
         misfit = "" if self.misfit is None else json.dumps(to_plain(self.misfit))
         table = self.to_written().assign(
             n_draws=self.n_draws,
@@ -370,13 +419,23 @@ class AttitudeError(Shown):
             n_sampled_frames=self.n_sampled_frames,
             frames=self.frames,
         )
-        every = {"rest_constant_arcsec": self.rest_constant_arcsec, "alignment_sigma_arcsec": self.alignment_arcsec}
-        columns = {name: np.tile(with_cross(values), len(CONTRIBUTORS)) for name, values in every.items()}
+        every = {
+            "rest_constant_arcsec": self.rest_constant_arcsec,
+            "alignment_sigma_arcsec": self.alignment_arcsec,
+        }
+        columns = {
+            name: np.tile(with_cross(values), len(CONTRIBUTORS)) for name, values in every.items()
+        }
         # A line holds its row of the matrix; the angle across the boresight has none.
-        for prefix, matrices in (("", self.covariance_arcsec2), ("alignment_", self.alignment_covariance_arcsec2)):
+        for prefix, matrices in (
+            ("", self.covariance_arcsec2),
+            ("alignment_", self.alignment_covariance_arcsec2),
+        ):
             filled = np.full((len(CONTRIBUTORS), len(TOTAL_AXES), 3), np.nan)
             filled[:, :3] = matrices
-            columns |= {prefix + name: filled[..., i].ravel() for i, name in enumerate(_COVARIANCES)}
+            columns |= {
+                prefix + name: filled[..., i].ravel() for i, name in enumerate(_COVARIANCES)
+            }
         table = table.assign(alignment=self.alignment, **columns)
         # Once is enough: it is the same for all rows.
         write_csv(table.assign(misfit=[misfit] + [""] * (len(table) - 1)), path)
@@ -385,17 +444,31 @@ class AttitudeError(Shown):
     def load(cls, path: str | os.PathLike[str]) -> AttitudeError:
         """Read what `save` wrote.
 
-        A table of a version that did not sample the interaction is read; the interaction is then not known (NaN).
+        A table of a version that did not sample the interaction is read; the interaction is then
+        not known (NaN).
 
         Raises
         ------
         RunFolderError
             If the file is missing or is not such a table.
         """
-        names: tuple[str, ...] = ("if_model_holds", "p95_if_model_holds", "p997_if_model_holds", "first_order")
+        names: tuple[str, ...] = (
+            "if_model_holds",
+            "p95_if_model_holds",
+            "p997_if_model_holds",
+            "first_order",
+        )
         # What earlier versions called them.
-        old = {"if_model_holds": "sigma", "p95_if_model_holds": "p95", "p997_if_model_holds": "p997"}
-        with reading(path, "a table of attitude errors", "run `starcal-uq propagate RUN --force` to write it again"):
+        old = {
+            "if_model_holds": "sigma",
+            "p95_if_model_holds": "p95",
+            "p997_if_model_holds": "p997",
+        }
+        with reading(
+            path,
+            "a table of attitude errors",
+            "run `starcal-uq propagate RUN --force` to write it again",
+        ):
             with open(path, newline="", encoding="utf-8") as file:
                 rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
             known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED
@@ -405,27 +478,37 @@ class AttitudeError(Shown):
             if "if_model_holds_arcsec" not in first:
                 names = tuple(old.get(name, name) for name in names)
             table[:, : len(known)] = [
-                [[float(row[f"{name}_arcsec"] or "nan") for row in line] for line in chosen] for name in names
+                [[float(row[f"{name}_arcsec"] or "nan") for row in line] for line in chosen]
+                for name in names
             ]
             if not np.isfinite(table[:, : len(_REQUIRED)]).all():
                 raise ValueError("a number is missing")
             counts = {name: int(first[name]) for name in ("n_draws", "n_frames")}
             n_sampled = int(first.get("n_sampled_frames") or 0)
             frames = first.get("frames") or OBSERVED
-            misfit = from_plain(MisfitFound, json.loads(first["misfit"])) if first.get("misfit") else None
+            misfit = (
+                from_plain(MisfitFound, json.loads(first["misfit"]))
+                if first.get("misfit")
+                else None
+            )
             later: dict[str, Any] = {}
             if first.get("alignment"):
 
                 def matrix(contributor: str, prefix: str = "") -> list[list[float]]:
                     names = [prefix + name for name in _COVARIANCES]
-                    return [[float(rows[contributor, axis][name] or "nan") for name in names] for axis in AXES]
+                    return [
+                        [float(rows[contributor, axis][name] or "nan") for name in names]
+                        for axis in AXES
+                    ]
 
                 unknown = [[math.nan] * len(AXES)] * len(AXES)
                 later = {
                     "alignment": first["alignment"],
                     "total_arcsec": table[0, 3, :3],
                     "analytic_total_arcsec": table[3, 3, :3],
-                    "rest_constant_arcsec": np.array([float(row["rest_constant_arcsec"]) for row in chosen[0][:3]]),
+                    "rest_constant_arcsec": np.array(
+                        [float(row["rest_constant_arcsec"]) for row in chosen[0][:3]]
+                    ),
                     "covariance_arcsec2": np.array(
                         [matrix(name) for name in known] + [unknown] * (table.shape[1] - len(known))
                     ),
@@ -450,32 +533,50 @@ def two_figures(with_misfit_found: float, if_model_holds: float) -> str:
     found, held = significant(float(with_misfit_found)), significant(float(if_model_holds))
     if np.isnan(with_misfit_found):
         return f"{held} arcsec {IF_MODEL_HOLDS} ({WITH_MISFIT_FOUND}: {NOT_ASSESSED})"
-    return f"{held} arcsec" if found == held else f"{found} arcsec {WITH_MISFIT_FOUND} ({held} {IF_MODEL_HOLDS})"
+    return (
+        f"{held} arcsec"
+        if found == held
+        else f"{found} arcsec {WITH_MISFIT_FOUND} ({held} {IF_MODEL_HOLDS})"
+    )
 
 
 def choice_words(error: AttitudeError) -> str:
-    """What other models that the data do not reject would do to attitudes, in a sentence; empty where it is little."""
+    """What other models that the data do not reject would do to attitudes, in a sentence; empty
+    where it is little.
+    """
     if error.misfit is None or not error.misfit.choice_models:
         return ""
     names = join_words([repr(name) for name in error.misfit.choice_models])
     verb = "predicts" if len(error.misfit.choice_models) == 1 else "predict"
     moved = []
-    for what, row in zip(("the common rotation", "the rest"), error.choice_of_model_arcsec[1:3], strict=True):
+    for what, row in zip(
+        ("the common rotation", "the rest"), error.choice_of_model_arcsec[1:3], strict=True
+    ):
         sizes = ((row[3], "across the boresight"), (row[2], "in roll"))
-        stated = [f"{significant(float(size))} arcsec {where}" for size, where in sizes if size > 0.0]
+        stated = [
+            f"{significant(float(size))} arcsec {where}" for size, where in sizes if size > 0.0
+        ]
         moved += [f"{what} by up to {join_words(stated)}"] if stated else []
     return (
-        f"{CHOICE_OF_MODEL[0].upper()}{CHOICE_OF_MODEL[1:]}, in none of these errors: {names} {verb} about as well as "
+        f"{CHOICE_OF_MODEL[0].upper()}{CHOICE_OF_MODEL[1:]}, in none of these errors: {names} "
+        f"{verb} about as well as "
         f"the fitted model, and would move {', '.join(moved)}."
     )
 
 
 def _gaussian_tails(sigmas: FloatArray, confidence: float, one_axis: float) -> FloatArray:
-    """Half-widths over sigmas (5, 4) that Gaussian errors would have: of one axis, and of the angle across."""
-    across = [mixture_radius(np.diag(row[:2] ** 2), confidence) / row[3] if row[3] > 0.0 else np.nan for row in sigmas]
+    """Half-widths over sigmas (5, 4) that Gaussian errors would have: of one axis, and of the angle
+    across.
+    """
+    across = [
+        mixture_radius(np.diag(row[:2] ** 2), confidence) / row[3] if row[3] > 0.0 else np.nan
+        for row in sigmas
+    ]
     return np.column_stack((np.full((len(sigmas), 3), one_axis), across))
 
 
 def with_cross(sigma: FloatArray) -> FloatArray:
-    """Sigmas of the three axes (3,), then the root mean square of the two across the boresight: (4,)."""
+    """Sigmas of the three axes (3,), then the root mean square of the two across the boresight:
+    (4,).
+    """
     return np.append(sigma, np.sqrt(np.mean(sigma[:2] ** 2)))

@@ -1,4 +1,6 @@
-"""How the parameters are coupled: which trade against each other, by how much, and what the data say of each."""
+"""How the parameters are coupled: which trade against each other, by how much, and what the data
+say of each.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ ALONE = (0.7, 1.4)
 
 
 class HasCovariance(Protocol):
-    """What a coupling is taken from: a `Posterior`, a `Calibration`, or a `Plan` before there are data."""
+    """What a coupling is taken from: a `Posterior`, a `Calibration`, or a `Plan` before there are
+    data.
+    """
 
     @property
     def camera(self) -> Camera:
@@ -61,7 +65,8 @@ class WeakDirection:
     Attributes
     ----------
     weights : (p,) array
-        Unit vector over the parameters divided by their marginal sigmas; the largest entry is positive.
+        Unit vector over the parameters divided by their marginal sigmas; the largest entry is
+        positive.
     variance : float
         Variance along it, as an eigenvalue of the correlation matrix (they sum to p).
     words : str
@@ -106,11 +111,13 @@ class Coupling(Shown):
     extended_names : tuple of str
         Parameters, then pitch, yaw and roll of the common rotation.
     extended_correlation : (p + 3, p + 3) array
-        Correlations including the attitude common to all frames: the near-gauge of principal point and boresight.
+        Correlations including the attitude common to all frames: the near-gauge of principal point
+        and boresight.
     common_rotation_arcsec : (3,) array
         Standard deviation of that common rotation about X, Y and Z.
     single_frame_correlation : (p, 3) array
-        Correlation of the parameters with the attitude of one average frame, centroid noise included.
+        Correlation of the parameters with the attitude of one average frame, centroid noise
+        included.
     """
 
     parameter_names: tuple[str, ...]
@@ -141,7 +148,9 @@ class Coupling(Shown):
         return sorted(strong, key=lambda pair: -abs(pair[2]))
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per parameter: sigmas, inflation, bound, contraction and its row of the extended correlations."""
+        """One row per parameter: sigmas, inflation, bound, contraction and its row of the extended
+        correlations.
+        """
         import pandas as pd
 
         p = len(self.parameter_names)
@@ -169,9 +178,10 @@ def coupling(result: HasCovariance) -> Coupling:
     Parameters
     ----------
     result : Posterior, Calibration or Plan
-        Supplies the covariance (of the draws, or of the estimate), the Fisher information of the data, the response of
-        the common attitude to the parameters, and, for a posterior, the prior. Of a plan it is what the frames that
-        its target takes will give (`Plan.expected` for another number).
+        Supplies the covariance (of the draws, or of the estimate), the Fisher information of the
+        data, the response of the common attitude to the parameters, and, for a posterior, the
+        prior. Of a plan it is what the frames that its target takes will give (`Plan.expected` for
+        another number).
     """
     from starcal_uq.camera.distortion import parameters
 
@@ -210,7 +220,9 @@ def coupling(result: HasCovariance) -> Coupling:
 
 
 def _extended(covariance: FloatArray, response: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Correlations of the parameters with the common rotation they cause, and its standard deviations (rad)."""
+    """Correlations of the parameters with the common rotation they cause, and its standard
+    deviations (rad).
+    """
     joint = np.vstack([np.eye(len(covariance)), response])
     correlation, sigma = correlation_of(joint @ covariance @ joint.T)
     return correlation, sigma[-3:]
@@ -222,7 +234,9 @@ def weak_directions(correlation: FloatArray, names: tuple[str, ...]) -> tuple[We
     directions = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         weights = vector * np.sign(vector[np.argmax(np.abs(vector))])
-        directions.append(WeakDirection(weights, float(value), _words(weights, float(value), names)))
+        directions.append(
+            WeakDirection(weights, float(value), _words(weights, float(value), names))
+        )
     return tuple(directions)
 
 
@@ -233,7 +247,13 @@ def _words(weights: FloatArray, variance: float, names: tuple[str, ...]) -> str:
     down = [names[i] for i in order if weights[i] < 0.0]
     if len(order) == 1 or ALONE[0] < variance < ALONE[1]:
         return f"{' and '.join(names[i] for i in order)}: not coupled to the others"
-    trade = f"{' and '.join(up)} against {' and '.join(down)}" if down else f"{' and '.join(up)} together"
+    trade = (
+        f"{' and '.join(up)} against {' and '.join(down)}"
+        if down
+        else f"{' and '.join(up)} together"
+    )
     if variance > 1.0:
-        return f"{trade}: poorly determined, {variance:.2g} times the variance of uncoupled parameters"
+        return (
+            f"{trade}: poorly determined, {variance:.2g} times the variance of uncoupled parameters"
+        )
     return f"{trade}: well determined, {variance:.2g} times the variance of uncoupled parameters"

@@ -1,13 +1,15 @@
 """The distortion that the posterior believes in: displacement against radius, with credible bands.
 
-The displacement is what distortion does to an image point, distorted minus ideal, at the place where the point is seen;
-its radial part points away from the principal point of each draw. A pointwise band holds the given share of draws at
-each radius by itself; a curve of the posterior leaves it somewhere more often than that. The simultaneous band is
-mean +- c sd with c such that the given share of draws stays inside everywhere (the "sup-t" band; Montiel Olea &
-Plagborg-Moller 2019, J. Applied Econometrics 34(1), 1-17).
+The displacement is what distortion does to an image point, distorted minus ideal, at the place
+where the point is seen; its radial part points away from the principal point of each draw. A
+pointwise band holds the given share of draws at each radius by itself; a curve of the posterior
+leaves it somewhere more often than that. The simultaneous band is mean +- c sd with c such that the
+given share of draws stays inside everywhere (the "sup-t" band; Montiel Olea & Plagborg-Moller 2019,
+J. Applied Econometrics 34(1), 1-17).
 
-Focal length and distortion are coupled: what one adds, the other takes off. These bands are of the distortion alone;
-where there are stars, they are wider than the uncertainty of directions, which the field map shows.
+Focal length and distortion are coupled: what one adds, the other takes off. These bands are of the
+distortion alone; where there are stars, they are wider than the uncertainty of directions, which
+the field map shows.
 """
 
 from __future__ import annotations
@@ -47,8 +49,8 @@ class DistortionCurve(Shown):
     radius_px : (n,) array
         Distance from the principal point, from zero to the farthest corner of the detector.
     azimuth_deg : (A,) array
-        Directions from the principal point, 0 along rising x and 90 along rising y; empty of meaning, and of length
-        one, for models that are the same in all directions.
+        Directions from the principal point, 0 along rising x and 90 along rising y; empty of
+        meaning, and of length one, for models that are the same in all directions.
     mean_px, sd_px : (A, n) array
         Mean and standard deviation of the radial displacement over the posterior, px.
     lower_px, upper_px : (A, n) array
@@ -66,7 +68,8 @@ class DistortionCurve(Shown):
     n_draws : int
         Draws used.
     star_radius_px : float
-        Largest radius of an observed star: beyond it the curve is extrapolated; NaN where stars were not given.
+        Largest radius of an observed star: beyond it the curve is extrapolated; NaN where stars
+        were not given.
     """
 
     radius_px: FloatArray
@@ -90,7 +93,14 @@ class DistortionCurve(Shown):
 
         count, n = self.mean_px.shape
         scale = np.tile(self.arcsec_per_px, count)
-        names = ("mean_px", "sd_px", "lower_px", "upper_px", "lower_simultaneous_px", "upper_simultaneous_px")
+        names = (
+            "mean_px",
+            "sd_px",
+            "lower_px",
+            "upper_px",
+            "lower_simultaneous_px",
+            "upper_simultaneous_px",
+        )
         return pd.DataFrame(
             {
                 "azimuth_deg": np.repeat(self.azimuth_deg, n),
@@ -128,7 +138,8 @@ def distortion_curve(
     level : float
         Share of the posterior in the bands.
     azimuths_deg : sequence of float, optional
-        Directions for models with decentring terms; by default every 45 degrees. Others are the same in all.
+        Directions for models with decentring terms; by default every 45 degrees. Others are the
+        same in all.
     seed : int
         Chooses the draws.
 
@@ -140,10 +151,14 @@ def distortion_curve(
         For a camera without distortion, or when a draw folds the distortion within the detector.
     """
     if n < 2 or not 0.0 < level < 1.0:
-        raise ValueError(f"a curve needs at least 2 radii and a level between 0 and 1, not {n} and {level:g}.")
+        raise ValueError(
+            f"a curve needs at least 2 radii and a level between 0 and 1, not {n} and {level:g}."
+        )
     model = get_model(post.camera.distortion)
     if not model.coefficients:
-        raise DistortionError("the camera's distortion model is 'none', so there is no curve: choose another model.")
+        raise DistortionError(
+            "the camera's distortion model is 'none', so there is no curve: choose another model."
+        )
     decentred = any(not c.name.startswith("k") for c in model.coefficients)
     chosen = _AZIMUTHS_DEG if azimuths_deg is None else tuple(azimuths_deg)
     azimuth = np.array(chosen if decentred else (0.0,), dtype=np.float64)
@@ -158,7 +173,8 @@ def distortion_curve(
     curves = np.concatenate([_radial(model.name, part, offsets, outward) for part in parts])
     if not np.isfinite(curves).all():
         raise DistortionError(
-            f"at some posterior draws the distortion {model.name!r} folds over within the detector: use more frames, a "
+            f"at some posterior draws the distortion {model.name!r} folds over within the "
+            "detector: use more frames, a "
             "tighter prior or a model with fewer coefficients."
         )
     mean, sd = curves.mean(axis=0), curves.std(axis=0, ddof=1)
@@ -182,7 +198,9 @@ def distortion_curve(
         multiplier=multiplier,
         model=model.name,
         n_draws=len(draws),
-        star_radius_px=np.nan if obs is None else float(np.hypot(*(obs.xy - post.mean[:2]).T).max()),
+        star_radius_px=np.nan
+        if obs is None
+        else float(np.hypot(*(obs.xy - post.mean[:2]).T).max()),
     )
 
 
@@ -194,7 +212,9 @@ def _farthest(width: int, height: int, theta: FloatArray) -> float:
 
 
 def _radial(model: str, thetas: FloatArray, offsets: FloatArray, outward: FloatArray) -> FloatArray:
-    """Radial part (d, A, n) of distorted minus ideal points, at offsets (A * n, 2) from each draw's principal point."""
+    """Radial part (d, A, n) of distorted minus ideal points, at offsets (A * n, 2) from each draw's
+    principal point.
+    """
     count, directions = len(thetas), len(outward)
     theta = np.repeat(thetas, len(offsets), axis=0)
     b = unproject_theta(model, theta.T, np.tile(offsets, (count, 1)) + theta[:, :2])

@@ -1,23 +1,28 @@
 """What the posterior of the camera means for attitude: draws through QUEST on frames.
 
-Every draw of the camera turns the measured pixels into directions, and QUEST turns these into one attitude per frame.
-Its difference from the attitude at the posterior mean is a left rotation vector phi (pitch, yaw, roll), split into
+Every draw of the camera turns the measured pixels into directions, and QUEST turns these into one
+attitude per frame. Its difference from the attitude at the posterior mean is a left rotation vector
+phi (pitch, yaw, roll), split into
 
-- the *common rotation*: what an alignment calibration with the same parameters finds on its own frames, and removes,
+- the *common rotation*: what an alignment calibration with the same parameters finds on its own
+  frames, and removes,
 - the *rest*: what remains on the frames of the mission, and is absorbed by nothing.
 
-Alignment and mission see different frames: a mission that stares at one field keeps the error of that field. Centroid
-noise (the noise-equivalent angle, NEA) stands beside them: it is new in every frame. What noise and a wrong camera do
-together, phi(camera, noise) - phi(camera, 0) - phi(0, noise), is their *interaction*, of second order.
+Alignment and mission see different frames: a mission that stares at one field keeps the error of
+that field. Centroid noise (the noise-equivalent angle, NEA) stands beside them: it is new in every
+frame. What noise and a wrong camera do together, phi(camera, noise) - phi(camera, 0) - phi(0,
+noise), is their *interaction*, of second order.
 
-A few hundred draws give a standard deviation to 4 % only. But phi is linear in the parameters to high accuracy, and its
-first-order response K is known, so it serves as a control variate: to the variance of the sampled phi is added
-K (Sigma - Sigma_d) K^T, with Sigma the covariance of all draws and Sigma_d that of the draws that went through QUEST.
-What is sampled is then only the difference from linearity. Quantiles are those of K applied to all draws, scaled to
-that standard deviation. The same holds for noise, whose first-order response is known as well.
+A few hundred draws give a standard deviation to 4 % only. But phi is linear in the parameters to
+high accuracy, and its first-order response K is known, so it serves as a control variate: to the
+variance of the sampled phi is added K (Sigma - Sigma_d) K^T, with Sigma the covariance of all draws
+and Sigma_d that of the draws that went through QUEST. What is sampled is then only the difference
+from linearity. Quantiles are those of K applied to all draws, scaled to that standard deviation.
+The same holds for noise, whose first-order response is known as well.
 
-For the same reason not every frame has to go through QUEST: what is sampled hardly varies between frames, so that a few
-hundred of them, one of each stretch of the run, tell it for all, while first order is that of every frame.
+For the same reason not every frame has to go through QUEST: what is sampled hardly varies between
+frames, so that a few hundred of them, one of each stretch of the run, tell it for all, while first
+order is that of every frame.
 """
 
 from __future__ import annotations
@@ -50,11 +55,14 @@ if TYPE_CHECKING:
 _LEVELS = (0.95, 0.997)
 _STARS_AT_ONCE = 1_000_000
 _SAMPLES = 400_000
-# Draws that are given noise as well: the interaction is averaged over frames, and its size is what counts.
+# Draws that are given noise as well: the interaction is averaged over frames, and its size is what
+# counts.
 _NOISY_DRAWS = 40
-# Frames that go through QUEST, of more: so many, or fewer that hold so many stars, but not fewer than the last.
+# Frames that go through QUEST, of more: so many, or fewer that hold so many stars, but not fewer
+# than the last.
 _SAMPLED_FRAMES, _SAMPLED_STARS, _FEWEST_FRAMES = 300, 20_000, 30
-# Half a pixel: the map is so smooth that the central difference errs by (h / f)^2, while rounding stays below 1e-12.
+# Half a pixel: the map is so smooth that the central difference errs by (h / f)^2, while rounding
+# stays below 1e-12.
 _STEP_PX = 0.5
 
 
@@ -69,7 +77,8 @@ def propagate(
     alignment: Observations | str | None = None,
     alignment_frames: int | None = None,
 ) -> AttitudeError:
-    """Attitude error of single frames: centroid noise, calibration as common rotation and rest, and their interaction.
+    """Attitude error of single frames: centroid noise, calibration as common rotation and rest, and
+    their interaction.
 
     QUEST weights stars equally, or by their stated noise where the posterior scales it.
 
@@ -85,8 +94,8 @@ def propagate(
     seed : int
         Chooses them, the noise, and a random sky.
     alignment : Observations or str, optional
-        Frames on which alignment is calibrated in flight: ``random`` (by default) for a random sky with as many stars a
-        frame as `obs`, ``observed`` for `obs` itself, or a table.
+        Frames on which alignment is calibrated in flight: ``random`` (by default) for a random sky
+        with as many stars a frame as `obs`, ``observed`` for `obs` itself, or a table.
     alignment_frames : int, optional
         Number of frames of the random sky; 100 by default.
 
@@ -97,7 +106,8 @@ def propagate(
     DistortionError
         When a draw folds the distortion within the observed pixels.
     ObservationError
-        When the posterior scales stated noises that the observations lack, or the alignment is none of these.
+        When the posterior scales stated noises that the observations lack, or the alignment is none
+        of these.
     DegenerateFrameError
         When a frame does not determine an attitude.
     """
@@ -117,14 +127,23 @@ def propagate(
     common = sampled.common + shift @ (together - sampled.together).T
     nea = frames.noise_covariance
     common_variance = np.maximum(spread(together, post.covariance) + sampled.beyond_common, 0.0)
-    constant_variance = np.maximum(spread(apart.mean(axis=0), post.covariance) + sampled.beyond_constant, 0.0)
-    rest_variance = np.maximum(spread(apart, post.covariance) + sampled.over(obs.n_frames, sampled.beyond_rest), 0.0)
-    whole = spread(frames.response, post.covariance) + sampled.over(obs.n_frames, sampled.beyond_whole)
+    constant_variance = np.maximum(
+        spread(apart.mean(axis=0), post.covariance) + sampled.beyond_constant, 0.0
+    )
+    rest_variance = np.maximum(
+        spread(apart, post.covariance) + sampled.over(obs.n_frames, sampled.beyond_rest), 0.0
+    )
+    whole = spread(frames.response, post.covariance) + sampled.over(
+        obs.n_frames, sampled.beyond_whole
+    )
     whole_variance = np.maximum(whole, 0.0).mean(axis=0)
     interaction = sampled.interaction
     half_widths = [_noise_half_widths(nea, seed)]
     sigmas = (np.sqrt(common_variance), _rms(rest_variance))
-    half_widths += [*_calibration_half_widths(post, together, apart, sigmas, seed), _half_widths(interaction)]
+    half_widths += [
+        *_calibration_half_widths(post, together, apart, sigmas, seed),
+        _half_widths(interaction),
+    ]
     p95, p997 = np.swapaxes(half_widths, 0, 1) * ARCSEC
     noise_sigma = np.sqrt(np.maximum(_diagonal(nea).mean(axis=0) + sampled.noise_excess, 0.0))
     met = interaction.reshape(-1, 3)
@@ -168,12 +187,14 @@ def propagate(
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """What draws through QUEST say, and what of it first order does not, on k of the frames (`places`).
+    """What draws through QUEST say, and what of it first order does not, on k of the frames
+    (`places`).
 
-    Variances beyond first order, rad^2, are those of the draws less those that the responses give for the same draws:
-    of the common rotation and of the mean of the rest (3,), of the rest and of the whole rotation in each frame (k, 3),
-    and of noise (3,). `common` (D, 3) is the common rotation of every draw, rad, `together` (3, p) its first-order
-    response on these frames, and `interaction` (d, k, 3) that of noise and camera, rad.
+    Variances beyond first order, rad^2, are those of the draws less those that the responses give
+    for the same draws: of the common rotation and of the mean of the rest (3,), of the rest and of
+    the whole rotation in each frame (k, 3), and of noise (3,). `common` (D, 3) is the common
+    rotation of every draw, rad, `together` (3, p) its first-order response on these frames, and
+    `interaction` (d, k, 3) that of noise and camera, rad.
     """
 
     places: IntArray
@@ -187,20 +208,30 @@ class _Sampled:
     interaction: FloatArray
 
     def over(self, n_frames: int, values: FloatArray) -> FloatArray:
-        """Values (n_frames, 3) of all frames: those of the sample (k, 3), and their mean elsewhere."""
+        """Values (n_frames, 3) of all frames: those of the sample (k, 3), and their mean
+        elsewhere.
+        """
         every = np.tile(values.mean(axis=0), (n_frames, 1))
         every[self.places] = values
         return every
 
 
 def _few(obs: Observations, seed: int) -> tuple[Observations, IntArray]:
-    """Frames that draws are taken through, and their places: fewer of those with very many stars, which are alike."""
-    limit = int(np.clip(_SAMPLED_STARS * obs.n_frames // obs.n_stars, _FEWEST_FRAMES, _SAMPLED_FRAMES))
+    """Frames that draws are taken through, and their places: fewer of those with very many stars,
+    which are alike.
+    """
+    limit = int(
+        np.clip(_SAMPLED_STARS * obs.n_frames // obs.n_stars, _FEWEST_FRAMES, _SAMPLED_FRAMES)
+    )
     return frame_sample(obs, limit, seed)
 
 
 def _sampled(
-    post: Posterior, every: FrameGeometry, every_aligned: FrameGeometry, draws: FloatArray, seed: int
+    post: Posterior,
+    every: FrameGeometry,
+    every_aligned: FrameGeometry,
+    draws: FloatArray,
+    seed: int,
 ) -> _Sampled:
     """Take draws (D, p) through QUEST on some of the frames and of those of the alignment."""
     some, places = _few(every.obs, seed)
@@ -209,7 +240,9 @@ def _sampled(
         aligned = frames
     else:
         aligning, _ = _few(every_aligned.obs, seed)
-        aligned = every_aligned if aligning is every_aligned.obs else FrameGeometry.of(post, aligning)
+        aligned = (
+            every_aligned if aligning is every_aligned.obs else FrameGeometry.of(post, aligning)
+        )
     weights, _ = alignment_weights(aligned.noise_covariance)
     common, constant = np.empty((len(draws), 3)), np.empty((len(draws), 3))
     # Where the same frames align and are propagated to, their attitudes are found once.
@@ -229,7 +262,9 @@ def _sampled(
     together = np.einsum("nij,njp->ip", weights, aligned.response)
     apart = frames.response - together
     own = np.cov(draws, rowvar=False).reshape(draws.shape[1], -1)
-    noise_excess, interaction = _with_noise(frames, draws[:_NOISY_DRAWS], np.concatenate(quiet), seed)
+    noise_excess, interaction = _with_noise(
+        frames, draws[:_NOISY_DRAWS], np.concatenate(quiet), seed
+    )
     return _Sampled(
         places=places,
         common=common,
@@ -265,11 +300,12 @@ class _Moments:
 class FrameGeometry:
     """Frames as QUEST sees them at the posterior mean, with its first-order responses.
 
-    Displacements db of the directions turn the attitude by phi = [sum w (I - b b^T)]^-1 sum w b x db; weights (N,) are
-    None where all stars count alike. `noise_px` (N,) is the centroid noise per axis; `response` (K, 3, p) is
-    d phi / d theta, rad per px unit, `noise_response` (2, N, 3) the turns of a star's frame by one standard deviation
-    of its x and of its y, or of two independent parts where a noise model has its axes correlate, rad, and
-    `noise_covariance` (K, 3, 3) the covariance of phi from centroid noise, rad^2.
+    Displacements db of the directions turn the attitude by phi = [sum w (I - b b^T)]^-1 sum w b x
+    db; weights (N,) are None where all stars count alike. `noise_px` (N,) is the centroid noise per
+    axis; `response` (K, 3, p) is d phi / d theta, rad per px unit, `noise_response` (2, N, 3) the
+    turns of a star's frame by one standard deviation of its x and of its y, or of two independent
+    parts where a noise model has its axes correlate, rad, and `noise_covariance` (K, 3, 3) the
+    covariance of phi from centroid noise, rad^2.
     """
 
     post: Posterior
@@ -289,13 +325,20 @@ class FrameGeometry:
         b, per_theta = unproject_jacobian(model, post.mean, xy)
         steps = _STEP_PX * np.eye(2)
         per_pixel = [
-            (unproject_theta(model, post.mean, xy + step) - unproject_theta(model, post.mean, xy - step))
+            (
+                unproject_theta(model, post.mean, xy + step)
+                - unproject_theta(model, post.mean, xy - step)
+            )
             / (2.0 * _STEP_PX)
             for step in steps
         ]
         w = np.ones(obs.n_stars) if weights is None else weights
-        inverse = np.linalg.inv(_frame_sums(w[:, None, None] * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts))
-        by_theta = _frame_sums(w[:, None, None] * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts)
+        inverse = np.linalg.inv(
+            _frame_sums(w[:, None, None] * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts)
+        )
+        by_theta = _frame_sums(
+            w[:, None, None] * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts
+        )
         root = np.eye(2) if obs.noise_axes is None else np.linalg.cholesky(obs.noise_axes)
         torque = np.stack([(w * noise_px)[:, None] * np.cross(b, column) for column in per_pixel])
         torque = np.einsum("anj,ab->bnj", torque, root)
@@ -314,18 +357,26 @@ class FrameGeometry:
         """Quaternions (d, K, 4) by QUEST for parameters (d, p) and pixels (N, 2), or (d, N, 2)."""
         model = self.post.camera.distortion
         pixels = np.broadcast_to(xy, (len(thetas), *xy.shape[-2:]))
-        b = np.stack([unproject_theta(model, theta, own) for theta, own in zip(thetas, pixels, strict=True)])
+        b = np.stack(
+            [unproject_theta(model, theta, own) for theta, own in zip(thetas, pixels, strict=True)]
+        )
         folded = ~np.isfinite(b).all(axis=(1, 2))
         if folded.any():
             raise DistortionError(
-                f"at {int(folded.sum())} of {len(b)} posterior draws the distortion {model!r} folds over within the "
-                "observed field: use more frames, a tighter prior or a model with fewer coefficients."
+                f"at {int(folded.sum())} of {len(b)} posterior draws the distortion {model!r} "
+                "folds over within the "
+                "observed field: use more frames, a tighter prior or a model with fewer "
+                "coefficients."
             )
         obs = self.obs
-        return quest(b, obs.directions_icrs, obs.frame_starts, self.weights, covariance=False).quaternions
+        return quest(
+            b, obs.directions_icrs, obs.frame_starts, self.weights, covariance=False
+        ).quaternions
 
     def rotations(self, draws: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
-        """Left rotations (d, K, 3) rad of the attitudes at some draws from those at the posterior mean."""
+        """Left rotations (d, K, 3) rad of the attitudes at some draws from those at the posterior
+        mean.
+        """
         xy = self.obs.xy
         reference = self.attitudes(self.post.mean[None], xy)
         for part in self.batches(len(draws)):
@@ -340,7 +391,8 @@ class FrameGeometry:
 def _with_noise(
     frames: FrameGeometry, draws: FloatArray, quiet: FloatArray, seed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """What noise does beyond first order: excess variance (3,) of noise alone, and the interaction (d, K, 3), rad.
+    """What noise does beyond first order: excess variance (3,) of noise alone, and the interaction
+    (d, K, 3), rad.
 
     `quiet` (d, K, 3) are the rotations at the draws without noise.
     """
@@ -351,25 +403,33 @@ def _with_noise(
     for part in frames.batches(len(draws)):
         thetas = draws[part]
         e = rng.standard_normal((len(thetas), len(xy), 2))
-        errors = e if frames.obs.noise_axes is None else e @ np.linalg.cholesky(frames.obs.noise_axes).T
+        errors = (
+            e if frames.obs.noise_axes is None else e @ np.linalg.cholesky(frames.obs.noise_axes).T
+        )
         noisy = xy + frames.noise_px[:, None] * errors
         noise = left_error(frames.attitudes(np.repeat(mean, len(thetas), axis=0), noisy), reference)
         both = left_error(frames.attitudes(thetas, noisy), reference)
-        linear = np.add.reduceat(np.einsum("dna,ani->dni", e, frames.noise_response), starts[:-1], axis=1)
+        linear = np.add.reduceat(
+            np.einsum("dna,ani->dni", e, frames.noise_response), starts[:-1], axis=1
+        )
         excess += np.sum(noise * noise - linear * linear, axis=(0, 1))
         interactions.append(both - quiet[part] - noise)
     return excess / (len(draws) * frames.obs.n_frames), np.concatenate(interactions)
 
 
 def _noise(post: Posterior, obs: Observations) -> tuple[FloatArray, FloatArray | None]:
-    """Noise of every star (N,) in px at the posterior mean, its own direction error included, and QUEST's weights."""
+    """Noise of every star (N,) in px at the posterior mean, its own direction error included, and
+    QUEST's weights.
+    """
     sigma = float(np.mean(post.sigma_draws))
     if post.sigma_name != "sigma_scale":
         return np.full(obs.n_stars, np.hypot(sigma, post.star_error_px)), None
     if obs.sigma_px is None:
         raise ObservationError(
-            "the posterior scales the stated noise of the stars, but these observations have no sigma_px: "
-            "pass the observations that it was sampled from, or mission_frames(..., noise_like=observations).",
+            "the posterior scales the stated noise of the stars, but these observations have no "
+            "sigma_px: "
+            "pass the observations that it was sampled from, or mission_frames(..., "
+            "noise_like=observations).",
             column="sigma_px",
         )
     return np.hypot(sigma * obs.sigma_px, post.star_error_px), obs.sigma_px**-2.0
@@ -383,13 +443,21 @@ def _frame_sums(values: Any, starts: IntArray) -> FloatArray:
 def _noise_half_widths(covariance: FloatArray, seed: int) -> FloatArray:
     """Half-widths of Gaussian errors with the covariance (K, 3, 3) of a frame taken at random."""
     shape = (max(1, _SAMPLES // len(covariance)), len(covariance), 3, 1)
-    return _half_widths(np.linalg.cholesky(covariance) @ np.random.default_rng(seed).standard_normal(shape))
+    return _half_widths(
+        np.linalg.cholesky(covariance) @ np.random.default_rng(seed).standard_normal(shape)
+    )
 
 
 def _calibration_half_widths(
-    post: Posterior, together: FloatArray, apart: FloatArray, sigmas: tuple[FloatArray, FloatArray], seed: int
+    post: Posterior,
+    together: FloatArray,
+    apart: FloatArray,
+    sigmas: tuple[FloatArray, FloatArray],
+    seed: int,
 ) -> list[FloatArray]:
-    """Half-widths of common rotation, rest and total: first-order errors of draws and frames, scaled to `sigmas`."""
+    """Half-widths of common rotation, rest and total: first-order errors of draws and frames,
+    scaled to `sigmas`.
+    """
     shift = post.theta_draws - post.mean
     common = _scaled(shift @ together.T, sigmas[0])
     rng = np.random.default_rng(seed)
@@ -399,7 +467,9 @@ def _calibration_half_widths(
 
 
 def _with_sigmas(covariance: FloatArray, sigma: FloatArray) -> FloatArray:
-    """A first-order covariance (3, 3) with the correlations it has, and these standard deviations."""
+    """A first-order covariance (3, 3) with the correlations it has, and these standard
+    deviations.
+    """
     own = np.sqrt(np.diag(covariance))
     scale = np.divide(sigma, own, out=np.zeros(3), where=own > 0.0)
     scaled: FloatArray = covariance * np.outer(scale, scale)
@@ -413,9 +483,13 @@ def _scaled(errors: FloatArray, sigma: FloatArray) -> FloatArray:
 
 
 def _half_widths(errors: FloatArray) -> FloatArray:
-    """Quantiles of the absolute errors (..., 3) over all leading axes: (2, 4), rad, the last across the boresight."""
+    """Quantiles of the absolute errors (..., 3) over all leading axes: (2, 4), rad, the last across
+    the boresight.
+    """
     e = np.abs(errors.reshape(-1, 3))
-    widths: FloatArray = np.quantile(np.column_stack((e, np.hypot(e[:, 0], e[:, 1]))), _LEVELS, axis=0)
+    widths: FloatArray = np.quantile(
+        np.column_stack((e, np.hypot(e[:, 0], e[:, 1]))), _LEVELS, axis=0
+    )
     return widths
 
 

@@ -1,14 +1,17 @@
-"""How fast the attitude error of a wrong calibration changes along a slew: its spectrum, beside that of the noise.
+"""How fast the attitude error of a wrong calibration changes along a slew: its spectrum, beside
+that of the noise.
 
-Along an attitude profile stars enter, cross and leave the field. A wrong camera then causes an attitude error that
-follows them: constant over seconds, different after a field has passed. It is a FOV spatial error in the sense of
-ECSS-E-ST-60-20C Rev. 2, which the angular rate of the sensor turns into a temporal one, here exactly for a given
-profile. Averaging over frames lowers centroid noise, which is white, but hardly this part.
+Along an attitude profile stars enter, cross and leave the field. A wrong camera then causes an
+attitude error that follows them: constant over seconds, different after a field has passed. It is a
+FOV spatial error in the sense of ECSS-E-ST-60-20C Rev. 2, which the angular rate of the sensor
+turns into a temporal one, here exactly for a given profile. Averaging over frames lowers centroid
+noise, which is white, but hardly this part.
 
-The spectrum is one-sided, PSD_j = 2 dt / K |X_j|^2 at f_j = j / (K dt) for K frames dt apart (without the 2 at the
-Nyquist frequency), averaged over posterior draws, so that its sum times df is the mean square of the error over time.
-As in `starcal_uq.propagation.propagate`, the first-order response of QUEST gives the average over the whole posterior,
-and draws through QUEST give what first order misses.
+The spectrum is one-sided, PSD_j = 2 dt / K |X_j|^2 at f_j = j / (K dt) for K frames dt apart
+(without the 2 at the Nyquist frequency), averaged over posterior draws, so that its sum times df is
+the mean square of the error over time. As in `starcal_uq.propagation.propagate`, the first-order
+response of QUEST gives the average over the whole posterior, and draws through QUEST give what
+first order misses.
 """
 
 from __future__ import annotations
@@ -36,7 +39,8 @@ if TYPE_CHECKING:
 
 MIN_SPECTRUM_FRAMES = 16
 _MAX_GAPS = 0.2
-# Times of a uniform series may be rounded, to milliseconds say; more than this share of a step is another series.
+# Times of a uniform series may be rounded, to milliseconds say; more than this share of a step is
+# another series.
 _UNEVEN = 0.05
 # Averaging times that are tried, evenly in their logarithm.
 _AVERAGES = 60
@@ -58,8 +62,8 @@ def error_spectrum(
     post : Posterior
         Draws of the camera and the noise.
     obs : Observations
-        Frames along an attitude profile (`starcal_uq.simulation.profile_frames`), or any others that are evenly
-        spaced in time.
+        Frames along an attitude profile (`starcal_uq.simulation.profile_frames`), or any others
+        that are evenly spaced in time.
     times_s : (K,) array, optional
         Time of each frame, s, in the order of frame numbers; those of `profile_frames` by default.
     n_draws : int
@@ -70,7 +74,8 @@ def error_spectrum(
     Raises
     ------
     AttitudeProfileError
-        When times are missing, not evenly spaced, or more than a fifth of the instants has no frame.
+        When times are missing, not evenly spaced, or more than a fifth of the instants has no
+        frame.
     SamplingError
         For fewer than two draws.
     DistortionError, ObservationError, DegenerateFrameError
@@ -122,16 +127,19 @@ def _series(obs: Observations, times_s: FloatArray | None) -> tuple[FloatArray, 
     given = obs.meta.get("frame_times_s") if times_s is None else times_s
     if given is None:
         raise AttitudeProfileError(
-            "these frames carry no times: pass times_s, one for each frame, or frames of profile_frames."
+            "these frames carry no times: pass times_s, one for each frame, or frames of "
+            "profile_frames."
         )
     time = np.asarray(given, dtype=float)
     if time.shape != (obs.n_frames,):
         raise AttitudeProfileError(
-            f"times_s has shape {time.shape}, but there are {obs.n_frames} frames; give one time for each."
+            f"times_s has shape {time.shape}, but there are {obs.n_frames} frames; give one time "
+            "for each."
         )
     if len(time) < MIN_SPECTRUM_FRAMES:
         raise AttitudeProfileError(
-            f"a spectrum needs at least {MIN_SPECTRUM_FRAMES} frames, not {len(time)}: raise the rate, or propagate "
+            f"a spectrum needs at least {MIN_SPECTRUM_FRAMES} frames, not {len(time)}: raise the "
+            "rate, or propagate "
             "without a spectrum."
         )
     steps = np.diff(time)
@@ -143,12 +151,16 @@ def _series(obs: Observations, times_s: FloatArray | None) -> tuple[FloatArray, 
     step = float((time[-1] - time[0]) / whole[-1])
     place = np.concatenate([[0.0], whole])
     if np.any(np.abs((time - time[0]) / step - place) > _UNEVEN):
-        raise AttitudeProfileError("the frames are not evenly spaced in time: interpolate the profile, with rate_hz.")
+        raise AttitudeProfileError(
+            "the frames are not evenly spaced in time: interpolate the profile, with rate_hz."
+        )
     size = int(place[-1]) + 1
     if len(time) < (1.0 - _MAX_GAPS) * size:
         raise AttitudeProfileError(
-            f"{size - len(time)} of {size} evenly spaced instants have no frame, more than a spectrum can bridge (the "
-            f"longest gap begins at {time[int(np.argmax(steps))]:g} s): where frames show too few stars, raise max_mag "
+            f"{size - len(time)} of {size} evenly spaced instants have no frame, more than a "
+            "spectrum can bridge (the "
+            f"longest gap begins at {time[int(np.argmax(steps))]:g} s): where frames show too "
+            "few stars, raise max_mag "
             "or lower min_stars; where the profile has no attitudes, cut it there."
         )
     return time[0] + step * np.arange(size), place.astype(np.int64)
@@ -169,7 +181,9 @@ def _filled(values: FloatArray, before: IntArray, weight: FloatArray) -> FloatAr
 
 
 def _square_root(covariance: FloatArray) -> FloatArray:
-    """L (p, p) with L L^T = covariance, whose entries differ by thirty orders of magnitude and may be singular."""
+    """L (p, p) with L L^T = covariance, whose entries differ by thirty orders of magnitude and may
+    be singular.
+    """
     sd = np.sqrt(np.diag(covariance))
     scale = np.where(sd > 0.0, sd, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -190,10 +204,14 @@ def _power(series: FloatArray) -> FloatArray:
 
 
 def _autocorrelation(first: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-    """Lags and the autocorrelation (L, 3) of independent amplitudes (K, 3, p), without wrapping round."""
+    """Lags and the autocorrelation (L, 3) of independent amplitudes (K, 3, p), without wrapping
+    round.
+    """
     size = len(first)
     amplitude = np.fft.rfft(first, n=2 * size, axis=0)
-    products = np.fft.irfft(np.sum(amplitude.real**2 + amplitude.imag**2, axis=-1), n=2 * size, axis=0)[: size // 2]
+    products = np.fft.irfft(
+        np.sum(amplitude.real**2 + amplitude.imag**2, axis=-1), n=2 * size, axis=0
+    )[: size // 2]
     products /= np.arange(size, size - size // 2, -1)[:, None]
     power = np.where(products[0] > 0.0, products[0], 1.0)
     lag: FloatArray = step * np.arange(size // 2, dtype=float)
@@ -211,11 +229,13 @@ class ErrorSpectrum(Shown, Saved):
     frequency_hz : (F,) array
         Frequencies, from one over the duration to half the frame rate, Hz.
     psd_arcsec2_hz : (F, 3) array
-        One-sided power spectral density of the frame-dependent part, average over the posterior, arcsec^2 / Hz.
+        One-sided power spectral density of the frame-dependent part, average over the posterior,
+        arcsec^2 / Hz.
     nea_psd_arcsec2_hz : (3,) array
         That of centroid noise, which is white, arcsec^2 / Hz.
     variance_arcsec2 : (3,) array
-        Mean square of the frame-dependent part over time and posterior, found without the spectrum, arcsec^2.
+        Mean square of the frame-dependent part over time and posterior, found without the spectrum,
+        arcsec^2.
     nea_arcsec : (3,) array
         Centroid noise of a frame, root mean square over frames, arcsec.
     lag_s : (L,) array
@@ -225,7 +245,8 @@ class ErrorSpectrum(Shown, Saved):
     time_s : (K,) array
         Instants of the uniform series, s.
     sigma_arcsec : (K, 3) array
-        Standard deviation of the frame-dependent part over the posterior at each instant, first order, arcsec.
+        Standard deviation of the frame-dependent part over the posterior at each instant, first
+        order, arcsec.
     step_s : float
         Time between frames, s.
     gap_share : float
@@ -253,7 +274,12 @@ class ErrorSpectrum(Shown, Saved):
     KIND = "starcal_uq error spectrum 1"
     FILE = "an error spectrum", "compute it with error_spectrum"
     SHAPES: ClassVar[Shapes] = {
-        **{"frequency_hz": ("f",), "psd_arcsec2_hz": ("f", 3), "lag_s": ("l",), "autocorrelation": ("l", 3)},
+        **{
+            "frequency_hz": ("f",),
+            "psd_arcsec2_hz": ("f", 3),
+            "lag_s": ("l",),
+            "autocorrelation": ("l", 3),
+        },
         **dict.fromkeys(("nea_psd_arcsec2_hz", "variance_arcsec2", "nea_arcsec"), (3,)),
         **{"time_s": ("k",), "sigma_arcsec": ("k", 3)},
     }
@@ -274,26 +300,34 @@ class ErrorSpectrum(Shown, Saved):
         return np.array([_crossing(self.lag_s, column) for column in self.autocorrelation.T])
 
     def averaged_arcsec(self, seconds: float) -> tuple[FloatArray, FloatArray]:
-        """Standard deviations (3,) of the frame-dependent part and of noise after averaging over some time, arcsec.
+        """Standard deviations (3,) of the frame-dependent part and of noise after averaging over
+        some time, arcsec.
 
-        An average over n frames dt apart passes the share (sin(pi f n dt) / (n sin(pi f dt)))^2 of the power at
-        frequency f; noise falls with the root of the frames.
+        An average over n frames dt apart passes the share (sin(pi f n dt) / (n sin(pi f dt)))^2 of
+        the power at frequency f; noise falls with the root of the frames.
 
         Raises
         ------
         ValueError
-            For less than one frame, or more than a quarter of the duration, over which the spectrum knows nothing.
+            For less than one frame, or more than a quarter of the duration, over which the spectrum
+            knows nothing.
         """
         longest = self.longest_average_s
         if not self.step_s * (1.0 - 1e-9) <= seconds <= longest * (1.0 + 1e-9):
-            raise ValueError(f"averaging over {seconds:g} s: choose {self.step_s:g} s to {longest:g} s.")
-        passed = (np.sinc(self.frequency_hz * seconds) / np.sinc(self.frequency_hz * self.step_s)) ** 2
+            raise ValueError(
+                f"averaging over {seconds:g} s: choose {self.step_s:g} s to {longest:g} s."
+            )
+        passed = (
+            np.sinc(self.frequency_hz * seconds) / np.sinc(self.frequency_hz * self.step_s)
+        ) ** 2
         rest: FloatArray = np.sqrt(passed @ self.psd_arcsec2_hz * self.frequency_hz[0])
         return rest, self.nea_arcsec * np.sqrt(self.step_s / seconds)
 
     @property
     def dominates_after_s(self) -> FloatArray:
-        """Averaging time (3,) from which the frame-dependent part exceeds noise, s; NaN if not within a quarter."""
+        """Averaging time (3,) from which the frame-dependent part exceeds noise, s; NaN if not
+        within a quarter.
+        """
         times = np.geomspace(self.step_s, self.longest_average_s, _AVERAGES)
         larger = np.array([np.greater(*self.averaged_arcsec(float(t))) for t in times])
         return np.where(larger.any(axis=0), times[np.argmax(larger, axis=0)], np.nan)
@@ -304,14 +338,18 @@ class ErrorSpectrum(Shown, Saved):
         return 0.25 * self.step_s * len(self.time_s)
 
     def share_below(self, frequency_hz: float) -> FloatArray:
-        """Share (3,) of the variance of the frame-dependent part at frequencies up to `frequency_hz`."""
+        """Share (3,) of the variance of the frame-dependent part at frequencies up to
+        `frequency_hz`.
+        """
         low = self.psd_arcsec2_hz[self.frequency_hz <= frequency_hz].sum(axis=0)
         total = self.psd_arcsec2_hz.sum(axis=0)
         share: FloatArray = low / np.where(total > 0.0, total, np.nan)
         return share
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per frequency and axis: ``frequency_hz``, ``axis``, ``rest_arcsec2_hz``, ``nea_arcsec2_hz``."""
+        """One row per frequency and axis: ``frequency_hz``, ``axis``, ``rest_arcsec2_hz``,
+        ``nea_arcsec2_hz``.
+        """
         import pandas as pd
 
         n = len(self.frequency_hz)
@@ -326,7 +364,9 @@ class ErrorSpectrum(Shown, Saved):
 
 
 def _crossing(lag: FloatArray, correlation: FloatArray) -> float:
-    """First lag at which a correlation falls below 1/e, between samples linearly; NaN if there is none."""
+    """First lag at which a correlation falls below 1/e, between samples linearly; NaN if there is
+    none.
+    """
     below: BoolArray = correlation < np.exp(-1.0)
     if not below.any() or below[0]:
         return float("nan")

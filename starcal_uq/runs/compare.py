@@ -29,7 +29,8 @@ def compare_runs(
     Parameters
     ----------
     run_a, run_b : path
-        Folders with a calibration each. Posteriors are compared if both hold one, else the estimates.
+        Folders with a calibration each. Posteriors are compared if both hold one, else the
+        estimates.
     labels : (str, str), optional
         Names in words and figures; by default those of the folders.
     same_data : bool, optional
@@ -46,22 +47,36 @@ def compare_runs(
     """
     first, second = Run(run_a), Run(run_b)
     if first.path.resolve() == second.path.resolve():
-        raise ComparisonError(f"{run_a}: both runs are the same folder; name two, or split one with --split odd-even.")
+        raise ComparisonError(
+            f"{run_a}: both runs are the same folder; name two, or split one with --split odd-even."
+        )
     calibrations = first.calibration, second.calibration
     if labels is None:
-        labels = (first.name, second.name) if first.name != second.name else (str(run_a), str(run_b))
+        labels = (
+            (first.name, second.name) if first.name != second.name else (str(run_a), str(run_b))
+        )
     table_a, table_b = _table(first), _table(second)
     observations = None if table_a is None or table_b is None else (table_a, table_b)
-    fingerprints = fingerprints_of(calibrations[0], table_a), fingerprints_of(calibrations[1], table_b)
+    fingerprints = (
+        fingerprints_of(calibrations[0], table_a),
+        fingerprints_of(calibrations[1], table_b),
+    )
     sampled = first.has("posterior") and second.has("posterior")
     pair: tuple[Any, Any] = (first.posterior, second.posterior) if sampled else calibrations
     return compare(
-        *pair, labels=labels, same_data=same_data, observations=observations, fingerprints=fingerprints, **options
+        *pair,
+        labels=labels,
+        same_data=same_data,
+        observations=observations,
+        fingerprints=fingerprints,
+        **options,
     )
 
 
 @bounded
-def compare_split(run: PathLike, how: str = "odd-even", *, seed: int = 0, **options: Any) -> CameraComparison:
+def compare_split(
+    run: PathLike, how: str = "odd-even", *, seed: int = 0, **options: Any
+) -> CameraComparison:
     """Calibrate two halves of a run's frames by themselves and compare them.
 
     Parameters
@@ -88,12 +103,16 @@ def compare_split(run: PathLike, how: str = "odd-even", *, seed: int = 0, **opti
     cal = whole.calibration
     obs = _table(whole)
     if obs is None:
-        raise RunFolderError(f"{run}: holds no observations to split; calibrate a table that it can keep.")
+        raise RunFolderError(
+            f"{run}: holds no observations to split; calibrate a table that it can keep."
+        )
     return compare_halves(obs, cal.nominal, how, seed=seed, method=cal.method, **options)
 
 
 def _table(run: Run) -> Observations | None:
-    """The observations of a run; None for those of a stream, which kept none, and of partitions, but for a sample."""
+    """The observations of a run; None for those of a stream, which kept none, and of partitions,
+    but for a sample.
+    """
     if run.calibration.partitions is not None:
         return None
     return run.observations if run.has("observations") and run.observations.n_stars else None

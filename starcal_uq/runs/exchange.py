@@ -1,4 +1,6 @@
-"""What a run gives to other programs: its camera in their files, the covariance, the draws, and tables for a text."""
+"""What a run gives to other programs: its camera in their files, the covariance, the draws, and
+tables for a text.
+"""
 
 from __future__ import annotations
 
@@ -39,13 +41,13 @@ def export(
     Parameters
     ----------
     what : path, Run, Calibration, Posterior or Camera
-        A run gives the mean of its posterior, or its estimate where there is no posterior. A path is that of a run
-        folder, or of a camera.
+        A run gives the mean of its posterior, or its estimate where there is no posterior. A path
+        is that of a run folder, or of a camera.
     to : str
-        One of `FORMATS`. ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``tetra3rs``, ``tetra3``, ``sip`` and ``asdf``
-        hold the camera; ``covariance`` (JSON) parameters and their covariance, ``csv`` and ``netcdf`` the draws,
-        ``arviz`` (netCDF) a thousand of them with all of ArviZ's groups, ``latex`` and ``markdown`` the table of the
-        parameters.
+        One of `FORMATS`. ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``tetra3rs``, ``tetra3``,
+        ``sip`` and ``asdf`` hold the camera; ``covariance`` (JSON) parameters and their covariance,
+        ``csv`` and ``netcdf`` the draws, ``arviz`` (netCDF) a thousand of them with all of ArviZ's
+        groups, ``latex`` and ``markdown`` the table of the parameters.
     path : path, optional
         File to write; by default one in the current folder, named after the run and the format.
     force : bool
@@ -76,11 +78,16 @@ def export(
         name, what = what.name, what.best
     place = Path(f"{name}-{to}{FORMATS[to]}" if path is None else path)
     if to in CAMERA_FORMATS:
-        return export_camera(what if isinstance(what, Camera) else _camera_of(what), to, place, force=force)
+        return export_camera(
+            what if isinstance(what, Camera) else _camera_of(what), to, place, force=force
+        )
     if isinstance(what, Camera):
         raise RunFolderError(f"a camera alone has no {to}: name the folder of a run.")
     if to in _OF_DRAWS and not isinstance(what, Posterior):
-        raise RunFolderError(f"{name}: has no draws for {to}; run `starcal-uq sample RUN` first, or export covariance.")
+        raise RunFolderError(
+            f"{name}: has no draws for {to}; run `starcal-uq sample RUN` first, or export "
+            "covariance."
+        )
     ensure_new(place, force)
     if to == "arviz":
         if run is None or not isinstance(what, Posterior):
@@ -95,7 +102,9 @@ def _camera_of(best: Calibration | Posterior) -> Camera:
 
 
 def _write_covariance(best: Calibration | Posterior, path: Path) -> str:
-    """Parameters with their units and covariance, px units, as a filter takes them for its state."""
+    """Parameters with their units and covariance, px units, as a filter takes them for its
+    state.
+    """
     specs = parameters(best.camera.distortion)
     content: AnyDict = {
         "format": COVARIANCE,
@@ -109,7 +118,10 @@ def _write_covariance(best: Calibration | Posterior, path: Path) -> str:
         "versions": best.provenance.get("versions"),
     }
     atomic_write_text(path, json.dumps(content, indent=1) + "\n")
-    return f"mean and covariance of {', '.join(p.name for p in specs)}, of the {content['source']}, in px units."
+    return (
+        f"mean and covariance of {', '.join(p.name for p in specs)}, of the {content['source']}, "
+        "in px units."
+    )
 
 
 def _write_draws(best: Calibration | Posterior, path: Path) -> str:
@@ -128,7 +140,9 @@ def _write_netcdf(best: Calibration | Posterior, path: Path) -> str:
     return f"{len(best.draws)} draws, as ArviZ and xarray read them."
 
 
-def _write_table(mark: Callable[[TextTable], str], needs: str = "") -> Callable[[Calibration | Posterior, Path], str]:
+def _write_table(
+    mark: Callable[[TextTable], str], needs: str = ""
+) -> Callable[[Calibration | Posterior, Path], str]:
     def write(best: Calibration | Posterior, path: Path) -> str:
         table = posterior_table(best) if isinstance(best, Posterior) else calibration_table(best)
         atomic_write_text(path, mark(table) + "\n")

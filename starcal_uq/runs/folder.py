@@ -1,8 +1,9 @@
-"""The run folder: its file names, the rule by which steps replace results, and the check that a file is of this run.
+"""The run folder: its file names, the rule by which steps replace results, and the check that a
+file is of this run.
 
-The rule. What a run holds is kept unless it is forced to go. A step that is done again removes what rests on its
-result, and names it first; a budget is a further result, and makes a report older. All files of a step are replaced at
-once; files that the run has not written are left alone.
+The rule. What a run holds is kept unless it is forced to go. A step that is done again removes what
+rests on its result, and names it first; a budget is a further result, and makes a report older. All
+files of a step are replaced at once; files that the run has not written are left alone.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import STEP, PathLike, as_plain, check_new_folder, flushed_together, new_folder
+from starcal_uq.core.files import (
+    STEP,
+    PathLike,
+    as_plain,
+    check_new_folder,
+    flushed_together,
+    new_folder,
+)
 from starcal_uq.core.manifest import (
     MANIFEST,
     NEW,
@@ -40,7 +48,9 @@ _CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN"
 
 
 class _File:
-    """A file of a run folder: its name, the command that makes it, and the step that it belongs to."""
+    """A file of a run folder: its name, the command that makes it, and the step that it
+    belongs to.
+    """
 
     def __init__(self, name: str, command: str) -> None:
         self.name, self.command, self.step = name, command, command.split()[1]
@@ -62,7 +72,16 @@ CHECKPOINT = "sampling.checkpoint.npz"
 _PAGES = ("report", "pdf", "notebook")
 # Step -> steps that rest on its result.
 REST_ON: dict[str, tuple[str, ...]] = {
-    "calibrate": ("images", "inspect", "sample", "coupling", "propagate", "diagnose", "budget", *_PAGES),
+    "calibrate": (
+        "images",
+        "inspect",
+        "sample",
+        "coupling",
+        "propagate",
+        "diagnose",
+        "budget",
+        *_PAGES,
+    ),
     "images": ("inspect", *_PAGES),
     "inspect": (),
     "sample": ("coupling", "propagate", "budget", *_PAGES),
@@ -74,12 +93,15 @@ REST_ON: dict[str, tuple[str, ...]] = {
     "pdf": (),
     "notebook": (),
 }
-# A further result of the run replaces nothing but a file of its name: what rests on it stays, and is older.
+# A further result of the run replaces nothing but a file of its name: what rests on it stays, and
+# is older.
 _ADDED = ("budget",)
 # Files that have no name of their own in a run.
 _OTHERS = {
     **dict.fromkeys(DIAGNOSIS_TABLES.values(), "diagnose"),
-    **dict.fromkeys(("centroids.parquet", "identification.csv", "images.json", "matched.parquet"), "images"),
+    **dict.fromkeys(
+        ("centroids.parquet", "identification.csv", "images.json", "matched.parquet"), "images"
+    ),
     HISTORY: "calibrate",
 }
 
@@ -97,7 +119,8 @@ class RunFolder:
     camera : Path
         The nominal camera, as it was given (TOML).
     calibrated : Path
-        The calibrated camera: at the posterior mean, or the estimate where there is no posterior (TOML).
+        The calibrated camera: at the posterior mean, or the estimate where there is no posterior
+        (TOML).
     calibration : Path
         Estimate, covariance, stages, status and provenance (JSON).
     arrays : Path
@@ -180,8 +203,8 @@ class RunFolder:
         Raises
         ------
         RunFolderError
-            If the folder or the file is missing, or the file is not the one that the run has written; the message names
-            the command that makes it.
+            If the folder or the file is missing, or the file is not the one that the run has
+            written; the message names the command that makes it.
         ValueError
             If a run folder has no file of that name.
         """
@@ -189,32 +212,50 @@ class RunFolder:
             raise ValueError(f"a run folder has no {name!r}: use one of {', '.join(FILES)}")
         file = FILES[name]
         if os.path.exists(self.path) and not os.path.isdir(self.path):
-            raise RunFolderError(f"{self.path}: is not a run folder but a file; name the folder given to -o.")
+            raise RunFolderError(
+                f"{self.path}: is not a run folder but a file; name the folder given to -o."
+            )
         if not os.path.isdir(self.path):
             raise RunFolderError(
-                f"{self.path}: the run folder does not exist; check the path, or run `{file.command}` first."
+                f"{self.path}: the run folder does not exist; check the path, or run "
+                f"`{file.command}` first."
             )
         # Read first: it may have files to put in their places.
         manifest = read_manifest(self.path)
         path = self.path / file.name
         if not os.path.exists(path):
-            raise RunFolderError(f"{self.path}: the run folder has no {file.name}; run `{file.command}` first.")
+            raise RunFolderError(
+                f"{self.path}: the run folder has no {file.name}; run `{file.command}` first."
+            )
         # Folders of versions before this one have no record.
         if manifest is not None:
-            check_file(path, manifest.files.get(file.name), f"run `{file.command} --force` to make it again")
+            check_file(
+                path,
+                manifest.files.get(file.name),
+                f"run `{file.command} --force` to make it again",
+            )
         return path
 
     @property
     def manifest(self) -> Manifest:
-        """What the run holds; of a folder made by a version without records, the files by their names."""
+        """What the run holds; of a folder made by a version without records, the files by their
+        names.
+        """
         found = read_manifest(self.path)
         if found is not None:
             return found
         if not (os.path.exists(self.calibration) or os.path.exists(self.posterior)):
             return Manifest()
         steps = {file.name: file.step for file in FILES.values()} | _OTHERS
-        steps |= {path.relative_to(self.path).as_posix(): "report" for path in self.figures.glob("*.[ps][nv]g")}
-        files = {name: entry_of(self.path / name, steps[name]) for name in steps if (self.path / name).is_file()}
+        steps |= {
+            path.relative_to(self.path).as_posix(): "report"
+            for path in self.figures.glob("*.[ps][nv]g")
+        }
+        files = {
+            name: entry_of(self.path / name, steps[name])
+            for name in steps
+            if (self.path / name).is_file()
+        }
         return Manifest(files, {entry.step: {} for entry in files.values()})
 
     def resting_on(self, step: str) -> list[str]:
@@ -225,7 +266,9 @@ class RunFolder:
     def is_older(self, step: str) -> bool:
         """Whether a step is done, and something that it rests on was done after it."""
         steps = list(self.manifest.steps)
-        return step in steps and any(step in REST_ON[later] for later in steps[steps.index(step) + 1 :])
+        return step in steps and any(
+            step in REST_ON[later] for later in steps[steps.index(step) + 1 :]
+        )
 
     @contextmanager
     def writing(self, *, make: bool = False) -> Iterator[None]:
@@ -244,7 +287,8 @@ class RunFolder:
         tell: Callable[[str], None] | None = None,
         words: Sequence[str] = (),
     ) -> Iterator[RunFolder]:
-        """Yield a folder for the files of a step, which take their places all at once if the block succeeds.
+        """Yield a folder for the files of a step, which take their places all at once if the block
+        succeeds.
 
         Parameters
         ----------
@@ -253,7 +297,8 @@ class RunFolder:
         record : dict
             Its provenance.
         making : bool
-            Whether it belongs to the command that makes the whole run; a step of its own ends what that had begun.
+            Whether it belongs to the command that makes the whole run; a step of its own ends what
+            that had begun.
         tell : callable, optional
             Function that gets the sentence on what goes.
         words : sequence of str
@@ -278,7 +323,9 @@ class RunFolder:
             if step == "calibrate":
                 remove_checkpoints(self.path)
                 shutil.rmtree(self.path / NEW, ignore_errors=True)
-            steps = {name: content for name, content in old.steps.items() if name not in (step, *stale)}
+            steps = {
+                name: content for name, content in old.steps.items() if name not in (step, *stale)
+            }
             steps[step] = record
             new = replace(old, files=kept | made, steps=steps, stage=STEP)
             if step == "calibrate" and not making:
@@ -288,11 +335,15 @@ class RunFolder:
             commit(self.path, new, old.files)
 
     @contextmanager
-    def making(self, command: Mapping[str, object], force: bool, words: Sequence[str] = ()) -> Iterator[RunFolder]:
-        """Yield the folder in which one command makes a whole run, which goes on where it was interrupted.
+    def making(
+        self, command: Mapping[str, object], force: bool, words: Sequence[str] = ()
+    ) -> Iterator[RunFolder]:
+        """Yield the folder in which one command makes a whole run, which goes on where it was
+        interrupted.
 
-        That is this folder. Where it holds another run, it is a hidden one inside, whose files take their places all at
-        once when the run is complete; an error, a kill or a full disk leaves the run of before.
+        That is this folder. Where it holds another run, it is a hidden one inside, whose files take
+        their places all at once when the run is complete; an error, a kill or a full disk leaves
+        the run of before.
 
         Parameters
         ----------
@@ -344,7 +395,9 @@ class RunFolder:
         check_hidden(self.path, NEW, (CHECKPOINT,))
 
     def _tried(self, old: Manifest, command: AnyDict, words: Sequence[str]) -> tuple[AnyDict, ...]:
-        """Options and outcomes of the runs of the same data that stood here, up to one with the options of this one."""
+        """Options and outcomes of the runs of the same data that stood here, up to one with the
+        options of this one.
+        """
         from starcal_uq.diagnostics.verdict.remedies import parsed
 
         if not old.complete or not old.words or _data_of(old.command) != _data_of(command):
@@ -352,7 +405,9 @@ class RunFolder:
         levels = []
         with suppress(OSError, ValueError, KeyError, TypeError):
             checks = json.loads(self.verdict.read_text(encoding="utf-8"))["checks"]
-            levels = [check["level"] for check in checks if check["question"] != Question.REQUIRED.value]
+            levels = [
+                check["level"] for check in checks if check["question"] != Question.REQUIRED.value
+            ]
         if not levels:
             return ()
         failed, warned = (levels.count(level.value) for level in (Level.FAIL, Level.WARN))
@@ -392,4 +447,7 @@ def _gone(names: list[str], folder: Path) -> str:
     shown = [name for name in names if not name.startswith("figures/")]
     commands = dict.fromkeys(file.command for file in FILES.values() if file.name in shown)
     again = ", ".join(f"`{command.replace('RUN', str(folder), 1)}`" for command in commands)
-    return f"{', '.join(shown)}: removed, because it rested on what is replaced; run {again} to make it again."
+    return (
+        f"{', '.join(shown)}: removed, because it rested on what is replaced; run {again} to "
+        "make it again."
+    )

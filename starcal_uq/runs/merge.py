@@ -1,4 +1,6 @@
-"""Merge run folders into a run folder, with the observations of all of them where they are there."""
+"""Merge run folders into a run folder, with the observations of all of them where they are
+there.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,13 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import optimum
 from starcal_uq.estimation.duplicates import fingerprints_of
 from starcal_uq.estimation.fingerprints import shared
-from starcal_uq.estimation.merging import check_mergeable, merge, merging_noise, refuse_shared, renumbered
+from starcal_uq.estimation.merging import (
+    check_mergeable,
+    merge,
+    merging_noise,
+    refuse_shared,
+    renumbered,
+)
 from starcal_uq.observations.table import Observations, joined_columns
 from starcal_uq.runs.run import Run
 
@@ -31,9 +39,10 @@ def merge_runs(
 ) -> Calibration:
     """Merge run folders and write the result as a run folder.
 
-    Where every run still holds the observations it was calibrated on, they are joined (`join_observations`) and written
-    too, so that exact checks and the attitude error remain possible. Otherwise the merged run has none: `sample` takes
-    it with ``obs=None``, and its residuals and attitudes are those of the runs.
+    Where every run still holds the observations it was calibrated on, they are joined
+    (`join_observations`) and written too, so that exact checks and the attitude error remain
+    possible. Otherwise the merged run has none: `sample` takes it with ``obs=None``, and its
+    residuals and attitudes are those of the runs.
 
     Parameters
     ----------
@@ -44,8 +53,9 @@ def merge_runs(
     noise, allow_inconsistent
         As in `merging.merge`.
     duplicates : {"refuse", "drop", "keep"}
-        What to do with frames that hold the same measurement in two runs. ``drop`` leaves them out of the later run,
-        which is calibrated again without them and must hold its observations for that.
+        What to do with frames that hold the same measurement in two runs. ``drop`` leaves them out
+        of the later run, which is calibrated again without them and must hold its observations for
+        that.
     force : bool
         Replace the results in `out` if it is not empty.
 
@@ -78,14 +88,23 @@ def merge_runs(
     joined = None
     if len(present) == len(tables) and len(present) > 1:
         if duplicates == "refuse":
-            # Said before the joined table finds stars that agree to the last bit: by frames, with the way out.
-            marks = [fingerprints_of(cal, table) for cal, table in zip(calibrations, present, strict=True)]
+            # Said before the joined table finds stars that agree to the last bit: by frames, with
+            # the way out.
+            marks = [
+                fingerprints_of(cal, table)
+                for cal, table in zip(calibrations, present, strict=True)
+            ]
             refuse_shared(calibrations, marks, names)
         noise = merging_noise(calibrations, noise)
         stated = [optimum(cal.compressed).sigma for cal in calibrations] if noise == "own" else None
         joined = join_observations(present, names, stated, keep_shared=duplicates == "keep")
     merged = merge(
-        calibrations, joined, names=names, noise=noise, allow_inconsistent=allow_inconsistent, duplicates=duplicates
+        calibrations,
+        joined,
+        names=names,
+        noise=noise,
+        allow_inconsistent=allow_inconsistent,
+        duplicates=duplicates,
     )
     if target is not None:
         target.write(merged, joined)
@@ -101,33 +120,47 @@ def join_observations(
 ) -> Observations:
     """All rows in one table, frames renumbered run by run.
 
-    The frame numbers of the first run stay, those of each further run are shifted to follow; ``meta["merged"]`` holds
-    the shifts. An optional column that only some runs have is filled where it may have gaps, and left out otherwise.
-    `noise` of each run (px, or a factor on what its stars state) is written as their stated noise. A star of a frame
-    that is in two runs is refused unless `keep_shared`; so are tables of which only some state their noise, and
-    directions of different kinds.
+    The frame numbers of the first run stay, those of each further run are shifted to follow;
+    ``meta["merged"]`` holds the shifts. An optional column that only some runs have is filled where
+    it may have gaps, and left out otherwise. `noise` of each run (px, or a factor on what its stars
+    state) is written as their stated noise. A star of a frame that is in two runs is refused unless
+    `keep_shared`; so are tables of which only some state their noise, and directions of different
+    kinds.
     """
     kinds = {table.meta["directions"] for table in tables}
     if len(kinds) > 1:
         raise CalibrationError(
-            f"the runs' directions are of different kinds ({', '.join(sorted(kinds))}), so that their focal lengths "
+            f"the runs' directions are of different kinds ({', '.join(sorted(kinds))}), so that "
+            "their focal lengths "
             "mean different things: declare them when calibrating."
         )
     _, shifts = renumbered([table.frame_ids for table in tables])
     if noise is None:
         if len({table.sigma_px is None for table in tables}) > 1:
-            raise CalibrationError("only some of the runs state the noise of their stars: merge with noise 'own'.")
+            raise CalibrationError(
+                "only some of the runs state the noise of their stars: merge with noise 'own'."
+            )
         columns = joined_columns(tables)
     else:
         columns = joined_columns(tables, sigma_px=list(map(_stated, tables, noise)))
-    columns["frame"] = np.concatenate([table.frame + shift for table, shift in zip(tables, shifts, strict=True)])
+    columns["frame"] = np.concatenate(
+        [table.frame + shift for table, shift in zip(tables, shifts, strict=True)]
+    )
     if not keep_shared:
         _check_disjoint(columns, tables, names)
     parts = [
-        {"name": name, "frame_shift": shift, "n_frames": table.n_frames, "data_sha256": table.data_hash}
+        {
+            "name": name,
+            "frame_shift": shift,
+            "n_frames": table.n_frames,
+            "data_sha256": table.data_hash,
+        }
         for name, shift, table in zip(names, shifts, tables, strict=True)
     ]
-    meta: AnyDict = {"directions": tables[0].meta["directions"], "source": f"merged from {', '.join(names)}"}
+    meta: AnyDict = {
+        "directions": tables[0].meta["directions"],
+        "source": f"merged from {', '.join(names)}",
+    }
     truths = [table.meta.get("truth") for table in tables]
     if truths[0] is not None and all(truth == truths[0] for truth in truths):
         meta["truth"] = truths[0]
@@ -151,15 +184,22 @@ def _check_disjoint(columns: AnyDict, tables: Sequence[Observations], names: Seq
         at = int(np.flatnonzero(shared)[0])
         first, second = owner[order[at]], owner[order[at + 1]]
         raise CalibrationError(
-            f"{names[second]}: {int(np.sum(shared))} of its stars are measurements that another run holds too (first "
-            f"{names[first]}), which would count twice: leave one of the runs out, or calibrate them apart."
+            f"{names[second]}: {int(np.sum(shared))} of its stars are measurements that another "
+            "run holds too (first "
+            f"{names[first]}), which would count twice: leave one of the runs out, or calibrate "
+            "them apart."
         )
 
 
-def _drop_shared(calibrations: list[Calibration], tables: list[Observations | None], names: Sequence[str]) -> None:
+def _drop_shared(
+    calibrations: list[Calibration], tables: list[Observations | None], names: Sequence[str]
+) -> None:
     """Leave the frames that an earlier run holds out of each later run, and calibrate it again."""
     for i, (name, table) in enumerate(zip(names, tables, strict=True)):
-        marks = [fingerprints_of(cal, obs) for cal, obs in zip(calibrations[: i + 1], tables, strict=False)]
+        marks = [
+            fingerprints_of(cal, obs)
+            for cal, obs in zip(calibrations[: i + 1], tables, strict=False)
+        ]
         own = marks.pop()
         places = [shared(mark, own)[:, 1] for mark in marks if mark is not None and own is not None]
         repeating = np.unique(np.concatenate(places)) if places else np.empty(0, dtype=np.int64)
@@ -167,21 +207,28 @@ def _drop_shared(calibrations: list[Calibration], tables: list[Observations | No
             continue
         cal = calibrations[i]
         if len(repeating) == cal.n_frames:
-            raise CalibrationError(f"{name}: all of its frames are measurements that earlier runs hold: leave it out.")
+            raise CalibrationError(
+                f"{name}: all of its frames are measurements that earlier runs hold: leave it out."
+            )
         if table is None:
             raise CalibrationError(
-                f"{name}: {len(repeating)} of its frames are measurements that an earlier run holds, and it has no "
+                f"{name}: {len(repeating)} of its frames are measurements that an earlier run "
+                "holds, and it has no "
                 "observations to be calibrated again without them: leave one of the runs out."
             )
         rest = table.select_frames(np.delete(table.frame_ids, repeating))
         tables[i] = rest
         noise = cal.provenance["settings"].get("noise", "common")
         model = cal.nominal.distortion
-        calibrations[i] = calibrate(rest, cal.nominal, model=model, method=cal.method, noise=noise, duplicates="keep")
+        calibrations[i] = calibrate(
+            rest, cal.nominal, model=model, method=cal.method, noise=noise, duplicates="keep"
+        )
 
 
 def _own_observations(run: Run) -> Observations | None:
-    """The observations of a run; None where they are missing, no longer those of its calibration, or a sample."""
+    """The observations of a run; None where they are missing, no longer those of its calibration,
+    or a sample.
+    """
     if run.calibration.partitions is not None:
         return None
     try:
@@ -198,5 +245,7 @@ def _names(runs: Sequence[Run]) -> list[str]:
 def _check_target(target: Run, runs: Sequence[Run], force: bool) -> None:
     place: Path = target.path.resolve()
     if any(run.path.resolve() == place for run in runs):
-        raise RunFolderError(f"{target.path}: is one of the runs to merge; name another folder for the result.")
+        raise RunFolderError(
+            f"{target.path}: is one of the runs to merge; name another folder for the result."
+        )
     check_new_folder(target.path, force)

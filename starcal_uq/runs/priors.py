@@ -24,7 +24,9 @@ _CHAIN = Section(
     },
     PriorError,
 )
-_SHIFT = Section({name: Key(float, "a number, zero or more", ge=0.0) for name in SHIFT_KEYS}, PriorError)
+_SHIFT = Section(
+    {name: Key(float, "a number, zero or more", ge=0.0) for name in SHIFT_KEYS}, PriorError
+)
 
 
 def prior_from_run(run: str | Path, **options: Any) -> GaussianPriors:
@@ -43,12 +45,17 @@ def read_priors(run: Run, path: str | Path) -> Priors:
 
 
 def load_priors(
-    path: str | Path, camera: Camera, per_star_sigma: bool = False, data_sha256: Collection[str] = ()
+    path: str | Path,
+    camera: Camera,
+    per_star_sigma: bool = False,
+    data_sha256: Collection[str] = (),
 ) -> Priors:
-    """Read a ``[priors]`` table: physical terms, or ``prior_from = "RUN"`` for the posterior of an earlier run.
+    """Read a ``[priors]`` table: physical terms, or ``prior_from = "RUN"`` for the posterior of an
+    earlier run.
 
-    With ``prior_from`` (relative to the file), the table may hold ``inflation``, ``noise`` (``default``, ``posterior``)
-    and a table ``[priors.shift]`` with ``principal_point_px``, ``focal_fraction`` and ``distortion_corner_px``.
+    With ``prior_from`` (relative to the file), the table may hold ``inflation``, ``noise``
+    (``default``, ``posterior``) and a table ``[priors.shift]`` with ``principal_point_px``,
+    ``focal_fraction`` and ``distortion_corner_px``.
 
     Parameters
     ----------
@@ -64,7 +71,8 @@ def load_priors(
     Raises
     ------
     PriorError
-        For a file that cannot be read, an unknown key, or an earlier run of another camera or of the same data.
+        For a file that cannot be read, an unknown key, or an earlier run of another camera or of
+        the same data.
     """
     table = read_section(path, "priors", PriorError, alone=False)
     if "prior_from" not in table:
@@ -73,7 +81,9 @@ def load_priors(
     shift = _SHIFT.check(options.pop("shift", {}), f"{path}, section [priors.shift]")
     run = Path(path).parent / options.pop("prior_from")
     try:
-        priors = prior_from_run(run, per_star_sigma=per_star_sigma, shift=AllowedShift(**shift), **options)
+        priors = prior_from_run(
+            run, per_star_sigma=per_star_sigma, shift=AllowedShift(**shift), **options
+        )
         check_chain(priors, camera, data_sha256)
     except PriorError as error:
         raise PriorError(f"{path}: {error}") from None

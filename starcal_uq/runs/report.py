@@ -31,14 +31,16 @@ def report(
     Parameters
     ----------
     what : path, Run, Plan, CameraComparison, Budget, Study or Frames
-        Folder of a run that holds a calibration at least, whose ``report.html`` and ``figures`` are written; what is
-        missing beyond that is named in the report together with the command that makes it. Or a result.
+        Folder of a run that holds a calibration at least, whose ``report.html`` and ``figures`` are
+        written; what is missing beyond that is named in the report together with the command that
+        makes it. Or a result.
     to : path, optional
-        Folder for the page of a plan, a comparison or a study, file for that of frames (`Run.inspect`) or of a budget,
-        whose ending names the format (``.html``, ``.xlsx``, ``.tex``, ``.csv``); a run has its own place.
+        Folder for the page of a plan, a comparison or a study, file for that of frames
+        (`Run.inspect`) or of a budget, whose ending names the format (``.html``, ``.xlsx``,
+        ``.tex``, ``.csv``); a run has its own place.
     truth : Camera, optional
-        The camera of a simulation, shown beside the estimate of a run. Observations made by `starcal_uq.simulate`
-        carry it, and it is then taken from them.
+        The camera of a simulation, shown beside the estimate of a run. Observations made by
+        `starcal_uq.simulate` carry it, and it is then taken from them.
     format : {"html", "pdf"}
         ``"pdf"`` prints the page of a run as well, by an installed browser or WeasyPrint.
 
@@ -63,7 +65,10 @@ def report(
         # A truth that is given is not of the folder.
         return (run.pdf if format == "pdf" else run.report)(force=truth is not None)
     if format != "html":
-        raise TypeError(f"only the report of a run is printed: open the page of a {type(what).__name__} in a browser.")
+        raise TypeError(
+            f"only the report of a run is printed: open the page of a {type(what).__name__} in a "
+            "browser."
+        )
     if to is None:
         raise TypeError(f"say where the page of a {type(what).__name__} goes: report(what, to).")
     from starcal_uq.presentation.pages.write import write_page

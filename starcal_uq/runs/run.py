@@ -1,6 +1,7 @@
 """A run: the results in a folder, each loaded once, and the steps that add to them.
 
-A step takes results and gives one, and writes it. `RunFolder` has the rule by which it replaces what was there.
+A step takes results and gives one, and writes it. `RunFolder` has the rule by which it replaces
+what was there.
 """
 
 from __future__ import annotations
@@ -41,7 +42,15 @@ from starcal_uq.observations.files import arrow_values
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
-from starcal_uq.runs.folder import CHECKPOINT, DIAGNOSIS_TABLES, FILES, HISTORY, REST_ON, RunFolder, remove_checkpoints
+from starcal_uq.runs.folder import (
+    CHECKPOINT,
+    DIAGNOSIS_TABLES,
+    FILES,
+    HISTORY,
+    REST_ON,
+    RunFolder,
+    remove_checkpoints,
+)
 
 # Frames in a report, whose pictures are some hundred kilobytes together.
 REPORT_FRAMES = 12
@@ -87,11 +96,13 @@ class MissionSky:
     n_frames : int
         Number of random attitudes.
     min_stars : int or None
-        Least stars of a frame that gives an attitude; 5 at random attitudes and 3 along a profile by default.
+        Least stars of a frame that gives an attitude; 5 at random attitudes and 3 along a profile
+        by default.
     rate_hz : float or None
         Frames per second along the profile; its own instants where it is None.
     scalar, sense
-        Conventions of the profile's quaternions, as for `starcal_uq.attitude.load_attitude_profile`.
+        Conventions of the profile's quaternions, as for
+        `starcal_uq.attitude.load_attitude_profile`.
     """
 
     profile: Path | None = None
@@ -105,7 +116,9 @@ class MissionSky:
 
     @bounded
     def frames(self, posterior: Posterior, obs: Observations, seed: int) -> Observations:
-        """Noise-free frames, with the noise of the observed ones by magnitude where it is stated."""
+        """Noise-free frames, with the noise of the observed ones by magnitude where it is
+        stated.
+        """
         from starcal_uq.attitude.profile import load_attitude_profile
         from starcal_uq.simulation.mission import mission_frames, profile_frames
         from starcal_uq.sky.catalogue import load_catalogue
@@ -115,10 +128,17 @@ class MissionSky:
         like = obs if posterior.sigma_name == sigma_parameter(True).name else None
         if self.profile is None:
             return mission_frames(
-                stars, camera, n_frames=self.n_frames, min_stars=self.min_stars or 5, seed=seed, noise_like=like
+                stars,
+                camera,
+                n_frames=self.n_frames,
+                min_stars=self.min_stars or 5,
+                seed=seed,
+                noise_like=like,
             )
         profile = load_attitude_profile(self.profile, scalar=self.scalar, sense=self.sense)
-        frames = profile_frames(stars, camera, profile, self.rate_hz, min_stars=self.min_stars or 3, noise_like=like)
+        frames = profile_frames(
+            stars, camera, profile, self.rate_hz, min_stars=self.min_stars or 3, noise_like=like
+        )
         return frames.with_meta(messages=[*profile.messages])
 
 
@@ -137,7 +157,8 @@ def _writing(method: Callable[P, R]) -> Callable[P, R]:
 class Run:
     """A run folder with what it holds; a result is loaded when it is first asked for.
 
-    A result that is not there raises `RunFolderError`, whose message names the command that makes it.
+    A result that is not there raises `RunFolderError`, whose message names the command that makes
+    it.
 
     Parameters
     ----------
@@ -153,13 +174,18 @@ class Run:
     path : Path
         The folder.
     folder : RunFolder
-        The folder and the paths of its files; a hidden one inside, while a command makes a run to replace this one.
+        The folder and the paths of its files; a hidden one inside, while a command makes a run to
+        replace this one.
     screening : Screening or None
         What the last `calibrate` of this object left out, if it screened.
     """
 
     def __init__(
-        self, path: PathLike, truth: Camera | None = None, *, tell: Callable[[str], None] | None = None
+        self,
+        path: PathLike,
+        truth: Camera | None = None,
+        *,
+        tell: Callable[[str], None] | None = None,
     ) -> None:
         self.path, self.folder = Path(path), RunFolder(path)
         self._truth, self._tell, self._making = truth, tell, False
@@ -208,18 +234,26 @@ class Run:
 
     @property
     def camera_changed(self) -> str:
-        """That the file of the nominal camera was changed after the run was made, in one sentence; empty if not."""
+        """That the file of the nominal camera was changed after the run was made, in one sentence;
+        empty if not.
+        """
         known = self.folder.manifest.files.get(RunFolder.camera.name)
-        if known is None or not self.has("camera") or known == entry_of(self.folder.camera, known.step):
+        if (
+            known is None
+            or not self.has("camera")
+            or known == entry_of(self.folder.camera, known.step)
+        ):
             return ""
         return (
-            f"{self.folder.camera}: was changed after the run was made; its results are of the camera as it was, not "
+            f"{self.folder.camera}: was changed after the run was made; its results are of the "
+            "camera as it was, not "
             "of this file."
         )
 
     @cached_property
     def observations(self) -> Observations:
-        """The data that the calibration was made from, with the noise that its noise model gives each star.
+        """The data that the calibration was made from, with the noise that its noise model gives
+        each star.
 
         The file holds them as they were given.
 
@@ -232,7 +266,8 @@ class Run:
         table = load_observations(self.folder.require("observations"))
         if calibration.data_hash_of(table) != calibration.provenance.get("data_sha256"):
             raise RunFolderError(
-                f"{self.path}: the calibration was made from other observations than {self.folder.observations.name} "
+                f"{self.path}: the calibration was made from other observations than "
+                f"{self.folder.observations.name} "
                 "holds; run `starcal-uq calibrate` again."
             )
         return weighed(table, calibration)
@@ -245,7 +280,8 @@ class Run:
         return Posterior.load(self.folder.require("posterior"))
 
     def arviz(self, **options: Any) -> Any:
-        """The posterior with all of ArviZ's groups, as ``InferenceData`` (0.23) or ``DataTree`` (1.x); made each time.
+        """The posterior with all of ArviZ's groups, as ``InferenceData`` (0.23) or ``DataTree``
+        (1.x); made each time.
 
         Parameters
         ----------
@@ -258,7 +294,9 @@ class Run:
 
     @property
     def best(self) -> Calibration | Posterior:
-        """What the run knows of the camera: the posterior, or the calibration where there is no posterior yet."""
+        """What the run knows of the camera: the posterior, or the calibration where there is no
+        posterior yet.
+        """
         return self.posterior if self.has("posterior") else self.calibration
 
     @cached_property
@@ -314,7 +352,9 @@ class Run:
 
     @cached_property
     def images(self) -> ImageRecord | None:
-        """What became of the images that the run started from; None where it started from a table."""
+        """What became of the images that the run started from; None where it started from a
+        table.
+        """
         from starcal_uq.pipeline.record import IMAGES, ImageRecord
 
         path = self.folder.path / IMAGES
@@ -342,19 +382,30 @@ class Run:
         obs = self.observations
         if record is None:
             raise RunFolderError(
-                f"{self.path}: has no {IMAGES}, because the run did not start from images; to look at some, run "
+                f"{self.path}: has no {IMAGES}, because the run did not start from images; to "
+                "look at some, run "
                 "`starcal-uq run IMAGES... -o RUN`."
             )
         path = self.folder.path / IDENTIFICATION
-        with reading(path, "a table of identified frames", "run `starcal-uq run IMAGES... -o RUN` again"):
+        with reading(
+            path, "a table of identified frames", "run `starcal-uq run IMAGES... -o RUN` again"
+        ):
             table = pd.read_csv(path)
-            seconds = dict(zip(table["frame"].tolist(), (1e-3 * table["milliseconds"]).tolist(), strict=True))
+            seconds = dict(
+                zip(table["frame"].tolist(), (1e-3 * table["milliseconds"]).tolist(), strict=True)
+            )
         reasons = {}
         if self.has("rejected"):
             path = self.folder.rejected
             with reading(path, "a table of rejected stars", "run `starcal-uq calibrate` again"):
                 table = pd.read_csv(path)
-                reasons = dict(zip(zip(table["frame"], table["star_id"], strict=True), table["reason"], strict=True))
+                reasons = dict(
+                    zip(
+                        zip(table["frame"], table["star_id"], strict=True),
+                        table["reason"],
+                        strict=True,
+                    )
+                )
         matched, cal = self.folder.path / MATCHED, self.calibration
         return Frames(
             str(self.path),
@@ -372,7 +423,9 @@ class Run:
         )
 
     def _uncalibrated(self, record: ImageRecord) -> Frames:
-        """The images where nothing could be calibrated: detections, and stars where some were identified."""
+        """The images where nothing could be calibrated: detections, and stars where some were
+        identified.
+        """
         import numpy as np
 
         from starcal_uq.identification.engine import sheet_of
@@ -382,7 +435,9 @@ class Run:
 
         folder = self.folder.path
         centroids, none = Centroids.load(folder / CENTROIDS), np.empty(0)
-        nothing = Observations(frame=none.astype(int), x_px=none, y_px=none, ra_deg=none, dec_deg=none)
+        nothing = Observations(
+            frame=none.astype(int), x_px=none, y_px=none, ra_deg=none, dec_deg=none
+        )
         matched = load_observations(folder / MATCHED) if (folder / MATCHED).exists() else nothing
         known = self.has("camera")
         return Frames(
@@ -398,8 +453,11 @@ class Run:
             known=known,
         )
 
-    def inspect(self, *which: int | str, most: int = 24, images: Sequence[PathLike] | None = None) -> Frames:
-        """Frames to be looked at: they show themselves in a notebook, and `starcal_uq.report` writes them as a page.
+    def inspect(
+        self, *which: int | str, most: int = 24, images: Sequence[PathLike] | None = None
+    ) -> Frames:
+        """Frames to be looked at: they show themselves in a notebook, and `starcal_uq.report`
+        writes them as a page.
 
         Parameters
         ----------
@@ -417,7 +475,9 @@ class Run:
         ImageError
             If there is no such frame.
         """
-        frames = self.frames if images is None else replace(self.frames, images=tuple(map(Path, images)))
+        frames = (
+            self.frames if images is None else replace(self.frames, images=tuple(map(Path, images)))
+        )
         return frames.select(*which, large=True) if which else frames.telling(most)
 
     @_writing
@@ -447,7 +507,11 @@ class Run:
     def truth(self) -> Camera | None:
         """The camera of a simulation: the one given, or that of the observations."""
         simulated = self.observations.meta.get("truth")
-        return self._truth if self._truth is not None or simulated is None else Camera.from_dict(simulated)
+        return (
+            self._truth
+            if self._truth is not None or simulated is None
+            else Camera.from_dict(simulated)
+        )
 
     @property
     def missing(self) -> tuple[Missing, ...]:
@@ -465,9 +529,17 @@ class Run:
                 self.diagnosis is not None,
             ),
             # Before these two there can be no budget.
-            ("budget", "The error budget", self.has("budget") or not (self.has("posterior") and self.has("attitude"))),
+            (
+                "budget",
+                "The error budget",
+                self.has("budget") or not (self.has("posterior") and self.has("attitude")),
+            ),
         )
-        return tuple(Missing(what, f"starcal-uq {command} {self.path}") for command, what, there in parts if not there)
+        return tuple(
+            Missing(what, f"starcal-uq {command} {self.path}")
+            for command, what, there in parts
+            if not there
+        )
 
     @property
     def place(self) -> Place:
@@ -531,7 +603,8 @@ class Run:
     def making(
         self, command: Mapping[str, object], *, force: bool = False, words: Sequence[str] = ()
     ) -> Iterator[None]:
-        """All steps within the block make one run, which replaces that of before when it is complete, and not sooner.
+        """All steps within the block make one run, which replaces that of before when it is
+        complete, and not sooner.
 
         An interrupted one goes on where it was: steps that are done, `did`, need not be done again.
 
@@ -559,9 +632,15 @@ class Run:
             self.folder, self._making = here, False
 
     @contextmanager
-    def _step(self, step: str, seed: int | None, settings: Mapping[str, Any]) -> Iterator[RunFolder]:
-        record = provenance(seed, {name: as_setting(value) for name, value in settings.items()}, None)
-        with self.folder.step(step, record, making=self._making, tell=self._tell, words=self._words) as files:
+    def _step(
+        self, step: str, seed: int | None, settings: Mapping[str, Any]
+    ) -> Iterator[RunFolder]:
+        record = provenance(
+            seed, {name: as_setting(value) for name, value in settings.items()}, None
+        )
+        with self.folder.step(
+            step, record, making=self._making, tell=self._tell, words=self._words
+        ) as files:
             yield files
         if "report" in REST_ON[step]:
             self._forget(*(["error_budget"] if "budget" in REST_ON[step] else []))
@@ -580,19 +659,23 @@ class Run:
         progress: Progress | None = None,
         **options: Any,
     ) -> Calibration:
-        """Calibrate and write observations, camera and calibration; nothing is written when the estimate fails.
+        """Calibrate and write observations, camera and calibration; nothing is written when the
+        estimate fails.
 
         Parameters
         ----------
         obs : Observations or PartitionedObservations
-            Identified stars. Of partitioned ones the run keeps the sample of frames that its results are shown by.
+            Identified stars. Of partitioned ones the run keeps the sample of frames that its
+            results are shown by.
         camera : Camera
             The nominal camera.
         screening : bool
-            Whether to leave out wrong identifications first. The run then holds the kept rows, ``rejected.csv`` the
-            others with their reasons, and `screening` of this object all about it.
+            Whether to leave out wrong identifications first. The run then holds the kept rows,
+            ``rejected.csv`` the others with their reasons, and `screening` of this object all about
+            it.
         undetermined : bool
-            Whether to write an estimate that leaves parameters open, to be sampled with priors that determine them.
+            Whether to write an estimate that leaves parameters open, to be sampled with priors that
+            determine them.
         accept_inflation : bool
             Whether to multiply sigma by how much more the frames scatter than their noise says
             (`starcal_uq.diagnostics.accept_inflation`); draws are as wide.
@@ -629,17 +712,22 @@ class Run:
 
             calibration = calibrate(obs, camera, progress=progress, **options)
             if isinstance(obs, PartitionedObservations):
-                # The stars stay where they are; the run holds the sample of frames that its results are shown by.
+                # The stars stay where they are; the run holds the sample of frames that its results
+                # are shown by.
                 obs = obs.sample()
             elif calibration.n_frames < obs.n_frames:
                 obs = obs.select_frames(calibration.frame_ids)
         if undetermined and not calibration.status.ok and not calibration.undetermined:
             status = calibration.status
-            raise CalibrationError(f"the calibration did not end well ({status.name}): {calibration.remedy}.", status)
+            raise CalibrationError(
+                f"the calibration did not end well ({status.name}): {calibration.remedy}.", status
+            )
         if accept_inflation:
             from starcal_uq.diagnostics import jackknife
 
-            found = jackknife.jackknife_of_all(calibration) or jackknife.jackknife_frames(obs, calibration)
+            found = jackknife.jackknife_of_all(calibration) or jackknife.jackknife_frames(
+                obs, calibration
+            )
             calibration = jackknife.accept_inflation(calibration, found)
         if not self._making:
             check_new_folder(self.path, force)
@@ -655,7 +743,8 @@ class Run:
         screened: Screening | None = None,
         history: pd.DataFrame | None = None,
     ) -> None:
-        """Write a calibration with its nominal camera, and with observations and more where there are any.
+        """Write a calibration with its nominal camera, and with observations and more where there
+        are any.
 
         Whatever the run has written before goes.
         """
@@ -683,9 +772,11 @@ class Run:
         sources: Sequence[PathLike] = (),
         camera: Camera | None = None,
     ) -> None:
-        """Keep centroids, matches and the record of every image that the run started from, and where these are.
+        """Keep centroids, matches and the record of every image that the run started from, and
+        where these are.
 
-        Where nothing is calibrated, `images` is the identification, if there is one, and the `camera` is kept too.
+        Where nothing is calibrated, `images` is the identification, if there is one, and the
+        `camera` is kept too.
         """
         from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION, MATCHED
         from starcal_uq.pipeline.record import IMAGES, record_images
@@ -694,7 +785,9 @@ class Run:
         with self._step("images", None, {}) as files:
             centroids.save(files.path / CENTROIDS)
             record_images(centroids, images, sources).save(files.path / IMAGES)
-            identification = images.identification if isinstance(images, ImageCalibration) else images
+            identification = (
+                images.identification if isinstance(images, ImageCalibration) else images
+            )
             if identification is not None:
                 write_csv(identification.to_dataframe(), files.path / IDENTIFICATION)
             if identification is not None and identification.n_identified:
@@ -704,7 +797,9 @@ class Run:
         self._forget("images", "frames")
 
     @_writing
-    def sample(self, *, force: bool = False, progress: Progress | None = None, **options: Any) -> Posterior:
+    def sample(
+        self, *, force: bool = False, progress: Progress | None = None, **options: Any
+    ) -> Posterior:
         """Sample the posterior and write it; an interrupted call goes on from its checkpoint.
 
         Parameters
@@ -720,10 +815,16 @@ class Run:
         obs = self.observations if self._keeps_observations else None
         if options.get("likelihood") is None:
             # A calibration knows which likelihood its estimate maximises.
-            options["likelihood"] = self.calibration.provenance.get("settings", {}).get("likelihood", "marginal")
+            options["likelihood"] = self.calibration.provenance.get("settings", {}).get(
+                "likelihood", "marginal"
+            )
         checkpoint = self.folder.path / CHECKPOINT
-        posterior = sample(obs, self.calibration, progress=progress, checkpoint=checkpoint, **options)
-        with self._step("sample", posterior.provenance["seed"], posterior.provenance["settings"]) as files:
+        posterior = sample(
+            obs, self.calibration, progress=progress, checkpoint=checkpoint, **options
+        )
+        with self._step(
+            "sample", posterior.provenance["seed"], posterior.provenance["settings"]
+        ) as files:
             posterior.save(files.posterior)
             posterior.calibrated_camera.save(files.calibrated)
         remove_checkpoints(self.folder.path)
@@ -732,7 +833,8 @@ class Run:
         return posterior
 
     def couple(self, *, force: bool = False) -> Coupling:
-        """Write the table of the couplings, which follow from the rest of the run: one that is there is left as it is.
+        """Write the table of the couplings, which follow from the rest of the run: one that is
+        there is left as it is.
 
         Parameters
         ----------
@@ -756,7 +858,8 @@ class Run:
         alignment_frames: int | None = None,
         force: bool = False,
     ) -> tuple[AttitudeError, FieldMap, ErrorSpectrum | None]:
-        """Carry the posterior through QUEST on the observed frames or a mission's, and over the field; write all of it.
+        """Carry the posterior through QUEST on the observed frames or a mission's, and over the
+        field; write all of it.
 
         Along an attitude profile the spectrum of the frame-dependent part is written as well.
 
@@ -767,7 +870,8 @@ class Run:
         sky : MissionSky, optional
             Frames in place of the observed ones.
         alignment : str or path
-            Frames on which alignment is calibrated: ``random`` sky, those ``observed`` for this run, or a table.
+            Frames on which alignment is calibrated: ``random`` sky, those ``observed`` for this
+            run, or a table.
         alignment_frames : int, optional
             Number of frames of the random sky; 100 by default.
         force : bool
@@ -777,7 +881,8 @@ class Run:
         posterior = self.posterior
         if not self._keeps_observations and not self.has("observations"):
             raise RunFolderError(
-                f"{self.path}: holds no observations, so that there are no frames to propagate to: calibrate a table "
+                f"{self.path}: holds no observations, so that there are no frames to propagate "
+                "to: calibrate a table "
                 "that fits into memory with `starcal-uq calibrate`."
             )
         from starcal_uq.propagation import attitude_error
@@ -785,14 +890,21 @@ class Run:
         from starcal_uq.propagation.field import field_map
         from starcal_uq.propagation.propagate import propagate
 
-        frames = self.observations if sky is None else sky.frames(posterior, self.observations, seed)
+        frames = (
+            self.observations if sky is None else sky.frames(posterior, self.observations, seed)
+        )
         aligning: Observations | str = str(alignment)
         if aligning == OBSERVED:
             aligning = self.observations.with_meta(frames=attitude_error.OBSERVED)
         elif aligning != RANDOM:
             aligning = load_observations(alignment).with_meta(frames=str(alignment))
         error = propagate(
-            posterior, frames, n_draws=n_draws, seed=seed, alignment=aligning, alignment_frames=alignment_frames
+            posterior,
+            frames,
+            n_draws=n_draws,
+            seed=seed,
+            alignment=aligning,
+            alignment_frames=alignment_frames,
         )
         fields = field_map(posterior, self.observations)
         spectrum = None
@@ -804,10 +916,16 @@ class Run:
                 spectrum = error_spectrum(posterior, frames, n_draws=min(n_draws, 100), seed=seed)
             else:
                 told.append(
-                    f"the profile has {frames.n_frames} frames, too few for a spectrum ({MIN_SPECTRUM_FRAMES})."
+                    f"the profile has {frames.n_frames} frames, too few for a spectrum "
+                    f"({MIN_SPECTRUM_FRAMES})."
                 )
         error = self._with_misfit(error)
-        settings = {"n_draws": n_draws, "sky": sky, "alignment": alignment, "alignment_frames": alignment_frames}
+        settings = {
+            "n_draws": n_draws,
+            "sky": sky,
+            "alignment": alignment,
+            "alignment_frames": alignment_frames,
+        }
         with self._step("propagate", seed, settings) as files:
             # A diagnosis of later is carried to the same frames.
             if sky is not None:
@@ -818,7 +936,8 @@ class Run:
             fields.save(files.field_map)
             if spectrum is not None:
                 spectrum.save(files.spectrum)
-        # The file of the attitude error holds less than the result, and a report shows what is in the file.
+        # The file of the attitude error holds less than the result, and a report shows what is in
+        # the file.
         self._forget("attitude", "spectrum")
         self.field_map = fields
         if self._tell is not None:
@@ -830,7 +949,8 @@ class Run:
     def diagnose(self, *, force: bool = False, **options: Any) -> Diagnosis:
         """Question the model; writes ``diagnosis.json``, with the tables as CSV beside it.
 
-        The attitude error is written again with what was found, and a budget that rested on it is removed.
+        The attitude error is written again with what was found, and a budget that rested on it is
+        removed.
 
         Parameters
         ----------
@@ -849,7 +969,9 @@ class Run:
         if posterior is not None and self.has("attitude"):
             self.diagnosis = diagnosis if diagnosis.is_of(self.calibration) else None
             found = self._with_misfit(self.attitude)
-        settings = {name: value for name, value in options.items() if name not in ("progress", "apart")}
+        settings = {
+            name: value for name, value in options.items() if name not in ("progress", "apart")
+        }
         with self._step("diagnose", settings.pop("seed", None), settings) as files:
             for name, file_name in DIAGNOSIS_TABLES.items():
                 part = getattr(diagnosis, name)
@@ -889,16 +1011,17 @@ class Run:
     ) -> Budget:
         """Make the attitude error budget and write it.
 
-        The attitude errors are those of ``attitude.csv``, with the misfit found if the run was diagnosed. A report
-        stays, and is older than the budget until it is made again; the verdict has the new requirements at once.
+        The attitude errors are those of ``attitude.csv``, with the misfit found if the run was
+        diagnosed. A report stays, and is older than the budget until it is made again; the verdict
+        has the new requirements at once.
 
         Parameters
         ----------
         file, confidence, seed
             As for `starcal_uq.budget`.
         force : bool
-            Whether a budget that was made with another file goes. It is kept as ``budget-1.csv``, or the next free
-            number, otherwise.
+            Whether a budget that was made with another file goes. It is kept as ``budget-1.csv``,
+            or the next free number, otherwise.
 
         Raises
         ------
@@ -928,7 +1051,10 @@ class Run:
                 write_json(replace(self.results, budget=made).verdict.to_dict(), files.verdict)
         self.error_budget = made
         if self.folder.is_older("report") and self._tell is not None:
-            self._tell(f"report.html is older than the budget; run `starcal-uq report {self.path}` to make it again.")
+            self._tell(
+                f"report.html is older than the budget; run `starcal-uq report {self.path}` to "
+                "make it again."
+            )
         return made
 
     def report(
@@ -940,14 +1066,14 @@ class Run:
     ) -> Path:
         """Write ``RUN/report.html`` of whatever the run holds, and the figures in ``RUN/figures``.
 
-        A report follows from the rest of the run, and goes when that changes: one that is there is left as it is, if
-        no budget was made after it.
+        A report follows from the rest of the run, and goes when that changes: one that is there is
+        left as it is, if no budget was made after it.
 
         Parameters
         ----------
         drawn : callable, optional
-            Figures of these results that are drawn elsewhere, as SVG by name, asked for when all else is ready; the
-            others are drawn now.
+            Figures of these results that are drawn elsewhere, as SVG by name, asked for when all
+            else is ready; the others are drawn now.
         force : bool
             Whether to write it again.
         progress : callable, optional
@@ -959,12 +1085,19 @@ class Run:
             If there is no calibration, or a file cannot be read or is not of this run.
         """
         if force or not self.has("report") or self.folder.is_older("report"):
-            from starcal_uq.presentation.report.drawing import FIGURES, GALLERY, draw_figures, draw_gallery
+            from starcal_uq.presentation.report.drawing import (
+                FIGURES,
+                GALLERY,
+                draw_figures,
+                draw_gallery,
+            )
             from starcal_uq.presentation.report.page import prepared
 
             page = prepared(self.results)
             figures = {} if drawn is None else dict(drawn())
-            figures |= draw_figures(self.results, [name for name in FIGURES if name not in figures], progress)
+            figures |= draw_figures(
+                self.results, [name for name in FIGURES if name not in figures], progress
+            )
             if GALLERY not in figures and self.images is not None:
                 figures |= draw_gallery(self.shown_frames)
             html = page(figures, figures.pop(GALLERY, b"").decode())
@@ -1001,8 +1134,11 @@ class Run:
                 atomic_write_bytes(files.pdf, content)
         return self.path / RunFolder.pdf
 
-    def notebook(self, to: PathLike | None = None, *, force: bool = False, progress: Progress | None = None) -> Path:
-        """Write an executed notebook of whatever the run holds, ``RUN/report.ipynb``, to go on from.
+    def notebook(
+        self, to: PathLike | None = None, *, force: bool = False, progress: Progress | None = None
+    ) -> Path:
+        """Write an executed notebook of whatever the run holds, ``RUN/report.ipynb``, to go on
+        from.
 
         It is of the run as it is now, and goes when that changes, if it is in the folder.
 
@@ -1041,7 +1177,9 @@ class Run:
 
     @property
     def _keeps_observations(self) -> bool:
-        """Whether it has stars: merged runs may have none, streams have none, and sampling can do without them."""
+        """Whether it has stars: merged runs may have none, streams have none, and sampling can do
+        without them.
+        """
         record = self.calibration.provenance
         merged = record.get("merge", {}).get("has_observations") is False
         return not merged and not record["settings"].get("stream", False)
@@ -1055,7 +1193,9 @@ class Run:
         """Refuse to do a step again whose result is there."""
         if self.has(name) and not force:
             place = self.path / FILES[name].name
-            raise RunFolderError(f"{place}: exists already; make it again with --force (force=True in Python).")
+            raise RunFolderError(
+                f"{place}: exists already; make it again with --force (force=True in Python)."
+            )
 
     def _forget(self, *names: str) -> None:
         """Load results again when they are next asked for."""
@@ -1068,18 +1208,30 @@ _LOADED = tuple(name for name, value in vars(Run).items() if isinstance(value, c
 
 
 def _of_one_file(one: Budget, other: Budget) -> bool:
-    """Whether the second of two budgets holds no file of the user's that the first does not hold."""
+    """Whether the second of two budgets holds no file of the user's that the first does not
+    hold.
+    """
     first, second = (made.provenance["settings"].get("file", "") for made in (one, other))
     return not second or Path(first).resolve() == Path(second).resolve()
 
 
 def as_setting(value: object) -> object:
     """A setting as a record holds it."""
-    return value if value is None or isinstance(value, bool | int | float | str | list | dict) else str(value)
+    return (
+        value
+        if value is None or isinstance(value, bool | int | float | str | list | dict)
+        else str(value)
+    )
 
 
 def _frames_of(path: Path) -> Observations:
-    """Frames that a run keeps for itself; random places of a drawn sky may coincide, which no measured table may."""
-    with reading(path, "a table of frames", "run `starcal-uq propagate RUN --force` to write it again"):
+    """Frames that a run keeps for itself; random places of a drawn sky may coincide, which no
+    measured table may.
+    """
+    with reading(
+        path, "a table of frames", "run `starcal-uq propagate RUN --force` to write it again"
+    ):
         table = read_parquet(path)
-        return Observations(**{name: arrow_values(table.column(name)) for name in table.column_names})
+        return Observations(
+            **{name: arrow_values(table.column(name)) for name in table.column_names}
+        )

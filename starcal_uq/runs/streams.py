@@ -1,7 +1,8 @@
-"""A recursive calibration of a table of any size, from file to run folder; an interrupted one goes on.
+"""A recursive calibration of a table of any size, from file to run folder; an interrupted one goes
+on.
 
-While the filter runs, its state is kept in the folder; at the end the state gives way to the calibration and to the
-estimates after every frame.
+While the filter runs, its state is kept in the folder; at the end the state gives way to the
+calibration and to the estimates after every frame.
 """
 
 from __future__ import annotations
@@ -46,13 +47,17 @@ def filter_run(
     columns: Mapping[str, str] | None = None,
     force: bool = False,
 ) -> Calibration:
-    """Calibrate recursively from a file that need not fit into memory, into a run folder without observations.
+    """Calibrate recursively from a file that need not fit into memory, into a run folder without
+    observations.
 
-    `path` and `columns` are what `stream_frames` takes, `method` and `options` those of `RecursiveCalibration`. After
-    Ctrl-C the state is kept, and the same call goes on from it. A folder that holds results is refused unless `force`.
+    `path` and `columns` are what `stream_frames` takes, `method` and `options` those of
+    `RecursiveCalibration`. After Ctrl-C the state is kept, and the same call goes on from it. A
+    folder that holds results is refused unless `force`.
     """
     with RunFolder(out).writing(make=True):
-        return _filter_run(Run(out), stream_frames(path, camera, columns), camera, method, options, columns, force)
+        return _filter_run(
+            Run(out), stream_frames(path, camera, columns), camera, method, options, columns, force
+        )
 
 
 def _filter_run(
@@ -67,7 +72,10 @@ def _filter_run(
     options = options or RecursionOptions()
     filtering = RecursiveCalibration(camera, method, options)
     identity: AnyDict = {
-        "files": [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in stream.paths],
+        "files": [
+            [str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns]
+            for file in stream.paths
+        ],
         "columns": dict(columns or {}),
         "camera": camera.to_dict(),
         "method": method,
@@ -125,21 +133,27 @@ def _feed(filtering: RecursiveCalibration, stream: FrameStream, keep: Callable[[
 def _same(path: Path, identity: AnyDict) -> bool:
     """Whether what was begun is of these data and settings; anything else starts again."""
     try:
-        return bool(json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(identity)))
+        return bool(
+            json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(identity))
+        )
     except (OSError, ValueError):
         return False
 
 
 def history(calibration: Calibration) -> pd.DataFrame:
-    """Estimates and the filter's own sigmas after every frame (every second, fourth ... of very many).
+    """Estimates and the filter's own sigmas after every frame (every second, fourth ... of very
+    many).
 
-    Columns are ``row`` (0 is the start), the parameters in px units, and ``sigma_`` with each parameter's name.
+    Columns are ``row`` (0 is the start), the parameters in px units, and ``sigma_`` with each
+    parameter's name.
     """
     import pandas as pd
 
     stage = next(stage for stage in calibration.stages if stage.name == "filter")
     table: AnyDict = {"row": range(len(stage.trajectory))}
-    for index, parameter in enumerate(parameters(calibration.camera.distortion)[: stage.trajectory.shape[1]]):
+    for index, parameter in enumerate(
+        parameters(calibration.camera.distortion)[: stage.trajectory.shape[1]]
+    ):
         table[parameter.name] = stage.trajectory[:, index]
         if stage.sigmas is not None and index < stage.sigmas.shape[1]:
             table[f"sigma_{parameter.name}"] = stage.sigmas[:, index]

@@ -44,14 +44,17 @@ def render_frames(
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Render frames at random attitudes into FITS files ``frame_00000.fits``, ``frame_00001.fits``, ...
+    """Render frames at random attitudes into FITS files ``frame_00000.fits``, ``frame_00001.fits``,
+    ...
 
-    The attitudes are those of `simulate` with the same catalogue, camera, `seed`, `min_stars` and `sigma_px`.
+    The attitudes are those of `simulate` with the same catalogue, camera, `seed`, `min_stars` and
+    `sigma_px`.
 
     Parameters
     ----------
     stars : StarCatalogue
-        Stars with the directions that the camera sees; all of them shine, and all count for `min_stars`.
+        Stars with the directions that the camera sees; all of them shine, and all count for
+        `min_stars`.
     camera : Camera
         The truth.
     out_dir : str or path
@@ -65,14 +68,15 @@ def render_frames(
     seed : int
         Repeats bit for bit. The noise of a frame depends on the seed and the frame number only.
     attitudes : (n, 3, 3) array, optional
-        R_cam_icrs at the middle of the exposures, instead of random ones; `n_frames` is then ignored.
+        R_cam_icrs at the middle of the exposures, instead of random ones; `n_frames` is then
+        ignored.
     rates_rad_s : (3,) or (n, 3) array, optional
         Angular rate of the camera in its own axes, rad/s, of all frames or of each.
     times_utc : sequence of str, optional
         Middle of each exposure, UTC, ISO 8601; recorded only, the stars are not moved.
     sigma_px : float
-        The noise of the `simulate` to be matched: stars within six times this of the edge do not count for
-        `min_stars`. It adds no noise.
+        The noise of the `simulate` to be matched: stars within six times this of the edge do not
+        count for `min_stars`. It adds no noise.
     force : bool
         Whether existing files may be replaced.
     progress : callable, optional
@@ -86,7 +90,8 @@ def render_frames(
     Raises
     ------
     RunFolderError
-        If frames are in the folder already and `force` is false, or would remain among the new ones.
+        If frames are in the folder already and `force` is false, or would remain among the new
+        ones.
     CatalogueError
         When too few attitudes show `min_stars` stars.
     SensorError
@@ -94,7 +99,8 @@ def render_frames(
     """
     if n_frames < 1 or min_stars < 0 or seed < 0 or not sigma_px >= 0.0:
         raise SensorError(
-            f"rendering: n_frames={n_frames}, min_stars={min_stars}, seed={seed}, sigma_px={sigma_px} do not fit; "
+            f"rendering: n_frames={n_frames}, min_stars={min_stars}, seed={seed}, "
+            f"sigma_px={sigma_px} do not fit; "
             "give at least one frame and no negative number."
         )
     rotations, _ = choose_attitudes(
@@ -102,15 +108,21 @@ def render_frames(
         np.random.default_rng(seed),
         n_frames=n_frames,
         min_stars=min_stars,
-        attitudes=None if attitudes is None else np.asarray(attitudes, dtype=np.float64).reshape(-1, 3, 3),
+        attitudes=None
+        if attitudes is None
+        else np.asarray(attitudes, dtype=np.float64).reshape(-1, 3, 3),
     )
     n = len(rotations)
     rates = np.zeros(3) if rates_rad_s is None else np.asarray(rates_rad_s, dtype=np.float64)
     if rates.shape not in ((3,), (n, 3)):
-        raise SensorError(f"rendering: the rates have shape {rates.shape}; give (3,) or ({n}, 3) in rad/s.")
+        raise SensorError(
+            f"rendering: the rates have shape {rates.shape}; give (3,) or ({n}, 3) in rad/s."
+        )
     times = [None] * n if times_utc is None else [check_time(text) for text in times_utc]
     if len(times) != n:
-        raise SensorError(f"rendering: there are {len(times)} times for {n} frames; give one for each.")
+        raise SensorError(
+            f"rendering: there are {len(times)} times for {n} frames; give one for each."
+        )
     scene = Scene(stars, camera, Sensor() if sensor is None else sensor)
     with alone(out_dir):
         paths = _targets(Path(out_dir), n, force)
@@ -136,7 +148,8 @@ def _targets(folder: Path, n: int, force: bool) -> list[Path]:
     others = sorted(set(present) - set(paths))
     if others:
         raise RunFolderError(
-            f"{others[0]}: the folder holds {len(others)} other frames that would mix with the new ones; "
+            f"{others[0]}: the folder holds {len(others)} other frames that would mix with the "
+            "new ones; "
             "choose an empty folder or remove them."
         )
     if present:

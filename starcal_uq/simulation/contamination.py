@@ -25,7 +25,9 @@ _SAME_RAD = 1e-6
 class Contaminated:
     """Observations with wrong identifications, and which they are."""
 
-    observations: Observations  # Same rows, some with the direction, name and magnitude of another star
+    observations: (
+        Observations  # Same rows, some with the direction, name and magnitude of another star
+    )
     wrong: BoolArray  # (N,): rows that were changed
 
 
@@ -47,14 +49,16 @@ def contaminate(
     obs : Observations
         Right identifications.
     stars : StarCatalogue
-        Catalogue that wrong stars are taken from; its directions must be of the same kind as those of the observations.
+        Catalogue that wrong stars are taken from; its directions must be of the same kind as those
+        of the observations.
     camera : Camera
         Camera whose focal length turns `radius_px` into an angle.
     fraction : float
-        Share of the rows that becomes wrong; rounded to whole rows, chosen at random over all frames.
+        Share of the rows that becomes wrong; rounded to whole rows, chosen at random over all
+        frames.
     kind : {"random", "neighbour"}
-        Any star of the catalogue, or one within `radius_px` of the right one. Stars that the frame has already are not
-        used.
+        Any star of the catalogue, or one within `radius_px` of the right one. Stars that the frame
+        has already are not used.
     seed : int
         Repeats bit for bit.
     radius_px : float
@@ -68,7 +72,10 @@ def contaminate(
         For a kind or fraction that makes no sense.
     """
     if kind not in KINDS or not 0.0 <= fraction <= 1.0:
-        raise ValueError(f"kind={kind!r}, fraction={fraction}: use {' or '.join(KINDS)}, and a number from 0 to 1.")
+        raise ValueError(
+            f"kind={kind!r}, fraction={fraction}: use {' or '.join(KINDS)}, and a number from 0 "
+            "to 1."
+        )
     from scipy.spatial import cKDTree
 
     rng = np.random.default_rng(seed)
@@ -97,7 +104,8 @@ def contaminate(
                 break
     if len(rows) < wanted:
         raise CatalogueError(
-            f"only {len(rows)} of {obs.n_stars} rows have another star of the catalogue within {radius_px:g} px, and "
+            f"only {len(rows)} of {obs.n_stars} rows have another star of the catalogue within "
+            f"{radius_px:g} px, and "
             f"{wanted} are asked for: use a catalogue with fainter stars."
         )
     wrong = np.zeros(obs.n_stars, dtype=bool)

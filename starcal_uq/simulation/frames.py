@@ -24,14 +24,18 @@ if TYPE_CHECKING:
 
 # Of a row of a table: seven columns.
 _BYTES_PER_STAR = 56.0
-# Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its catalogue.
+# Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its
+# catalogue.
 _BATCH = 256
 _MAX_TRIES_PER_FRAME = 2000
-# More attitudes than this take minutes: refused as soon as the first tries say that so many would be needed.
+# More attitudes than this take minutes: refused as soon as the first tries say that so many would
+# be needed.
 _MAX_TRIES = 500_000
-# Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
+# Stars nearer to the edge than this many sigma are left out, so that noise does not decide which
+# stars are seen.
 EDGE_SIGMAS = 6.0
-# Of cones wider than 60 degrees from the axis, a tree finds the stars no faster than a look at all of them.
+# Of cones wider than 60 degrees from the axis, a tree finds the stars no faster than a look at all
+# of them.
 _TREE_COSINE = 0.5
 
 
@@ -39,7 +43,8 @@ _TREE_COSINE = 0.5
 class Campaign:
     """Data of one calibration, as simulated studies take them.
 
-    Frames, the least stars in each (3 or more), centroid noise in px per axis, and the sensor's magnitude limit.
+    Frames, the least stars in each (3 or more), centroid noise in px per axis, and the sensor's
+    magnitude limit.
     """
 
     n_frames: int
@@ -52,12 +57,17 @@ class Campaign:
         for good, text in (
             (self.n_frames >= 1, f"n_frames is {self.n_frames}: give at least 1."),
             (self.min_stars >= 3, f"min_stars is {self.min_stars}: an attitude needs at least 3."),
-            (0.0 < self.sigma_px < np.inf, f"sigma_px is {self.sigma_px:g}: give a noise above zero."),
+            (
+                0.0 < self.sigma_px < np.inf,
+                f"sigma_px is {self.sigma_px:g}: give a noise above zero.",
+            ),
         ):
             if not good:
                 raise error(text)
 
-    def simulate(self, stars: StarCatalogue, camera: Camera, seed: int | np.integer) -> Observations:
+    def simulate(
+        self, stars: StarCatalogue, camera: Camera, seed: int | np.integer
+    ) -> Observations:
         """`simulate` with these settings; `stars` are those to the magnitude limit."""
         return simulate(
             stars,
@@ -101,7 +111,8 @@ def simulate(
     seed : int
         Repeats bit for bit.
     attitudes : (n_frames, 3, 3) array, optional
-        R_cam_icrs to use instead of random ones; `n_frames` is then ignored, and every frame must hold `min_stars`.
+        R_cam_icrs to use instead of random ones; `n_frames` is then ignored, and every frame must
+        hold `min_stars`.
 
     Returns
     -------
@@ -119,10 +130,14 @@ def simulate(
     if min_stars < 3:
         raise SettingError(f"min_stars is {min_stars}: a frame needs at least 3 stars.")
     if attitudes is None:
-        check_memory(f"n_frames={n_frames}, min_stars={min_stars}", _BYTES_PER_STAR * n_frames * min_stars)
+        check_memory(
+            f"n_frames={n_frames}, min_stars={min_stars}", _BYTES_PER_STAR * n_frames * min_stars
+        )
     rng = np.random.default_rng(seed)
     sky = Sky(stars, camera, EDGE_SIGMAS * sigma_px)
-    frame, index, xy = observed(sky, rng, sigma_px, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes)
+    frame, index, xy = observed(
+        sky, rng, sigma_px, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes
+    )
     return Observations(
         frame=frame,
         x_px=xy[:, 0],
@@ -155,8 +170,12 @@ def observed(
     min_stars: int,
     attitudes: FloatArray | None = None,
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Frame (N,), catalogue index (N,) and noisy pixels (N, 2) of the stars in frames chosen by `choose_attitudes`."""
-    _, frames = choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes)
+    """Frame (N,), catalogue index (N,) and noisy pixels (N, 2) of the stars in frames chosen by
+    `choose_attitudes`.
+    """
+    _, frames = choose_attitudes(
+        sky, rng, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes
+    )
     index = np.concatenate([seen for seen, _ in frames])
     xy = np.concatenate([xy for _, xy in frames])
     xy = xy + sigma_px * rng.standard_normal(xy.shape)
@@ -164,9 +183,15 @@ def observed(
 
 
 def choose_attitudes(
-    sky: Sky, rng: np.random.Generator, *, n_frames: int, min_stars: int, attitudes: FloatArray | None = None
+    sky: Sky,
+    rng: np.random.Generator,
+    *,
+    n_frames: int,
+    min_stars: int,
+    attitudes: FloatArray | None = None,
 ) -> tuple[FloatArray, list[tuple[IntArray, FloatArray]]]:
-    """Attitudes (n, 3, 3), random or given, that show at least `min_stars` stars, and their `Sky.views`.
+    """Attitudes (n, 3, 3), random or given, that show at least `min_stars` stars, and their
+    `Sky.views`.
 
     CatalogueError when a given attitude shows fewer stars, or random ones nearly always do.
     """
@@ -175,7 +200,8 @@ def choose_attitudes(
         for number, (seen, _) in enumerate(frames):
             if len(seen) < min_stars:
                 raise CatalogueError(
-                    f"the attitude with index {number} shows {len(seen)} stars, fewer than min_stars={min_stars}: "
+                    f"the attitude with index {number} shows {len(seen)} stars, fewer than "
+                    f"min_stars={min_stars}: "
                     "choose other attitudes, a deeper catalogue or a smaller min_stars."
                 )
         return attitudes, frames
@@ -189,10 +215,13 @@ def choose_attitudes(
         frames += [views[number] for number in enough]
         chosen.append(rotations[enough])
         tries += _BATCH
-        hopeless = tries >= _MAX_TRIES_PER_FRAME and n_frames * tries > _MAX_TRIES * (len(frames) + 1)
+        hopeless = tries >= _MAX_TRIES_PER_FRAME and n_frames * tries > _MAX_TRIES * (
+            len(frames) + 1
+        )
         if hopeless or tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
             raise CatalogueError(
-                f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the catalogue: "
+                f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the "
+                "catalogue: "
                 "raise max_mag (--max-mag), or lower min_stars (--min-stars)."
             )
     return np.concatenate(chosen)[:n_frames], frames[:n_frames]
@@ -201,15 +230,19 @@ def choose_attitudes(
 class Window:
     """The detector on the sky.
 
-    Stars nearer to the edge than `margin_px` are left out; a negative margin lets in stars outside the detector.
-    `min_cosine` is that of the cone around the optical axis that holds everything on it.
+    Stars nearer to the edge than `margin_px` are left out; a negative margin lets in stars outside
+    the detector. `min_cosine` is that of the cone around the optical axis that holds everything on
+    it.
     """
 
     def __init__(self, camera: Camera, margin_px: float) -> None:
         self.camera = camera
         self.low = -0.5 + margin_px
         self.high = np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
-        low, high = min(-0.5, self.low), np.maximum(np.array([camera.width_px, camera.height_px]) - 0.5, self.high)
+        low, high = (
+            min(-0.5, self.low),
+            np.maximum(np.array([camera.width_px, camera.height_px]) - 0.5, self.high),
+        )
         b = unproject(camera, np.array([(x, y) for x in (low, high[0]) for y in (low, high[1])]))
         # A little wider than the farthest corner; the exact cut is made in pixels.
         self.min_cosine = float(np.cos(1.02 * np.max(np.arccos(b[:, 2]))))
@@ -219,7 +252,9 @@ class Window:
                 self.min_cosine = float(np.min(b[:, 2]))
 
     def seen(self, b: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Pixels (N, 2) of directions (N, 3) in the camera, and which of them are on the detector (N,)."""
+        """Pixels (N, 2) of directions (N, 3) in the camera, and which of them are on the detector
+        (N,).
+        """
         xy = project(self.camera, b)
         return xy, np.all((xy > self.low) & (xy < self.high), axis=1)
 
@@ -232,7 +267,9 @@ class Sky(Window):
         self.directions = stars.directions_icrs
 
     def views(self, rotations: FloatArray) -> list[tuple[IntArray, FloatArray]]:
-        """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector, for each rotation."""
+        """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector, for
+        each rotation.
+        """
         frame, star = self._near(rotations[:, 2])
         b = np.einsum("nij,nj->ni", rotations[frame], self.directions[star])
         xy, inside = self.seen(b)
@@ -245,7 +282,9 @@ class Sky(Window):
         if self.min_cosine < _TREE_COSINE:
             frame, star = np.nonzero(axes @ self.directions.T > self.min_cosine)
             return frame, star
-        found = self._tree.query_ball_point(axes, np.sqrt(2.0 - 2.0 * self.min_cosine), return_sorted=True)
+        found = self._tree.query_ball_point(
+            axes, np.sqrt(2.0 - 2.0 * self.min_cosine), return_sorted=True
+        )
         sizes = np.fromiter(map(len, found), dtype=np.int64, count=len(found))
         star = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(sizes.sum()))
         return np.repeat(np.arange(len(axes)), sizes), star

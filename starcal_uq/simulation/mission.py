@@ -1,7 +1,9 @@
-"""Frames that a mission will see: noise-free star positions at random attitudes, or along an attitude profile.
+"""Frames that a mission will see: noise-free star positions at random attitudes, or along an
+attitude profile.
 
-A posterior from ground or commissioning data says what the camera is; the attitude error that follows depends on which
-stars stand where. These frames bring the star geometry of the mission's catalogue and magnitude limit.
+A posterior from ground or commissioning data says what the camera is; the attitude error that
+follows depends on which stars stand where. These frames bring the star geometry of the mission's
+catalogue and magnitude limit.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ if TYPE_CHECKING:
 
 _FRAMES_AT_ONCE = 256
 _MAG_GROUPS = 12
-# Photon noise alone grows by 10^0.2 per magnitude; fainter than all that was measured, noise grows at least so much.
+# Photon noise alone grows by 10^0.2 per magnitude; fainter than all that was measured, noise grows
+# at least so much.
 _PHOTON_DEX_PER_MAG = 0.2
 
 
@@ -50,13 +53,15 @@ def mission_frames(
     n_frames : int
         Number of frames.
     min_stars : int
-        Attitudes with fewer stars in the field are drawn again (at least 3): what the mission calls a valid frame.
+        Attitudes with fewer stars in the field are drawn again (at least 3): what the mission calls
+        a valid frame.
     seed : int
         Repeats bit for bit.
     noise_like : Observations, optional
-        A table with stated noise, whose ``sigma_px`` is carried over by magnitude: the median of each of a dozen groups
-        of stars, interpolated; fainter than them all it grows as photon noise does. Where magnitudes are missing, all
-        stars get the median. Needed where the posterior scales stated noise.
+        A table with stated noise, whose ``sigma_px`` is carried over by magnitude: the median of
+        each of a dozen groups of stars, interpolated; fainter than them all it grows as photon
+        noise does. Where magnitudes are missing, all stars get the median. Needed where the
+        posterior scales stated noise.
 
     Raises
     ------
@@ -65,11 +70,18 @@ def mission_frames(
     ObservationError
         When `noise_like` states no noise.
     """
-    frames = simulate(stars, camera, n_frames=n_frames, min_stars=min_stars, sigma_px=0.0, seed=seed)
+    frames = simulate(
+        stars, camera, n_frames=n_frames, min_stars=min_stars, sigma_px=0.0, seed=seed
+    )
     faintest = float(np.nanmax(frames.mag)) if frames.mag is not None else float("nan")
-    words = f"random attitudes, {significant(np.diff(frames.frame_starts).mean(), 3)} stars each on average"
+    words = (
+        f"random attitudes, {significant(np.diff(frames.frame_starts).mean(), 3)} stars each on "
+        "average"
+    )
     words += f", faintest star of magnitude {faintest:.1f}" if np.isfinite(faintest) else ""
-    frames = frames.with_meta(source="mission frames at random attitudes", frames=words, min_stars=min_stars)
+    frames = frames.with_meta(
+        source="mission frames at random attitudes", frames=words, min_stars=min_stars
+    )
     return frames if noise_like is None else _with_noise(frames, noise_like)
 
 
@@ -83,7 +95,8 @@ def profile_frames(
     min_stars: int = 3,
     noise_like: Observations | None = None,
 ) -> Observations:
-    """Noise-free frames along an attitude profile, for `propagate` and `starcal_uq.propagation.error_spectrum`.
+    """Noise-free frames along an attitude profile, for `propagate` and
+    `starcal_uq.propagation.error_spectrum`.
 
     Parameters
     ----------
@@ -92,14 +105,17 @@ def profile_frames(
     profile : AttitudeProfile
         Attitudes of the camera over time.
     rate_hz : float, optional
-        Frames per second; the profile is interpolated. By default frames are taken at the profile's own instants.
+        Frames per second; the profile is interpolated. By default frames are taken at the profile's
+        own instants.
     min_stars : int
-        Instants with fewer stars in the field (at least 2) are left out and counted in ``meta["skipped_frames"]``.
+        Instants with fewer stars in the field (at least 2) are left out and counted in
+        ``meta["skipped_frames"]``.
 
     Returns
     -------
     Observations
-        Frame numbers count the instants from 0; ``meta["frame_times_s"]`` holds the times of the frames that are there.
+        Frame numbers count the instants from 0; ``meta["frame_times_s"]`` holds the times of the
+        frames that are there.
 
     Raises
     ------
@@ -116,13 +132,16 @@ def profile_frames(
     kept = counts >= min_stars
     if not kept.any():
         raise CatalogueError(
-            f"none of the {count(len(rotations))} attitudes of the profile shows {min_stars} stars of the catalogue "
+            f"none of the {count(len(rotations))} attitudes of the profile shows {min_stars} "
+            "stars of the catalogue "
             f"(at most {int(counts.max())}): raise max_mag, or lower min_stars."
         )
     rows = kept[frame]
     seen = seen[rows]
     skipped = int(np.sum(~kept))
-    words = f"attitude profile {profile.name}, {significant(path.duration_s, 3)} s".replace("  ", " ")
+    words = f"attitude profile {profile.name}, {significant(path.duration_s, 3)} s".replace(
+        "  ", " "
+    )
     if skipped:
         words += f"; {plural(skipped, 'instant')} with fewer than {min_stars} stars left out"
     frames = Observations(
@@ -159,25 +178,35 @@ def _seen(sky: Sky, rotations: FloatArray) -> tuple[IntArray, IntArray, FloatArr
 def _with_noise(frames: Observations, like: Observations) -> Observations:
     """The frames with stated noise like that of other observations."""
     if like.stated_px is not None and like.unweighted.sigma_px is None:
-        # A fitted noise model gives these frames their noise when an attitude error is propagated to them.
+        # A fitted noise model gives these frames their noise when an attitude error is propagated
+        # to them.
         return frames
     like = like.unweighted
     if like.sigma_px is None:
         raise ObservationError(
-            "noise_like has no column sigma_px, so that there is no stated noise to carry over: leave it out.",
+            (
+                "noise_like has no column sigma_px, so that there is no stated noise to carry "
+                "over: "
+                "leave it out."
+            ),
             column="sigma_px",
         )
     import dataclasses
 
     if like.mag is None or frames.mag is None or not np.any(np.isfinite(like.mag)):
-        sigma, rule = np.full(frames.n_stars, float(np.median(like.sigma_px))), "median stated noise for every star"
+        sigma, rule = (
+            np.full(frames.n_stars, float(np.median(like.sigma_px))),
+            "median stated noise for every star",
+        )
     else:
         sigma, rule = noise_by_magnitude(like, frames.mag), "median stated noise by magnitude"
     return dataclasses.replace(frames, sigma_px=sigma, meta={**frames.meta, "noise": rule})
 
 
 def noise_by_magnitude(like: Observations, mag: FloatArray) -> FloatArray:
-    """Stated noise (N,), px, for magnitudes (N,) from the medians of another table; NaN gets the overall median."""
+    """Stated noise (N,), px, for magnitudes (N,) from the medians of another table; NaN gets the
+    overall median.
+    """
     assert like.sigma_px is not None and like.mag is not None
     known = np.isfinite(like.mag)
     order = np.argsort(like.mag[known], kind="stable")

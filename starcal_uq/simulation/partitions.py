@@ -48,8 +48,9 @@ def simulate_partitions(
 ) -> PartitionedObservations:
     """Simulate identified stars, as `simulate` does, into a folder of Parquet files.
 
-    A file depends on the seed and its number alone. The files take their places when all are made: an interrupted call
-    goes on, and until its end the folder holds what it held before. What the same call has made stays.
+    A file depends on the seed and its number alone. The files take their places when all are made:
+    an interrupted call goes on, and until its end the folder holds what it held before. What the
+    same call has made stays.
 
     Parameters
     ----------
@@ -86,30 +87,51 @@ def simulate_partitions(
     """
     if n_frames < 1 or partition_frames < 1 or min_stars < 3 or not sigma_px >= 0.0:
         raise ValueError(
-            f"n_frames={n_frames}, partition_frames={partition_frames}, min_stars={min_stars}, sigma_px={sigma_px}: "
+            f"n_frames={n_frames}, partition_frames={partition_frames}, min_stars={min_stars}, "
+            f"sigma_px={sigma_px}: "
             "give at least one frame, 3 stars, and no negative noise."
         )
     folder = Path(folder).resolve()
-    known = {"min_stars": min_stars, "stars": stars.source, "n_stars": len(stars), "epoch": stars.epoch}
+    known = {
+        "min_stars": min_stars,
+        "stars": stars.source,
+        "n_stars": len(stars),
+        "epoch": stars.epoch,
+    }
     meta = simulated_meta(camera, sigma_px, seed) | known
     unfinished = folder / UNFINISHED
-    make = _Maker(stars, camera, unfinished, n_frames, partition_frames, min_stars, sigma_px, seed, meta)
+    make = _Maker(
+        stars, camera, unfinished, n_frames, partition_frames, min_stars, sigma_px, seed, meta
+    )
     names = [_NAME.format(number) for number in range(-(-n_frames // partition_frames))]
     with alone(folder):
         others = _others(folder, names)
-        if not force and not others and all(make.is_made(folder, number) for number in range(len(names))):
+        if (
+            not force
+            and not others
+            and all(make.is_made(folder, number) for number in range(len(names)))
+        ):
             return open_partitions(folder)
         with making(folder, "simulate", names[0], force=force) as stage:
             if others:
                 raise RunFolderError(
-                    f"{others[0]}: the folder holds {len(others)} other files that would mix with the new ones; choose "
+                    f"{others[0]}: the folder holds {len(others)} other files that would mix "
+                    "with the new ones; choose "
                     "an empty folder or remove them."
                 )
             new_folder(unfinished)
-            missing = [number for number in range(len(names)) if not make.is_made(unfinished, number)]
+            missing = [
+                number for number in range(len(names)) if not make.is_made(unfinished, number)
+            ]
             # Starting processes takes as long as making a few files.
-            few = workers is None and scheduler is None and len(missing) * partition_frames < _FRAMES_WORTH_PROCESSES
-            with cluster(scheduler, workers=0 if few else workers, caller="simulate_partitions") as processes:
+            few = (
+                workers is None
+                and scheduler is None
+                and len(missing) * partition_frames < _FRAMES_WORTH_PROCESSES
+            )
+            with cluster(
+                scheduler, workers=0 if few else workers, caller="simulate_partitions"
+            ) as processes:
                 processes.map(make, missing, progress=progress)
             for name in names:
                 os.replace(unfinished / name, stage / name)
@@ -132,12 +154,18 @@ class _Maker:
 
     def _meta(self, number: int) -> AnyDict:
         first = number * self.partition_frames
-        return {**self.meta, "first_frame": first, "frames": min(self.partition_frames, self.n_frames - first)}
+        return {
+            **self.meta,
+            "first_frame": first,
+            "frames": min(self.partition_frames, self.n_frames - first),
+        }
 
     def is_made(self, folder: Path, number: int) -> bool:
         """Whether a folder holds the file as this would make it."""
         try:
-            return parquet_summary(folder / _NAME.format(number), "frame").meta == self._meta(number)
+            return parquet_summary(folder / _NAME.format(number), "frame").meta == self._meta(
+                number
+            )
         except ObservationError:
             return False
 
@@ -145,7 +173,9 @@ class _Maker:
         stars, meta = self.stars, self._meta(number)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         sky = Sky(stars, self.camera, EDGE_SIGMAS * self.sigma_px)
-        frame, star, xy = observed(sky, rng, self.sigma_px, n_frames=meta["frames"], min_stars=self.min_stars)
+        frame, star, xy = observed(
+            sky, rng, self.sigma_px, n_frames=meta["frames"], min_stars=self.min_stars
+        )
         columns: dict[str, Any] = {
             "frame": frame + meta["first_frame"],
             "x_px": xy[:, 0],
@@ -154,11 +184,17 @@ class _Maker:
             "dec_deg": stars.dec_deg[star],
             "mag": stars.mag[star],
         }
-        write_partition(columns, {"star_id": (star, stars.star_id)}, meta, self.folder / _NAME.format(number))
+        write_partition(
+            columns, {"star_id": (star, stars.star_id)}, meta, self.folder / _NAME.format(number)
+        )
 
 
 def _others(folder: Path, names: list[str]) -> list[Path]:
-    """Files in a folder that would be read with those of these names, and that no call before has made."""
+    """Files in a folder that would be read with those of these names, and that no call before has
+    made.
+    """
     record = read_manifest(folder)
     own = {*names, *(record.files if record else ())}
-    return sorted(path for path in folder.iterdir() if path.suffix == ".parquet" and path.name not in own)
+    return sorted(
+        path for path in folder.iterdir() if path.suffix == ".parquet" and path.name not in own
+    )

@@ -7,8 +7,9 @@ import numpy as np
 from starcal_uq.attitude.rotations import exp_rotation, random_rotations
 from starcal_uq.core.types import FloatArray
 
-# random: anywhere; stare: one place and one roll; roll: one place, turned about the boresight; raster: steps of a
-# quarter of the field around one place; scan: along a great circle, a tenth of the field at a time.
+# random: anywhere; stare: one place and one roll; roll: one place, turned about the boresight;
+# raster: steps of a quarter of the field around one place; scan: along a great circle, a tenth of
+# the field at a time.
 POINTINGS = ("random", "stare", "roll", "raster", "scan")
 _RASTER_SIDE, _RASTER_STEP, _SCAN_STEP = 5, 0.25, 0.1
 
@@ -18,9 +19,10 @@ def pattern_rotations(
 ) -> FloatArray:
     """Attitudes (n, 3, 3) of a pattern, R_cam_icrs.
 
-    "random": anywhere; "stare": always the same; "roll": one place with the roll going once around; "raster": five by
-    five places that are a quarter of the field apart, in turn; "scan": along a great circle with a tenth of the field
-    from frame to frame. They start from an attitude `place` (3, 3), or from a drawn one.
+    "random": anywhere; "stare": always the same; "roll": one place with the roll going once around;
+    "raster": five by five places that are a quarter of the field apart, in turn; "scan": along a
+    great circle with a tenth of the field from frame to frame. They start from an attitude `place`
+    (3, 3), or from a drawn one.
     """
     if pattern == "random":
         return random_rotations(n, rng)

@@ -1,4 +1,6 @@
-"""The image of a point: a Gaussian along each axis, integrated over each pixel or sampled at its centre."""
+"""The image of a point: a Gaussian along each axis, integrated over each pixel or sampled at its
+centre.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,12 @@ def half_width_px(sigma_px: float) -> int:
 
 
 def profiles(centre_px: FloatArray, sigma_px: float, kind: str) -> tuple[IntArray, FloatArray]:
-    """Fractions of the light along one axis, around each of many centres (n,); a whole number is the centre of a pixel.
+    """Fractions of the light along one axis, around each of many centres (n,); a whole number is
+    the centre of a pixel.
 
-    `sigma_px` is that of the Gaussian before integration over pixels (which adds 1/12 px^2 to its square); the kind
-    ``sampled`` takes the density at each pixel's centre instead. The first pixel of each row (n,), and the fractions
-    (n, w) in the pixels from there on.
+    `sigma_px` is that of the Gaussian before integration over pixels (which adds 1/12 px^2 to its
+    square); the kind ``sampled`` takes the density at each pixel's centre instead. The first pixel
+    of each row (n,), and the fractions (n, w) in the pixels from there on.
     """
     reach = half_width_px(sigma_px)
     first = np.rint(centre_px).astype(np.int64) - reach

@@ -22,8 +22,8 @@ from starcal_uq.simulation.truth import FrameTruth, RenderedFrame
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
-# Gauss-Legendre nodes along a smeared image: this many, and more for each sigma of its length. The exposure integral of
-# a Gaussian is then exact to 2e-9 of its peak.
+# Gauss-Legendre nodes along a smeared image: this many, and more for each sigma of its length. The
+# exposure integral of a Gaussian is then exact to 2e-9 of its peak.
 _NODES = 9
 _NODES_PER_SIGMA = 1.5
 # Values of stamps that are held at once.
@@ -31,7 +31,9 @@ _MAX_VALUES = 2_000_000
 
 
 class Scene:
-    """A catalogue, down to its faintest star, in front of a camera with a sensor, prepared for many frames."""
+    """A catalogue, down to its faintest star, in front of a camera with a sensor, prepared for many
+    frames.
+    """
 
     def __init__(self, stars: StarCatalogue, camera: Camera, sensor: Sensor) -> None:
         self.stars = stars
@@ -58,9 +60,14 @@ class Scene:
         centre = np.asarray(rotation, dtype=np.float64)
         rate = np.zeros(3) if rate_rad_s is None else np.asarray(rate_rad_s, dtype=np.float64)
         if centre.shape != (3, 3) or not np.allclose(centre @ centre.T, np.eye(3), atol=1e-6):
-            raise SensorError("rendering: the attitude is no rotation; give R_cam_icrs as an orthogonal 3 x 3 matrix.")
+            raise SensorError(
+                "rendering: the attitude is no rotation; give R_cam_icrs as an orthogonal 3 x 3 "
+                "matrix."
+            )
         if rate.shape != (3,) or not np.isfinite(rate).all():
-            raise SensorError(f"rendering: the rate is {rate_rad_s!r}; give three finite numbers in rad/s.")
+            raise SensorError(
+                f"rendering: the rate is {rate_rad_s!r}; give three finite numbers in rad/s."
+            )
         pixel, light, seen, xy = self._starlight(centre, rate)
         data = self._counts(pixel, light, rng if noise else None, quantise)
         truth = FrameTruth(
@@ -81,16 +88,24 @@ class Scene:
         )
         return RenderedFrame(data, truth)
 
-    def _starlight(self, centre: FloatArray, rate: FloatArray) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
-        """Lit pixels (flat, ascending), their expected electrons, catalogue indices and pixels of the true stars."""
+    def _starlight(
+        self, centre: FloatArray, rate: FloatArray
+    ) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
+        """Lit pixels (flat, ascending), their expected electrons, catalogue indices and pixels of
+        the true stars.
+        """
         sigma, camera = self.sensor.psf_sigma_px, self.camera
-        # The fastest star is in a corner: the boresight's motion is stretched there, and the roll adds to it.
+        # The fastest star is in a corner: the boresight's motion is stretched there, and the roll
+        # adds to it.
         f, radius = camera.focal_px, camera.corner_radius_px
         across, around = float(np.hypot(rate[0], rate[1])), abs(float(rate[2]))
-        length_px = self.sensor.exposure_s * (across * f * (1.0 + (radius / f) ** 2) + around * radius)
+        length_px = self.sensor.exposure_s * (
+            across * f * (1.0 + (radius / f) ** 2) + around * radius
+        )
         if length_px > np.hypot(camera.width_px, camera.height_px):
             raise SensorError(
-                f"rendering: at {float(np.linalg.norm(rate)):.3g} rad/s a star moves up to {length_px:.0f} px in one "
+                f"rendering: at {float(np.linalg.norm(rate)):.3g} rad/s a star moves up to "
+                f"{length_px:.0f} px in one "
                 "exposure, more than the detector: lower the rate or the exposure time."
             )
         if length_px:
@@ -110,7 +125,9 @@ class Scene:
         return pixel, light, seen[on], xy[on]
 
     def _deposit(self, place: FloatArray, electrons: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Flat indices (ascending) of the pixels lit by points at `place` (n, 2), and their expected electrons."""
+        """Flat indices (ascending) of the pixels lit by points at `place` (n, 2), and their
+        expected electrons.
+        """
         sensor, width, height = self.sensor, self.camera.width_px, self.camera.height_px
         offset = np.arange(2 * half_width_px(sensor.psf_sigma_px) + 1)
         step = max(1, _MAX_VALUES // offset.size**2)
@@ -135,7 +152,9 @@ class Scene:
     def _counts(
         self, pixel: IntArray, light: FloatArray, rng: np.random.Generator | None, quantise: bool
     ) -> np.ndarray[Any, Any]:
-        """The detector (height_px, width_px): uniform electrons, stars and hot pixels, then the electronics."""
+        """The detector (height_px, width_px): uniform electrons, stars and hot pixels, then the
+        electronics.
+        """
         sensor, shape = self.sensor, (self.camera.height_px, self.camera.width_px)
         uniform = (sensor.background_e_px_s + sensor.dark_e_px_s) * sensor.exposure_s
         hot, level = self.hot
@@ -143,9 +162,13 @@ class Scene:
         if rng is None:
             electrons = np.full(shape, uniform)
         else:
-            # Sums of Poisson numbers are Poisson numbers: only the uniform part is drawn for every pixel.
+            # Sums of Poisson numbers are Poisson numbers: only the uniform part is drawn for every
+            # pixel.
             electrons = uniform_shot_noise(uniform, shape, rng)
-            light, level = rng.poisson(light).astype(np.float64), rng.poisson(level).astype(np.float64)
+            light, level = (
+                rng.poisson(light).astype(np.float64),
+                rng.poisson(level).astype(np.float64),
+            )
         flat = electrons.reshape(-1)
         flat[pixel] += light
         flat[hot] += level
@@ -183,7 +206,8 @@ def render(
     Parameters
     ----------
     stars : StarCatalogue
-        Stars with the directions that the camera sees (proper motion and aberration applied, where they matter).
+        Stars with the directions that the camera sees (proper motion and aberration applied, where
+        they matter).
     camera : Camera
         Optics and distortion.
     rotation : (3, 3) array
@@ -195,12 +219,14 @@ def render(
     rng : numpy.random.Generator, optional
         Source of the noise instead of `seed`.
     rate_rad_s : (3,) array, optional
-        Angular rate of the camera in its own axes (x right, y down, z along the boresight), constant over the
-        exposure, rad/s. A positive rate about y turns the boresight towards +x, and the stars move towards -x.
+        Angular rate of the camera in its own axes (x right, y down, z along the boresight),
+        constant over the exposure, rad/s. A positive rate about y turns the boresight towards +x,
+        and the stars move towards -x.
     noise : bool
         False: expected values, without shot and read noise.
     quantise : bool
-        False: counts before rounding and before the ends of the converter, as float64; the full well holds.
+        False: counts before rounding and before the ends of the converter, as float64; the full
+        well holds.
     frame : int
         Frame number, which also enters the seed.
     time_utc : str, optional
@@ -215,11 +241,14 @@ def render(
 
     Notes
     -----
-    There is no blooming, no difference in response between pixels, and no rolling shutter. The PSF is the same over
-    the field. The smear is the exposure integral of the PSF along the star's path, by Gauss-Legendre quadrature.
+    There is no blooming, no difference in response between pixels, and no rolling shutter. The PSF
+    is the same over the field. The smear is the exposure integral of the PSF along the star's path,
+    by Gauss-Legendre quadrature.
     """
     if rng is None and (seed < 0 or frame < 0):
-        raise SensorError(f"rendering: seed is {seed} and frame {frame}; give whole numbers of 0 or more.")
+        raise SensorError(
+            f"rendering: seed is {seed} and frame {frame}; give whole numbers of 0 or more."
+        )
     source = np.random.default_rng([seed, frame]) if rng is None else rng
     return Scene(stars, camera, Sensor() if sensor is None else sensor).render(
         rotation,
@@ -233,8 +262,8 @@ def render(
     )
 
 
-# The unit interval is cut into this many buckets. Nearly all of them lie within one step of the distribution function,
-# so that 16 random bits decide; in the others a further uniform number does.
+# The unit interval is cut into this many buckets. Nearly all of them lie within one step of the
+# distribution function, so that 16 random bits decide; in the others a further uniform number does.
 _BUCKETS = 1 << 16
 # Beyond, the steps become as narrow as the buckets, and NumPy's own method takes over.
 _MAX_MEAN = 1000.0
@@ -254,8 +283,12 @@ def _table(mean: float) -> tuple[FloatArray, np.ndarray[Any, Any]]:
     return cumulative, np.where(low == high, low, -1).astype(np.float32)
 
 
-def uniform_shot_noise(mean: float, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray[Any, Any]:
-    """Independent Poisson numbers of one mean; single precision holds whole numbers exactly up to 16 million."""
+def uniform_shot_noise(
+    mean: float, shape: tuple[int, int], rng: np.random.Generator
+) -> np.ndarray[Any, Any]:
+    """Independent Poisson numbers of one mean; single precision holds whole numbers exactly up to
+    16 million.
+    """
     if mean == 0.0:
         return np.zeros(shape, dtype=np.float32)
     if mean > _MAX_MEAN:

@@ -27,11 +27,15 @@ from starcal_uq.simulation.sensor import Sensor
 
 
 def check_time(text: str) -> str:
-    """A UTC time in ISO 8601, with microseconds; `SensorError` if it cannot be read or has a time zone other than Z."""
+    """A UTC time in ISO 8601, with microseconds; `SensorError` if it cannot be read or has a time
+    zone other than Z.
+    """
     try:
         time = datetime.fromisoformat(text.removesuffix("Z"))
     except (AttributeError, ValueError):
-        raise SensorError(f"rendering: {text!r} is no time; write UTC such as 2026-11-21T01:02:03.5.") from None
+        raise SensorError(
+            f"rendering: {text!r} is no time; write UTC such as 2026-11-21T01:02:03.5."
+        ) from None
     if time.tzinfo is not None:
         raise SensorError(f"rendering: {text!r} has a time zone; write UTC without one.")
     return time.isoformat(timespec="microseconds")
@@ -52,7 +56,8 @@ class FrameTruth:
     rate_rad_s : (3,) array
         Angular rate of the camera in its own axes, rad/s.
     star_id : (n,) array of str
-        Names of the stars whose noise-free position at the middle of the exposure lies on the detector.
+        Names of the stars whose noise-free position at the middle of the exposure lies on the
+        detector.
     ra_deg, dec_deg : (n,) array
         Directions as the camera saw them, deg.
     mag : (n,) array
@@ -60,11 +65,13 @@ class FrameTruth:
     x_px, y_px : (n,) array
         Positions at mid-exposure, px; (0, 0) is the centre of the first pixel, y grows downwards.
     electrons : (n,) array
-        Expected electrons of each star in the exposure, those beyond the edge or the full well included.
+        Expected electrons of each star in the exposure, those beyond the edge or the full well
+        included.
     frame : int
         Frame number.
     seed : int or None
-        Seed of the noise, with the frame number; None if the noise came from a generator, or there is none.
+        Seed of the noise, with the frame number; None if the noise came from a generator, or there
+        is none.
     time_utc : str or None
         Middle of the exposure, UTC.
     """
@@ -103,7 +110,12 @@ class FrameTruth:
             star_id=self.star_id,
             mag=self.mag,
             time_utc=None if self.time_utc is None else np.full(len(self), self.time_utc),
-            meta={"source": "rendered", "directions": "apparent", "seed": self.seed, "truth": self.camera.to_dict()},
+            meta={
+                "source": "rendered",
+                "directions": "apparent",
+                "seed": self.seed,
+                "truth": self.camera.to_dict(),
+            },
         )
 
 
@@ -114,7 +126,8 @@ class RenderedFrame:
     Attributes
     ----------
     data : (height_px, width_px) array
-        Counts, uint16; float64 if they were not quantised. ``data[y, x]`` is the pixel whose centre is (x, y).
+        Counts, uint16; float64 if they were not quantised. ``data[y, x]`` is the pixel whose centre
+        is (x, y).
     truth : FrameTruth
         Truth of what the frame shows.
     """
@@ -175,8 +188,8 @@ _TRUTH_COLUMNS = {
 def write_frame(frame: RenderedFrame, path: str | os.PathLike[str], force: bool = False) -> None:
     """Write a rendered frame and its truth as FITS; the same frame gives the same bytes.
 
-    Quantised counts become 16-bit integers (``BZERO`` = 32768), others 64-bit floats. RunFolderError if the file exists
-    and `force` is false, or cannot be written.
+    Quantised counts become 16-bit integers (``BZERO`` = 32768), others 64-bit floats.
+    RunFolderError if the file exists and `force` is false, or cannot be written.
     """
     with extra("images", "FITS images"):
         from astropy.io import fits
@@ -188,9 +201,14 @@ def write_frame(frame: RenderedFrame, path: str | os.PathLike[str], force: bool 
     # FITS knows ASCII only; other letters become escapes such as \u03b1.
     star_id = np.char.encode(truth.star_id, "ascii", "backslashreplace")
     names = fits.Column("star_id", f"{max(1, star_id.dtype.itemsize)}A", array=star_id)
-    columns = [fits.Column(key, "D", unit, array=getattr(truth, key)) for key, unit in _TRUTH_COLUMNS.items()]
+    columns = [
+        fits.Column(key, "D", unit, array=getattr(truth, key))
+        for key, unit in _TRUTH_COLUMNS.items()
+    ]
     stream = io.BytesIO()
-    fits.HDUList([image, fits.BinTableHDU.from_columns([names, *columns], name="TRUTH")]).writeto(stream)
+    fits.HDUList([image, fits.BinTableHDU.from_columns([names, *columns], name="TRUTH")]).writeto(
+        stream
+    )
     atomic_write_bytes(path, stream.getvalue())
 
 
@@ -220,17 +238,25 @@ def _cards(truth: FrameTruth) -> list[tuple[str, Any, str]]:
     ]
     cards.append(("CAMNAME", camera.name.encode("ascii", "replace").decode("ascii"), "camera"))
     table = camera.to_dict()
-    cards += [(keyword, table[key], text) for key, (keyword, text) in _CAMERA_KEYS.items() if key in table]
+    cards += [
+        (keyword, table[key], text) for key, (keyword, text) in _CAMERA_KEYS.items() if key in table
+    ]
     cards.append(("DISTORT", camera.distortion, "distortion model"))
     cards += [
         (coefficient.name.upper(), value, f"[{coefficient.unit}] distortion")
-        for coefficient, value in zip(get_model(camera.distortion).coefficients, camera.coefficients, strict=True)
+        for coefficient, value in zip(
+            get_model(camera.distortion).coefficients, camera.coefficients, strict=True
+        )
     ]
     cards += [(keyword, getattr(sensor, key), text) for key, (keyword, text) in SENSOR_KEYS.items()]
     return [
         *cards,
         ("SATURATE", sensor.saturation_counts, "[adu] a pixel with this or more is saturated"),
-        ("CREATOR", f"starcal-uq {installed_version('starcal-uq')}", "program that rendered the frame"),
+        (
+            "CREATOR",
+            f"starcal-uq {installed_version('starcal-uq')}",
+            "program that rendered the frame",
+        ),
         ("NUMPY", np.__version__, "version of NumPy, which draws the noise"),
     ]
 
@@ -260,9 +286,16 @@ def read_truth(path: str | os.PathLike[str]) -> FrameTruth:
         lengths = {"pixel_um": None, "focal_mm": None}
         camera = Camera(
             *size,
-            **lengths | {key: header[keyword] for key, (keyword, _) in _CAMERA_KEYS.items() if keyword in header},
+            **lengths
+            | {
+                key: header[keyword]
+                for key, (keyword, _) in _CAMERA_KEYS.items()
+                if keyword in header
+            },
             distortion=model.name,
-            coefficients=tuple(header[coefficient.name.upper()] for coefficient in model.coefficients),
+            coefficients=tuple(
+                header[coefficient.name.upper()] for coefficient in model.coefficients
+            ),
             name=header["CAMNAME"],
         )
         sensor = Sensor(**{key: header[keyword] for key, (keyword, _) in SENSOR_KEYS.items()})
@@ -273,10 +306,14 @@ def read_truth(path: str | os.PathLike[str]) -> FrameTruth:
         raise ImageError(f"{path}: the file does not exist; check the path.") from None
     except KeyError as error:
         what = str(error.args[0]).rstrip(".")
-        raise ImageError(f"{path}: the file carries no truth ({what}); name a frame that was rendered.") from None
+        raise ImageError(
+            f"{path}: the file carries no truth ({what}); name a frame that was rendered."
+        ) from None
     except (OSError, ValueError, TypeError, Warning, StarcalError) as error:
         reason = str(error).rstrip(".")
-        raise ImageError(f"{path}: the truth cannot be read ({reason}); render the frame again.") from error
+        raise ImageError(
+            f"{path}: the truth cannot be read ({reason}); render the frame again."
+        ) from error
     return FrameTruth(
         camera,
         sensor,
@@ -308,5 +345,7 @@ def truth_table(paths: Iterable[str | os.PathLike[str]]) -> Observations:
     columns["star_id"] = np.concatenate([truth.star_id for truth in truths])
     columns["mag"] = np.concatenate([truth.mag for truth in truths])
     if all(truth.time_utc is not None for truth in truths):
-        columns["time_utc"] = np.repeat([str(truth.time_utc) for truth in truths], [len(truth) for truth in truths])
+        columns["time_utc"] = np.repeat(
+            [str(truth.time_utc) for truth in truths], [len(truth) for truth in truths]
+        )
     return Observations(**columns, meta=tables[0].meta)

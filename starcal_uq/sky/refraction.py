@@ -1,9 +1,10 @@
 """The sky as seen from the ground: the zenith, the motion of the site, refraction.
 
-Everything is done on unit vectors along the ICRS axes: what turns the whole sky (precession, nutation, the rotation of
-the Earth) only decides where the zenith is among the stars, because attitudes are free. So UT1 - UTC, which is not
-known without a table from the network, may be taken as zero: it is below 0.9 s, which moves the zenith by at most 13.5
-arcsec and refraction, at 30 degrees of altitude, by 15 mas. Polar motion (0.3 arcsec) is left out for the same reason.
+Everything is done on unit vectors along the ICRS axes: what turns the whole sky (precession,
+nutation, the rotation of the Earth) only decides where the zenith is among the stars, because
+attitudes are free. So UT1 - UTC, which is not known without a table from the network, may be taken
+as zero: it is below 0.9 s, which moves the zenith by at most 13.5 arcsec and refraction, at 30
+degrees of altitude, by 15 mas. Polar motion (0.3 arcsec) is left out for the same reason.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import FloatArray
 from starcal_uq.sky.site import Site
 
-# Below this altitude refraction depends on the layers of the air, which two constants do not describe: at 10 degrees
-# the formula is 0.6 arcsec off in 320, at 5 degrees tens of arcsec.
+# Below this altitude refraction depends on the layers of the air, which two constants do not
+# describe: at 10 degrees the formula is 0.6 arcsec off in 320, at 5 degrees tens of arcsec.
 LEAST_ALTITUDE_DEG = 10.0
-# Sine of the altitude below which `refract` goes on as if the star were there; the limit of `erfa.atioq`.
+# Sine of the altitude below which `refract` goes on as if the star were there; the limit of
+# `erfa.atioq`.
 _LEAST_SINE = 0.05
 _TURNS_PER_UT1_DAY = 1.00273781191135448
 _EARTH_RATE_RAD_S = 2.0 * np.pi * _TURNS_PER_UT1_DAY / 86400.0
@@ -27,22 +29,37 @@ _WGS84 = 1
 _NEWTON_STEPS = 4
 
 
-def site_among_stars(site: Site, time_utc: Any, ut1_minus_utc_s: float = 0.0) -> tuple[FloatArray, FloatArray]:
+def site_among_stars(
+    site: Site, time_utc: Any, ut1_minus_utc_s: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
     """Zenith and velocity of a site, ICRS axes, at one UTC time (shape (3,)) or a sequence (n, 3).
 
-    The zenith is the outward normal of the ellipsoid (WGS 84); the velocity, relative to the Earth's centre, is at most
-    0.465 km/s: the cause of diurnal aberration, 0.32 arcsec. UT1 - UTC, seconds, turns the site together with its sky.
-    Precession and nutation are those of IAU 2006/2000A (`erfa.c2t06a`); polar motion is left out.
+    The zenith is the outward normal of the ellipsoid (WGS 84); the velocity, relative to the
+    Earth's centre, is at most 0.465 km/s: the cause of diurnal aberration, 0.32 arcsec. UT1 - UTC,
+    seconds, turns the site together with its sky. Precession and nutation are those of IAU
+    2006/2000A (`erfa.c2t06a`); polar motion is left out.
     """
     import erfa
 
     tt, ut1, inverse = julian_days(time_utc, ut1_minus_utc_s)
-    to_earth = np.asarray(erfa.c2t06a(tt[:, 0], tt[:, 1], ut1[:, 0], ut1[:, 1], 0.0, 0.0)).reshape(-1, 3, 3)
+    to_earth = np.asarray(erfa.c2t06a(tt[:, 0], tt[:, 1], ut1[:, 0], ut1[:, 1], 0.0, 0.0)).reshape(
+        -1, 3, 3
+    )
     latitude, longitude = np.radians(site.latitude_deg), np.radians(site.longitude_deg)
-    up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
-    place_km = np.asarray(erfa.gd2gc(_WGS84, longitude, latitude, site.height_m), dtype=np.float64) / 1000.0
+    up = np.array(
+        [
+            np.cos(latitude) * np.cos(longitude),
+            np.cos(latitude) * np.sin(longitude),
+            np.sin(latitude),
+        ]
+    )
+    place_km = (
+        np.asarray(erfa.gd2gc(_WGS84, longitude, latitude, site.height_m), dtype=np.float64)
+        / 1000.0
+    )
     velocity = _EARTH_RATE_RAD_S * np.array([-place_km[1], place_km[0], 0.0])
-    # Rows times the rotation are columns times its transpose: from the axes of the Earth to those of the stars.
+    # Rows times the rotation are columns times its transpose: from the axes of the Earth to those
+    # of the stars.
     zenith, moving = (up @ to_earth)[inverse], (velocity @ to_earth)[inverse]
     return (zenith[0], moving[0]) if np.ndim(time_utc) == 0 else (zenith, moving)
 
@@ -50,16 +67,22 @@ def site_among_stars(site: Site, time_utc: Any, ut1_minus_utc_s: float = 0.0) ->
 def refraction_constants(site: Site) -> tuple[float, float]:
     """A and B of the refraction R = A tan z + B tan^3 z, with z the zenith distance as seen; rad.
 
-    From `erfa.refco` (8 mas RMS, 62 mas at worst against ray tracing down to 15 degrees of altitude).
+    From `erfa.refco` (8 mas RMS, 62 mas at worst against ray tracing down to 15 degrees of
+    altitude).
     """
     import erfa
 
-    a, b = erfa.refco(site.air_pressure_hpa, site.air_temperature_c, site.relative_humidity, site.wavelength_um)
+    a, b = erfa.refco(
+        site.air_pressure_hpa, site.air_temperature_c, site.relative_humidity, site.wavelength_um
+    )
     return float(a), float(b)
 
 
-def refract(directions: FloatArray, zenith: FloatArray, constants: tuple[float, float]) -> FloatArray:
-    """Directions (n, 3) as seen through the air: each is raised towards the zenith, by `refraction_constants`.
+def refract(
+    directions: FloatArray, zenith: FloatArray, constants: tuple[float, float]
+) -> FloatArray:
+    """Directions (n, 3) as seen through the air: each is raised towards the zenith, by
+    `refraction_constants`.
 
     Lower than 3 degrees the refraction of 3 degrees is taken; check `altitude_deg` before.
     """
@@ -78,21 +101,25 @@ def refract(directions: FloatArray, zenith: FloatArray, constants: tuple[float, 
     # At the zenith itself there is no direction to be raised along, and nothing to raise.
     along = level / np.where(cosine > 0.0, cosine, 1.0)[..., None]
     seen = z_vacuum - raised
-    return np.asarray(np.cos(seen)[..., None] * zenith + np.sin(seen)[..., None] * along, dtype=np.float64)
+    return np.asarray(
+        np.cos(seen)[..., None] * zenith + np.sin(seen)[..., None] * along, dtype=np.float64
+    )
 
 
 def altitude_deg(directions: FloatArray, zenith: FloatArray) -> FloatArray:
     """Altitude of directions above the horizon, degrees; shapes as for `refract`."""
     sine = np.sum(directions * zenith, axis=-1)
-    altitude: FloatArray = np.degrees(np.arctan2(sine, np.linalg.norm(directions - sine[..., None] * zenith, axis=-1)))
+    altitude: FloatArray = np.degrees(
+        np.arctan2(sine, np.linalg.norm(directions - sine[..., None] * zenith, axis=-1))
+    )
     return altitude
 
 
 def shrinking(altitude_seen_deg: FloatArray | float, constants: tuple[float, float]) -> FloatArray:
     """By which part of themselves refraction shrinks small angles, mean of vertical and horizontal.
 
-    Vertically dR/dz = (A + 3 B tan^2 z) / cos^2 z, horizontally R / tan z = A + B tan^2 z. A focal length that is
-    estimated without refraction is too short by this part.
+    Vertically dR/dz = (A + 3 B tan^2 z) / cos^2 z, horizontally R / tan z = A + B tan^2 z. A focal
+    length that is estimated without refraction is too short by this part.
     """
     a, b = constants
     squared = np.tan(np.radians(90.0 - np.asarray(altitude_seen_deg, dtype=np.float64))) ** 2

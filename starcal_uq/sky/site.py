@@ -25,20 +25,36 @@ _HEADER = """\
 _SECTION = Section(
     {
         "latitude_deg": Key(
-            float, "the latitude in degrees, north positive, from -90 to 90", required=True, ge=-90.0, le=90.0
+            float,
+            "the latitude in degrees, north positive, from -90 to 90",
+            required=True,
+            ge=-90.0,
+            le=90.0,
         ),
         "longitude_deg": Key(
-            float, "the longitude in degrees, east positive, from -180 to 360", required=True, ge=-180.0, le=360.0
+            float,
+            "the longitude in degrees, east positive, from -180 to 360",
+            required=True,
+            ge=-180.0,
+            le=360.0,
         ),
         "height_m": Key(float, "the height in metres, from -500 to 9000", ge=-500.0, le=9000.0),
         "pressure_hpa": Key(
-            float | None, "the pressure at the site in hPa, from 200 to 1100, or leave it out", ge=200.0, le=1100.0
+            float | None,
+            "the pressure at the site in hPa, from 200 to 1100, or leave it out",
+            ge=200.0,
+            le=1100.0,
         ),
         "temperature_c": Key(
-            float | None, "the temperature in degrees Celsius, from -90 to 60, or leave it out", ge=-90.0, le=60.0
+            float | None,
+            "the temperature in degrees Celsius, from -90 to 60, or leave it out",
+            ge=-90.0,
+            le=60.0,
         ),
         "relative_humidity": Key(float, "the relative humidity, from 0 to 1", ge=0.0, le=1.0),
-        "wavelength_um": Key(float, "the effective wavelength in micrometres, from 0.3 to 2.5", ge=0.3, le=2.5),
+        "wavelength_um": Key(
+            float, "the effective wavelength in micrometres, from 0.3 to 2.5", ge=0.3, le=2.5
+        ),
         "name": Key(str, "a name in quotes"),
     },
     SiteError,
@@ -56,7 +72,8 @@ class Site:
     height_m : float
         Height, metres.
     pressure_hpa : float or None
-        Pressure at the site (not reduced to sea level), hPa; None for that of the standard atmosphere.
+        Pressure at the site (not reduced to sea level), hPa; None for that of the standard
+        atmosphere.
     temperature_c : float or None
         Temperature of the air, Celsius; None for that of the standard atmosphere.
     relative_humidity : float
@@ -88,14 +105,18 @@ class Site:
 
     @property
     def air_pressure_hpa(self) -> float:
-        """Pressure, hPa: as given, or that of the International Standard Atmosphere at the site's height."""
+        """Pressure, hPa: as given, or that of the International Standard Atmosphere at the site's
+        height.
+        """
         if self.pressure_hpa is not None:
             return self.pressure_hpa
         return float(1013.25 * (1.0 - 2.25577e-5 * self.height_m) ** 5.25588)
 
     @property
     def air_temperature_c(self) -> float:
-        """Temperature, Celsius: as given, or that of the International Standard Atmosphere at the site's height."""
+        """Temperature, Celsius: as given, or that of the International Standard Atmosphere at the
+        site's height.
+        """
         return 15.0 - 0.0065 * self.height_m if self.temperature_c is None else self.temperature_c
 
     @property
@@ -108,11 +129,16 @@ class Site:
     def words(self) -> str:
         """Latitude and longitude."""
         north, east = self.latitude_deg, (self.longitude_deg + 180.0) % 360.0 - 180.0
-        return f"{abs(north):.2f}° {'N' if north >= 0 else 'S'}, {abs(east):.2f}° {'E' if east >= 0 else 'W'}"
+        return (
+            f"{abs(north):.2f}° {'N' if north >= 0 else 'S'}, {abs(east):.2f}° "
+            f"{'E' if east >= 0 else 'W'}"
+        )
 
     def later(self, hours: float) -> Site:
         """The place that has the sky of so many hours later: one further east."""
-        return replace(self, longitude_deg=(self.longitude_deg + HOUR_DEG * hours + 180.0) % 360.0 - 180.0)
+        return replace(
+            self, longitude_deg=(self.longitude_deg + HOUR_DEG * hours + 180.0) % 360.0 - 180.0
+        )
 
     def __str__(self) -> str:
         return f"{self.name + ', ' if self.name else ''}{self.words}, {self.height_m:.0f} m"
@@ -139,9 +165,12 @@ class Site:
         Raises
         ------
         SiteError
-            If the file cannot be read, is no TOML, has no [site] table, or a key is missing, unknown or wrong.
+            If the file cannot be read, is no TOML, has no [site] table, or a key is missing,
+            unknown or wrong.
         """
-        return cls(**_SECTION.check(read_section(path, "site", SiteError), f"{path}, section [site]"))
+        return cls(
+            **_SECTION.check(read_section(path, "site", SiteError), f"{path}, section [site]")
+        )
 
     def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write a TOML file without loss of digits.
@@ -160,6 +189,7 @@ def check_sky(directions: str | None, site: Site | None, in_space: bool) -> None
         raise SiteError("A camera in space has no site on the ground: give one or the other.")
     if site is not None and directions not in (None, "catalogue"):
         raise SiteError(
-            f"With a site the directions are made apparent, but they are declared {directions}: leave out the site or "
+            f"With a site the directions are made apparent, but they are declared {directions}: "
+            "leave out the site or "
             "the declaration."
         )

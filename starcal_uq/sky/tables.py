@@ -1,5 +1,6 @@
-"""Readers for a user's own star catalogue: tables with named columns, and three catalogues in the format of the
-CDS."""
+"""Readers for a user's own star catalogue: tables with named columns, and three catalogues in the
+format of the CDS.
+"""
 
 from __future__ import annotations
 
@@ -25,18 +26,56 @@ Format = Literal["csv", "ecsv", "fits", "hipparcos", "sao", "bsc"]
 # Barnard's star, the fastest, moves 10,400 mas/yr.
 MAX_PROPER_MOTION_MAS_YR = 11000.0
 
-# Names under which columns are found without being told, first hit wins; compared without regard to case. Columns of
-# equinox B1950 are left out on purpose: their names must not be mistaken.
+# Names under which columns are found without being told, first hit wins; compared without regard to
+# case. Columns of equinox B1950 are left out on purpose: their names must not be mistaken.
 _GUESSES: dict[str, tuple[str, ...]] = {
-    "star_id": ("star_id", "source_id", "designation", "hip", "hr", "sao", "hd", "tyc", "name", "id"),
-    "ra_deg": ("ra_deg", "ra", "raicrs", "ra_icrs", "radeg", "raj2000", "_raj2000", "ra_j2000", "alpha"),
-    "dec_deg": ("dec_deg", "dec", "deicrs", "de_icrs", "dedeg", "dej2000", "_dej2000", "dec_j2000", "de", "delta"),
+    "star_id": (
+        "star_id",
+        "source_id",
+        "designation",
+        "hip",
+        "hr",
+        "sao",
+        "hd",
+        "tyc",
+        "name",
+        "id",
+    ),
+    "ra_deg": (
+        "ra_deg",
+        "ra",
+        "raicrs",
+        "ra_icrs",
+        "radeg",
+        "raj2000",
+        "_raj2000",
+        "ra_j2000",
+        "alpha",
+    ),
+    "dec_deg": (
+        "dec_deg",
+        "dec",
+        "deicrs",
+        "de_icrs",
+        "dedeg",
+        "dej2000",
+        "_dej2000",
+        "dec_j2000",
+        "de",
+        "delta",
+    ),
     "mag": ("mag", "phot_g_mean_mag", "gmag", "g_mag", "vmag", "v_mag", "hpmag", "vtmag", "vt_mag"),
     "pm_ra_mas_yr": ("pm_ra_mas_yr", "pmra", "pm_ra", "pmra_masyr", "pm_ra_cosdec"),
     "pm_dec_mas_yr": ("pm_dec_mas_yr", "pmdec", "pm_dec", "pmde", "pm_de", "pmdec_masyr"),
     "epoch": ("epoch", "ref_epoch", "epoch_yr"),
 }
-_UNITS = {"ra_deg": "deg", "dec_deg": "deg", "pm_ra_mas_yr": "mas/yr", "pm_dec_mas_yr": "mas/yr", "epoch": "yr"}
+_UNITS = {
+    "ra_deg": "deg",
+    "dec_deg": "deg",
+    "pm_ra_mas_yr": "mas/yr",
+    "pm_dec_mas_yr": "mas/yr",
+    "epoch": "yr",
+}
 _BANDS = {
     "phot_g_mean_mag": "Gaia G",
     "gmag": "Gaia G",
@@ -72,34 +111,42 @@ def read_catalogue(
 ) -> StarCatalogue:
     """Stars of a user's own catalogue, in the file's order.
 
-    Tables (CSV, ECSV, FITS; also compressed with gzip) have named columns: directions in ICRS, and optionally a
-    magnitude, a name, proper motions (in right ascension *times cos(dec)*) and an epoch. Units stated in the table
-    are converted; without them, angles are deg and proper motions mas/yr.
+    Tables (CSV, ECSV, FITS; also compressed with gzip) have named columns: directions in ICRS, and
+    optionally a magnitude, a name, proper motions (in right ascension *times cos(dec)*) and an
+    epoch. Units stated in the table are converted; without them, angles are deg and proper motions
+    mas/yr.
 
-    Three catalogues of the CDS are read as they are distributed, their units, equinox and epoch being known:
+    Three catalogues of the CDS are read as they are distributed, their units, equinox and epoch
+    being known:
 
     - "hipparcos": The Hipparcos Catalogue, I/239, `hip_main.dat`. ICRS at J1991.25.
-    - "sao": the SAO catalogue, I/131A, `sao.dat`. FK5 J2000 columns, turned to ICRS; 0.1 to 1 arcsec at J2000.
-    - "bsc": the Bright Star Catalogue, V/50, `catalog`. FK5 J2000, turned to ICRS; rounded to 0.1 s and 1 arcsec.
+    - "sao": the SAO catalogue, I/131A, `sao.dat`. FK5 J2000 columns, turned to ICRS; 0.1 to 1
+      arcsec at J2000.
+    - "bsc": the Bright Star Catalogue, V/50, `catalog`. FK5 J2000, turned to ICRS; rounded to 0.1 s
+      and 1 arcsec.
 
-    Their entries without a position (and those that SAO marks as deleted) are left out; `source` says how many.
+    Their entries without a position (and those that SAO marks as deleted) are left out; `source`
+    says how many.
 
     Parameters
     ----------
     path
         The file.
     columns
-        For tables: names of this package to names in the file, such as ``{"ra_deg": "RA_corr", "mag": "imag"}``. The
-        names of this package are star_id, ra_deg, dec_deg, mag, pm_ra_mas_yr, pm_dec_mas_yr and epoch (Julian year of
-        each position). Those not given are looked for under their usual names (ra, RAICRS, pmRA, Vmag, ...).
+        For tables: names of this package to names in the file, such as ``{"ra_deg": "RA_corr",
+        "mag": "imag"}``. The names of this package are star_id, ra_deg, dec_deg, mag, pm_ra_mas_yr,
+        pm_dec_mas_yr and epoch (Julian year of each position). Those not given are looked for under
+        their usual names (ra, RAICRS, pmRA, Vmag, ...).
     format
         "csv", "ecsv", "fits", "hipparcos", "sao" or "bsc"; by default from the file's name.
     file_epoch
-        Julian year of the positions. Tables that hold no epoch (a column, or the key "epoch" of their metadata) need
-        it: "J2000" in a column's name is an equinox. Not for the catalogues of the CDS.
+        Julian year of the positions. Tables that hold no epoch (a column, or the key "epoch" of
+        their metadata) need it: "J2000" in a column's name is an equinox. Not for the catalogues of
+        the CDS.
     max_mag
-        Faintest magnitude, in the band of the file's magnitude column (`band` of the result: Johnson V for the three
-        catalogues of the CDS, photographic-visual in parts of SAO). Stars without a magnitude are then left out.
+        Faintest magnitude, in the band of the file's magnitude column (`band` of the result:
+        Johnson V for the three catalogues of the CDS, photographic-visual in parts of SAO). Stars
+        without a magnitude are then left out.
     epoch
         Julian year to move the stars to; by default that of the file (the latest, if rows differ).
     observer_velocity_km_s
@@ -109,14 +156,14 @@ def read_catalogue(
     band
         Name of the photometric band, if the column's name does not tell.
     readme
-        For the CDS: the ReadMe to take the columns' places from. By default, the file "ReadMe" beside the catalogue
-        if it describes the needed columns, and else the published layout.
+        For the CDS: the ReadMe to take the columns' places from. By default, the file "ReadMe"
+        beside the catalogue if it describes the needed columns, and else the published layout.
 
     Raises
     ------
     CatalogueError
-        One sentence that names the file and, where there is one, the row (the line of a text file), the column and
-        the remedy.
+        One sentence that names the file and, where there is one, the row (the line of a text file),
+        the column and the remedy.
     """
     path = Path(path)
     if path.is_dir():
@@ -127,20 +174,30 @@ def read_catalogue(
     with reading(path, f"readable as {kind.upper()}", "check the file", CatalogueError):
         if kind in ("hipparcos", "sao", "bsc"):
             if columns is not None or file_epoch is not None:
-                raise CatalogueError(f"{path}: the columns and the epoch of format {kind!r} are fixed; leave them out.")
+                raise CatalogueError(
+                    f"{path}: the columns and the epoch of format {kind!r} are fixed; leave them "
+                    "out."
+                )
             stars = _checked_cds(path, kind, None if readme is None else Path(readme), band)
         elif kind in ("csv", "ecsv", "fits"):
             stars = _read_table(path, kind, dict(columns or {}), file_epoch, epoch, band)
         else:
-            raise CatalogueError(f"{path}: unknown format {kind!r}; use csv, ecsv, fits, hipparcos, sao or bsc.")
+            raise CatalogueError(
+                f"{path}: unknown format {kind!r}; use csv, ecsv, fits, hipparcos, sao or bsc."
+            )
     if max_mag is not None and not np.isfinite(stars.mag).any():
-        raise CatalogueError(f"{path}: has no magnitudes to cut at {max_mag:g}; leave out max_mag or name the column.")
+        raise CatalogueError(
+            f"{path}: has no magnitudes to cut at {max_mag:g}; leave out max_mag or name the "
+            "column."
+        )
     return prepare(stars, max_mag, epoch, observer_velocity_km_s, require_proper_motion)
 
 
 @dataclass(frozen=True)
 class _Source:
-    """A table with what error messages need: file, format, and the line of the file that each row comes from."""
+    """A table with what error messages need: file, format, and the line of the file that each row
+    comes from.
+    """
 
     path: Path
     kind: Format
@@ -149,7 +206,9 @@ class _Source:
 
     def fail(self, name: str, row: int, what: str, remedy: str) -> CatalogueError:
         column = self.names[name]
-        return CatalogueError(f"{self.path}, {self.place(row)}, column {column!r}: {what}; {remedy}.")
+        return CatalogueError(
+            f"{self.path}, {self.place(row)}, column {column!r}: {what}; {remedy}."
+        )
 
     def place(self, row: int) -> str:
         return f"row {row + 1}" if self.kind == "fits" else f"line {_text_line(self.path, row)}"
@@ -157,7 +216,9 @@ class _Source:
     def numbers(self, name: str) -> FloatArray:
         """A column as floats in this package's unit; NaN where the file has no value."""
         column = self.table[self.names[name]]
-        values = np.ma.filled(np.ma.asarray(_as_floats(self, name, column), dtype=np.float64), np.nan)
+        values = np.ma.filled(
+            np.ma.asarray(_as_floats(self, name, column), dtype=np.float64), np.nan
+        )
         unit, wanted = getattr(column, "unit", None), _UNITS.get(name)
         if unit is None or wanted is None or name == "epoch":
             return values
@@ -168,7 +229,8 @@ class _Source:
             return np.asarray(Unit(unit).to(Unit(wanted), values), dtype=np.float64)
         except (UnitsError, TypeError, ValueError) as error:
             raise CatalogueError(
-                f"{self.path}, column {self.names[name]!r}: the unit {str(unit)!r} cannot be converted to {wanted}; "
+                f"{self.path}, column {self.names[name]!r}: the unit {str(unit)!r} cannot be "
+                f"converted to {wanted}; "
                 "correct the unit or name another column."
             ) from error
 
@@ -209,7 +271,9 @@ def _read_table(
     )
 
 
-def _checked_cds(path: Path, kind: CdsFormat, readme: Path | None, band: str | None) -> StarCatalogue:
+def _checked_cds(
+    path: Path, kind: CdsFormat, readme: Path | None, band: str | None
+) -> StarCatalogue:
     stars = read_cds(path, kind, readme)
     return stars if band is None else StarCatalogue(**{**vars(stars), "band": band})
 
@@ -228,8 +292,8 @@ def _load_table(path: Path, kind: Format) -> Any:
     if kind == "fits":
         check_fits(content)
     with warnings.catch_warnings():
-        # What is odd matters only in a column that is used, whose conversion complains about it; but a cut-off file is
-        # no catalogue.
+        # What is odd matters only in a column that is used, whose conversion complains about it;
+        # but a cut-off file is no catalogue.
         warnings.simplefilter("ignore", AstropyWarning)
         warnings.filterwarnings("error", "File may have been truncated", AstropyWarning)
         return Table.read(path, **options)
@@ -240,7 +304,9 @@ def _find_columns(path: Path, present: list[str], given: dict[str, str]) -> dict
     listing = listed(present) or "none"
     for name, column in given.items():
         if name not in _GUESSES:
-            raise CatalogueError(f"{path}: columns names {name!r}, which is none of {', '.join(_GUESSES)}.")
+            raise CatalogueError(
+                f"{path}: columns names {name!r}, which is none of {', '.join(_GUESSES)}."
+            )
         if column not in present:
             raise CatalogueError(f"{path}: has no column {column!r} for {name}; it has {listing}.")
     lower = {column.lower(): column for column in reversed(present)}
@@ -252,11 +318,14 @@ def _find_columns(path: Path, present: list[str], given: dict[str, str]) -> dict
     for name in ("ra_deg", "dec_deg"):
         if name not in columns:
             raise CatalogueError(
-                f'{path}: no column is known as {name}; name it with columns={{"{name}": ...}}, among {listing}.'
+                f'{path}: no column is known as {name}; name it with columns={{"{name}": ...}}, '
+                f"among {listing}."
             )
     if ("pm_ra_mas_yr" in columns) != ("pm_dec_mas_yr" in columns):
         missing = "pm_dec_mas_yr" if "pm_ra_mas_yr" in columns else "pm_ra_mas_yr"
-        raise CatalogueError(f"{path}: has half of a proper motion but no {missing}; name it, among {listing}.")
+        raise CatalogueError(
+            f"{path}: has half of a proper motion but no {missing}; name it, among {listing}."
+        )
     return columns
 
 
@@ -270,7 +339,9 @@ def _as_floats(source: _Source, name: str, column: Any) -> Any:
         try:
             values[row] = float(stripped) if stripped else np.nan
         except ValueError as error:
-            raise source.fail(name, row, f"{stripped!r} is not a number", "write decimal numbers") from error
+            raise source.fail(
+                name, row, f"{stripped!r} is not a number", "write decimal numbers"
+            ) from error
     return values
 
 
@@ -279,7 +350,11 @@ def _check_positions(source: _Source, ra: FloatArray, dec: FloatArray) -> None:
         bad = np.flatnonzero(~((values >= low) & (values <= high)))
         if len(bad):
             value = values[bad[0]]
-            what = "has no value" if np.isnan(value) else f"{value:g} deg is outside [{low:g}, {high:g}]"
+            what = (
+                "has no value"
+                if np.isnan(value)
+                else f"{value:g} deg is outside [{low:g}, {high:g}]"
+            )
             more = f" ({len(bad) - 1} more such rows)" if len(bad) > 1 else ""
             raise source.fail(name, int(bad[0]), what + more, "correct or remove the row")
 
@@ -292,7 +367,9 @@ def _motion(source: _Source, name: str) -> FloatArray:
     bad = np.flatnonzero(np.abs(values) > MAX_PROPER_MOTION_MAS_YR)
     if len(bad):
         what = f"a proper motion of {values[bad[0]]:g} mas/yr is faster than any star's"
-        raise source.fail(name, int(bad[0]), what, "convert it to mas/yr, or state its unit in the table")
+        raise source.fail(
+            name, int(bad[0]), what, "convert it to mas/yr, or state its unit in the table"
+        )
     return values
 
 
@@ -314,7 +391,8 @@ def _epochs(source: _Source, file_epoch: float | None) -> FloatArray:
             if re.fullmatch(r"\d{4}(\.\d*)?", text):
                 return np.full(n, check_epoch(float(text)))
     raise CatalogueError(
-        f"{source.path}: does not say the epoch of its positions; give it as a Julian year, such as file_epoch=2016.0."
+        f"{source.path}: does not say the epoch of its positions; give it as a Julian year, such "
+        "as file_epoch=2016.0."
     )
 
 
@@ -323,7 +401,11 @@ def _star_ids(source: _Source) -> StrArray:
         return np.array([f"row {row + 1}" for row in range(len(source.table))], dtype=np.str_)
     column = source.names["star_id"]
     values = source.table[column]
-    prefix = f"{column.upper()} " if column.lower() in ("hip", "hr", "sao", "hd") and values.dtype.kind in "iu" else ""
+    prefix = (
+        f"{column.upper()} "
+        if column.lower() in ("hip", "hr", "sao", "hd") and values.dtype.kind in "iu"
+        else ""
+    )
     text: StrArray = np.ma.filled(np.ma.asarray(values).astype(str), "")
     return np.array([prefix + str(value).strip() if value else "" for value in text], dtype=np.str_)
 
@@ -339,19 +421,27 @@ def _format_of(path: Path) -> Format:
     kind = _CDS_NAMES.get(name) or _ENDINGS.get(Path(name).suffix)
     if kind is None:
         raise CatalogueError(
-            f"{path}: the name does not tell the format; give format='csv', 'ecsv', 'fits', 'hipparcos' (I/239), "
+            f"{path}: the name does not tell the format; give format='csv', 'ecsv', 'fits', "
+            "'hipparcos' (I/239), "
             "'sao' (I/131A) or 'bsc' (V/50)."
         )
     return kind
 
 
 def _text_line(path: Path, row: int) -> int:
-    """Line, from 1, of a data row of a CSV or ECSV file: comments and empty lines count, the header is one line."""
+    """Line, from 1, of a data row of a CSV or ECSV file: comments and empty lines count, the header
+    is one line.
+    """
     with extra("images", "catalogue files"):
         from astropy.utils.data import get_readable_fileobj
 
     with get_readable_fileobj(path) as file:
         lines: IntArray = np.array(
-            [number for number, line in enumerate(file, 1) if line.strip() and not line.startswith("#")], dtype=np.int64
+            [
+                number
+                for number, line in enumerate(file, 1)
+                if line.strip() and not line.startswith("#")
+            ],
+            dtype=np.int64,
         )
     return int(lines[min(row + 1, len(lines) - 1)])

@@ -19,7 +19,8 @@ from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.simulation.pointing import POINTINGS
 
 FLAT = "flat"
-# Terms of a distortion that cancel to less than this share of their sum have no size that could be scaled.
+# Terms of a distortion that cancel to less than this share of their sum have no size that could be
+# scaled.
 _CANCELLED = 0.02
 
 
@@ -27,8 +28,8 @@ _CANCELLED = 0.02
 class Axis:
     """Something that a study can vary: its key in files, and words and unit for labels.
 
-    It takes numbers within a limit, or names, any where there are no `choices`. `base` is its value where nothing is
-    said; None leaves it to the camera, or to nature.
+    It takes numbers within a limit, or names, any where there are no `choices`. `base` is its value
+    where nothing is said; None leaves it to the camera, or to nature.
     """
 
     name: str
@@ -46,7 +47,11 @@ class Axis:
             return value
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         # Whole numbers may come as floats.
-        value = int(value) if self.kind == "whole" and number and math.isfinite(value) and value % 1 == 0 else value
+        value = (
+            int(value)
+            if self.kind == "whole" and number and math.isfinite(value) and value % 1 == 0
+            else value
+        )
         if not number or self.limit is None or not self.limit.holds(value):
             raise StudyError(f"{where}: {self.name} is {shown(value)}; {self.wanted}.")
         return value if self.kind == "whole" else float(value)
@@ -60,7 +65,11 @@ class Axis:
     def wanted(self) -> str:
         """What to write, as an order."""
         if self.limit is None:
-            return f"write one of {', '.join(self.choices)}" if self.choices else "write a name in quotes"
+            return (
+                f"write one of {', '.join(self.choices)}"
+                if self.choices
+                else "write a name in quotes"
+            )
         return self.limit.wanted().replace("give", "write", 1)
 
 
@@ -98,7 +107,8 @@ AXES = {
 }  # fmt: skip
 # Axes that make another camera.
 CAMERA_AXES = tuple(AXES)[: tuple(AXES).index("max_mag")]
-# Both set the focal length; the coefficients and the size of the distortion both set the distortion.
+# Both set the focal length; the coefficients and the size of the distortion both set the
+# distortion.
 EXCLUSIVE = (("fov_deg", "focal_mm"), *((name, "distortion_px") for name in COEFFICIENTS))
 
 
@@ -111,8 +121,9 @@ def base_settings(given: Mapping[str, Any]) -> AnyDict:
 def camera_of(base: Camera, settings: Mapping[str, Any]) -> Camera:
     """The camera of a cell.
 
-    The distortion stays what it is in millimetres on the detector when pixels change, and in pixels when the focal
-    length does. StudyError for a distortion that folds over inside the field, or terms that cancel.
+    The distortion stays what it is in millimetres on the detector when pixels change, and in pixels
+    when the focal length does. StudyError for a distortion that folds over inside the field, or
+    terms that cancel.
     """
     camera = base
     if "pixels" in settings:
@@ -120,10 +131,16 @@ def camera_of(base: Camera, settings: Mapping[str, Any]) -> Camera:
         camera = _resampled(camera, n / camera.width_px, n, n)
     if "pixel_um" in settings:
         if camera.pixel_um is None:
-            raise StudyError("the axis pixel_um needs the pitch of the camera: state pixel_um under [camera].")
-        camera = _resampled(camera, camera.pixel_um / settings["pixel_um"], camera.width_px, camera.height_px)
+            raise StudyError(
+                "the axis pixel_um needs the pitch of the camera: state pixel_um under [camera]."
+            )
+        camera = _resampled(
+            camera, camera.pixel_um / settings["pixel_um"], camera.width_px, camera.height_px
+        )
     if "fov_deg" in settings:
-        camera = camera.replace(focal_px=camera.width_px / (2.0 * math.tan(0.5 * math.radians(settings["fov_deg"]))))
+        camera = camera.replace(
+            focal_px=camera.width_px / (2.0 * math.tan(0.5 * math.radians(settings["fov_deg"])))
+        )
     if "focal_mm" in settings:
         camera = camera.replace(focal_mm=settings["focal_mm"])
     if "x0_offset_px" in settings:
@@ -153,23 +170,35 @@ def _resampled(camera: Camera, finer: float, width: int, height: int) -> Camera:
         height_px=height,
         pixel_um=None if camera.pixel_um is None else camera.pixel_um / finer,
         focal_px=camera.focal_px * finer,
-        coefficients=tuple(k * finer ** (1 - n) for k, n in zip(camera.coefficients, orders, strict=True)),
+        coefficients=tuple(
+            k * finer ** (1 - n) for k, n in zip(camera.coefficients, orders, strict=True)
+        ),
     )
     x, y = camera.centre_px
     return new.replace(
-        x0_px=new.centre_px[0] + finer * (camera.x0_px - x), y0_px=new.centre_px[1] + finer * (camera.y0_px - y)
+        x0_px=new.centre_px[0] + finer * (camera.x0_px - x),
+        y0_px=new.centre_px[1] + finer * (camera.y0_px - y),
     )
 
 
 def _with_displacement(camera: Camera, wanted_px: float) -> Camera:
-    """All coefficients scaled alike, so that the corner moves outwards by so much; the first alone, where all are 0."""
+    """All coefficients scaled alike, so that the corner moves outwards by so much; the first alone,
+    where all are 0.
+    """
     model = get_model(camera.distortion)
-    given = camera.coefficients if any(camera.coefficients) else (1.0, *(0.0 for _ in camera.coefficients[1:]))
-    terms = [_outwards(camera, [k * (i == j) for j in range(len(given))]) for i, k in enumerate(given)]
+    given = (
+        camera.coefficients
+        if any(camera.coefficients)
+        else (1.0, *(0.0 for _ in camera.coefficients[1:]))
+    )
+    terms = [
+        _outwards(camera, [k * (i == j) for j in range(len(given))]) for i, k in enumerate(given)
+    ]
     total = sum(terms)
     if abs(total) <= _CANCELLED * sum(map(abs, terms)):
         raise StudyError(
-            "distortion_px: the terms of the camera's distortion cancel in the corner, so that it has no size; "
+            "distortion_px: the terms of the camera's distortion cancel in the corner, so that "
+            "it has no size; "
             "change the coefficients of [camera], or set them to zero."
         )
     sign = 1.0 if model.direction == "forward" else -1.0
@@ -179,6 +208,9 @@ def _with_displacement(camera: Camera, wanted_px: float) -> Camera:
 def _outwards(camera: Camera, coefficients: list[float]) -> float:
     """Displacement of the farthest corner away from the principal point, px."""
     ends = (-0.5, camera.width_px - 0.5), (-0.5, camera.height_px - 0.5)
-    u, v = (max((end - c for end in side), key=abs) for side, c in zip(ends, (camera.x0_px, camera.y0_px), strict=True))
+    u, v = (
+        max((end - c for end in side), key=abs)
+        for side, c in zip(ends, (camera.x0_px, camera.y0_px), strict=True)
+    )
     du, dv = get_model(camera.distortion).displacement(u, v, coefficients)
     return float((u * du + v * dv) / math.hypot(u, v))

@@ -4,9 +4,10 @@ The covariance after n frames is that of an estimate which weighs images by thei
 
     C = (n F + P)^-1 (n F + P + n A + n (n - 1) B) (n F + P)^-1,
 
-with F the mean information of a frame (attitudes eliminated) and P the prior's precision. A and B are there where stars
-bring errors into all of their images: what these add to the variance of a frame's score, and the covariance of the
-scores of two frames. Everything else follows from C: it is what `coupling` says of a posterior, before there is any.
+with F the mean information of a frame (attitudes eliminated) and P the prior's precision. A and B
+are there where stars bring errors into all of their images: what these add to the variance of a
+frame's score, and the covariance of the scores of two frames. Everything else follows from C: it is
+what `coupling` says of a posterior, before there is any.
 """
 
 from __future__ import annotations
@@ -42,13 +43,21 @@ from starcal_uq.studies.geometry import (
     take_frames,
 )
 
-# Numbers of frames, relative to a cell's own, at which its errors are kept: what a target takes follows from them.
+# Numbers of frames, relative to a cell's own, at which its errors are kept: what a target takes
+# follows from them.
 FRAME_FACTORS = 10.0 ** np.arange(-3.0, 3.01, 0.25)
 # Entries of a `priors` table, and the parameters that they are about.
-_PRIOR_OF = {"principal_point_px": slice(0, 2), "focal_fraction": slice(2, 3), "distortion_corner_px": slice(3, None)}
-# Sets of frames that are kept: the last ones, and those of the mission for the patterns of a camera.
+_PRIOR_OF = {
+    "principal_point_px": slice(0, 2),
+    "focal_fraction": slice(2, 3),
+    "distortion_corner_px": slice(3, None),
+}
+# Sets of frames that are kept: the last ones, and those of the mission for the patterns of a
+# camera.
 _KEPT = 8
-UNDETERMINED = "the frames do not determine every parameter: use more stars, a simpler model, or a prior."
+UNDETERMINED = (
+    "the frames do not determine every parameter: use more stars, a simpler model, or a prior."
+)
 Numbers = AnyDict
 
 
@@ -122,7 +131,9 @@ class FisherCells(Cells):
         return found
 
     def stated(self, cell: Cell, camera: Camera) -> tuple[Statements, float]:
-        """What the frames of a cell say, and do to attitudes of a mission, and the noise to scale it by."""
+        """What the frames of a cell say, and do to attitudes of a mission, and the noise to scale
+        it by.
+        """
         settings = cell.settings
         key = geometry_key(camera, settings, self.definition.seed, cell.seed_index, False)
         offset = offset_of(camera, settings)
@@ -138,7 +149,9 @@ class FisherCells(Cells):
             self._stated = whole, stated
         return self._stated[1], scale
 
-    def _state(self, key: GeometryKey, stars: int | None, shape: NoiseShape, offset: float) -> Statements:
+    def _state(
+        self, key: GeometryKey, stars: int | None, shape: NoiseShape, offset: float
+    ) -> Statements:
         chosen = self.geometry(key).brightest(stars)
         return statements(chosen, star_noise(chosen.mag, shape), offset)
 
@@ -158,7 +171,9 @@ def prior_precision(table: Mapping[str, Any] | None, camera: Camera) -> FloatArr
 def campaign_numbers(
     stated: Statements, counts: FloatArray, prior: FloatArray | None, n: int, scale: float = 1.0
 ) -> Numbers:
-    """What a campaign of n frames says, frame k counted `counts[k]` times; noise `scale` times that stated."""
+    """What a campaign of n frames says, frame k counted `counts[k]` times; noise `scale` times that
+    stated.
+    """
     camera = stated.camera
     frame = np.tensordot(counts, stated.information, 1) / n
     found = coupling_numbers(frame, prior, n, stated)
@@ -173,7 +188,10 @@ def campaign_numbers(
 
 
 def covariances(
-    frame: FloatArray, prior: FloatArray, spread: tuple[FloatArray, FloatArray] | None, n: FloatArray
+    frame: FloatArray,
+    prior: FloatArray,
+    spread: tuple[FloatArray, FloatArray] | None,
+    n: FloatArray,
 ) -> FloatArray:
     """Covariances (k, p, p) after numbers of frames (k,): the module's formula."""
     total = n[:, None, None] * frame + np.diag(prior)
@@ -197,7 +215,11 @@ def coupling_numbers(
     every = covariances(frame, precision, stated.star_spread, numbers)
     if not np.isfinite(every[0]).all():
         raise StudyError(UNDETERMINED)
-    data = every[0] if prior is None else covariances(frame, np.zeros(len(frame)), stated.star_spread, numbers[:1])[0]
+    data = (
+        every[0]
+        if prior is None
+        else covariances(frame, np.zeros(len(frame)), stated.star_spread, numbers[:1])[0]
+    )
     common, forms = stated.common, stated.rest_forms
     cross = 0.5 * (forms[0] + forms[1])
     with np.errstate(invalid="ignore"):
@@ -212,7 +234,9 @@ def coupling_numbers(
     }
 
 
-def covariance_numbers(covariance: FloatArray, model: str, common: FloatArray, forms: FloatArray) -> Numbers:
+def covariance_numbers(
+    covariance: FloatArray, model: str, common: FloatArray, forms: FloatArray
+) -> Numbers:
     """What couples in a covariance (p, p), and what it does to attitudes."""
     names = parameter_names(model)
     correlation, sigma = correlation_of(covariance)
@@ -241,14 +265,20 @@ def condition(information: FloatArray) -> float:
 
 
 def simpler_numbers(frame: FloatArray, n: int, weight: float, stated: Statements) -> Numbers:
-    """What goes wrong when a simpler model is fitted, to first order in the coefficients that it lacks.
+    """What goes wrong when a simpler model is fitted, to first order in the coefficients that it
+    lacks.
 
-    The fit of the common parameters s to data with coefficients c of the others moves by ``F_ss^-1 F_sc c``; what
-    remains of the residuals after every attitude is the error of directions over the field.
+    The fit of the common parameters s to data with coefficients c of the others moves by ``F_ss^-1
+    F_sc c``; what remains of the residuals after every attitude is the error of directions over the
+    field.
     """
     camera = stated.camera
     names = list(camera.parameter_names)
-    found: Numbers = {"model_bias_arcsec": {}, "model_bias_attitude_arcsec": {}, "model_bias_sigma": {}}
+    found: Numbers = {
+        "model_bias_arcsec": {},
+        "model_bias_attitude_arcsec": {},
+        "model_bias_sigma": {},
+    }
     for model in simpler_models(camera.distortion):
         kept = np.array([name in parameter_names(model) for name in names])
         inner = frame[np.ix_(kept, kept)]

@@ -1,4 +1,6 @@
-"""What a study is: a base camera and observation, what is varied around them, and how cells are counted."""
+"""What a study is: a base camera and observation, what is varied around them, and how cells are
+counted.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ POSTERIORS = ("importance", "ensemble", "none")
 # One of each, in the order in which a reader would try them.
 TEMPLATES = get_args(StudyTemplate)
 MAX_CELLS = int(KEYS["values"].high)
-# Changes whenever the same settings would give other numbers: results from before are then computed anew.
+# Changes whenever the same settings would give other numbers: results from before are then computed
+# anew.
 VERSION = 1
 _SECTIONS = ("study", "camera", "observation", "sweep", "priors")
 _SPACINGS = ("linear", "log")
@@ -40,10 +43,14 @@ _STUDY = Section(
         "name": Key(str, "a name in quotes"),
         "question": Key(str, "the question that the study answers, in quotes"),
         "mode": Key(str, f"one of {', '.join(MODES)}, in quotes"),
-        "seeds": Key(int | list[int], "a number of repetitions of at least 1, or a list of whole numbers"),
+        "seeds": Key(
+            int | list[int], "a number of repetitions of at least 1, or a list of whole numbers"
+        ),
         "seed": Key.number(SEED, "the root of all that is random"),
         "target_arcsec": Key.number(KEYS["target_arcsec"], "an error in arcsec"),
-        "target_sigma": Key(dict[str, float], "a table of errors above zero by parameter, such as {f = 0.05}"),
+        "target_sigma": Key(
+            dict[str, float], "a table of errors above zero by parameter, such as {f = 0.05}"
+        ),
         "camera": Key(str, "the path of a camera file in quotes"),
         "epoch": Key.number(KEYS["epoch"], "a Julian year such as 2026.9"),
         "geometries": Key.number(KEYS["geometries"], "a number of frames"),
@@ -63,7 +70,9 @@ _RANGE = {name: key for name, key in _SPAN.items() if name != "n"}
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination of settings, the value of every axis that has one; another seed is another sky, other noise."""
+    """One combination of settings, the value of every axis that has one; another seed is another
+    sky, other noise.
+    """
 
     settings: AnyDict
     seed_index: int
@@ -82,8 +91,8 @@ class StudyDefinition:
     observation : dict
         Base values of the axes that are not varied.
     latin : dict
-        Ranges of the axes of a Latin hypercube: ``start``, ``stop`` and ``spacing``; each of its points is combined
-        with the grid.
+        Ranges of the axes of a Latin hypercube: ``start``, ``stop`` and ``spacing``; each of its
+        points is combined with the grid.
     latin_n : int
         Points of the hypercube.
     priors : dict
@@ -105,7 +114,8 @@ class StudyDefinition:
     geometries : int
         Frames at random attitudes that campaigns are drawn from, at most.
     posterior : {"importance", "ensemble", "none"}
-        Sampling of a simulated cell: by importance around the Laplace approximation, or by one ensemble of emcee.
+        Sampling of a simulated cell: by importance around the Laplace approximation, or by one
+        ensemble of emcee.
     draws : int
         Draws of a simulated cell.
     """
@@ -138,11 +148,16 @@ class StudyDefinition:
             If the file cannot be read or makes no sense; the message names file, key and remedy.
         """
         remedy = "write one with `starcal-uq new study`"
-        return cls.from_dict(read_toml(path, "study", StudyError, remedy), str(path), Path(path).parent)
+        return cls.from_dict(
+            read_toml(path, "study", StudyError, remedy), str(path), Path(path).parent
+        )
 
     @classmethod
-    def from_dict(cls, content: Mapping[str, Any], where: str = "study", folder: Path | None = None) -> StudyDefinition:
-        """A definition from the tables of a STUDY.toml; `folder` is where a camera's path starts from.
+    def from_dict(
+        cls, content: Mapping[str, Any], where: str = "study", folder: Path | None = None
+    ) -> StudyDefinition:
+        """A definition from the tables of a STUDY.toml; `folder` is where a camera's path starts
+        from.
 
         Raises
         ------
@@ -151,20 +166,35 @@ class StudyDefinition:
         """
         for name, table in content.items():
             if name not in _SECTIONS:
-                raise StudyError(f"{where}: {unknown_key(name, _SECTIONS).replace('key', 'section', 1)}.")
+                raise StudyError(
+                    f"{where}: {unknown_key(name, _SECTIONS).replace('key', 'section', 1)}."
+                )
             if not isinstance(table, Mapping):
                 raise StudyError(f"{where}: {name} is no section; write [{name}] above its keys.")
         study = _STUDY.check(content.get("study", {}), f"{where}, section [study]")
         camera = _camera(content, study.pop("camera", None), where, folder)
         sweep, latin, latin_n = _swept(dict(content.get("sweep", {})), f"{where}, section [sweep]")
         given = _observation(content.get("observation", {}), f"{where}, section [observation]")
-        priors = {name: _prior(name, table, where) for name, table in content.get("priors", {}).items()}
+        priors = {
+            name: _prior(name, table, where) for name, table in content.get("priors", {}).items()
+        }
         seeds = study.pop("seeds", 1)
         if isinstance(seeds, int) and not KEYS["seeds"].holds(seeds):
             wanted = KEYS["seeds"].wanted().replace("give", "write", 1)
-            raise StudyError(f"{where}, section [study]: key seeds is {shown(seeds)}; {wanted}, or a list of them.")
+            raise StudyError(
+                f"{where}, section [study]: key seeds is {shown(seeds)}; {wanted}, or a list of "
+                "them."
+            )
         study["seeds"] = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
-        made = cls(camera=camera, sweep=sweep, observation=given, latin=latin, latin_n=latin_n, priors=priors, **study)
+        made = cls(
+            camera=camera,
+            sweep=sweep,
+            observation=given,
+            latin=latin,
+            latin_n=latin_n,
+            priors=priors,
+            **study,
+        )
         made.check(where)
         return made
 
@@ -179,7 +209,12 @@ class StudyDefinition:
         sweep: AnyDict = {name: list(values) for name, values in self.sweep.items()}
         if self.latin:
             sweep["latin"] = {"n": self.latin_n, **self.latin}
-        tables = {"study": study, "camera": self.camera.to_dict(), "observation": self.observation, "sweep": sweep}
+        tables = {
+            "study": study,
+            "camera": self.camera.to_dict(),
+            "observation": self.observation,
+            "sweep": sweep,
+        }
         return tables | ({"priors": self.priors} if self.priors else {})
 
     def check(self, where: str = "study") -> None:
@@ -191,8 +226,13 @@ class StudyDefinition:
                 f"posterior is {self.posterior!r}; write one of {', '.join(POSTERIORS)}",
             ),
             (
-                len(self.seeds) > 0 and len(set(self.seeds)) == len(self.seeds) and SEED.holds(self.seeds),
-                "seeds holds no number, one twice, below 0 or beyond 64 bits; write how many repetitions you want",
+                len(self.seeds) > 0
+                and len(set(self.seeds)) == len(self.seeds)
+                and SEED.holds(self.seeds),
+                (
+                    "seeds holds no number, one twice, below 0 or beyond 64 bits; write how many "
+                    "repetitions you want"
+                ),
             ),
         ):
             if not good:
@@ -200,7 +240,10 @@ class StudyDefinition:
         for section, name, values in (
             *(("sweep", name, values) for name, values in self.sweep.items()),
             *(("observation", name, (value,)) for name, value in self.observation.items()),
-            *(("sweep.latin", name, (span["start"], span["stop"])) for name, span in self.latin.items()),
+            *(
+                ("sweep.latin", name, (span["start"], span["stop"]))
+                for name, span in self.latin.items()
+            ),
         ):
             axis = _axis(name, f"{where}, section [{section}]")
             if section != "sweep.latin" or axis.kind != "whole":
@@ -209,41 +252,56 @@ class StudyDefinition:
         every = {**self.observation, **self.sweep, **self.latin}
         self._check_names(every, where)
         for name in self.target_sigma:
-            if name not in self.parameter_names or not KEYS["target_sigma"].holds(self.target_sigma[name]):
+            if name not in self.parameter_names or not KEYS["target_sigma"].holds(
+                self.target_sigma[name]
+            ):
                 low, high = KEYS["target_sigma"].low, KEYS["target_sigma"].high
                 raise StudyError(
-                    f"{where}, section [study]: target_sigma of {name} is no error from {low:g} to {high:g} of one of "
+                    f"{where}, section [study]: target_sigma of {name} is no error from {low:g} "
+                    f"to {high:g} of one of "
                     f"{', '.join(self.parameter_names)}; correct it."
                 )
         if not self.sweep and not self.latin:
-            raise StudyError(f"{where}, section [sweep]: nothing is varied; add an axis such as frames = [50, 200].")
+            raise StudyError(
+                f"{where}, section [sweep]: nothing is varied; add an axis such as frames = [50, "
+                "200]."
+            )
         if self.n_cells > MAX_CELLS:
             raise StudyError(
-                f"{where}, section [sweep]: the axes make {self.n_cells:,} cells, more than {MAX_CELLS:,}; use fewer "
+                f"{where}, section [sweep]: the axes make {self.n_cells:,} cells, more than "
+                f"{MAX_CELLS:,}; use fewer "
                 "values, or a Latin hypercube."
             )
         try:
-            camera_of(self.camera, {k: v for k, v in self.observation.items() if k not in self.sweep})
+            camera_of(
+                self.camera, {k: v for k, v in self.observation.items() if k not in self.sweep}
+            )
         except StudyError as error:
             raise StudyError(f"{where}, section [camera]: {error}") from None
 
     def _check_names(self, every: AnyDict, where: str) -> None:
         for one, other in EXCLUSIVE:
             if one in every and other in every:
-                raise StudyError(f"{where}: {one} and {other} set the same thing; leave one of them out.")
+                raise StudyError(
+                    f"{where}: {one} and {other} set the same thing; leave one of them out."
+                )
         for name in every:
             if name in COEFFICIENTS and name not in self.parameter_names:
                 raise StudyError(
-                    f"{where}: {name} is no coefficient of distortion {' or '.join(map(repr, self.models))}; remove "
+                    f"{where}: {name} is no coefficient of distortion "
+                    f"{' or '.join(map(repr, self.models))}; remove "
                     "it, or use another model."
                 )
             if self.mode == "fisher" and name in ("method", "likelihood"):
                 raise StudyError(
-                    f"{where}: {name} makes no difference to Fisher information; set mode to 'simulate', or remove it."
+                    f"{where}: {name} makes no difference to Fisher information; set mode to "
+                    "'simulate', or remove it."
                 )
         for name in (*self.sweep.get("prior", ()), self.observation.get("prior", FLAT)):
             if name != FLAT and name not in self.priors:
-                raise StudyError(f"{where}: prior {name!r} is not defined; add a section [priors.{name}].")
+                raise StudyError(
+                    f"{where}: prior {name!r} is not defined; add a section [priors.{name}]."
+                )
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -260,7 +318,11 @@ class StudyDefinition:
     @property
     def n_cells(self) -> int:
         """Number of cells."""
-        return math.prod(len(values) for values in self.sweep.values()) * max(1, self.latin_n) * len(self.seeds)
+        return (
+            math.prod(len(values) for values in self.sweep.values())
+            * max(1, self.latin_n)
+            * len(self.seeds)
+        )
 
     @cached_property
     def axes(self) -> dict[str, tuple[Any, ...]]:
@@ -275,7 +337,9 @@ class StudyDefinition:
             return [{}]
         from scipy.stats import qmc
 
-        unit = qmc.LatinHypercube(len(self.latin), rng=np.random.default_rng(self.seed)).random(self.latin_n)
+        unit = qmc.LatinHypercube(len(self.latin), rng=np.random.default_rng(self.seed)).random(
+            self.latin_n
+        )
         columns = {}
         for (name, span), u in zip(self.latin.items(), unit.T, strict=True):
             ends = span["start"], span["stop"]
@@ -283,8 +347,14 @@ class StudyDefinition:
                 values = np.exp(np.interp(u, (0.0, 1.0), np.log(ends)))
             else:
                 values = np.interp(u, (0.0, 1.0), ends)
-            columns[name] = np.round(values).astype(int).tolist() if AXES[name].kind == "whole" else values.tolist()
-        return [dict(zip(columns, point, strict=True)) for point in zip(*columns.values(), strict=True)]
+            columns[name] = (
+                np.round(values).astype(int).tolist()
+                if AXES[name].kind == "whole"
+                else values.tolist()
+            )
+        return [
+            dict(zip(columns, point, strict=True)) for point in zip(*columns.values(), strict=True)
+        ]
 
     def cells(self) -> list[Cell]:
         """Every cell: the grid, the hypercube within it, and the repetitions within that."""
@@ -297,7 +367,9 @@ class StudyDefinition:
         return made
 
     def key(self, cell: Cell, stars: str) -> str:
-        """Hash of all that the numbers of a cell depend on; `stars` is that of the catalogue to its magnitude limit."""
+        """Hash of all that the numbers of a cell depend on; `stars` is that of the catalogue to its
+        magnitude limit.
+        """
         return _hash(
             {
                 "version": VERSION,
@@ -334,18 +406,23 @@ def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _camera(content: Mapping[str, Any], path: str | None, where: str, folder: Path | None) -> Camera:
+def _camera(
+    content: Mapping[str, Any], path: str | None, where: str, folder: Path | None
+) -> Camera:
     if ("camera" in content) == (path is not None):
         both = "given twice" if path is not None else "missing"
         raise StudyError(
-            f'{where}: the camera is {both}; write a section [camera], or camera = "camera.toml" in [study].'
+            f'{where}: the camera is {both}; write a section [camera], or camera = "camera.toml" '
+            "in [study]."
         )
     try:
         if path is not None:
             return Camera.load((folder or Path()) / path)
         return Camera.from_dict(content["camera"])
     except CameraError as error:
-        raise StudyError(str(error) if path is not None else f"{where}, section [camera]: {error}") from None
+        raise StudyError(
+            str(error) if path is not None else f"{where}, section [camera]: {error}"
+        ) from None
 
 
 def _observation(table: Mapping[str, Any], where: str) -> AnyDict:
@@ -359,7 +436,9 @@ def _axis(name: str, where: str) -> Any:
     return AXES[name]
 
 
-def _swept(table: AnyDict, where: str) -> tuple[dict[str, tuple[Any, ...]], dict[str, AnyDict], int]:
+def _swept(
+    table: AnyDict, where: str
+) -> tuple[dict[str, tuple[Any, ...]], dict[str, AnyDict], int]:
     """Grid, ranges and points of the hypercube."""
     latin = table.pop("latin", None)
     grid = {name: _values(name, value, where) for name, value in table.items()}
@@ -369,8 +448,15 @@ def _swept(table: AnyDict, where: str) -> tuple[dict[str, tuple[Any, ...]], dict
     if not isinstance(latin, Mapping):
         raise StudyError(f"{where}: latin is no section; write [sweep.latin] above its keys.")
     n = latin.get("n")
-    if not isinstance(n, int) or isinstance(n, bool) or not KEYS["values"].holds(n) or len(latin) < 2:
-        raise StudyError(f"{inside}: write n, a number of points from 1 to {MAX_CELLS}, and at least one axis.")
+    if (
+        not isinstance(n, int)
+        or isinstance(n, bool)
+        or not KEYS["values"].holds(n)
+        or len(latin) < 2
+    ):
+        raise StudyError(
+            f"{inside}: write n, a number of points from 1 to {MAX_CELLS}, and at least one axis."
+        )
     ranges = {}
     for name, span in latin.items():
         if name == "n":
@@ -379,7 +465,10 @@ def _swept(table: AnyDict, where: str) -> tuple[dict[str, tuple[Any, ...]], dict
         if name in grid:
             raise StudyError(f"{inside}: {name} stands in [sweep] too; leave one of them out.")
         if axis.kind == "name" or not isinstance(span, Mapping):
-            raise StudyError(f"{inside}: {name} is {span!r}; write a range of numbers such as {{start = 1, stop = 2}}.")
+            raise StudyError(
+                f"{inside}: {name} is {span!r}; write a range of numbers such as {{start = 1, "
+                "stop = 2}."
+            )
         ranges[name] = {"spacing": "linear"} | _span(axis, span, _RANGE, inside)
     return grid, ranges, n
 
@@ -388,7 +477,9 @@ def _values(name: str, value: Any, where: str) -> tuple[Any, ...]:
     axis = _axis(name, where)
     if isinstance(value, Mapping):
         if axis.kind == "name":
-            raise StudyError(f"{where}: {name} is {dict(value)!r}; write a list of names in quotes.")
+            raise StudyError(
+                f"{where}: {name} is {dict(value)!r}; write a list of names in quotes."
+            )
         span = _span(axis, value, _SPAN, where)
         spread = np.geomspace if span.get("spacing") == "log" else np.linspace
         numbers = spread(span["start"], span["stop"], span["n"]).tolist()
@@ -396,7 +487,9 @@ def _values(name: str, value: Any, where: str) -> tuple[Any, ...]:
         values = [round(v) if axis.kind == "whole" else float(f"{v:.12g}") for v in numbers]
         return tuple(dict.fromkeys(values))
     if not isinstance(value, (list, tuple)):
-        raise StudyError(f"{where}: {name} is {value!r}; write a list, or {{start = 1, stop = 2, n = 5}}.")
+        raise StudyError(
+            f"{where}: {name} is {value!r}; write a list, or {{start = 1, stop = 2, n = 5}}."
+        )
     if not value:
         raise StudyError(f"{where}: {name} is an empty list; give at least one value.")
     values = [axis.check(v, where) for v in value]
@@ -409,21 +502,27 @@ def _span(axis: Any, span: Mapping[str, Any], keys: dict[str, Key], where: str) 
     inside = f"{where}, {axis.name}"
     checked = Section(keys, StudyError).check(span, inside)
     if checked.get("spacing", "linear") not in _SPACINGS:
-        raise StudyError(f"{inside}: spacing is {checked['spacing']!r}; write one of {', '.join(_SPACINGS)}.")
+        raise StudyError(
+            f"{inside}: spacing is {checked['spacing']!r}; write one of {', '.join(_SPACINGS)}."
+        )
     for end in ("start", "stop"):
         if axis.kind != "whole":
             axis.check(checked[end], f"{inside}, {end}")
         elif not axis.limit.low <= checked[end] <= axis.limit.high:
             raise StudyError(f"{inside}, {end}: {axis.name} is {checked[end]:g}; {axis.wanted}.")
     if checked.get("spacing") == "log" and min(checked["start"], checked["stop"]) <= 0.0:
-        raise StudyError(f"{inside}: a range with spacing 'log' starts and stops above zero; correct it.")
+        raise StudyError(
+            f"{inside}: a range with spacing 'log' starts and stops above zero; correct it."
+        )
     return checked
 
 
 def _prior(name: str, table: Any, where: str) -> AnyDict:
     inside = f"{where}, section [priors.{name}]"
     if name == FLAT or not isinstance(table, Mapping):
-        raise StudyError(f"{inside}: write a table under another name than {FLAT!r}, which is no prior at all.")
+        raise StudyError(
+            f"{inside}: write a table under another name than {FLAT!r}, which is no prior at all."
+        )
     try:
         return PRIORS.check(table, inside)
     except PriorError as error:

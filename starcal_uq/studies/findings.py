@@ -1,4 +1,6 @@
-"""What a study found: which pairs are coupled, which axis changes that, and where the weakest direction turns."""
+"""What a study found: which pairs are coupled, which axis changes that, and where the weakest
+direction turns.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,13 @@ from starcal_uq.propagation.coupling import ALONE, COUPLED, PART
 if TYPE_CHECKING:
     import xarray as xr
 
-# An axis matters where it changes what a pair's coupling costs in sigma by this factor, and by more than chance does.
+# An axis matters where it changes what a pair's coupling costs in sigma by this factor, and by more
+# than chance does.
 MATTERS = 1.25
 # Probability with which chance alone passes for a change.
 _FALSE_ALARM = 1e-3
-# A median's standard error over a mean's: of normal numbers, and of the evenly spread ones of a hypercube.
+# A median's standard error over a mean's: of normal numbers, and of the evenly spread ones of a
+# hypercube.
 _MEDIAN, _EVEN = 1.25, 1.75
 # An axis of a Latin hypercube is cut into this many parts of equal number.
 _PARTS = 6
@@ -33,10 +37,10 @@ Statistic = Literal["median", "low", "high", "mean", "count"]
 class Curve:
     """A number along one axis, its median over seeds first and then over all other axes.
 
-    `values` are those of the axis, the median of each part where there are too many; median, least and most (n,) are
-    over the other axes. `change` is the largest less the smallest value along the axis, the median of it over the other
-    axes; `chance` is what other seeds (in a Latin hypercube, the other drawn axes) make of it less than once in a
-    thousand times, 0 with one seed.
+    `values` are those of the axis, the median of each part where there are too many; median, least
+    and most (n,) are over the other axes. `change` is the largest less the smallest value along the
+    axis, the median of it over the other axes; `chance` is what other seeds (in a Latin hypercube,
+    the other drawn axes) make of it less than once in a thousand times, 0 with one seed.
     """
 
     axis: str
@@ -72,7 +76,8 @@ class Curve:
 
 @dataclass(frozen=True)
 class Lines:
-    """A number along one axis (n values), a line for every value of another one, `by`, where there is one.
+    """A number along one axis (n values), a line for every value of another one, `by`, where there
+    is one.
 
     The other axes are `held` at values; median, least and most (lines, n) are over seeds.
     """
@@ -91,10 +96,11 @@ class Lines:
 class Pair:
     """How two parameters are coupled over the sweep.
 
-    Correlations (median over seeds) where they are largest and smallest in size, and where that is. `seeds` is their
-    range over seeds at a place, the median over all places, 0 for a Latin hypercube; `mean_size` their size, the mean
-    over all places, 0 where a model lacks one of the two. Along every axis, `sizes` are the size, and `costs` the
-    logarithm of 1 / sqrt(1 - r^2), what the coupling of this pair alone costs in sigma.
+    Correlations (median over seeds) where they are largest and smallest in size, and where that is.
+    `seeds` is their range over seeds at a place, the median over all places, 0 for a Latin
+    hypercube; `mean_size` their size, the mean over all places, 0 where a model lacks one of the
+    two. Along every axis, `sizes` are the size, and `costs` the logarithm of 1 / sqrt(1 - r^2),
+    what the coupling of this pair alone costs in sigma.
     """
 
     names: tuple[str, str]
@@ -134,8 +140,8 @@ class Direction:
 class Turn:
     """The kinds of weakest direction along the axis that tells them apart best.
 
-    `runs` are neighbouring values that share a kind, with its number; `told` is the part of the places that the axis
-    alone tells right.
+    `runs` are neighbouring values that share a kind, with its number; `told` is the part of the
+    places that the axis alone tells right.
     """
 
     axis: str
@@ -158,21 +164,38 @@ class Sweep:
         self.values = {axis: values for axis, (_, values) in zip(self.axes, levels, strict=True)}
         self.shape = tuple(len(values) for _, values in levels)
         self._codes = [code for code, _ in levels]
-        # Axes that were drawn and not laid out: their cells are no lines, and are told apart along one axis at a time.
-        self.drawn = tuple(axis for axis in self.axes if len(np.unique(data[axis].values)) > len(self.values[axis]))
+        # Axes that were drawn and not laid out: their cells are no lines, and are told apart along
+        # one axis at a time.
+        self.drawn = tuple(
+            axis for axis in self.axes if len(np.unique(data[axis].values)) > len(self.values[axis])
+        )
 
     def over(
-        self, numbers: FloatArray, statistic: Statistic = "median", pooled: Sequence[str] = (), cells: Any = True
+        self,
+        numbers: FloatArray,
+        statistic: Statistic = "median",
+        pooled: Sequence[str] = (),
+        cells: Any = True,
     ) -> FloatArray:
-        """A statistic of a number (C,) of every cell, over seeds, as an array over the axes; NaN where no cell has it.
+        """A statistic of a number (C,) of every cell, over seeds, as an array over the axes; NaN
+        where no cell has it.
 
-        Axes `pooled` count as seeds; the array has one value for them. Of `cells` (C,), those that are true count.
+        Axes `pooled` count as seeds; the array has one value for them. Of `cells` (C,), those that
+        are true count.
         """
-        shape = tuple(1 if axis in pooled else n for axis, n in zip(self.axes, self.shape, strict=True))
+        shape = tuple(
+            1 if axis in pooled else n for axis, n in zip(self.axes, self.shape, strict=True)
+        )
         numbers = np.asarray(numbers, dtype=np.float64)
         good = self.ok & ~np.isnan(numbers) & cells
-        codes = [c[good] * (axis not in pooled) for axis, c in zip(self.axes, self._codes, strict=True)]
-        where = np.ravel_multi_index(codes, shape) if codes else np.zeros(int(good.sum()), dtype=np.int64)
+        codes = [
+            c[good] * (axis not in pooled) for axis, c in zip(self.axes, self._codes, strict=True)
+        ]
+        where = (
+            np.ravel_multi_index(codes, shape)
+            if codes
+            else np.zeros(int(good.sum()), dtype=np.int64)
+        )
         grid = np.full(int(np.prod(shape, dtype=np.int64)), np.nan)
         values = numbers[good]
         order = np.lexsort((values, where))
@@ -184,12 +207,16 @@ class Sweep:
     def at(self, index: int) -> dict[str, Any]:
         """The values of the axes at a place, by its number in the flattened array."""
         codes = np.unravel_index(index, self.shape) if self.axes else ()
-        return {axis: self.values[axis][int(code)] for axis, code in zip(self.axes, codes, strict=True)}
+        return {
+            axis: self.values[axis][int(code)] for axis, code in zip(self.axes, codes, strict=True)
+        }
 
     def along(self, numbers: FloatArray, axis: str) -> Curve | None:
-        """A number of every cell along an axis; None where fewer than two values of the axis have it.
+        """A number of every cell along an axis; None where fewer than two values of the axis have
+        it.
 
-        Only what was found at all values of the axis is compared, so that missing cells do not pass for a change.
+        Only what was found at all values of the axis is compared, so that missing cells do not pass
+        for a change.
         """
         pooled = tuple(other for other in self.drawn if other != axis)
         lines = np.moveaxis(self.over(numbers, pooled=pooled), self.axes.index(axis), 0)
@@ -204,7 +231,11 @@ class Sweep:
             return None
         return Curve(
             axis,
-            tuple(value for value, there in zip(self.values[axis], np.atleast_1d(has), strict=True) if there),
+            tuple(
+                value
+                for value, there in zip(self.values[axis], np.atleast_1d(has), strict=True)
+                if there
+            ),
             np.nanmedian(lines, axis=1),
             np.nanmin(lines, axis=1),
             np.nanmax(lines, axis=1),
@@ -218,7 +249,9 @@ class Sweep:
         return float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
 
     def _chance(self, numbers: FloatArray, pooled: Sequence[str], n_values: int) -> float:
-        """Range of medians at so many places that chance exceeds once in a thousand times; Bonferroni over pairs."""
+        """Range of medians at so many places that chance exceeds once in a thousand times;
+        Bonferroni over pairs.
+        """
         from scipy.special import stdtrit
 
         n = self.over(numbers, "count", pooled)
@@ -238,13 +271,18 @@ class Sweep:
         return tuple(curve for curve in found if curve is not None)
 
     def lines(
-        self, numbers: FloatArray, along: str, by: str | None = None, at: Mapping[str, Any] | None = None
+        self,
+        numbers: FloatArray,
+        along: str,
+        by: str | None = None,
+        at: Mapping[str, Any] | None = None,
     ) -> Lines:
-        """A number (C,) of every cell along an axis, a line for every value of another one, all others held.
+        """A number (C,) of every cell along an axis, a line for every value of another one, all
+        others held.
 
-        They are held `at` values, by default at the middle one of theirs (where most cells have numbers); what was
-        drawn from a Latin hypercube is not held at all. ValueError for a name that is no axis, or a value that an axis
-        does not have.
+        They are held `at` values, by default at the middle one of theirs (where most cells have
+        numbers); what was drawn from a Latin hypercube is not held at all. ValueError for a name
+        that is no axis, or a value that an axis does not have.
         """
         held = self.held(along, by, at)
         cells = self._cells(held)
@@ -260,7 +298,9 @@ class Sweep:
         seen = self.over(np.zeros(len(self.ok)), "median", pooled, cells).transpose(*rest, *order)
         there = np.isfinite(seen.reshape(-1, len(self.values[along])))
         rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
-        median, low, high = (laid_out(statistic)[np.ix_(rows, columns)] for statistic in ("median", "low", "high"))
+        median, low, high = (
+            laid_out(statistic)[np.ix_(rows, columns)] for statistic in ("median", "low", "high")
+        )
         return Lines(
             along,
             tuple(self.values[along][i] for i in columns),
@@ -272,26 +312,41 @@ class Sweep:
             high,
         )
 
-    def held(self, along: str, by: str | None = None, at: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    def held(
+        self, along: str, by: str | None = None, at: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
         """Where the other axes are held."""
         for axis in filter(None, (along, by)):
             self._check(axis)
         given = {axis: value for axis, value in (at or {}).items() if axis not in (along, by)}
         cells = self.ok & self._cells(given)
-        free = [i for i, axis in enumerate(self.axes) if axis not in (*self.drawn, along, by, *given)]
+        free = [
+            i for i, axis in enumerate(self.axes) if axis not in (*self.drawn, along, by, *given)
+        ]
         if not free or not cells.any():
             return given
         # The middle, unless cells are missing there.
-        places, counts = np.unique(np.stack([self._codes[i][cells] for i in free]), axis=1, return_counts=True)
+        places, counts = np.unique(
+            np.stack([self._codes[i][cells] for i in free]), axis=1, return_counts=True
+        )
         middle = np.array([self.shape[i] // 2 for i in free])[:, None]
         best = int(np.lexsort((np.abs(places - middle).sum(axis=0), -counts))[0])
-        chosen = {self.axes[i]: self.values[self.axes[i]][int(places[j, best])] for j, i in enumerate(free)}
+        chosen = {
+            self.axes[i]: self.values[self.axes[i]][int(places[j, best])]
+            for j, i in enumerate(free)
+        }
         return chosen | given
 
     def pooled(
-        self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None = None, statistic: Statistic = "median"
+        self,
+        numbers: FloatArray,
+        along: str,
+        at: Mapping[str, Any] | None = None,
+        statistic: Statistic = "median",
     ) -> FloatArray:
-        """A statistic of a number at every value of an axis, over seeds and all axes that `at` does not hold."""
+        """A statistic of a number at every value of an axis, over seeds and all axes that `at` does
+        not hold.
+        """
         self._check(along)
         others = [axis for axis in self.axes if axis != along]
         return self.over(numbers, statistic, others, self._cells(at or {})).ravel()
@@ -303,22 +358,30 @@ class Sweep:
             self._check(axis)
             known = self.values[axis]
             if value not in known:
-                raise ValueError(f"{axis} has no value {value!r}: use one of {', '.join(map(str, known))}.")
+                raise ValueError(
+                    f"{axis} has no value {value!r}: use one of {', '.join(map(str, known))}."
+                )
             cells &= self._codes[self.axes.index(axis)] == known.index(value)
         return cells
 
     def _check(self, axis: str) -> None:
         if axis not in self.axes:
-            raise ValueError(f"{axis!r} was not swept: use one of {', '.join(self.axes) or 'none'}.")
+            raise ValueError(
+                f"{axis!r} was not swept: use one of {', '.join(self.axes) or 'none'}."
+            )
 
     @cached_property
     def frame_error(self) -> FloatArray:
-        """Frame-dependent error of the calibration across the boresight, 1 sigma per axis, of every cell (arcsec)."""
+        """Frame-dependent error of the calibration across the boresight, 1 sigma per axis, of every
+        cell (arcsec).
+        """
         return self.cross("frame_error_arcsec")
 
     @cached_property
     def common_rotation(self) -> FloatArray:
-        """Rotation common to all frames across the boresight, 1 sigma per axis, of every cell (arcsec)."""
+        """Rotation common to all frames across the boresight, 1 sigma per axis, of every cell
+        (arcsec).
+        """
         return self.cross("common_rotation_arcsec")
 
     def cross(self, variable: str) -> FloatArray:
@@ -342,7 +405,10 @@ class Sweep:
         return tuple(pair for pair in self.pairs if abs(pair.strongest) >= COUPLED)
 
     def _pair(self, first: str, second: str) -> Pair | None:
-        r = np.asarray(self.data["correlation"].sel(parameter=first, parameter_2=second).values, dtype=np.float64)
+        r = np.asarray(
+            self.data["correlation"].sel(parameter=first, parameter_2=second).values,
+            dtype=np.float64,
+        )
         grid = self.over(r).ravel()
         if not np.isfinite(grid).any():
             return None
@@ -364,7 +430,9 @@ class Sweep:
 
     @cached_property
     def directions(self) -> tuple[tuple[Direction, ...], IntArray]:
-        """The kinds of weakest direction, the most common first, and the kind of every place (-1 where unknown)."""
+        """The kinds of weakest direction, the most common first, and the kind of every place (-1
+        where unknown).
+        """
         weights = np.nan_to_num(self.data["weak_direction"].values)
         # Nothing takes part in a direction that is hardly worse than the parameters themselves.
         part = (np.abs(weights) >= PART) & (self.data["weak_variance"].values >= ALONE[1])[:, None]
@@ -375,7 +443,9 @@ class Sweep:
         codes = np.full(len(self.ok), np.nan)
         codes[self.ok] = code.ravel()
         # At each place the kind of most seeds.
-        votes = np.stack([self.over(np.where(codes == i, 1.0, 0.0), "mean") for i in range(max(1, len(known)))])
+        votes = np.stack(
+            [self.over(np.where(codes == i, 1.0, 0.0), "mean") for i in range(max(1, len(known)))]
+        )
         seen = np.isfinite(votes[0])
         places = np.where(seen, np.argmax(np.where(seen, votes, 0.0), axis=0), np.nan)
         counts = Counter(places[np.isfinite(places)].astype(int).tolist())
@@ -383,10 +453,17 @@ class Sweep:
         rank = {code: position for position, code in enumerate(order)}
         whole = max(1, sum(counts.values()))
         found = tuple(
-            Direction(self._members(known[code] > 0.0), self._members(known[code] < 0.0), counts[code] / whole)
+            Direction(
+                self._members(known[code] > 0.0),
+                self._members(known[code] < 0.0),
+                counts[code] / whole,
+            )
             for code in order
         )
-        where = np.array([rank[int(code)] if np.isfinite(code) else -1 for code in places.ravel()], dtype=np.int64)
+        where = np.array(
+            [rank[int(code)] if np.isfinite(code) else -1 for code in places.ravel()],
+            dtype=np.int64,
+        )
         return found, where.reshape(self.shape)
 
     def _members(self, flags: BoolArray) -> tuple[str, ...]:
@@ -394,7 +471,9 @@ class Sweep:
 
     @cached_property
     def turn(self) -> Turn | None:
-        """Where the weakest direction becomes another one, along the axis that tells it best; None where it stays."""
+        """Where the weakest direction becomes another one, along the axis that tells it best; None
+        where it stays.
+        """
         kinds, _ = self.directions
         if len(kinds) < 2:
             return None
@@ -426,11 +505,15 @@ class Sweep:
 
 def cross(errors: xr.DataArray) -> xr.DataArray:
     """Root mean square over pitch and yaw of errors by axis."""
-    across: xr.DataArray = (errors.sel(axis=list(ATTITUDE[:2])) ** 2).mean("axis", skipna=False) ** 0.5
+    across: xr.DataArray = (errors.sel(axis=list(ATTITUDE[:2])) ** 2).mean(
+        "axis", skipna=False
+    ) ** 0.5
     return across
 
 
-def _statistic(values: FloatArray, first: IntArray, n: IntArray, statistic: Statistic) -> FloatArray:
+def _statistic(
+    values: FloatArray, first: IntArray, n: IntArray, statistic: Statistic
+) -> FloatArray:
     """A statistic of groups of sorted values that begin at `first`."""
     if statistic == "median":
         return np.asarray(0.5 * (values[first + (n - 1) // 2] + values[first + n // 2]))
@@ -442,7 +525,9 @@ def _statistic(values: FloatArray, first: IntArray, n: IntArray, statistic: Stat
 
 
 def _levels(values: Any, drawn: bool) -> tuple[IntArray, tuple[Any, ...]]:
-    """Number of the level of every cell, and the levels: values of the axis, or parts of those that were drawn."""
+    """Number of the level of every cell, and the levels: values of the axis, or parts of those that
+    were drawn.
+    """
     array = np.asarray(values)
     if array.dtype.kind in "OUS":
         # Names keep the order in which they were given.

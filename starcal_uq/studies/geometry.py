@@ -1,6 +1,7 @@
 """Frames that a cell is about: which stars fall where, and what each frame says of the camera.
 
-Nothing here knows the noise's size, the number of frames or a prior: cells that differ in those alone share it.
+Nothing here knows the noise's size, the number of frames or a prior: cells that differ in those
+alone share it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ if TYPE_CHECKING:
 
 # Stars that a set of frames holds: more of them make its mean information hardly better known.
 _STARS, _LEAST_FRAMES = 6000, 64
-# Frames of one campaign in which stars bring their own errors, and of a pattern: more repeat what these hold.
+# Frames of one campaign in which stars bring their own errors, and of a pattern: more repeat what
+# these hold.
 _MOST_FRAMES = 2000
 _BLOCK, _BLOCKS, _LEAST_TRIES, _PLACES = 64, 128, 2560, 200
 # Fewer attitudes than this that show enough stars are no night's work.
@@ -45,8 +47,8 @@ _DEPTH_STEP = 0.5
 class Attitudes(NamedTuple):
     """Some attitudes (n, 3, 3), and stars in a cone around each boresight.
 
-    Frame number, index, magnitude and cosine of the angle of every such star, by frame and then by index, for all
-    cosines above `least`.
+    Frame number, index, magnitude and cosine of the angle of every such star, by frame and then by
+    index, for all cosines above `least`.
     """
 
     rotations: FloatArray
@@ -81,13 +83,17 @@ class Depth:
         return Attitudes(rotations, least, frame, star, self.stars.mag[star], cosine)
 
     def random(self, seed: tuple[int, ...], block: int, least: float) -> Attitudes:
-        """A block of random attitudes with at least those stars; cells of all fields look at the same attitudes."""
+        """A block of random attitudes with at least those stars; cells of all fields look at the
+        same attitudes.
+        """
         key = (*seed, block)
         found = self._blocks.get(key)
         if found is None or found.least > least:
             rotations = random_rotations(_BLOCK, np.random.default_rng([*key, 11]))
             # A little wider than asked for, so that a slightly wider field need not begin again.
-            found = self.around(rotations, float(np.cos(min(1.2 * np.arccos(max(least, -1.0)), np.pi))))
+            found = self.around(
+                rotations, float(np.cos(min(1.2 * np.arccos(max(least, -1.0)), np.pi)))
+            )
         self._blocks[key] = found
         self._blocks.move_to_end(key)
         if len(self._blocks) > _BLOCKS:
@@ -135,7 +141,9 @@ class _Views(Window):
         rotations = np.concatenate([near.rotations for near in blocks])
         first = np.cumsum([0, *(len(near.rotations) for near in blocks)])
         kept = [(near.cosine > self.min_cosine) & (near.mag <= self.max_mag) for near in blocks]
-        frame = np.concatenate([n + near.frame[k] for n, near, k in zip(first[:-1], blocks, kept, strict=True)])
+        frame = np.concatenate(
+            [n + near.frame[k] for n, near, k in zip(first[:-1], blocks, kept, strict=True)]
+        )
         star = np.concatenate([near.star[k] for near, k in zip(blocks, kept, strict=True)])
         b = np.matmul(rotations[frame], self.depth.directions[star][:, :, None])[:, :, 0]
         xy, inside = self.seen(b)
@@ -146,9 +154,11 @@ class _Views(Window):
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """M frames without noise, N stars: attitudes (M, 3, 3), R_cam_icrs, and the stars' pixels (N, 2), px.
+    """M frames without noise, N stars: attitudes (M, 3, 3), R_cam_icrs, and the stars' pixels (N,
+    2), px.
 
-    ``starts`` (M + 1,) bounds the stars of each frame, and `star` (N,) counts in the catalogue of `depth`.
+    ``starts`` (M + 1,) bounds the stars of each frame, and `star` (N,) counts in the catalogue of
+    `depth`.
     """
 
     camera: Camera
@@ -169,13 +179,17 @@ class Geometry:
         good = sizes >= n
         kept = np.repeat(good, sizes)
         starts = np.concatenate([[0], np.cumsum(sizes[good])]).astype(np.int64)
-        return Geometry(self.camera, self.depth, self.rotations[good], starts, self.star[kept], self.pixel[kept])
+        return Geometry(
+            self.camera, self.depth, self.rotations[good], starts, self.star[kept], self.pixel[kept]
+        )
 
     def first(self, n: int) -> Geometry:
         """The first n frames."""
         stars = slice(0, int(self.starts[min(n, self.n_frames)]))
         starts = self.starts[: n + 1]
-        return Geometry(self.camera, self.depth, self.rotations[:n], starts, self.star[stars], self.pixel[stars])
+        return Geometry(
+            self.camera, self.depth, self.rotations[:n], starts, self.star[stars], self.pixel[stars]
+        )
 
     @classmethod
     def joined(cls, parts: Sequence[Geometry]) -> Geometry:
@@ -205,7 +219,9 @@ class Geometry:
         kept = np.sort(order[rank < n])
         sizes = np.minimum(np.diff(self.starts), n)
         starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        return Geometry(self.camera, self.depth, self.rotations, starts, self.star[kept], self.pixel[kept])
+        return Geometry(
+            self.camera, self.depth, self.rotations, starts, self.star[kept], self.pixel[kept]
+        )
 
     def frames(self, sigma_px: FloatArray) -> StarFrames:
         """Stars with this noise (N,), px per axis."""
@@ -221,7 +237,9 @@ NoiseShape = tuple[float, float, float, float]
 
 
 def noise_shape(settings: Mapping[str, Any]) -> tuple[NoiseShape, float]:
-    """How noise depends on magnitude (size, dex per magnitude, magnitude, floor), and a factor on all of it."""
+    """How noise depends on magnitude (size, dex per magnitude, magnitude, floor), and a factor on
+    all of it.
+    """
     size, slope = settings["sigma_px"], settings["noise_per_mag"]
     if settings["noise_floor_px"] > 0.0:
         return (size, slope, settings["noise_mag"], settings["noise_floor_px"]), 1.0
@@ -248,17 +266,22 @@ class GeometryKey(NamedTuple):
 
 
 def margin_px(settings: Mapping[str, Any]) -> float:
-    """Stars nearer to the edge than this are left out: a power of two, so that many noises share their frames."""
+    """Stars nearer to the edge than this are left out: a power of two, so that many noises share
+    their frames.
+    """
     shape, scale = noise_shape(settings)
     faintest = scale * float(star_noise(np.array([settings["max_mag"]]), shape)[0])
     return float(max(1.0, 2.0 ** np.ceil(np.log2(EDGE_SIGMAS * faintest))))
 
 
-def geometry_key(camera: Camera, settings: Mapping[str, Any], seed: int, seed_index: int, exact: bool) -> GeometryKey:
+def geometry_key(
+    camera: Camera, settings: Mapping[str, Any], seed: int, seed_index: int, exact: bool
+) -> GeometryKey:
     """What the frames of a cell depend on; `exact` asks for its own number of frames.
 
-    Frames at random attitudes serve all repetitions, which draw campaigns from them; a pattern starts at another place
-    each time, and stars that bring their own errors have to be counted over the frames that there are.
+    Frames at random attitudes serve all repetitions, which draw campaigns from them; a pattern
+    starts at another place each time, and stars that bring their own errors have to be counted over
+    the frames that there are.
     """
     own = exact or settings["pointing"] != "random" or settings["direction_mas"] > 0.0
     return GeometryKey(
@@ -273,7 +296,9 @@ def geometry_key(camera: Camera, settings: Mapping[str, Any], seed: int, seed_in
 
 
 def mission_key(key: GeometryKey) -> GeometryKey:
-    """Random attitudes for the same camera: where a mission looks, whatever its calibration looked at."""
+    """Random attitudes for the same camera: where a mission looks, whatever its calibration looked
+    at.
+    """
     return key._replace(pointing="random", n_frames=None, seed=key.seed[:1])
 
 
@@ -287,7 +312,9 @@ def frames_of(cell: Cell) -> tuple[Any, ...]:
 
 
 def weights_of(cell: Cell) -> str:
-    """What differs between cells that share frames, but neither their stars nor the weights of these."""
+    """What differs between cells that share frames, but neither their stars nor the weights of
+    these.
+    """
     settings = cell.settings
     return repr((settings.get("stars"), noise_shape(settings)[0], settings["direction_mas"]))
 
@@ -303,22 +330,30 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
         n = key.n_frames
         if n is None:
             sky = float(np.prod(np.deg2rad(key.camera.fov_deg))) / (4.0 * np.pi)
-            expected = max(float(np.sum(depth.stars.mag <= key.max_mag)) * sky, float(key.min_stars))
+            expected = max(
+                float(np.sum(depth.stars.mag <= key.max_mag)) * sky, float(key.min_stars)
+            )
             n = int(np.clip(_STARS / expected, min(_LEAST_FRAMES, most), most))
         return _random(key, window, n)
-    # What seeds a place does not depend on what is swept: neighbouring cells look at one part of the sky.
+    # What seeds a place does not depend on what is swept: neighbouring cells look at one part of
+    # the sky.
     rng = np.random.default_rng([*key.seed, 12])
     assert key.n_frames is not None
     field = key.camera.fov_deg[0]
     for _ in range(_PLACES):
         start = random_rotations(1, rng)
-        if window.frames([depth.around(start, window.min_cosine)]).with_stars(key.min_stars).n_frames:
+        if (
+            window.frames([depth.around(start, window.min_cosine)])
+            .with_stars(key.min_stars)
+            .n_frames
+        ):
             break
     rotations = pattern_rotations(key.pointing, key.n_frames, rng, field, start[0])
     found = window.frames([depth.around(rotations, window.min_cosine)]).with_stars(key.min_stars)
     if found.n_frames == 0:
         raise StudyError(
-            f"no frame of the pattern {key.pointing!r} shows {key.min_stars} stars: raise max_mag, or lower min_stars."
+            f"no frame of the pattern {key.pointing!r} shows {key.min_stars} stars: raise "
+            "max_mag, or lower min_stars."
         )
     return found
 
@@ -328,7 +363,11 @@ def _random(key: GeometryKey, window: _Views, n: int) -> Geometry:
     good = tries = 0
     while good < n:
         # As many blocks as will do if frames go on to show enough stars as often as so far.
-        wanted = int(np.ceil((n - good) * min(tries / max(good, 1), 4.0) / _BLOCK)) if tries else -(-n // _BLOCK)
+        wanted = (
+            int(np.ceil((n - good) * min(tries / max(good, 1), 4.0) / _BLOCK))
+            if tries
+            else -(-n // _BLOCK)
+        )
         number = range(tries // _BLOCK, tries // _BLOCK + wanted)
         blocks = [window.depth.random(key.seed, block, window.min_cosine) for block in number]
         parts.append(window.frames(blocks).with_stars(key.min_stars))
@@ -336,7 +375,8 @@ def _random(key: GeometryKey, window: _Views, n: int) -> Geometry:
         tries += _BLOCK * wanted
         if tries >= _LEAST_TRIES and good < _LEAST_SKY * tries:
             raise StudyError(
-                f"only {good} of {count(tries)} random attitudes show {key.min_stars} stars to magnitude "
+                f"only {good} of {count(tries)} random attitudes show {key.min_stars} stars to "
+                "magnitude "
                 f"{key.max_mag:g}: raise max_mag, widen the field, or lower min_stars."
             )
     return Geometry.joined(parts).first(n)
@@ -346,11 +386,12 @@ def _random(key: GeometryKey, window: _Views, n: int) -> Geometry:
 class Statements:
     """What M frames say of p parameters, and what the parameters do to M attitudes.
 
-    `information` (M, p, p) of each frame, its attitude eliminated; `weights` (M,), the sum over its stars of the
-    squared inverse noise, px^-2; `common` (3, p), the common rotation, rad per unit of a parameter; `rest_forms`
-    (3, p, p), the mean square over frames of what an attitude adds to it, rad^2; `noise` (3,), the mean over frames of
-    the variance of an attitude, rad^2; `star_spread`, by errors of the stars, (p, p) each: variance of a frame's score
-    beyond its information, and covariance of two frames'.
+    `information` (M, p, p) of each frame, its attitude eliminated; `weights` (M,), the sum over its
+    stars of the squared inverse noise, px^-2; `common` (3, p), the common rotation, rad per unit of
+    a parameter; `rest_forms` (3, p, p), the mean square over frames of what an attitude adds to it,
+    rad^2; `noise` (3,), the mean over frames of the variance of an attitude, rad^2; `star_spread`,
+    by errors of the stars, (p, p) each: variance of a frame's score beyond its information, and
+    covariance of two frames'.
     """
 
     camera: Camera
@@ -370,8 +411,8 @@ class Statements:
 def statements(geometry: Geometry, noise_px: FloatArray, offset_px: float = 0.0) -> Statements:
     """What the frames of a geometry say with centroid noise (N,), px per axis.
 
-    `offset_px` is the error of a star's direction, px at the boresight per axis, the same in all of its images; images
-    are weighed by both together.
+    `offset_px` is the error of a star's direction, px at the boresight per axis, the same in all of
+    its images; images are weighed by both together.
     """
     frames = geometry.frames(np.hypot(noise_px, offset_px))
     camera = geometry.camera
@@ -386,14 +427,18 @@ def statements(geometry: Geometry, noise_px: FloatArray, offset_px: float = 0.0)
         common=common,
         rest_forms=np.einsum("kap,kaq->apq", rest, rest, optimize=True) / len(rest),
         noise=np.diagonal(noise, axis1=1, axis2=2).mean(axis=0),
-        star_spread=_star_spread(geometry, frames, noise_px, offset_px) if offset_px > 0.0 else None,
+        star_spread=_star_spread(geometry, frames, noise_px, offset_px)
+        if offset_px > 0.0
+        else None,
     )
 
 
 def _star_spread(
     geometry: Geometry, frames: StarFrames, noise_px: FloatArray, offset_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Variance of a frame's score beyond its information, and covariance of two frames' scores, by errors of stars."""
+    """Variance of a frame's score beyond its information, and covariance of two frames' scores, by
+    errors of stars.
+    """
     camera, m = geometry.camera, geometry.n_frames
     likelihood = MarginalLikelihood(frames, camera.distortion)
     state, _ = likelihood.profile(camera.theta, geometry.rotations)

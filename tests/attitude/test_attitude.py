@@ -13,7 +13,11 @@ Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 def half_turns() -> np.ndarray:
     """Half turns about the axes, about diagonals and about random directions, and the identity."""
     axes = np.concatenate(
-        (np.eye(3), [[1, 1, 0], [0, -1, 1], [1, 1, 1]], np.random.default_rng(4).standard_normal((20, 3)))
+        (
+            np.eye(3),
+            [[1, 1, 0], [0, -1, 1], [1, 1, 1]],
+            np.random.default_rng(4).standard_normal((20, 3)),
+        )
     )
     axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     return np.concatenate((2.0 * axes[:, :, None] * axes[:, None, :] - np.eye(3), np.eye(3)[None]))
@@ -25,16 +29,22 @@ def same_quaternion(a: np.ndarray, b: np.ndarray, tolerance: float) -> None:
 
 
 def test_quaternions_agree_with_scipy() -> None:
-    rotations = np.concatenate((attitude.random_rotations(500, np.random.default_rng(0)), half_turns()))
+    rotations = np.concatenate(
+        (attitude.random_rotations(500, np.random.default_rng(0)), half_turns())
+    )
     quaternions = attitude.rotation_to_quaternion(rotations)
     same_quaternion(quaternions, Rotation.from_matrix(rotations).as_quat(), 1e-14)
     assert (quaternions[:, 3] >= 0.0).all()
-    np.testing.assert_allclose(attitude.quaternion_to_rotation(-3.0 * quaternions), rotations, atol=1e-14)
+    np.testing.assert_allclose(
+        attitude.quaternion_to_rotation(-3.0 * quaternions), rotations, atol=1e-14
+    )
 
 
 def test_product_has_the_sense_of_matrices() -> None:
     a, b = attitude.random_rotations(2, np.random.default_rng(1))
-    product = attitude.quaternion_multiply(attitude.rotation_to_quaternion(a), attitude.rotation_to_quaternion(b))
+    product = attitude.quaternion_multiply(
+        attitude.rotation_to_quaternion(a), attitude.rotation_to_quaternion(b)
+    )
     np.testing.assert_allclose(attitude.quaternion_to_rotation(product), a @ b, atol=1e-14)
 
 
@@ -58,7 +68,9 @@ def test_left_error_is_in_the_camera_frame() -> None:
     reference = attitude.random_rotations(20, rng)
     phi = 1e-5 * rng.standard_normal((7, 20, 3))
     turned = attitude.exp_rotation(phi) @ reference
-    found = attitude.left_error(attitude.rotation_to_quaternion(turned), attitude.rotation_to_quaternion(reference))
+    found = attitude.left_error(
+        attitude.rotation_to_quaternion(turned), attitude.rotation_to_quaternion(reference)
+    )
     np.testing.assert_allclose(found, phi, atol=2e-15)
 
 

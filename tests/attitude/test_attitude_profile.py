@@ -12,7 +12,12 @@ from starcal_uq.attitude.profile import AttitudeProfile, load_attitude_profile
 from starcal_uq.attitude.rotations import left_error, quaternion_to_rotation
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import project
-from starcal_uq.core.errors import AttitudeProfileError, CatalogueError, ObservationError, SettingError
+from starcal_uq.core.errors import (
+    AttitudeProfileError,
+    CatalogueError,
+    ObservationError,
+    SettingError,
+)
 from starcal_uq.simulation.mission import mission_frames, profile_frames
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers.profiles import slew
@@ -67,18 +72,28 @@ def test_utc_times_are_seconds_since_the_first(tmp_path: Path) -> None:
 def test_order_and_sense_of_quaternions_are_stated_or_refused(tmp_path: Path) -> None:
     profile = slew()
     q = profile.quaternions
-    numbered = pd.DataFrame({"time_s": profile.time_s, **{f"q{i}": q[:, (i + 3) % 4] for i in range(4)}})
+    numbered = pd.DataFrame(
+        {"time_s": profile.time_s, **{f"q{i}": q[:, (i + 3) % 4] for i in range(4)}}
+    )
     path = write(numbered, tmp_path / "numbered.csv")
-    with pytest.raises(AttitudeProfileError, match="do not say which is the scalar part; name them qx, qy, qz, qw"):
+    with pytest.raises(
+        AttitudeProfileError, match="do not say which is the scalar part; name them qx, qy, qz, qw"
+    ):
         load_attitude_profile(path)
-    np.testing.assert_allclose(load_attitude_profile(path, scalar="first").quaternions, q, atol=1e-15)
+    np.testing.assert_allclose(
+        load_attitude_profile(path, scalar="first").quaternions, q, atol=1e-15
+    )
     last = numbered.set_axis(["time_s", "q1", "q2", "q3", "q4"], axis=1)
     other = load_attitude_profile(write(last, tmp_path / "last.csv"), scalar="last").quaternions
     # Control: the wrong order is another attitude.
     assert np.abs(left_error(other, q)).max() > 0.1
 
-    back = load_attitude_profile(write(table(profile), tmp_path / "back.csv"), sense="camera_to_icrs").quaternions
-    np.testing.assert_allclose(quaternion_to_rotation(back), np.swapaxes(quaternion_to_rotation(q), 1, 2), atol=1e-14)
+    back = load_attitude_profile(
+        write(table(profile), tmp_path / "back.csv"), sense="camera_to_icrs"
+    ).quaternions
+    np.testing.assert_allclose(
+        quaternion_to_rotation(back), np.swapaxes(quaternion_to_rotation(q), 1, 2), atol=1e-14
+    )
 
 
 def test_what_is_given_is_copied_and_kept_from_change() -> None:
@@ -129,7 +144,9 @@ def test_nearly_unit_quaternions_are_normalised_and_said() -> None:
     q[[3, 5]] *= 1.0 + 3e-5
     mended = AttitudeProfile(profile.time_s, q)
     np.testing.assert_allclose(mended.quaternions, profile.quaternions, atol=1e-15)
-    assert mended.messages == ("2 quaternions differed from unit length by up to 3.0×10⁻⁵ and were normalised.",)
+    assert mended.messages == (
+        "2 quaternions differed from unit length by up to 3.0×10⁻⁵ and were normalised.",
+    )
     assert AttitudeProfile(profile.time_s, profile.quaternions * (1.0 + 1e-7)).messages == ()
 
 
@@ -168,7 +185,14 @@ def broken(frame: pd.DataFrame, change: str) -> pd.DataFrame:
         ("length", r"line 7: the quaternion has the length 1\.0015, not 1"),
         ("nan", r"line 7: qz is '', not a number"),
         ("text", r"line 7: qz is 'north', not a number"),
-        ("column", r"column qz is missing; give qx, qy, qz, qw beside time_s or time_utc \(the file has time_s, qx"),
+        (
+            "column",
+            (
+                r"column qz is missing; give qx, qy, qz, qw beside time_s or time_utc \(the file "
+                r"has "
+                r"time_s, qx"
+            ),
+        ),
         ("time", r"column time_s or time_utc is missing"),
         ("short", r"holds 1 attitude; give at least two"),
         ("empty", r"holds no attitudes"),
@@ -191,7 +215,11 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
         ("list.txt", b"", "ending .txt is unknown"),
         ("bad.parquet", b"PAR1 no", "is not a readable table"),
         ("latin.csv", "time_s,qx\n1,é\n".encode("latin-1"), "not UTF-8"),
-        ("ragged.csv", b"time_s,qx,qy,qz,qw\n1,0,0,0,1\n2,0,0,1\n", "line 3: holds 4 values under a header of 5"),
+        (
+            "ragged.csv",
+            b"time_s,qx,qy,qz,qw\n1,0,0,0,1\n2,0,0,1\n",
+            "line 3: holds 4 values under a header of 5",
+        ),
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)
@@ -212,7 +240,8 @@ def test_frames_show_what_the_camera_sees() -> None:
     rotations = quaternion_to_rotation(profile.at(times))
     b = np.einsum("nij,nj->ni", rotations[frames.frame], frames.directions_icrs)
     np.testing.assert_allclose(project(camera(), b), frames.xy, atol=1e-9)
-    # Nothing on the detector is missing: the counts are those of all stars projected one frame at a time.
+    # Nothing on the detector is missing: the counts are those of all stars projected one frame at a
+    # time.
     for k in (0, 17, 300):
         b = stars.directions_icrs @ rotations[k].T
         b = b[b[:, 2] > 0.95]
@@ -233,7 +262,9 @@ def test_instants_with_few_stars_are_left_out_and_counted() -> None:
     assert 0 < skipped == 601 - frames.n_frames
     assert f"{skipped} instants with fewer than 4 stars left out" in frames.meta["frames"]
     np.testing.assert_array_equal(profile.time_s[frames.frame_ids], frames.meta["frame_times_s"])
-    with pytest.raises(CatalogueError, match="none of the 601 attitudes of the profile shows 90 stars"):
+    with pytest.raises(
+        CatalogueError, match="none of the 601 attitudes of the profile shows 90 stars"
+    ):
         profile_frames(stars, camera(), profile, min_stars=90)
     with pytest.raises(ValueError, match="min_stars is 1: give a whole number from 2"):
         profile_frames(stars, camera(), profile, min_stars=1)
@@ -241,13 +272,17 @@ def test_instants_with_few_stars_are_left_out_and_counted() -> None:
 
 def test_random_frames_repeat_and_are_free_of_noise() -> None:
     stars = load_catalogue(max_mag=6.0, epoch=2026.9)
-    one, again, other = (mission_frames(stars, camera(), n_frames=30, min_stars=7, seed=s) for s in (1, 1, 2))
+    one, again, other = (
+        mission_frames(stars, camera(), n_frames=30, min_stars=7, seed=s) for s in (1, 1, 2)
+    )
     assert one.data_hash == again.data_hash != other.data_hash
     assert np.diff(one.frame_starts).min() >= 7
     from starcal_uq.camera.projection import unproject
 
     sigma = np.radians(1e-6 / 3600.0)
-    found = quest(unproject(camera(), one.xy), one.directions_icrs, one.frame_starts, sigma_rad=sigma)
+    found = quest(
+        unproject(camera(), one.xy), one.directions_icrs, one.frame_starts, sigma_rad=sigma
+    )
     assert np.sqrt(np.mean(found.taste / found.dof)) < 1.0
     assert "faintest star of magnitude 6.0" in one.meta["frames"]
 

@@ -37,7 +37,11 @@ def perturbed(b: np.ndarray, sigma_rad: np.ndarray | float, rng: np.random.Gener
 
 
 def frames(
-    counts: list[int], field_deg: float, sigma_rad: float, seed: int, rotations: np.ndarray | None = None
+    counts: list[int],
+    field_deg: float,
+    sigma_rad: float,
+    seed: int,
+    rotations: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     starts = np.concatenate(([0], np.cumsum(counts)))
@@ -47,13 +51,17 @@ def frames(
     return perturbed(b, np.full(len(b), sigma_rad), rng), r, starts, rotations
 
 
-def davenport(b: np.ndarray, r: np.ndarray, starts: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def davenport(
+    b: np.ndarray, r: np.ndarray, starts: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvector of the largest eigenvalue of K, frame by frame."""
     quaternions, values = [], []
     for i, j in pairwise(starts):
         B = np.einsum("n,ni,nj->ij", w[i:j] / w[i:j].sum(), b[i:j], r[i:j])
         z = [[B[2, 1] - B[1, 2]], [B[0, 2] - B[2, 0]], [B[1, 0] - B[0, 1]]]
-        K = np.block([[B + B.T - np.trace(B) * np.eye(3), np.array(z)], [np.array(z).T, np.trace(B)]])
+        K = np.block(
+            [[B + B.T - np.trace(B) * np.eye(3), np.array(z)], [np.array(z).T, np.trace(B)]]
+        )
         value, vector = np.linalg.eigh(K)
         quaternions.append(vector[:, -1])
         values.append(value[-1])
@@ -62,8 +70,8 @@ def davenport(b: np.ndarray, r: np.ndarray, starts: np.ndarray, w: np.ndarray) -
 
 @pytest.mark.parametrize(
     ("field_deg", "tolerance_rad"),
-    # A relative error of 1e-16 in K turns the frame by about 1e-16 / (mean squared field angle): below 10 degrees the
-    # eigenvalue solution itself is not good to 1e-12.
+    # A relative error of 1e-16 in K turns the frame by about 1e-16 / (mean squared field angle):
+    # below 10 degrees the eigenvalue solution itself is not good to 1e-12.
     [(1.0, 1e-10), (10.0, 1e-12), (20.0, 2e-13), (100.0, 1e-14)],
 )
 @pytest.mark.parametrize("sigma_rad", [0.0, 1e-5, 1e-3])
@@ -86,12 +94,17 @@ def test_agrees_with_davenport_for_large_residuals() -> None:
     quaternions, lambda_max = davenport(b, r, starts, np.ones(6000))
     np.testing.assert_allclose(result.lambda_max, lambda_max, rtol=1e-13)
     # Unrelated directions sometimes leave two attitudes almost equally good.
-    assert np.max(np.abs(left_error(result.quaternions, quaternions)) * result.observability[:, None]) < 1e-14
+    assert (
+        np.max(np.abs(left_error(result.quaternions, quaternions)) * result.observability[:, None])
+        < 1e-14
+    )
     np.testing.assert_allclose(result.loss, quest(b, r, starts, sigma_rad=1.0).loss, rtol=1e-12)
 
 
 def half_turns() -> np.ndarray:
-    axes = np.concatenate((np.eye(3), [[1, 1, 0], [0, 1, -1]], np.random.default_rng(4).standard_normal((40, 3))))
+    axes = np.concatenate(
+        (np.eye(3), [[1, 1, 0], [0, 1, -1]], np.random.default_rng(4).standard_normal((40, 3)))
+    )
     return exp_rotation(np.pi * axes / np.linalg.norm(axes, axis=1, keepdims=True))
 
 
@@ -99,7 +112,9 @@ def half_turns() -> np.ndarray:
 def test_agrees_with_scipy_also_at_half_turns(sigma_rad: float) -> None:
     rng = np.random.default_rng(5)
     rotations = np.concatenate((half_turns(), [np.eye(3)], random_rotations(100, rng)))
-    rotations = np.concatenate((rotations, exp_rotation(1e-9 * rng.standard_normal(rotations.shape[:2])) @ rotations))
+    rotations = np.concatenate(
+        (rotations, exp_rotation(1e-9 * rng.standard_normal(rotations.shape[:2])) @ rotations)
+    )
     b, r, starts, _ = frames([12] * len(rotations), 15.0, sigma_rad, seed=6, rotations=rotations)
     w = rng.uniform(0.1, 3.0, len(b))
     result = quest(b, r, starts, w)
@@ -111,12 +126,19 @@ def test_agrees_with_scipy_also_at_half_turns(sigma_rad: float) -> None:
 
 
 def test_eigenvector_before_it_is_polished() -> None:
-    """One step of Newton would mend a wrong entry of the adjugate; whichever row is largest, it needs none."""
+    """One step of Newton would mend a wrong entry of the adjugate; whichever row is largest, it
+    needs none.
+    """
     # At the identity and at half turns about an axis, one row alone is not zero.
-    rotations = np.concatenate(([np.eye(3)], half_turns(), random_rotations(200, np.random.default_rng(5))))
+    rotations = np.concatenate(
+        ([np.eye(3)], half_turns(), random_rotations(200, np.random.default_rng(5)))
+    )
     b, r, starts, _ = frames([8] * len(rotations), 90.0, 1e-9, 6, rotations)
     quaternions, values = davenport(b, r, starts, np.ones(len(b)))
-    B = [[np.add.reduceat(b[:, i] * r[:, j], starts[:-1])[None] / 8.0 for j in range(3)] for i in range(3)]
+    B = [
+        [np.add.reduceat(b[:, i] * r[:, j], starts[:-1])[None] / 8.0 for j in range(3)]
+        for i in range(3)
+    ]
     found = _adjugate_quaternion(B, values[None])[:, 0].T
     assert set(np.argmax(np.abs(quaternions), axis=1)) == {0, 1, 2, 3}
     signs = np.sign(np.sum(found * quaternions, axis=1, keepdims=True))
@@ -134,9 +156,20 @@ def test_draws_give_the_same_as_one_call_each(monkeypatch: pytest.MonkeyPatch) -
         for references in (r, np.broadcast_to(r, draws.shape)):
             batch = quest(draws, references, starts, sigma_rad=sigma)
             assert batch.rotations.shape == (5, 60, 3, 3)
-            for field in ("quaternions", "lambda_max", "loss", "observability", "ok", "covariance", "taste"):
+            for field in (
+                "quaternions",
+                "lambda_max",
+                "loss",
+                "observability",
+                "ok",
+                "covariance",
+                "taste",
+            ):
                 np.testing.assert_allclose(
-                    getattr(batch, field), np.stack([getattr(s, field) for s in single]), rtol=1e-12, err_msg=field
+                    getattr(batch, field),
+                    np.stack([getattr(s, field) for s in single]),
+                    rtol=1e-12,
+                    err_msg=field,
                 )
 
 
@@ -147,16 +180,24 @@ def test_weights_and_sigmas_are_two_names_of_one_thing() -> None:
     np.testing.assert_array_equal(by_sigma.quaternions, by_weight.quaternions)
     np.testing.assert_array_equal(by_sigma.covariance, by_weight.covariance)
     plain = quest(b, r, starts)
-    np.testing.assert_allclose(plain.covariance * 1e-10, quest(b, r, starts, sigma_rad=1e-5).covariance, rtol=1e-12)
+    np.testing.assert_allclose(
+        plain.covariance * 1e-10, quest(b, r, starts, sigma_rad=1e-5).covariance, rtol=1e-12
+    )
     i, j = starts[3], starts[4]
-    information = np.sum((np.eye(3) - b[i:j, :, None] * b[i:j, None, :]) * sigma[i:j, None, None] ** -2.0, axis=0)
+    information = np.sum(
+        (np.eye(3) - b[i:j, :, None] * b[i:j, None, :]) * sigma[i:j, None, None] ** -2.0, axis=0
+    )
     np.testing.assert_allclose(by_sigma.covariance[3] @ information, np.eye(3), atol=1e-10)
-    np.testing.assert_allclose(plain.loss, 0.5e-10 * quest(b, r, starts, sigma_rad=1e-5).taste / 9, rtol=1e-4)
+    np.testing.assert_allclose(
+        plain.loss, 0.5e-10 * quest(b, r, starts, sigma_rad=1e-5).taste / 9, rtol=1e-4
+    )
     # Where 1 - lambda is rounding, the residuals still tell.
     b, r, starts, _ = frames([9] * 20, 10.0, 1e-9, seed=9)
     fine = quest(b, r, starts, sigma_rad=1e-9)
     residuals = b - np.einsum("nij,nj->ni", np.repeat(fine.rotations, 9, axis=0), r)
-    np.testing.assert_allclose(fine.loss, 0.5 * np.sum(residuals.reshape(20, -1) ** 2, axis=1) / 9, rtol=1e-5)
+    np.testing.assert_allclose(
+        fine.loss, 0.5 * np.sum(residuals.reshape(20, -1) ** 2, axis=1) / 9, rtol=1e-5
+    )
 
 
 def whitened_excess(errors: np.ndarray, covariance: np.ndarray) -> float:
@@ -212,12 +253,17 @@ def test_two_stars_close_together_have_an_honest_covariance() -> None:
 
 @pytest.mark.parametrize("scene", ["two stars", "stars on a line", "cluster off the axis"])
 def test_nearly_collinear_stars_have_an_honest_covariance(scene: str) -> None:
-    """Ill-conditioned, not degenerate: roll, or a turn about the cluster, is known worse by orders of magnitude."""
+    """Ill-conditioned, not degenerate: roll, or a turn about the cluster, is known worse by orders
+    of magnitude.
+    """
     rng = np.random.default_rng(24)
     along, across = {
         "two stars": (np.array([0.0, 2e-4]), np.array([0.0, 1e-4])),
         "stars on a line": (np.linspace(-0.1, 0.1, 9), 1e-6 * rng.standard_normal(9)),
-        "cluster off the axis": (0.09 + 1e-4 * rng.standard_normal(6), 0.08 + 1e-4 * rng.standard_normal(6)),
+        "cluster off the axis": (
+            0.09 + 1e-4 * rng.standard_normal(6),
+            0.08 + 1e-4 * rng.standard_normal(6),
+        ),
     }[scene]
     b = np.column_stack((along, across, np.ones_like(along)))
     b /= np.linalg.norm(b, axis=1, keepdims=True)
@@ -233,7 +279,9 @@ def test_nearly_collinear_stars_have_an_honest_covariance(scene: str) -> None:
     np.testing.assert_allclose(root @ result.covariance[0, 0] @ root.T, np.eye(3), atol=0.05)
     # Control: the covariance of a sound frame of as many stars is wrong by far.
     sound = directions(len(b), 12.0, rng)
-    other = np.linalg.inv(np.sum(np.eye(3) - sound[:, :, None] * sound[:, None, :], axis=0) / sigma**2)
+    other = np.linalg.inv(
+        np.sum(np.eye(3) - sound[:, :, None] * sound[:, None, :], axis=0) / sigma**2
+    )
     assert whitened_excess(errors, other) > 30.0
 
 
@@ -271,7 +319,9 @@ def test_degenerate_frames_are_flagged() -> None:
 def test_coinciding_stars_never_pass_unnoticed(angle_rad: float) -> None:
     rng = np.random.default_rng(19)
     centre = rng.standard_normal((500, 1, 3))
-    b = centre / np.linalg.norm(centre, axis=-1, keepdims=True) + angle_rad * rng.standard_normal((500, 4, 3))
+    b = centre / np.linalg.norm(centre, axis=-1, keepdims=True) + angle_rad * rng.standard_normal(
+        (500, 4, 3)
+    )
     b = (b / np.linalg.norm(b, axis=-1, keepdims=True)).reshape(-1, 3)
     rotation = random_rotations(1, rng)[0]
     result = quest(b, b @ rotation, np.arange(0, 2001, 4), on_degenerate="flag")
@@ -302,15 +352,24 @@ def test_wrong_arguments_are_named() -> None:
 
 
 def test_takes_a_fraction_of_as_many_decompositions() -> None:
-    """A quarter of what NumPy takes to decompose as many 3 x 3 matrices, with which the other way begins."""
+    """A quarter of what NumPy takes to decompose as many 3 x 3 matrices, with which the other way
+    begins.
+    """
     b, r, starts, _ = frames([12] * 20_000, 12.0, 1e-5, seed=22)
     matrices = np.random.default_rng(0).random((20_000, 3, 3))
-    assert times_as_long(lambda: quest(b, r, starts, covariance=False), lambda: np.linalg.svd(matrices)) < 0.6
+    assert (
+        times_as_long(
+            lambda: quest(b, r, starts, covariance=False), lambda: np.linalg.svd(matrices)
+        )
+        < 0.6
+    )
 
 
 def test_result_rotations_and_quaternions_agree() -> None:
     b, r, starts, truth = frames([5, 7], 12.0, 0.0, seed=23)
     result = quest(b, r, starts)
     np.testing.assert_array_equal(result.rotations, quaternion_to_rotation(result.quaternions))
-    np.testing.assert_allclose(np.einsum("kij,nj->kni", result.rotations, r)[0, :5], b[:5], atol=1e-12)
+    np.testing.assert_allclose(
+        np.einsum("kij,nj->kni", result.rotations, r)[0, :5], b[:5], atol=1e-12
+    )
     np.testing.assert_allclose(result.rotations, truth, atol=1e-12)

@@ -1,4 +1,6 @@
-"""The error budget: rows from the posterior, inflation, requirements, and every format it is written in."""
+"""The error budget: rows from the posterior, inflation, requirements, and every format it is
+written in.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,16 @@ from starcal_uq.budgeting.file import (
 )
 from starcal_uq.budgeting.posterior import alignment_rows, misfit_notes, posterior_rows
 from starcal_uq.budgeting.result import Budget
-from starcal_uq.budgeting.rows import ALIGNMENT, COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST, UNTESTED, Contributor
+from starcal_uq.budgeting.rows import (
+    ALIGNMENT,
+    COMMON,
+    FROM_FILE,
+    GAUSSIAN_997,
+    NEA,
+    REST,
+    UNTESTED,
+    Contributor,
+)
 from starcal_uq.budgeting.shapes import one_axis_factor
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
@@ -90,7 +101,11 @@ limit_arcsec = 100.0
 
 
 def attitude(**changes: Any) -> AttitudeError:
-    nea, common, rest = np.array([0.46, 0.46, 6.6]), np.array([4.8, 4.7, 0.01]), np.array([0.006, 0.006, 0.05])
+    nea, common, rest = (
+        np.array([0.46, 0.46, 6.6]),
+        np.array([4.8, 4.7, 0.01]),
+        np.array([0.006, 0.006, 0.05]),
+    )
     values = [nea, common, rest, np.hypot(common, rest), np.array([1e-4, 1e-4, 1e-3])]
     factors = np.array([[3.2], [3.3], [3.9], [2.97], [3.0]])
     cross = [float(np.sqrt(np.mean(v[:2] ** 2))) for v in values]
@@ -137,21 +152,37 @@ def pattern(size_px: float, p: float, against: str = "radius", dof: int = 5) -> 
     return MisfitTest(f"pattern over {against}", against, 9.0, dof, 1000, p, p, size_px, 0.5)
 
 
-# --- rows ------------------------------------------------------------------------------------------------------------
+# --- rows
+# --------------------------------------------------------------------------------------------------
 
 
 def test_the_posterior_fills_its_rows_and_no_others() -> None:
     found = made()
     rows = {(row.name, row.axis): row for row in found.rows}
-    for name, sigma in ((NEA, [0.46, 0.46, 6.6]), (COMMON, [4.8, 4.7, 0.01]), (REST, [0.006, 0.006, 0.05])):
+    for name, sigma in (
+        (NEA, [0.46, 0.46, 6.6]),
+        (COMMON, [4.8, 4.7, 0.01]),
+        (REST, [0.006, 0.006, 0.05]),
+    ):
         assert [rows[name, axis].sigma_arcsec for axis in AXES] == sigma
-        assert rows[name, "roll"].source == "posterior" and "0123456789ab" in rows[name, "roll"].provenance
+        assert (
+            rows[name, "roll"].source == "posterior"
+            and "0123456789ab" in rows[name, "roll"].provenance
+        )
     assert rows[COMMON, "pitch"].absorbed_by_alignment == "yes"
-    assert rows[COMMON, "pitch"].tail_997 == GAUSSIAN_997 < rows[NEA, "pitch"].tail_997 == pytest.approx(3.2)
+    assert (
+        rows[COMMON, "pitch"].tail_997
+        == GAUSSIAN_997
+        < rows[NEA, "pitch"].tail_997
+        == pytest.approx(3.2)
+    )
     assert rows[INTERACTION, "roll"].sigma_arcsec == 1e-3
     # Nobody has tested the model: what it misses is a contributor that is not assessed, never zero.
     assert set(found.not_assessed) == {entry.name for entry in (UNTESTED, *FROM_FILE)}
-    assert math.isnan(rows[REST, "roll"].with_misfit_found_arcsec) and rows[REST, "roll"].if_model_holds_arcsec == 0.05
+    assert (
+        math.isnan(rows[REST, "roll"].with_misfit_found_arcsec)
+        and rows[REST, "roll"].if_model_holds_arcsec == 0.05
+    )
     assert UNTESTED.name not in made(misfit=diagnosis()).not_assessed
     for row in found.rows:
         assert row.assessed is (row.source == "posterior")
@@ -160,7 +191,9 @@ def test_the_posterior_fills_its_rows_and_no_others() -> None:
 
 def test_totals_keep_common_and_rest_apart() -> None:
     found = made(n_samples=200_000)
-    before, after = (found.total("pitch", scope) for scope in ("before alignment", "after alignment"))
+    before, after = (
+        found.total("pitch", scope) for scope in ("before alignment", "after alignment")
+    )
     assert before.sigma_arcsec == pytest.approx(np.sqrt(4.8**2 + 0.46**2 + 0.006**2), rel=1e-6)
     assert after.sigma_arcsec == pytest.approx(np.hypot(0.46, 0.006), rel=1e-6)
     assert before.at_least and before.dominant == COMMON and after.dominant == NEA
@@ -179,7 +212,11 @@ def test_an_old_attitude_file_has_no_interaction() -> None:
 def test_confidence_of_call_file_and_default(tmp_path: Path) -> None:
     path = tmp_path / "b.toml"
     path.write_text("[budget]\nconfidence = 0.9\n", encoding="utf-8")
-    assert made().confidence == 0.997 and made(path).confidence == 0.9 and made(path, confidence=0.5).confidence == 0.5
+    assert (
+        made().confidence == 0.997
+        and made(path).confidence == 0.9
+        and made(path, confidence=0.5).confidence == 0.5
+    )
     assert made(load_budget_file(path)).confidence == 0.9
     with pytest.raises(BudgetError, match=r"write 0\.95 for 95 %"):
         made(confidence=95)
@@ -190,14 +227,17 @@ def test_confidence_of_call_file_and_default(tmp_path: Path) -> None:
 def test_rows_of_the_file_replace_what_is_not_assessed(stated: Path) -> None:
     found = made(stated)
     rows = {(row.name, row.axis): row for row in found.rows}
-    assert rows["thermo-elastic distortion", "pitch"].sigma_arcsec == pytest.approx(1.5 / math.sqrt(2.0))
+    assert rows["thermo-elastic distortion", "pitch"].sigma_arcsec == pytest.approx(
+        1.5 / math.sqrt(2.0)
+    )
     assert not rows["thermo-elastic distortion", "roll"].assessed
     assert "thermo-elastic distortion (about Z (roll))" in found.notes[-1]
     assert "measurement date error" not in found.not_assessed
     assert rows["=my own", "pitch"].ecss_class == "other" and not rows["=my own", "yaw"].assessed
 
 
-# --- inflation -------------------------------------------------------------------------------------------------------
+# --- inflation
+# --------------------------------------------------------------------------------------------------
 
 
 def test_without_a_diagnosis_the_budget_says_that_the_model_was_not_tested() -> None:
@@ -216,16 +256,26 @@ def test_classes_hold_what_counts_in_a_scope(stated: Path) -> None:
     assert any(not row.applies for row in found.rows)
     for scope in ("before alignment", "after alignment"):
         for line in found.classes_dataframe(scope).to_dict("records"):
-            rows = [r for r in found.rows if (r.ecss_class, r.axis) == (line["ecss_class"], line["axis"]) and r.applies]
+            rows = [
+                r
+                for r in found.rows
+                if (r.ecss_class, r.axis) == (line["ecss_class"], line["axis"]) and r.applies
+            ]
             if scope == "after alignment":
                 rows = [row for row in rows if row.absorbed_by_alignment != "yes"]
             else:
                 rows = [row for row in rows if row.absorbed_by_alignment != "caused by it"]
             known = [row.sigma_arcsec for row in rows if row.assessed]
             assert line["at_least"] == (len(known) < len(rows))
-            expected = math.sqrt(sum(sigma**2 for sigma in known)) if known or not rows else math.nan
+            expected = (
+                math.sqrt(sum(sigma**2 for sigma in known)) if known or not rows else math.nan
+            )
             assert line["sigma_arcsec"] == pytest.approx(expected, nan_ok=True)
-    counted = {row.ecss_class for row in found.rows if row.applies and row.absorbed_by_alignment != "caused by it"}
+    counted = {
+        row.ecss_class
+        for row in found.rows
+        if row.applies and row.absorbed_by_alignment != "caused by it"
+    }
     assert {*found.classes_dataframe("before alignment")["ecss_class"]} == counted
 
 
@@ -247,11 +297,21 @@ def test_tables_say_what_rows_totals_and_requirements_are(stated: Path) -> None:
 
 @pytest.mark.parametrize("factor", [1.0, 1.3])
 def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor: float) -> None:
-    """The attitude error brings it along; from pixels to there see `tests/diagnostics/test_pattern.py`."""
-    found = MisfitFound(factor, np.zeros(3), np.array([0.7, 0.7, 10.0]), (), ("misfit, pattern over radius",))
+    """The attitude error brings it along; from pixels to there see
+    `tests/diagnostics/test_pattern.py`.
+    """
+    found = MisfitFound(
+        factor, np.zeros(3), np.array([0.7, 0.7, 10.0]), (), ("misfit, pattern over radius",)
+    )
     held = attitude().if_model_holds_arcsec[:, :3]
-    covariance = held[:, :, None] * held[:, None] * np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
-    made_of = budget(POST, OBS, attitude(misfit=found, covariance_arcsec2=covariance), n_samples=20_000)  # type: ignore[arg-type]
+    covariance = (
+        held[:, :, None]
+        * held[:, None]
+        * np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
+    )
+    made_of = budget(
+        POST, OBS, attitude(misfit=found, covariance_arcsec2=covariance), n_samples=20_000
+    )  # type: ignore[arg-type]
     rows = {(row.name, row.axis): row for row in made_of.rows}
     # What is added is independent between the axes: covariances stay, variances grow.
     for name, place in ((COMMON, 1), (REST, 2)):
@@ -264,7 +324,8 @@ def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor
     assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(factor * 0.05, 10.0))
     # Common rotations are one Gaussian, whatever the tail of their draws.
     assert rows[COMMON, "pitch"].tail_997 == GAUSSIAN_997 < rows[NEA, "pitch"].tail_997
-    # The added part has no tail of its own; with next to all of the variance it leaves next to nothing of the tail.
+    # The added part has no tail of its own; with next to all of the variance it leaves next to
+    # nothing of the tail.
     assert GAUSSIAN_997 < rows[REST, "pitch"].tail_997 < GAUSSIAN_997 + 0.01
     assert rows[REST, "pitch"].if_model_holds_arcsec == 0.006 and rows[REST, "pitch"].inflated
     assert "pattern over radius" in rows[REST, "pitch"].conditions
@@ -281,12 +342,16 @@ def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor
     older.loc[older["name"] != REST, "raw_sigma_arcsec"] = "nan"
     older.to_csv(tmp_path / "older.csv", index=False)
     read = [row for row in Budget.load(tmp_path / "older.csv").rows if row.inflated]
-    assert [(row.name, row.axis) for row in read] == [(REST, axis) for axis in ("pitch", "yaw", "roll")]
+    assert [(row.name, row.axis) for row in read] == [
+        (REST, axis) for axis in ("pitch", "yaw", "roll")
+    ]
     assert read[0].if_model_holds_arcsec == 0.006
 
 
 def score(model: str, rejected: bool, common: Any, rest: Any, preferred: float = 0.0) -> Any:
-    return SimpleNamespace(model=model, rejected=rejected, common_arcsec=common, rest_arcsec=rest, preferred=preferred)
+    return SimpleNamespace(
+        model=model, rejected=rejected, common_arcsec=common, rest_arcsec=rest, preferred=preferred
+    )
 
 
 def comparison(rejected: bool, preferred: float = 0.0) -> Any:
@@ -316,7 +381,11 @@ def test_models_count_as_far_as_the_data_prefer_them() -> None:
     np.testing.assert_allclose(found.choice_common_arcsec, [9.0 * 0.75**0.5, 0.0, 0.0])
     assert "brown3" in found.common_reasons[0] and "none" not in found.common_reasons[0]
     worse = with_misfit(attitude(), diagnosis(comparison=comparison(True)), POST, OBS).misfit  # type: ignore[arg-type]
-    assert worse.common_arcsec.tolist() == [9.0, 0.1, 0.0] and worse.rest_arcsec.tolist() == [0.001, 0.02, 0.0]
+    assert worse.common_arcsec.tolist() == [9.0, 0.1, 0.0] and worse.rest_arcsec.tolist() == [
+        0.001,
+        0.02,
+        0.0,
+    ]
 
 
 def test_frames_that_disagree_multiply_both_calibration_rows() -> None:
@@ -330,25 +399,34 @@ def test_frames_that_disagree_multiply_both_calibration_rows() -> None:
     # What draws hold of an accepted inflation is not counted again.
     for held, factor in ((1.5, 1.0), (1.2, 1.25)):
         post: Any = SimpleNamespace(**{**vars(POST), "inflation": np.array([1.0, held])})
-        assert with_misfit(attitude(), diagnosis(jackknife=flagged), post, OBS).misfit.factor == pytest.approx(factor)
+        assert with_misfit(
+            attitude(), diagnosis(jackknife=flagged), post, OBS
+        ).misfit.factor == pytest.approx(factor)
 
 
 def test_reasons_that_differ_in_numbers_alone_are_told_once() -> None:
     texts = [
         f"The rule is {size} % below: the sigma of {name} reaches 3.35."
         for size, name in zip(
-            (11, 9.5, 14, 12, 11), ("'row 1'", "'row 1'", "'row 1'", "'row 2'", '"user\'s 1"'), strict=True
+            (11, 9.5, 14, 12, 11),
+            ("'row 1'", "'row 1'", "'row 1'", "'row 2'", '"user\'s 1"'),
+            strict=True,
         )
     ]
     whole = made()
     totals = [total for total in whole.totals if total.interpretation == "mixed"][:5]
-    few = [dataclasses.replace(total, explanation=text) for total, text in zip(totals, texts, strict=True)]
+    few = [
+        dataclasses.replace(total, explanation=text)
+        for total, text in zip(totals, texts, strict=True)
+    ]
     told = explanations(dataclasses.replace(whole, totals=tuple(few)))
     assert [line.partition(": ")[2] for line in told] == [
         "The rule is 9.5 to 14 % below: the sigma of 'row 1' reaches 3.35.",
         *texts[3:],
     ]
-    assert told[0].startswith("X (pitch), before alignment; Y (yaw), before alignment; Z (roll), before alignment: ")
+    assert told[0].startswith(
+        "X (pitch), before alignment; Y (yaw), before alignment; Z (roll), before alignment: "
+    )
 
 
 # --- every key of the file has an effect ---
@@ -368,7 +446,13 @@ PROBE = {
     "provenance": "note 1",
     "applies": True,
 }
-ASKED = {"name": "R-1", "axis": "roll", "limit_arcsec": 30.0, "confidence": 0.997, "frame": "sensor"}
+ASKED = {
+    "name": "R-1",
+    "axis": "roll",
+    "limit_arcsec": 30.0,
+    "confidence": 0.997,
+    "frame": "sensor",
+}
 TABLES = {
     "[budget]": (BUDGET_KEYS, {"title": "one", "confidence": 0.997}),
     "[[contributor]]": (CONTRIBUTOR_KEYS, PROBE),
@@ -381,13 +465,21 @@ def lines(table: dict[str, Any]) -> str:
 
 
 def result(folder: Path, head: str, table: dict[str, Any]) -> str:
-    """Everything that a budget states but its provenance, as text; beside others whose tails and groups matter."""
+    """Everything that a budget states but its provenance, as text; beside others whose tails and
+    groups matter.
+    """
     tables = {name: table if name == head else dict(base) for name, (_, base) in TABLES.items()}
     other = {**PROBE, "name": "other", "sigma_arcsec": 2.0, "interpretation": "ensemble"}
-    others = [{**other, "axis": "X"}, {**other, "axis": "Z", "correlation_group": "text of its own"}]
+    others = [
+        {**other, "axis": "X"},
+        {**other, "axis": "Z", "correlation_group": "text of its own"},
+    ]
     text = "".join(f"{name}\n{lines(entry)}" for name, entry in tables.items())
     text += "".join(f"[[contributor]]\n{lines(entry)}" for entry in others)
-    text += '[frame."text of its own"]\nrotation = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]\n'
+    text += (
+        '[frame."text of its own"]\nrotation = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, '
+        "0.0]]\n"
+    )
     (folder / "key.toml").write_text(text, encoding="utf-8")
     found = made(folder / "key.toml", n_samples=10_000)
     shown = found.to_dict()
@@ -402,17 +494,26 @@ def result(folder: Path, head: str, table: dict[str, Any]) -> str:
 
 def values(kind: Any, now: Any) -> list[Any]:
     if kind.words:
-        return list({str(aliases): word for word in kind.words for aliases in [_AXIS_NAMES.get(word, word)]}.values())
+        return list(
+            {
+                str(aliases): word
+                for word in kind.words
+                for aliases in [_AXIS_NAMES.get(word, word)]
+            }.values()
+        )
     if kind.kind is float:
         return [0.9 * (now or 10.0), now]
     return ["text of its own", now] if kind.kind is str else [False, True]
 
 
-@pytest.mark.parametrize(("head", "key"), [(head, key) for head, (keys, _) in TABLES.items() for key in keys])
+@pytest.mark.parametrize(
+    ("head", "key"), [(head, key) for head, (keys, _) in TABLES.items() for key in keys]
+)
 def test_every_value_of_every_key_changes_the_result(tmp_path: Path, head: str, key: str) -> None:
     keys, base = TABLES[head]
     found: dict[str, list[str]] = {}
-    # About the boresight noise has a heavy tail, and sampling says more; across it a uniform row, and the rule does.
+    # About the boresight noise has a heavy tail, and sampling says more; across it a uniform row,
+    # and the rule does.
     for axis in ("roll", "pitch") if key == "judged_by" else ("roll",):
         for value in values(keys[key], base.get(key)):
             table = {**base, **({"axis": axis} if "axis" in base else {}), key: value}
@@ -426,15 +527,21 @@ def test_every_value_of_every_key_changes_the_result(tmp_path: Path, head: str, 
 
 
 def test_a_key_without_effect_would_be_found(tmp_path: Path) -> None:
-    # Control: the time class of earlier versions was shown and changed nothing; it is refused with a sentence.
+    # Control: the time class of earlier versions was shown and changed nothing; it is refused with
+    # a sentence.
     path = tmp_path / "old.toml"
     path.write_text(f'[[contributor]]\n{lines(PROBE)}time_class = "field"\n', encoding="utf-8")
-    with pytest.raises(BudgetError, match="key time_class is no longer read, because interpretation alone decides"):
+    with pytest.raises(
+        BudgetError, match="key time_class is no longer read, because interpretation alone decides"
+    ):
         made(path)
-    assert result(tmp_path, "[[contributor]]", PROBE) == result(tmp_path, "[[contributor]]", dict(PROBE))
+    assert result(tmp_path, "[[contributor]]", PROBE) == result(
+        tmp_path, "[[contributor]]", dict(PROBE)
+    )
 
 
-# --- requirements ----------------------------------------------------------------------------------------------------
+# --- requirements
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_violated_requirement_is_named_and_the_others_stay_open(stated: Path) -> None:
@@ -443,7 +550,10 @@ def test_a_violated_requirement_is_named_and_the_others_stay_open(stated: Path) 
     assert [outcome.requirement.name for outcome in found.open_requirements] == ["R-2 about"]
     violated, unproven = found.outcomes
     assert "'R-1 across'" in violated.text and "is violated: at least" in violated.text
-    assert violated.margin_arcsec == pytest.approx(1.0 - violated.total.larger_arcsec) and violated.margin_arcsec < 0.0
+    assert (
+        violated.margin_arcsec == pytest.approx(1.0 - violated.total.larger_arcsec)
+        and violated.margin_arcsec < 0.0
+    )
     assert "not assessed" in unproven.text and unproven.margin_arcsec > 0.0
     table = found.requirements_dataframe()
     assert table["verdict"].tolist() == ["violated", "open"]
@@ -451,13 +561,17 @@ def test_a_violated_requirement_is_named_and_the_others_stay_open(stated: Path) 
 
 def complete(limit: float, judged_by: str = "both") -> str:
     rows = "".join(
-        f'[[contributor]]\nname = "{entry.name}"\naxis = "all"\nsigma_arcsec = 0.01\ndistribution = "gaussian"\n'
+        f'[[contributor]]\nname = "{entry.name}"\naxis = "all"\nsigma_arcsec = '
+        '0.01\ndistribution = "gaussian"\n'
         'provenance = "test"\n'
         for entry in FROM_FILE
     )
     return (
         rows
-        + f'[[requirement]]\nname = "R"\naxis = "roll"\nlimit_arcsec = {limit}\njudged_by = "{judged_by}"\n'
+        + (
+            f'[[requirement]]\nname = "R"\naxis = "roll"\nlimit_arcsec = {limit}\njudged_by = '
+            f'"{judged_by}"\n'
+        )
         + 'confidence = 0.997\nscope = "after alignment"\n'
     )
 
@@ -471,8 +585,12 @@ def test_met_only_if_everything_is_assessed(tmp_path: Path) -> None:
     assert not any(entry.at_least for entry in found.totals)
 
 
-@pytest.mark.parametrize(("judged_by", "verdict"), [("rule", "met"), ("sampling", "violated"), ("both", "violated")])
-def test_what_judges_decides_where_rule_and_sampling_disagree(tmp_path: Path, judged_by: str, verdict: str) -> None:
+@pytest.mark.parametrize(
+    ("judged_by", "verdict"), [("rule", "met"), ("sampling", "violated"), ("both", "violated")]
+)
+def test_what_judges_decides_where_rule_and_sampling_disagree(
+    tmp_path: Path, judged_by: str, verdict: str
+) -> None:
     # 6.6 arcsec of noise whose sigma varies: 19.6 by the rule, 21.1 by sampling.
     path = tmp_path / "complete.toml"
     path.write_text(complete(20.2, judged_by), encoding="utf-8")
@@ -511,7 +629,10 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
     if verdict == "open":
         assert "20000 samples do not resolve a confidence of 99.99999" in outcome.text
         assert "which knows Gaussian tails only, says 35.2 arcsec" in outcome.text
-        assert "1 requirement open: the samples do not resolve" in budget_context(found)["budget"]["headline"]
+        assert (
+            "1 requirement open: the samples do not resolve"
+            in budget_context(found)["budget"]["headline"]
+        )
     found.save(tmp_path / "budget.csv")
     assert [entry.verdict for entry in Budget.load(tmp_path / "budget.csv").outcomes] == [verdict]
     for ending in ("html", "tex"):
@@ -536,7 +657,9 @@ def test_a_budget_beyond_the_samples_is_whole(stated: Path, tmp_path: Path) -> N
     assert "not resolved" in found._repr_html_()
 
 
-def test_a_contributor_of_the_users_own_is_not_zero_on_axes_that_the_file_leaves_out(tmp_path: Path) -> None:
+def test_a_contributor_of_the_users_own_is_not_zero_on_axes_that_the_file_leaves_out(
+    tmp_path: Path,
+) -> None:
     own = FILE.split("[[contributor]]")[4].split("[[requirement]]")[0]
     path = tmp_path / "own.toml"
     path.write_text("[[contributor]]" + own, encoding="utf-8")
@@ -546,14 +669,17 @@ def test_a_contributor_of_the_users_own_is_not_zero_on_axes_that_the_file_leaves
     assert "=my own" in found.not_assessed and "=my own" in found.total("Z").not_assessed
     assert "=my own (about Y (yaw) and Z (roll))" in " ".join(found.notes)
     path.write_text(
-        "[[contributor]]" + own + "[[contributor]]\nname = '=my own'\naxis = 'Z'\napplies = false\nprovenance = 'p'\n",
+        "[[contributor]]"
+        + own
+        + "[[contributor]]\nname = '=my own'\naxis = 'Z'\napplies = false\nprovenance = 'p'\n",
         encoding="utf-8",
     )
     assert "=my own" not in made(path).total("Z").not_assessed
 
 
 @pytest.mark.parametrize(
-    ("label", "axis"), [("X", "pitch"), ("z", "roll"), ("Y (yaw)", "yaw"), ("X and Y together", "cross-boresight")]
+    ("label", "axis"),
+    [("X", "pitch"), ("z", "roll"), ("Y (yaw)", "yaw"), ("X and Y together", "cross-boresight")],
 )
 def test_totals_answer_to_the_labels_of_the_tables(label: str, axis: str) -> None:
     found = made()
@@ -562,7 +688,8 @@ def test_totals_answer_to_the_labels_of_the_tables(label: str, axis: str) -> Non
         found.total("W")
 
 
-# --- formats ---------------------------------------------------------------------------------------------------------
+# --- formats
+# --------------------------------------------------------------------------------------------------
 
 
 def test_csv_is_lossless(stated: Path, tmp_path: Path) -> None:
@@ -572,16 +699,24 @@ def test_csv_is_lossless(stated: Path, tmp_path: Path) -> None:
     for name in ("rows", "totals", "outcomes", "confidence", "title", "notes", "provenance"):
         assert repr(to_plain(getattr(back, name))) == repr(to_plain(getattr(found, name))), name
     found.to_dataframe().to_csv(tmp_path / "frame.csv")
-    assert len(found.to_dataframe()) == len(found.rows) and len(found.totals_dataframe()) == len(found.totals)
+    assert len(found.to_dataframe()) == len(found.rows) and len(found.totals_dataframe()) == len(
+        found.totals
+    )
 
 
-def test_correlations_of_axes_in_csv_are_lists_of_numbers_for_other_readers(stated: Path, tmp_path: Path) -> None:
-    """None begins with an apostrophe, whatever the sign of its first number; those of an earlier version are read."""
+def test_correlations_of_axes_in_csv_are_lists_of_numbers_for_other_readers(
+    stated: Path, tmp_path: Path
+) -> None:
+    """None begins with an apostrophe, whatever the sign of its first number; those of an earlier
+    version are read.
+    """
     import pandas as pd
 
     found = made(stated)
     signed = (-0.25, 0.1, 1.0)
-    changed = dataclasses.replace(found, rows=(dataclasses.replace(found.rows[0], axis_correlation=signed),))
+    changed = dataclasses.replace(
+        found, rows=(dataclasses.replace(found.rows[0], axis_correlation=signed),)
+    )
     path = tmp_path / "budget.csv"
     changed.save(path)
     (cell,) = pd.read_csv(path)["axis_correlation"].dropna()
@@ -623,12 +758,18 @@ def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None
     column = header.index("Sigma [arcsec]") + 1
     for index, row in enumerate(found.rows, start=2):
         value = sheet.cell(index, column).value
-        assert value == (pytest.approx(row.sigma_arcsec, rel=1e-14) if row.assessed else "not assessed")
+        assert value == (
+            pytest.approx(row.sigma_arcsec, rel=1e-14) if row.assessed else "not assessed"
+        )
         assert row.assessed or sheet.cell(index, column).fill.fgColor.rgb.endswith("FDF1D6")
     names = [cell.value for cell in sheet["A"]]
-    assert "'=my own" in names and not any(cell.data_type == "f" for cells in sheet.iter_rows() for cell in cells)
+    assert "'=my own" in names and not any(
+        cell.data_type == "f" for cells in sheet.iter_rows() for cell in cells
+    )
     requirements = book["Requirements"]
-    assert requirements["L2"].value == "violated" and requirements["A2"].fill.fgColor.rgb.endswith("FDE6DB")
+    assert requirements["L2"].value == "violated" and requirements["A2"].fill.fgColor.rgb.endswith(
+        "FDE6DB"
+    )
     assert all(dimension.width > 5 for dimension in sheet.column_dimensions.values())
     write_budget(made(), tmp_path / "plain.xlsx")
     assert "Requirements" not in load_workbook(tmp_path / "plain.xlsx").sheetnames
@@ -639,7 +780,9 @@ def test_names_with_characters_that_no_workbook_holds_are_written(tmp_path: Path
     from openpyxl import load_workbook
 
     path = tmp_path / "odd.toml"
-    text = FILE.replace("Test &", "=bell\\u0007 &").replace("analysis #3", "@SUM(A1)\\u0000\\r\\n'-1+1")
+    text = FILE.replace("Test &", "=bell\\u0007 &").replace(
+        "analysis #3", "@SUM(A1)\\u0000\\r\\n'-1+1"
+    )
     path.write_text(text, encoding="utf-8")
     found = made(path)
     write_budget(found, tmp_path / "budget.xlsx")
@@ -648,7 +791,9 @@ def test_names_with_characters_that_no_workbook_holds_are_written(tmp_path: Path
     found.save(tmp_path / "budget.csv")
     again = Budget.load(tmp_path / "budget.csv")
     assert again.title == found.title == "=bell\x07 & <budget>_1"
-    assert [row.provenance for row in again.rows] == [row.provenance.replace("\r", "") for row in found.rows]
+    assert [row.provenance for row in again.rows] == [
+        row.provenance.replace("\r", "") for row in found.rows
+    ]
     assert ",@SUM" not in (tmp_path / "budget.csv").read_text(encoding="utf-8")
 
 
@@ -663,7 +808,9 @@ def test_latex_is_balanced_and_escaped(stated: Path, tmp_path: Path) -> None:
     assert plain.count("{") == plain.count("}")
     assert body.replace(r"\$", "").count("$") % 2 == 0
     assert r"Test \& \textless{}budget\textgreater{}\_1" in text and r"analysis \#3" in text
-    for table in re.findall(r"\\begin\{longtable\}\{([^\n]*)\}\n(.*?)\\end\{longtable\}", body, flags=re.DOTALL):
+    for table in re.findall(
+        r"\\begin\{longtable\}\{([^\n]*)\}\n(.*?)\\end\{longtable\}", body, flags=re.DOTALL
+    ):
         columns = len(re.findall(r"L\{\d+mm\}|[lr]", table[0]))
         for line in table[1].splitlines():
             if line.rstrip().endswith(r"\\"):
@@ -712,7 +859,10 @@ def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Pa
     figure = found.plot.contributors()
     left, right = figure.axes
     labels = [text.get_text() for text in left.get_yticklabels()]
-    assert labels[-2:] == ["total before alignment", "total after alignment"] and "star catalogue" not in labels
+    assert (
+        labels[-2:] == ["total before alignment", "total after alignment"]
+        and "star catalogue" not in labels
+    )
     assert f"{len(FROM_FILE) - 3} contributors without a row: not assessed" in left.get_xlabel()
     texts = [text.get_text() for text in left.texts]
     # On some axes only.
@@ -721,23 +871,35 @@ def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Pa
     shown = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     assert "limit, violated" in shown
     assert "limit" not in {
-        text.get_text() for legend in made().plot.contributors().legends for text in legend.get_texts()
+        text.get_text()
+        for legend in made().plot.contributors().legends
+        for text in legend.get_texts()
     }
 
 
-@pytest.mark.parametrize(("line", "drawn"), [("", 1), ("confidence = 0.95\n", 0), ('interpretation = "ensemble"\n', 0)])
-def test_the_figure_draws_limits_of_its_own_confidence_only(tmp_path: Path, line: str, drawn: int) -> None:
+@pytest.mark.parametrize(
+    ("line", "drawn"), [("", 1), ("confidence = 0.95\n", 0), ('interpretation = "ensemble"\n', 0)]
+)
+def test_the_figure_draws_limits_of_its_own_confidence_only(
+    tmp_path: Path, line: str, drawn: int
+) -> None:
     path = tmp_path / "limit.toml"
-    path.write_text('[[requirement]]\nname = "R"\naxis = "Z"\nlimit_arcsec = 7654.0\n' + line, encoding="utf-8")
+    path.write_text(
+        '[[requirement]]\nname = "R"\naxis = "Z"\nlimit_arcsec = 7654.0\n' + line, encoding="utf-8"
+    )
     found = made(path)
     right = found.plot.contributors().axes[1]
     assert sum(list(curve.get_xdata()) == [7654.0, 7654.0] for curve in right.lines) == drawn
     page = found._repr_html_()
-    assert "Limits are drawn of requirements at this confidence in the mixed interpretation only" in page
+    assert (
+        "Limits are drawn of requirements at this confidence in the mixed interpretation only"
+        in page
+    )
     assert ("1 of 1 are of another" in page) is (drawn == 0)
 
 
-# --- a run folder ----------------------------------------------------------------------------------------------------
+# --- a run folder
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -758,17 +920,23 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def test_the_budget_of_a_run_is_written_to_its_folder(full: Any, stated: Path) -> None:
     found = sc.Run(full.path).budget(file=stated)
     back = Budget.load(full.budget)
-    assert repr(to_plain(back.totals)) == repr(to_plain(found.totals)) and len(found.violations) == 1
+    assert (
+        repr(to_plain(back.totals)) == repr(to_plain(found.totals)) and len(found.violations) == 1
+    )
     error = AttitudeError.load(full.attitude)
     assert found.total("roll").sigma_arcsec == pytest.approx(
-        np.linalg.norm([error.nea_arcsec[2], error.rest_arcsec[2], error.alignment_arcsec[2]]), rel=1e-3
+        np.linalg.norm([error.nea_arcsec[2], error.rest_arcsec[2], error.alignment_arcsec[2]]),
+        rel=1e-3,
     )
     # The noise of the alignment fills its row, which says on which frames.
     filled = [row for row in found.rows if row.name == ALIGNMENT]
     assert [row.sigma_arcsec for row in filled] == list(error.alignment_arcsec)
-    assert all("100 frames of random sky" in row.conditions and row.source == "posterior" for row in filled)
+    assert all(
+        "100 frames of random sky" in row.conditions and row.source == "posterior" for row in filled
+    )
     assert found.provenance["settings"]["alignment"] == "100 frames of random sky"
-    # Sampled from the rows, with their varying sigmas, it is what was propagated from the posterior.
+    # Sampled from the rows, with their varying sigmas, it is what was propagated from the
+    # posterior.
     assert found.total("roll").sampled_arcsec == pytest.approx(error.p997_arcsec[0][2], rel=0.03)
     # Negative control: the rule's Gaussian quantile is not.
     assert found.total("roll").rule_arcsec < 0.97 * error.p997_arcsec[0][2]
@@ -779,7 +947,9 @@ def test_the_budget_of_a_run_is_written_to_its_folder(full: Any, stated: Path) -
     )
 
 
-def test_a_diagnosed_run_is_inflated_or_says_that_nothing_was_found(full: Any, tmp_path: Path) -> None:
+def test_a_diagnosed_run_is_inflated_or_says_that_nothing_was_found(
+    full: Any, tmp_path: Path
+) -> None:
     shutil.copytree(full.path, tmp_path / "run")
     sc.Run(tmp_path / "run").diagnose(n_starts=0)
     assert not any("not tested" in note for note in sc.Run(tmp_path / "run").budget().notes)
@@ -795,16 +965,21 @@ def test_a_missing_part_is_named_with_its_command(full: Any, tmp_path: Path) -> 
         sc.Run(full.path).budget(file=tmp_path / "none.toml", force=True)
 
 
-# --- whole rows, tables and files, written a second time --------------------------------------------------------------
+# --- whole rows, tables and files, written a second time
+# --------------------------------------------------------------
 
 
 def test_rows_of_the_posterior_to_every_field() -> None:
-    """Each field of each row by hand: with correlated axes, a misfit, tails, and a rest that stays about X."""
+    """Each field of each row by hand: with correlated axes, a misfit, tails, and a rest that stays
+    about X.
+    """
     held = attitude().if_model_holds_arcsec[:, :3]
     correlation = np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
     error = attitude(
         covariance_arcsec2=held[:, :, None] * held[:, None] * correlation,
-        misfit=MisfitFound(1.3, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.02, 0.3]), ("why one",), ("a", "b")),
+        misfit=MisfitFound(
+            1.3, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.02, 0.3]), ("why one",), ("a", "b")
+        ),
         rest_constant_arcsec=np.array([0.0043, 0.0042, 0.0]),
         alignment="12 frames of sky",
         alignment_covariance_arcsec2=np.outer([0.1, 0.2, 0.3], [0.1, 0.2, 0.3]) * correlation,
@@ -823,7 +998,10 @@ def test_rows_of_the_posterior_to_every_field() -> None:
         index = len(expected) // 3
         sigma, own = sigmas[index], factor * held[place]
         for i, axis in enumerate(AXES):
-            line = [1.0 if i == j else correlation[i, j] * own[i] * own[j] / sigma[i] / sigma[j] for j in range(3)]
+            line = [
+                1.0 if i == j else correlation[i, j] * own[i] * own[j] / sigma[i] / sigma[j]
+                for j in range(3)
+            ]
             tail = tails[index]
             longer = 0.0 if tail is None else (tail[i] - GAUSSIAN_997) * (own[i] / sigma[i]) ** 2
             told = "star geometry of 100 frames (observed frames), brown distortion" + why
@@ -844,7 +1022,16 @@ def test_rows_of_the_posterior_to_every_field() -> None:
     for i, axis in enumerate(AXES):
         expected.append(
             Contributor(
-                *(ALIGNMENT, "bias", axis, 0.0, 0.1 * (i + 1), "gaussian", "ensemble", "caused by it"),
+                *(
+                    ALIGNMENT,
+                    "bias",
+                    axis,
+                    0.0,
+                    0.1 * (i + 1),
+                    "gaussian",
+                    "ensemble",
+                    "caused by it",
+                ),
                 axis_correlation=tuple(correlation[i]),
                 conditions="noise of 12 frames of sky, reference attitude without error",
                 provenance="propagated with the posterior",
@@ -857,16 +1044,26 @@ def test_rows_of_the_posterior_to_every_field() -> None:
         for field in dataclasses.fields(Contributor):
             value, wanted = getattr(one, field.name), getattr(other, field.name)
             number = isinstance(wanted, (float, tuple))
-            assert value == (pytest.approx(wanted, rel=1e-9, nan_ok=True) if number else wanted), (one.name, field.name)
+            assert value == (pytest.approx(wanted, rel=1e-9, nan_ok=True) if number else wanted), (
+                one.name,
+                field.name,
+            )
     # Without covariances, or without a spread, axes are independent; without a hash none is named.
-    plain = dataclasses.replace(error, covariance_arcsec2=np.full((5, 3, 3), np.nan), nea_arcsec=np.zeros(3))
+    plain = dataclasses.replace(
+        error, covariance_arcsec2=np.full((5, 3, 3), np.nan), nea_arcsec=np.zeros(3)
+    )
     nameless = SimpleNamespace(**{**vars(POST), "provenance": {}, "draws": np.zeros((1, 6))})
     first = posterior_rows(plain, nameless)[6]  # type: ignore[arg-type]
     assert (first.axis_correlation, first.tail_997, first.sigma_arcsec) == ((), GAUSSIAN_997, 0.0)
     assert first.provenance == "posterior of 1 draw"
-    assert misfit_notes(error) == (f"Inflated by what the tests of the model found: {COMMON!r} and {REST!r}.",)
+    assert misfit_notes(error) == (
+        f"Inflated by what the tests of the model found: {COMMON!r} and {REST!r}.",
+    )
     quiet = MisfitFound(1.0, np.zeros(3), np.zeros(3), notes=("more",))
-    assert len(misfit_notes(attitude(misfit=quiet))) == 2 and misfit_notes(attitude(misfit=quiet))[1] == "more"
+    assert (
+        len(misfit_notes(attitude(misfit=quiet))) == 2
+        and misfit_notes(attitude(misfit=quiet))[1] == "more"
+    )
 
 
 def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -875,7 +1072,8 @@ def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.Monke
         '[budget]\ntitle = "T"\nconfidence = 0.99\n[frame.payload]\n'
         "rotation = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]\n"
         + "".join(
-            f'[[contributor]]\nname = "{entry.name}"\naxis = "{axis}"\nsigma_arcsec = 0.5\nprovenance = "p"\n'
+            f'[[contributor]]\nname = "{entry.name}"\naxis = "{axis}"\nsigma_arcsec = '
+            '0.5\nprovenance = "p"\n'
             f'distribution = "gaussian"\nabsorbed_by_alignment = "{absorbed}"\n'
             for entry, axis, absorbed in (
                 (FROM_FILE[0], "all", "in part"),
@@ -896,16 +1094,26 @@ def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.Monke
         "frames": {"payload": [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]},
     }
     assert "frames" not in made(n_samples=10_000).provenance["settings"]
-    assert (found.title, found.confidence, made(n_samples=10_000).title) == ("T", 0.99, "Attitude error budget")
-    partly = {FROM_FILE[1].name: " (about Y (yaw) and Z (roll))", FROM_FILE[3].name: " (about Z (roll))"}
+    assert (found.title, found.confidence, made(n_samples=10_000).title) == (
+        "T",
+        0.99,
+        "Attitude error budget",
+    )
+    partly = {
+        FROM_FILE[1].name: " (about Y (yaw) and Z (roll))",
+        FROM_FILE[3].name: " (about Z (roll))",
+    }
     missing = [entry.name + partly.get(entry.name, "") for entry in (UNTESTED, *FROM_FILE[1:])]
     assert found.notes == (
         "After alignment: an alignment calibration on the frames themselves.",
-        "The model was not tested: the calibration rows hold if the model holds, and what they are with the misfit "
+        "The model was not tested: the calibration rows hold if the model holds, and what they "
+        "are with the misfit "
         "found is not assessed (run `starcal-uq diagnose RUN`).",
-        f"Not assessed, and in no total: {', '.join(missing[:-1])} and {missing[-1]}. The totals say at least how "
+        f"Not assessed, and in no total: {', '.join(missing[:-1])} and {missing[-1]}. The totals "
+        "say at least how "
         "large the error is.",
-        f"Absorbed by alignment in part: {FROM_FILE[0].name} and {FROM_FILE[1].name}. It counts in full in bounds "
+        f"Absorbed by alignment in part: {FROM_FILE[0].name} and {FROM_FILE[1].name}. It counts "
+        "in full in bounds "
         "after alignment, and not at all where these would violate a requirement.",
     )
     # A misfit that the attitude error holds is not found again.
@@ -915,7 +1123,9 @@ def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(BudgetError, match=r"n_samples is 9999, too few .* use at least 10000\."):
         made(n_samples=9_999)
     asked: list[tuple[str, float]] = []
-    monkeypatch.setattr("starcal_uq.budgeting.budget.check_memory", lambda *needed: asked.append(needed))
+    monkeypatch.setattr(
+        "starcal_uq.budgeting.budget.check_memory", lambda *needed: asked.append(needed)
+    )
     made(n_samples=10_000)
     # Four scopes and kinds of three axes, in double precision.
     assert asked == [("n_samples=10000", 8 * 12 * 10_000)]
@@ -924,24 +1134,48 @@ def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.Monke
 def test_rows_stated_on_one_axis_are_unknown_on_the_others() -> None:
     """All that is known of the one is kept but what belongs to its number."""
     stated = Contributor(
-        *("own", "other", "yaw", 1.0, 2.0, "uniform", "temporal", "in part", "heat", (0.1, 1.0, 0.2), 3.5, "hot", "by"),
+        *(
+            "own",
+            "other",
+            "yaw",
+            1.0,
+            2.0,
+            "uniform",
+            "temporal",
+            "in part",
+            "heat",
+            (0.1, 1.0, 0.2),
+            3.5,
+            "hot",
+            "by",
+        ),
         source="file",
         applies=False,
     )
     rows = [row for row in made(BudgetFile((stated,)), n_samples=10_000).rows if row.name == "own"]
     expected = dataclasses.replace(
         stated,
-        **{"mean_arcsec": math.nan, "sigma_arcsec": math.nan, "correlation_group": "", "axis_correlation": ()},
+        **{
+            "mean_arcsec": math.nan,
+            "sigma_arcsec": math.nan,
+            "correlation_group": "",
+            "axis_correlation": (),
+        },
         **{"conditions": "", "provenance": "", "source": "not assessed", "applies": True},
     )
     for row, axis in zip(rows, AXES, strict=True):
-        assert repr(row) == repr(stated if axis == "yaw" else dataclasses.replace(expected, axis=axis))
+        assert repr(row) == repr(
+            stated if axis == "yaw" else dataclasses.replace(expected, axis=axis)
+        )
     assert [row.inflated for row in rows] == [False] * 3
     # What a row is where nothing is said.
     assert repr(Contributor("a", "b", "c")) == (
-        "Contributor(name='a', ecss_class='b', axis='c', mean_arcsec=nan, sigma_arcsec=nan, distribution='gaussian', "
-        "interpretation='ensemble', absorbed_by_alignment='no', correlation_group='', axis_correlation=(), "
-        f"tail_997={GAUSSIAN_997}, conditions='', provenance='', source='not assessed', if_model_holds_arcsec=nan, "
+        "Contributor(name='a', ecss_class='b', axis='c', mean_arcsec=nan, sigma_arcsec=nan, "
+        "distribution='gaussian', "
+        "interpretation='ensemble', absorbed_by_alignment='no', correlation_group='', "
+        "axis_correlation=(), "
+        f"tail_997={GAUSSIAN_997}, conditions='', provenance='', source='not assessed', "
+        "if_model_holds_arcsec=nan, "
         "with_misfit_found_arcsec=nan, applies=True)"
     )
 
@@ -954,13 +1188,18 @@ def test_json_is_all_that_the_tables_hold(stated: Path) -> None:
         names = [field.name for field in dataclasses.fields(entries[0])]
         rows = [{name: getattr(entry, name) for name in (*names, *more)} for entry in entries]
         return [
-            {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
+            {
+                key: None if isinstance(value, float) and math.isnan(value) else value
+                for key, value in row.items()
+            }
             for row in rows
         ]
 
     assert plain["contributors"] == lines(found.rows, "assessed", "combination")
     totals = lines(found.totals, "at_least")
-    assert plain["totals"] == [{**line, "not_assessed": "; ".join(line["not_assessed"])} for line in totals]
+    assert plain["totals"] == [
+        {**line, "not_assessed": "; ".join(line["not_assessed"])} for line in totals
+    ]
     assert plain["requirements"] == [
         {
             **dataclasses.asdict(outcome.requirement),
@@ -968,7 +1207,8 @@ def test_json_is_all_that_the_tables_hold(stated: Path) -> None:
             "sampled_arcsec": outcome.total.sampled_arcsec,
             "least_arcsec": outcome.least_arcsec,
             "bound_arcsec": outcome.bound_arcsec,
-            "margin_arcsec": outcome.requirement.limit_arcsec - max(outcome.total.rule_arcsec, outcome.bound_arcsec),
+            "margin_arcsec": outcome.requirement.limit_arcsec
+            - max(outcome.total.rule_arcsec, outcome.bound_arcsec),
             "verdict": outcome.verdict,
             "at_least": True,
         }
@@ -993,21 +1233,38 @@ def test_names_of_axes_and_limits_of_this_confidence(tmp_path: Path) -> None:
     ]
     path.write_text(
         "[frame.payload]\nrotation = [0, 0, 0, 1]\n"
-        + "".join(f'[[requirement]]\nname = "{n}"\nlimit_arcsec = 9.0\n{keys}' for n, keys in enumerate(asked)),
+        + "".join(
+            f'[[requirement]]\nname = "{n}"\nlimit_arcsec = 9.0\n{keys}'
+            for n, keys in enumerate(asked)
+        ),
         encoding="utf-8",
     )
     found = made(path, n_samples=10_000)
     assert [outcome.requirement.name for outcome in found.comparable] == ["0"]
     for axis in ("pitch", "x", " X ", "X (pitch)", "PITCH"):
-        assert found.total(axis) == found.totals[4 * 3] == found.total(axis, "after alignment", "mixed")
+        assert (
+            found.total(axis)
+            == found.totals[4 * 3]
+            == found.total(axis, "after alignment", "mixed")
+        )
     assert found.total("Z", "before alignment", "temporal") is found.totals[3 * 2 + 2]
     with pytest.raises(BudgetError, match=r"is saved as \.csv"):
         found.save(tmp_path / "budget.txt")
     found.save(tmp_path / "budget.CSV")
     text = (tmp_path / "budget.CSV").read_text(encoding="utf-8").splitlines()
-    names = [field.name for kind in (Contributor, Requirement, Total) for field in dataclasses.fields(kind)]
+    names = [
+        field.name
+        for kind in (Contributor, Requirement, Total)
+        for field in dataclasses.fields(kind)
+    ]
     columns = ["record", *dict.fromkeys(names), "combination", "margin_arcsec", "verdict", "value"]
     assert text[0] == ",".join(columns)
     kinds = [line.split(",")[0] for line in text[1:]]
-    assert kinds == ["contributor"] * len(found.rows) + ["total"] * 24 + ["requirement"] * 5 + ["setting"] * 4
+    assert (
+        kinds
+        == ["contributor"] * len(found.rows)
+        + ["total"] * 24
+        + ["requirement"] * 5
+        + ["setting"] * 4
+    )
     assert "\r" not in "".join(text)

@@ -1,4 +1,6 @@
-"""Quantiles and combination rules of the error budget, against closed forms and against independent sampling."""
+"""Quantiles and combination rules of the error budget, against closed forms and against independent
+sampling.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,13 @@ from starcal_uq.presentation.words.budgeting import outcome_text
 def row(name: str, sigma: float, axis: str = "pitch", **changes: object) -> Contributor:
     return Contributor(
         **{  # type: ignore[arg-type]
-            **{"name": name, "ecss_class": "other", "axis": axis, "mean_arcsec": 0.0, "sigma_arcsec": sigma},
+            **{
+                "name": name,
+                "ecss_class": "other",
+                "axis": axis,
+                "mean_arcsec": 0.0,
+                "sigma_arcsec": sigma,
+            },
             **{"source": "file", "provenance": "test"},
             **changes,
         }
@@ -47,7 +55,9 @@ def both(name: str, sigma: float, **changes: object) -> list[Contributor]:
     return [row(name, sigma, axis, **changes) for axis in ("pitch", "yaw")]
 
 
-def combined(rows: list[Contributor], axis: str = "pitch", confidence: float = 0.997, **changes: object) -> Total:
+def combined(
+    rows: list[Contributor], axis: str = "pitch", confidence: float = 0.997, **changes: object
+) -> Total:
     options = {"scope": "before alignment", "interpretation": "mixed", **changes}
     return total(rows, draw(rows, 200_000, 3), axis=axis, confidence=confidence, **options)  # type: ignore[arg-type]
 
@@ -56,7 +66,9 @@ def test_two_axis_quantiles_are_not_those_of_one_axis() -> None:
     assert one_axis_factor(0.9973) == pytest.approx(3.0, abs=1e-4)
     for confidence, expected in ((0.95, 2.448), (0.997, 3.409), (0.9973, 3.439)):
         assert two_axis_radius(confidence, 1.0, 1.0) == pytest.approx(expected, abs=5e-4)
-        assert two_axis_radius(confidence, 1.0, 1.0) == pytest.approx(stats.rayleigh.ppf(confidence), rel=1e-10)
+        assert two_axis_radius(confidence, 1.0, 1.0) == pytest.approx(
+            stats.rayleigh.ppf(confidence), rel=1e-10
+        )
         # Negative control: the factor of one axis holds less.
         held = stats.rayleigh.cdf(one_axis_factor(confidence))
         assert held < confidence - 0.005
@@ -69,7 +81,8 @@ def test_unequal_axes_are_exact() -> None:
     size = np.hypot(3.0 * rng.standard_normal(1_000_000), rng.standard_normal(1_000_000))
     held = np.mean(size < two_axis_radius(0.95, 3.0, 1.0))
     assert held == pytest.approx(0.95, abs=4.0 * math.sqrt(0.95 * 0.05 / 1e6))
-    # Negative control: the quantile of equal axes of the same mean square is off by many standard errors.
+    # Negative control: the quantile of equal axes of the same mean square is off by many standard
+    # errors.
     wrong = np.mean(size < two_axis_radius(0.95, math.sqrt(5.0), math.sqrt(5.0)))
     assert abs(wrong - 0.95) > 20.0 * math.sqrt(0.95 * 0.05 / 1e6)
 
@@ -87,7 +100,9 @@ def test_deviates_have_unit_moments_and_the_stated_half_width(name: str) -> None
         "gaussian": stats.norm(),
         "uniform": stats.uniform(-math.sqrt(3.0), 2.0 * math.sqrt(3.0)),
         "arcsine": stats.arcsine(-math.sqrt(2.0), 2.0 * math.sqrt(2.0)),
-        "rayleigh": stats.rayleigh(-stats.rayleigh.mean() / stats.rayleigh.std(), 1.0 / stats.rayleigh.std()),
+        "rayleigh": stats.rayleigh(
+            -stats.rayleigh.mean() / stats.rayleigh.std(), 1.0 / stats.rayleigh.std()
+        ),
     }
     assert stats.kstest(sampled[:20_000], reference[name].cdf).pvalue > 1e-3
     # Negative control: another shape of the same moments is told apart.
@@ -107,7 +122,9 @@ def test_a_sigma_that_varies_keeps_variance_and_reaches_the_stated_tail(tail: fl
     reached = max(tail, GAUSSIAN_997)
     assert np.mean(np.abs(sampled) > reached) == pytest.approx(0.003, abs=3e-4)
     assert half_width("gaussian", 0.997, tail) == pytest.approx(reached, rel=1e-6)
-    plane = np.exp(mixture_spread(tail) * rng.standard_normal(1_000_000) - mixture_spread(tail) ** 2)
+    plane = np.exp(
+        mixture_spread(tail) * rng.standard_normal(1_000_000) - mixture_spread(tail) ** 2
+    )
     size = plane * np.hypot(rng.standard_normal(1_000_000), rng.standard_normal(1_000_000))
     radius = two_axis_radius(0.997, 1.0, 1.0, mixture_spread(tail))
     assert np.mean(size > radius) == pytest.approx(0.003, abs=3e-4)
@@ -132,7 +149,9 @@ def test_means_add_with_their_signs() -> None:
     assert found.mean_arcsec == pytest.approx(2.0)
     assert found.rule_arcsec == pytest.approx(2.0 + math.sqrt(2.0) * one_axis_factor(0.997))
     sides = stats.norm(2.0, math.sqrt(2.0))
-    assert sides.cdf(found.sampled_arcsec) - sides.cdf(-found.sampled_arcsec) == pytest.approx(0.997, abs=5e-4)
+    assert sides.cdf(found.sampled_arcsec) - sides.cdf(-found.sampled_arcsec) == pytest.approx(
+        0.997, abs=5e-4
+    )
     # A shifted error exceeds on one side only: fewer sigmas hold it, and the budget says so.
     assert found.sampled_arcsec < found.rule_arcsec
     assert "mean shifts" in found.explanation
@@ -150,18 +169,28 @@ def test_rows_of_a_group_add_linearly_in_rule_and_samples() -> None:
     assert found.sampled_arcsec - apart.sampled_arcsec > 20.0 * found.sampled_se_arcsec
 
 
-@pytest.mark.parametrize(("shape", "end"), [("uniform", math.sqrt(3.0)), ("arcsine", math.sqrt(2.0))])
+@pytest.mark.parametrize(
+    ("shape", "end"), [("uniform", math.sqrt(3.0)), ("arcsine", math.sqrt(2.0))]
+)
 def test_a_dominant_bounded_row_is_named_and_never_exceeded(shape: str, end: float) -> None:
     found = combined([row("big", 10.0, distribution=shape), row("small", 0.1)])
     assert found.sampled_arcsec == pytest.approx(10.0 * end, rel=0.02)
     assert found.rule_arcsec > 1.5 * found.sampled_arcsec
-    assert "'big'" in found.explanation and shape in found.explanation and "above" in found.explanation
+    assert (
+        "'big'" in found.explanation and shape in found.explanation and "above" in found.explanation
+    )
 
 
 def test_a_heavy_tail_puts_the_rule_below_the_samples_and_is_named() -> None:
-    found = combined([row("noise", 1.0, tail_997=3.9, interpretation="temporal"), row("other", 0.2)])
+    found = combined(
+        [row("noise", 1.0, tail_997=3.9, interpretation="temporal"), row("other", 0.2)]
+    )
     assert found.sampled_arcsec > found.rule_arcsec * 1.2
-    assert "below" in found.explanation and "'noise'" in found.explanation and "3.90 sigma" in found.explanation
+    assert (
+        "below" in found.explanation
+        and "'noise'" in found.explanation
+        and "3.90 sigma" in found.explanation
+    )
 
 
 def test_rayleigh_row_against_its_own_quantile() -> None:
@@ -178,7 +207,9 @@ def test_both_axes_together() -> None:
     unequal = combined([row("a", 3.0), row("b", 1.0, "yaw")], "cross-boresight")
     assert unequal.rule_arcsec == pytest.approx(two_axis_radius(0.997, 3.0, 1.0))
     assert abs(unequal.sampled_arcsec - unequal.rule_arcsec) < 4.0 * unequal.sampled_se_arcsec
-    shifted = combined([row("a", 1.0, mean_arcsec=3.0), row("b", 1.0, "yaw", mean_arcsec=4.0)], "cross-boresight")
+    shifted = combined(
+        [row("a", 1.0, mean_arcsec=3.0), row("b", 1.0, "yaw", mean_arcsec=4.0)], "cross-boresight"
+    )
     assert shifted.mean_arcsec == pytest.approx(5.0)
     assert shifted.rule_arcsec >= shifted.sampled_arcsec
 
@@ -192,11 +223,19 @@ def test_a_varying_sigma_is_shared_by_both_axes() -> None:
 def test_interpretations_differ_by_what_counts_as_random() -> None:
     rows = [row("calibration", 3.0), row("noise", 4.0, interpretation="temporal")]
     factor = one_axis_factor(0.997)
-    mixed, ensemble, temporal = (combined(rows, interpretation=kind) for kind in ("mixed", "ensemble", "temporal"))
+    mixed, ensemble, temporal = (
+        combined(rows, interpretation=kind) for kind in ("mixed", "ensemble", "temporal")
+    )
     assert mixed.rule_arcsec == pytest.approx(5.0 * factor)
-    assert ensemble.sigma_arcsec == pytest.approx(3.0) and ensemble.worst_arcsec == pytest.approx(4.0 * factor)
-    assert temporal.sigma_arcsec == pytest.approx(4.0) and temporal.worst_arcsec == pytest.approx(3.0 * factor)
-    assert ensemble.rule_arcsec == pytest.approx(7.0 * factor) == pytest.approx(temporal.rule_arcsec)
+    assert ensemble.sigma_arcsec == pytest.approx(3.0) and ensemble.worst_arcsec == pytest.approx(
+        4.0 * factor
+    )
+    assert temporal.sigma_arcsec == pytest.approx(4.0) and temporal.worst_arcsec == pytest.approx(
+        3.0 * factor
+    )
+    assert (
+        ensemble.rule_arcsec == pytest.approx(7.0 * factor) == pytest.approx(temporal.rule_arcsec)
+    )
     bounded = [row("shift", 1.0, distribution="uniform"), rows[1]]
     found = combined(bounded, interpretation="temporal")
     assert found.worst_arcsec == pytest.approx(math.sqrt(3.0))
@@ -207,15 +246,23 @@ def test_interpretations_differ_by_what_counts_as_random() -> None:
     assert math.isnan(combined(rows[:1], interpretation="temporal").factor)
 
 
-def of_one_sensor(rows: list[Contributor], confidence: float, rng: np.random.Generator) -> tuple[float, float]:
-    """NumPy alone, on one axis: quantiles over moments for the worst sensor, and for one in 1 / (1 - P)."""
+def of_one_sensor(
+    rows: list[Contributor], confidence: float, rng: np.random.Generator
+) -> tuple[float, float]:
+    """NumPy alone, on one axis: quantiles over moments for the worst sensor, and for one in 1 / (1
+    - P).
+    """
     shapes = {
         "gaussian": lambda n: rng.standard_normal(n),
         "uniform": lambda n: rng.uniform(-math.sqrt(3.0), math.sqrt(3.0), n),
         "arcsine": lambda n: math.sqrt(2.0) * np.sin(rng.uniform(0.0, 2.0 * math.pi, n)),
         "constant": lambda n: np.zeros(n),
     }
-    ends = {"gaussian": stats.norm.ppf(0.5 + 0.5 * confidence), "uniform": math.sqrt(3.0), "arcsine": math.sqrt(2.0)}
+    ends = {
+        "gaussian": stats.norm.ppf(0.5 + 0.5 * confidence),
+        "uniform": math.sqrt(3.0),
+        "arcsine": math.sqrt(2.0),
+    }
     constants = [entry for entry in rows if entry.interpretation == "ensemble"]
     mean = sum(entry.mean_arcsec for entry in rows)
     moments = np.zeros(400_000)
@@ -223,11 +270,15 @@ def of_one_sensor(rows: list[Contributor], confidence: float, rng: np.random.Gen
         if entry.interpretation != "ensemble":
             moments += entry.sigma_arcsec * shapes[entry.distribution](len(moments))
     worst = sum(ends.get(entry.distribution, 0.0) * entry.sigma_arcsec for entry in constants)
-    at_worst = max(np.quantile(np.abs(mean + side * worst + moments), confidence) for side in (1, -1))
-    sensors = mean + sum(
-        (entry.sigma_arcsec * shapes[entry.distribution](20_000) for entry in constants), start=np.zeros(20_000)
+    at_worst = max(
+        np.quantile(np.abs(mean + side * worst + moments), confidence) for side in (1, -1)
     )
-    # The quantile over moments grows with the size of the sensor's constant: its own quantile over sensors follows.
+    sensors = mean + sum(
+        (entry.sigma_arcsec * shapes[entry.distribution](20_000) for entry in constants),
+        start=np.zeros(20_000),
+    )
+    # The quantile over moments grows with the size of the sensor's constant: its own quantile over
+    # sensors follows.
     grid = np.quantile(np.abs(sensors), confidence)
     side = math.copysign(1.0, mean) if mean else 1.0
     return float(at_worst), float(np.quantile(np.abs(side * grid + moments), confidence))
@@ -248,19 +299,32 @@ def test_three_rows_that_are_random_over_both_do_not_add_linearly() -> None:
 def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
     rows = [row(name, 6.6) for name in ("ground", "launch", "lens")]
     found = combined(rows, confidence=0.9973, interpretation="temporal")
-    assert found.rule_arcsec == pytest.approx(59.4, abs=0.1) == pytest.approx(found.sampled_arcsec, abs=0.1)
+    assert (
+        found.rule_arcsec
+        == pytest.approx(59.4, abs=0.1)
+        == pytest.approx(found.sampled_arcsec, abs=0.1)
+    )
     assert found.rule_least_arcsec == pytest.approx(34.3, abs=0.1)
     assert found.sampled_least_arcsec == pytest.approx(34.3, rel=0.02)
     for limit, verdict in ((33.0, "violated"), (45.0, "open"), (60.0, "met")):
-        outcome = Outcome(Requirement("R", "pitch", limit, 0.9973, "before alignment", "temporal"), found)
+        outcome = Outcome(
+            Requirement("R", "pitch", limit, 0.9973, "before alignment", "temporal"), found
+        )
         assert outcome.verdict == verdict and outcome.between == (verdict == "open")
         assert f"is {verdict}" in outcome_text(outcome)
     # Open for another reason: half an arcsecond is left, and a row is missing.
     missing = dataclasses.replace(outcome, total=dataclasses.replace(found, not_assessed=("one",)))
-    missing = dataclasses.replace(missing, requirement=dataclasses.replace(outcome.requirement, limit_arcsec=59.9))
+    missing = dataclasses.replace(
+        missing, requirement=dataclasses.replace(outcome.requirement, limit_arcsec=59.9)
+    )
     assert missing.verdict == "open" and not missing.between
-    open_one = Outcome(Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal", "rule"), found)
-    assert "is open: at the least 34.3 and at most 59.4 arcsec against a limit of 45.0." in outcome_text(open_one)
+    open_one = Outcome(
+        Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal", "rule"), found
+    )
+    assert (
+        "is open: at the least 34.3 and at most 59.4 arcsec against a limit of 45.0."
+        in outcome_text(open_one)
+    )
 
 
 def test_what_is_absorbed_in_part_leaves_a_limit_open() -> None:
@@ -280,9 +344,16 @@ def test_what_is_absorbed_in_part_leaves_a_limit_open() -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_temporal_totals_of_random_rows_against_monte_carlo(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    kinds = [("ensemble", "gaussian"), ("ensemble", "uniform"), ("mixed", "uniform"), ("mixed", "gaussian")]
+    kinds = [
+        ("ensemble", "gaussian"),
+        ("ensemble", "uniform"),
+        ("mixed", "uniform"),
+        ("mixed", "gaussian"),
+    ]
     kinds += [("temporal", "gaussian"), ("temporal", "arcsine"), ("ensemble", "constant")]
-    chosen = [kinds[i] for i in rng.permutation(len(kinds))[: rng.integers(3, 6)]] + [("temporal", "gaussian")]
+    chosen = [kinds[i] for i in rng.permutation(len(kinds))[: rng.integers(3, 6)]] + [
+        ("temporal", "gaussian")
+    ]
     rows = [
         row(
             str(number),
@@ -297,11 +368,16 @@ def test_temporal_totals_of_random_rows_against_monte_carlo(seed: int) -> None:
     worst, least = of_one_sensor(rows, 0.95, rng)
     assert found.sampled_arcsec == pytest.approx(worst, rel=0.01)
     assert found.sampled_least_arcsec == pytest.approx(min(least, worst), rel=0.02)
-    assert found.sampled_least_arcsec <= found.sampled_arcsec and found.rule_least_arcsec <= found.rule_arcsec
+    assert (
+        found.sampled_least_arcsec <= found.sampled_arcsec
+        and found.rule_least_arcsec <= found.rule_arcsec
+    )
     # Control: the rule of before, which added what is random over both linearly.
     mixed = [entry.sigma_arcsec for entry in rows if entry.interpretation == "mixed"]
     if mixed:
-        random = math.hypot(*(entry.sigma_arcsec for entry in rows if entry.interpretation == "temporal"))
+        random = math.hypot(
+            *(entry.sigma_arcsec for entry in rows if entry.interpretation == "temporal")
+        )
         old = found.rule_arcsec + one_axis_factor(0.95) * (sum(mixed) + random - found.sigma_arcsec)
         assert old > worst * 1.05
 
@@ -313,13 +389,16 @@ def nested(
     rng: np.random.Generator,
     sizes: tuple[int, int] = (4000, 4000),
 ) -> float:
-    """NumPy alone: quantile over moments for each of many sensors, and of these the quantile over sensors.
+    """NumPy alone: quantile over moments for each of many sensors, and of these the quantile over
+    sensors.
 
-    Constants are a group, a sigma with the sign of its row, and a direction (axes,); noise is sigmas (axes,). Both are
-    Gaussian, and rows of one group share their deviate.
+    Constants are a group, a sigma with the sign of its row, and a direction (axes,); noise is
+    sigmas (axes,). Both are Gaussian, and rows of one group share their deviate.
     """
     drawn = {group: rng.standard_normal(sizes[0]) for group, _, _ in constant}
-    sensors = sum((sigma * drawn[group][:, None] * axis for group, sigma, axis in constant), start=np.zeros(1))
+    sensors = sum(
+        (sigma * drawn[group][:, None] * axis for group, sigma, axis in constant), start=np.zeros(1)
+    )
     moments = noise * rng.standard_normal((sizes[1], len(noise)))
     place = int(confidence * sizes[1])
     reached = [np.partition(np.linalg.norm(own + moments, axis=1), place)[place] for own in sensors]
@@ -331,24 +410,39 @@ OPTICS = (("A", 3.0, "opt"), ("B", 4.0, "opt"), ("C", 2.0, "-opt"))
 
 @pytest.mark.parametrize("axis", ["pitch", "cross-boresight"])
 def test_signs_count_in_a_group_that_is_at_its_worst(axis: str) -> None:
-    """A and B against C: one cause of 5 arcsec, and noise of 5; by lengths alone it was one of 9."""
+    """A and B against C: one cause of 5 arcsec, and noise of 5; by lengths alone it was one of
+    9.
+    """
     axes = ["pitch"] if axis == "pitch" else ["pitch", "yaw"]
-    rows = [row(name, sigma, one, correlation_group=group) for one in axes for name, sigma, group in OPTICS]
+    rows = [
+        row(name, sigma, one, correlation_group=group)
+        for one in axes
+        for name, sigma, group in OPTICS
+    ]
     rows += [row("noise", 5.0, one, interpretation="temporal") for one in axes]
     found = combined(rows, axis, interpretation="temporal")
     along = np.ones(len(axes))
     signed = [("opt", 3.0, along), ("opt", 4.0, along), ("opt", -2.0, along)]
     drawn = nested(signed, 5.0 * along, 0.997, np.random.default_rng(5))
     one_cause = one_axis_factor(0.997) * 5.0 * math.sqrt(len(axes))
-    assert found.worst_arcsec == pytest.approx(one_cause) == pytest.approx(found.rule_arcsec - found.factor * 5.0)
+    assert (
+        found.worst_arcsec
+        == pytest.approx(one_cause)
+        == pytest.approx(found.rule_arcsec - found.factor * 5.0)
+    )
     assert found.sampled_least_arcsec == pytest.approx(drawn, rel=0.06)
     assert found.rule_least_arcsec <= found.sampled_least_arcsec
     limit = 1.2 * found.sampled_least_arcsec
     for judge in ("both", "rule", "sampling"):
-        outcome = Outcome(Requirement("R", axis, limit, 0.997, "before alignment", "temporal", judge), found)
+        outcome = Outcome(
+            Requirement("R", axis, limit, 0.997, "before alignment", "temporal", judge), found
+        )
         assert outcome.verdict == "met" and outcome.least_arcsec < limit
     # Control: without the sign of C, nested draws and the budget agree that the limit is violated.
-    plain = [dataclasses.replace(entry, correlation_group=entry.correlation_group.lstrip("-")) for entry in rows]
+    plain = [
+        dataclasses.replace(entry, correlation_group=entry.correlation_group.lstrip("-"))
+        for entry in rows
+    ]
     unsigned = [(group, abs(sigma), direction) for group, sigma, direction in signed]
     assert nested(unsigned, 5.0 * along, 0.997, np.random.default_rng(5)) > limit
     assert combined(plain, axis, interpretation="temporal").sampled_least_arcsec > limit
@@ -366,7 +460,10 @@ def test_at_the_least_is_no_more_than_nested_draws_of_random_groups(seed: int) -
             rows.append(row(str(number), sigma, axis, correlation_group=text))
             constant.append((str(name) or f"{number} {axis}", sign * sigma, np.eye(2)[place]))
     noise = rng.uniform(2.0, 6.0, 2)
-    rows += [row("noise", noise[place], axis, interpretation="temporal") for place, axis in enumerate(("pitch", "yaw"))]
+    rows += [
+        row("noise", noise[place], axis, interpretation="temporal")
+        for place, axis in enumerate(("pitch", "yaw"))
+    ]
     found = combined(rows, "cross-boresight", 0.95, interpretation="temporal")
     drawn = nested(constant, noise, 0.95, rng, (2000, 1000))
     assert found.sampled_least_arcsec == pytest.approx(drawn, rel=0.1)
@@ -393,11 +490,15 @@ def test_a_rule_above_what_is_sampled_violates_nothing() -> None:
     limit = 1.2 * found.sampled_arcsec
     assert found.rule_arcsec > limit
     for judge, verdict in (("both", "open"), ("rule", "open"), ("sampling", "met")):
-        outcome = Outcome(Requirement("R", "pitch", limit, 0.997, "before alignment", "mixed", judge), found)
+        outcome = Outcome(
+            Requirement("R", "pitch", limit, 0.997, "before alignment", "mixed", judge), found
+        )
         assert outcome.verdict == verdict and outcome.between == (verdict == "open")
     # Control: a limit below the samples is violated by all.
     for judge in ("both", "rule", "sampling"):
-        asked = Requirement("R", "pitch", 0.9 * found.sampled_arcsec, 0.997, "before alignment", "mixed", judge)
+        asked = Requirement(
+            "R", "pitch", 0.9 * found.sampled_arcsec, 0.997, "before alignment", "mixed", judge
+        )
         assert Outcome(asked, found).verdict == "violated"
 
 
@@ -411,7 +512,10 @@ def test_least_and_worst_across_the_boresight_against_monte_carlo() -> None:
     ]
     found = combined(rows, "cross-boresight", 0.95, interpretation="temporal")
     sensors = rng.standard_normal((400, 2)) * np.hypot(3.0, [6.0, 1.0])
-    quantiles = [np.quantile(np.hypot(*(own[:, None] + 2.0 * rng.standard_normal((2, 4000)))), 0.95) for own in sensors]
+    quantiles = [
+        np.quantile(np.hypot(*(own[:, None] + 2.0 * rng.standard_normal((2, 4000)))), 0.95)
+        for own in sensors
+    ]
     assert found.sampled_least_arcsec == pytest.approx(np.quantile(quantiles, 0.95), rel=0.12)
     assert found.sampled_least_arcsec < found.sampled_arcsec
 
@@ -433,7 +537,9 @@ def test_a_row_that_is_not_assessed_is_no_zero() -> None:
     found = combined([row("noise", 1.0), missing])
     assert found.at_least and found.not_assessed == ("pixel",)
     nothing = combined([missing])
-    assert math.isnan(nothing.rule_arcsec) and math.isnan(nothing.sampled_arcsec) and nothing.at_least
+    assert (
+        math.isnan(nothing.rule_arcsec) and math.isnan(nothing.sampled_arcsec) and nothing.at_least
+    )
     # A row that is absorbed is not missed after alignment.
     absorbed = dataclasses.replace(missing, absorbed_by_alignment="yes")
     assert not combined([row("noise", 1.0), absorbed], scope="after alignment").at_least
@@ -450,7 +556,9 @@ def test_zero_is_zero() -> None:
 
 def test_the_seed_decides() -> None:
     rows = [row("a", 1.0)]
-    first, again, other = (draw(rows, 1000, seed).sums["before alignment", "ensemble"] for seed in (1, 1, 2))
+    first, again, other = (
+        draw(rows, 1000, seed).sums["before alignment", "ensemble"] for seed in (1, 1, 2)
+    )
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
@@ -475,13 +583,19 @@ def test_a_quantile_beyond_the_samples_is_not_known() -> None:
     found = combined(rows, confidence=0.9999999)
     assert math.isnan(found.sampled_arcsec) and found.unresolved and math.isnan(found.larger_arcsec)
     assert "200000 samples do not resolve" in found.explanation
-    # Negative control: the largest of so many samples is far below the quantile, and known where 20 lie beyond.
+    # Negative control: the largest of so many samples is far below the quantile, and known where 20
+    # lie beyond.
     true = 6.6 * half_width("gaussian", 0.9999999, 3.9)
     assert np.abs(draw(rows, 200_000, 3).sums["before alignment", "ensemble"]).max() < 0.9 * true
     resolved = combined(rows, confidence=0.9999)
-    assert abs(resolved.sampled_arcsec - 6.6 * half_width("gaussian", 0.9999, 3.9)) < 4.0 * resolved.sampled_se_arcsec
+    assert (
+        abs(resolved.sampled_arcsec - 6.6 * half_width("gaussian", 0.9999, 3.9))
+        < 4.0 * resolved.sampled_se_arcsec
+    )
     # What has no spread needs no samples.
-    assert combined([row("shift", 0.0, mean_arcsec=2.0)], confidence=0.9999999).sampled_arcsec == 2.0
+    assert (
+        combined([row("shift", 0.0, mean_arcsec=2.0)], confidence=0.9999999).sampled_arcsec == 2.0
+    )
     nothing = combined([row("one", 0.0), row("other", 0.0)])
     assert (nothing.dominant, nothing.dominant_share, nothing.rule_arcsec) == ("", 0.0, 0.0)
     assert nothing.explanation.startswith("No error is left")
@@ -521,13 +635,17 @@ def test_the_heaviest_tail_weighs_its_size() -> None:
 
 @pytest.mark.parametrize("confidence", [0.9999999, 1.0 - 1e-12])
 def test_quantiles_of_the_heaviest_tails_are_found(confidence: float) -> None:
-    assert one_axis_factor(confidence) == pytest.approx(stats.norm.isf(0.5 * (1.0 - confidence)), rel=1e-12)
+    assert one_axis_factor(confidence) == pytest.approx(
+        stats.norm.isf(0.5 * (1.0 - confidence)), rel=1e-12
+    )
     spread = mixture_spread(50.0)
     reach = half_width("gaussian", confidence, 50.0)
     assert math.isfinite(reach) and two_axis_radius(confidence, 1.0, 1.0, spread) >= reach
 
 
-@pytest.mark.parametrize(("axis", "words"), [("pitch", "a mean shifts"), ("cross-boresight", "adds the whole mean")])
+@pytest.mark.parametrize(
+    ("axis", "words"), [("pitch", "a mean shifts"), ("cross-boresight", "adds the whole mean")]
+)
 def test_a_mean_smaller_than_sigma_is_given_as_the_reason(axis: str, words: str) -> None:
     found = combined([*both("noise", 1.0, mean_arcsec=0.6)], axis=axis)
     assert words in found.explanation and "100 %" not in found.explanation
@@ -539,8 +657,16 @@ def test_no_reason_is_a_bare_share() -> None:
     cases = [
         ([row("noise", 1.0, tail_997=3.9)], 0.6, "more of its errors are small"),
         ([row("step", 1.0, distribution="uniform")], 0.6, "reaches further"),
-        ([row("step", 0.2, distribution="uniform"), row("noise", 0.2)], 0.997, "'step' cannot exceed a fixed size"),
-        ([row("noise", 1.0), row("tiny", 0.001, distribution="uniform", mean_arcsec=0.5)], 0.997, "a mean shifts"),
+        (
+            [row("step", 0.2, distribution="uniform"), row("noise", 0.2)],
+            0.997,
+            "'step' cannot exceed a fixed size",
+        ),
+        (
+            [row("noise", 1.0), row("tiny", 0.001, distribution="uniform", mean_arcsec=0.5)],
+            0.997,
+            "a mean shifts",
+        ),
     ]
     for rows, confidence, words in cases:
         found = combined(rows, confidence=confidence)
@@ -550,26 +676,45 @@ def test_no_reason_is_a_bare_share() -> None:
 def test_totals_scale_with_their_rows_and_their_sentences_stay() -> None:
     rows = [
         *both("noise", 1.0, tail_997=3.4, interpretation="temporal"),
-        *both("step", 2.0, distribution="uniform", interpretation="ensemble", absorbed_by_alignment="in part"),
+        *both(
+            "step",
+            2.0,
+            distribution="uniform",
+            interpretation="ensemble",
+            absorbed_by_alignment="in part",
+        ),
         *both("ground", 0.7, distribution="rayleigh", mean_arcsec=1.4, interpretation="ensemble"),
         row("wave", 0.8, distribution="arcsine", correlation_group="heat"),
         row("bend", 0.5, "yaw", correlation_group="-heat", absorbed_by_alignment="yes"),
         row("shift", 0.0, "roll", distribution="constant", mean_arcsec=3.0),
         row("lens", 0.4, "roll", absorbed_by_alignment="caused by it"),
     ]
-    small = [dataclasses.replace(r, sigma_arcsec=1e-3 * r.sigma_arcsec, mean_arcsec=1e-3 * r.mean_arcsec) for r in rows]
-    for one, other in zip(*(totals(some, 0.95, n_samples=20_000)[0] for some in (rows, small)), strict=True):
+    small = [
+        dataclasses.replace(r, sigma_arcsec=1e-3 * r.sigma_arcsec, mean_arcsec=1e-3 * r.mean_arcsec)
+        for r in rows
+    ]
+    for one, other in zip(
+        *(totals(some, 0.95, n_samples=20_000)[0] for some in (rows, small)), strict=True
+    ):
         for name, value in vars(one).items():
             expected = 1e-3 * value if name.endswith("_arcsec") else value
             found = getattr(other, name)
-            assert found == (pytest.approx(expected, nan_ok=True) if isinstance(value, float) else expected), name
+            assert found == (
+                pytest.approx(expected, nan_ok=True) if isinstance(value, float) else expected
+            ), name
 
 
 def test_the_case_of_many_is_of_one_sided_errors_about_their_mean() -> None:
     """A ground error of one sign, next to no noise: its distribution, and not its mirror image."""
     one = stats.rayleigh(scale=3.0)
     rows = [
-        row("ground", one.std(), distribution="rayleigh", mean_arcsec=one.mean(), interpretation="ensemble"),
+        row(
+            "ground",
+            one.std(),
+            distribution="rayleigh",
+            mean_arcsec=one.mean(),
+            interpretation="ensemble",
+        ),
         row("noise", 1e-3, interpretation="temporal"),
     ]
     found = combined(rows, confidence=0.95, interpretation="temporal")
@@ -577,13 +722,16 @@ def test_the_case_of_many_is_of_one_sided_errors_about_their_mean() -> None:
     assert 2.0 * one.mean() - one.ppf(0.05) < 0.9 * found.sampled_least_arcsec
 
 
-# --- correlated axes, and other frames --------------------------------------------------------------------------------
+# --- correlated axes, and other frames
+# --------------------------------------------------------------------------------
 
 
 CORRELATION = np.array([[1.0, 0.3, -0.1], [0.3, 1.0, 0.8], [-0.1, 0.8, 1.0]])
 # The payload looks along the sensor's -X, turned by 20 degrees.
 TURN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-ROLLED = np.array([[np.cos(0.35), np.sin(0.35), 0.0], [-np.sin(0.35), np.cos(0.35), 0.0], [0.0, 0.0, 1.0]])
+ROLLED = np.array(
+    [[np.cos(0.35), np.sin(0.35), 0.0], [-np.sin(0.35), np.cos(0.35), 0.0], [0.0, 0.0, 1.0]]
+)
 PAYLOAD = ROLLED @ TURN
 
 
@@ -597,17 +745,26 @@ def correlated(sigmas: tuple[float, float, float]) -> list[Contributor]:
 
 @pytest.mark.parametrize("rotation", [None, TURN, PAYLOAD])
 @pytest.mark.parametrize("axis", ["pitch", "cross-boresight"])
-def test_totals_of_correlated_axes_in_any_frame_against_monte_carlo(rotation: np.ndarray | None, axis: str) -> None:
+def test_totals_of_correlated_axes_in_any_frame_against_monte_carlo(
+    rotation: np.ndarray | None, axis: str
+) -> None:
     rng = np.random.default_rng(6)
-    rows = [*correlated((4.0, 5.0, 3.0)), row("shift", 2.0, "yaw", distribution="uniform", mean_arcsec=1.0)]
+    rows = [
+        *correlated((4.0, 5.0, 3.0)),
+        row("shift", 2.0, "yaw", distribution="uniform", mean_arcsec=1.0),
+    ]
     found = combined(rows, axis, 0.95, rotation=rotation)
-    errors = rng.multivariate_normal(np.zeros(3), CORRELATION * np.outer([4.0, 5.0, 3.0], [4.0, 5.0, 3.0]), 400_000)
+    errors = rng.multivariate_normal(
+        np.zeros(3), CORRELATION * np.outer([4.0, 5.0, 3.0], [4.0, 5.0, 3.0]), 400_000
+    )
     errors[:, 1] += 1.0 + 2.0 * rng.uniform(-math.sqrt(3.0), math.sqrt(3.0), len(errors))
     turned = errors @ (np.eye(3) if rotation is None else rotation).T
     size = np.abs(turned[:, 0]) if axis == "pitch" else np.hypot(turned[:, 0], turned[:, 1])
     assert found.sampled_arcsec == pytest.approx(np.quantile(size, 0.95), rel=0.01)
     # Control: axes taken as independent, as the totals were before.
-    apart = combined([dataclasses.replace(r, axis_correlation=()) for r in rows], axis, 0.95, rotation=rotation)
+    apart = combined(
+        [dataclasses.replace(r, axis_correlation=()) for r in rows], axis, 0.95, rotation=rotation
+    )
     if axis == "cross-boresight" and rotation is TURN:
         assert apart.sampled_arcsec < 0.97 * found.sampled_arcsec
         assert apart.rule_arcsec < 0.97 * found.rule_arcsec
@@ -617,9 +774,17 @@ def test_totals_of_correlated_axes_in_any_frame_against_monte_carlo(rotation: np
 
 
 def test_the_worst_of_correlated_axes_follows_the_rotation() -> None:
-    found = combined(correlated((4.0, 5.0, 3.0)), "yaw", interpretation="temporal", rotation=PAYLOAD)
-    sigma = math.sqrt(PAYLOAD[1] @ (CORRELATION * np.outer([4.0, 5.0, 3.0], [4.0, 5.0, 3.0])) @ PAYLOAD[1])
-    assert found.worst_arcsec == pytest.approx(sigma * one_axis_factor(0.997)) == pytest.approx(found.rule_arcsec)
+    found = combined(
+        correlated((4.0, 5.0, 3.0)), "yaw", interpretation="temporal", rotation=PAYLOAD
+    )
+    sigma = math.sqrt(
+        PAYLOAD[1] @ (CORRELATION * np.outer([4.0, 5.0, 3.0], [4.0, 5.0, 3.0])) @ PAYLOAD[1]
+    )
+    assert (
+        found.worst_arcsec
+        == pytest.approx(sigma * one_axis_factor(0.997))
+        == pytest.approx(found.rule_arcsec)
+    )
 
 
 def test_groups_err_together_on_all_axes_with_their_signs() -> None:
@@ -628,13 +793,19 @@ def test_groups_err_together_on_all_axes_with_their_signs() -> None:
         row("bend", 3.0, "yaw", correlation_group="-thermal"),
         row("twist", 2.0, correlation_group="thermal"),
     ]
-    np.testing.assert_allclose(covariance(bend), [[25.0, -15.0, 0.0], [-15.0, 9.0, 0.0], [0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(
+        covariance(bend), [[25.0, -15.0, 0.0], [-15.0, 9.0, 0.0], [0.0, 0.0, 0.0]]
+    )
     both_axes = combined(bend, "cross-boresight", 0.95)
     # One cause: the angle is that of one deviate, 5.83 arcsec long.
-    assert both_axes.rule_arcsec == pytest.approx(math.hypot(5.0, 3.0) * one_axis_factor(0.95), rel=1e-6)
+    assert both_axes.rule_arcsec == pytest.approx(
+        math.hypot(5.0, 3.0) * one_axis_factor(0.95), rel=1e-6
+    )
     assert both_axes.sampled_arcsec == pytest.approx(both_axes.rule_arcsec, rel=0.01)
     # About an axis between them the signs decide.
-    between = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, math.sqrt(2.0)]]) / math.sqrt(2.0)
+    between = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, math.sqrt(2.0)]]) / math.sqrt(
+        2.0
+    )
     there, across = (combined(bend, axis, 0.95, rotation=between) for axis in ("pitch", "yaw"))
     assert there.sigma_arcsec == pytest.approx(2.0 / math.sqrt(2.0))
     assert across.sigma_arcsec == pytest.approx(8.0 / math.sqrt(2.0))
@@ -645,7 +816,11 @@ def test_groups_err_together_on_all_axes_with_their_signs() -> None:
 
 
 def test_what_is_missing_on_an_axis_is_missing_wherever_it_is_seen() -> None:
-    rows = [row("noise", 1.0), row("noise", 1.0, "yaw"), Contributor("pixel", "pixel spatial", "roll")]
+    rows = [
+        row("noise", 1.0),
+        row("noise", 1.0, "yaw"),
+        Contributor("pixel", "pixel spatial", "roll"),
+    ]
     assert not combined(rows, "cross-boresight").at_least
     assert combined(rows, "pitch", rotation=TURN).not_assessed == ("pixel",)
     assert not combined(rows, "yaw", rotation=TURN).at_least

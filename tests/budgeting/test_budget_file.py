@@ -66,17 +66,29 @@ def test_axes(tmp_path: Path, axis: str, expected: tuple[str, ...]) -> None:
     ("lines", "sigma", "mean"),
     [
         ('distribution = "uniform"\nhalf_width_arcsec = 3.0', 3.0 / math.sqrt(3.0), 0.0),
-        ('distribution = "arcsine"\nhalf_width_arcsec = 3.0\nmean_arcsec = -1', 3.0 / math.sqrt(2.0), -1.0),
+        (
+            'distribution = "arcsine"\nhalf_width_arcsec = 3.0\nmean_arcsec = -1',
+            3.0 / math.sqrt(2.0),
+            -1.0,
+        ),
         ('distribution = "constant"\nmean_arcsec = 2.0', 0.0, 2.0),
-        ('distribution = "rayleigh"\nsigma_arcsec = 1.0', 1.0, math.sqrt(math.pi / (4.0 - math.pi))),
+        (
+            'distribution = "rayleigh"\nsigma_arcsec = 1.0',
+            1.0,
+            math.sqrt(math.pi / (4.0 - math.pi)),
+        ),
         ("applies = false", 0.0, 0.0),
     ],
 )
 def test_moments(tmp_path: Path, lines: str, sigma: float, mean: float) -> None:
-    row = load_budget_file(written(tmp_path, ROW.replace("sigma_arcsec = 0.2", lines))).contributors[0]
+    row = load_budget_file(
+        written(tmp_path, ROW.replace("sigma_arcsec = 0.2", lines))
+    ).contributors[0]
     assert row.sigma_arcsec == pytest.approx(sigma) and row.mean_arcsec == pytest.approx(mean)
     assert row.applies is ("applies" not in lines)
-    combination = "none" if "applies" in lines else "mean: linear" if "constant" in lines else "in squares"
+    combination = (
+        "none" if "applies" in lines else "mean: linear" if "constant" in lines else "in squares"
+    )
     assert row.combination == combination
 
 
@@ -88,17 +100,28 @@ def test_names_of_the_starter_may_be_in_any_case(tmp_path: Path, name: str) -> N
 
 @pytest.mark.parametrize("name", ["polishing residual", "star sensor cable", "launch lock"])
 def test_a_name_of_ones_own_is_taken_with_what_it_states(tmp_path: Path, name: str) -> None:
-    row = load_budget_file(written(tmp_path, ROW.replace("star catalogue", name) + OWN)).contributors[0]
+    row = load_budget_file(
+        written(tmp_path, ROW.replace("star catalogue", name) + OWN)
+    ).contributors[0]
     assert (row.name, row.interpretation, row.distribution) == (name, "mixed", "gaussian")
 
 
 def test_requirements_take_the_confidence_of_the_file(tmp_path: Path) -> None:
-    text = "[budget]\ntitle = 'T'\nconfidence = 0.95\n" + LIMIT + LIMIT.replace("R-1", "R-2") + "confidence = 0.5\n"
+    text = (
+        "[budget]\ntitle = 'T'\nconfidence = 0.95\n"
+        + LIMIT
+        + LIMIT.replace("R-1", "R-2")
+        + "confidence = 0.5\n"
+    )
     found = load_budget_file(written(tmp_path, text))
     assert (found.title, found.confidence) == ("T", 0.95)
     assert [asked.confidence for asked in found.requirements] == [0.95, 0.5]
     asked = found.requirements[0]
-    assert (asked.scope, asked.interpretation, asked.judged_by) == ("after alignment", "mixed", "both")
+    assert (asked.scope, asked.interpretation, asked.judged_by) == (
+        "after alignment",
+        "mixed",
+        "both",
+    )
 
 
 def test_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
@@ -113,22 +136,37 @@ BAD = {
     "name no text": (ROW.replace('"star catalogue"', "5"), "key name is 5; write text in quotes"),
     "name blank": (ROW.replace('"star catalogue"', '" "'), "key name is ' '; write text in quotes"),
     "axis": (ROW.replace('"all"', '"w"'), "key axis is 'w'"),
-    "sigma text": (ROW.replace("0.2", '"0.2"'), "key sigma_arcsec is '0.2'; write a number of arcsec"),
+    "sigma text": (
+        ROW.replace("0.2", '"0.2"'),
+        "key sigma_arcsec is '0.2'; write a number of arcsec",
+    ),
     "sigma true": (ROW.replace("0.2", "true"), "key sigma_arcsec is True"),
     "sigma negative": (ROW.replace("0.2", "-0.2"), "key sigma_arcsec is -0.2"),
     "sigma infinite": (ROW.replace("0.2", "inf"), "write a number of arcsec"),
-    "no sigma": (ROW.replace("sigma_arcsec = 0.2", ""), "write either sigma_arcsec or half_width_arcsec"),
+    "no sigma": (
+        ROW.replace("sigma_arcsec = 0.2", ""),
+        "write either sigma_arcsec or half_width_arcsec",
+    ),
     "both": (ROW + "half_width_arcsec = 1.0\n", "are both given"),
-    "half width of a gaussian": (ROW.replace("sigma_arc", "half_width_arc"), "a gaussian error has no end"),
+    "half width of a gaussian": (
+        ROW.replace("sigma_arc", "half_width_arc"),
+        "a gaussian error has no end",
+    ),
     "constant with sigma": (ROW + 'distribution = "constant"\n', "a constant has no spread"),
-    "distribution": (ROW + 'distribution = "normal"\n', "key distribution is 'normal'; write one of 'gaussian'"),
+    "distribution": (
+        ROW + 'distribution = "normal"\n',
+        "key distribution is 'normal'; write one of 'gaussian'",
+    ),
     "class": (ROW + 'ecss_class = "noise"\n', "key ecss_class is 'noise'"),
     "no provenance": (
         ROW.replace("provenance", "conditions"),
         "[[contributor]] 1 ('star catalogue'): key provenance is missing",
     ),
     "applies": (ROW + "applies = 'no'\n", "write true or false"),
-    "posterior's": (ROW.replace("star catalogue", "centroid noise (NEA)"), "filled by the posterior"),
+    "posterior's": (
+        ROW.replace("star catalogue", "centroid noise (NEA)"),
+        "filled by the posterior",
+    ),
     "twice": (ROW + ROW, "star catalogue, axis pitch is stated twice"),
     "one bracket": (
         ROW.replace("[[contributor]]", "[contributor]"),
@@ -137,13 +175,19 @@ BAD = {
     "other table": (ROW + "[limits]\na = 1\n", "limits is not known"),
     "confidence": ("[budget]\nconfidence = 99.7\n", "write 0.997 for 99.7 %"),
     "confidence of a few per cent": ("[budget]\nconfidence = 1.5\n", "write 0.015 for 1.5 %"),
-    "confidence 1": ("[budget]\nconfidence = 1\n", "is 1.0, but a confidence lies between 0 and 1, such as 0.997."),
+    "confidence 1": (
+        "[budget]\nconfidence = 1\n",
+        "is 1.0, but a confidence lies between 0 and 1, such as 0.997.",
+    ),
     "confidence of a hundred": (
         "[budget]\nconfidence = 100\n",
         "is 100.0, but a confidence lies between 0 and 1, such as 0.997.",
     ),
     "no confidence": ("[budget]\nconfidence = 0\n", "such as 0.997."),
-    "a turn and more": (ROW.replace("0.2", "1296000.1"), "write a number of arcsec from 0 to 1296000, a full turn."),
+    "a turn and more": (
+        ROW.replace("0.2", "1296000.1"),
+        "write a number of arcsec from 0 to 1296000, a full turn.",
+    ),
     "frame twice named": ("[frame.sensor]\nrotation = [0, 0, 0, 1]\n", "give yours another name"),
     "frame without": ("[frame.a]\n", "key rotation is missing"),
     "frame with more": ("[frame.a]\nrotation = [0, 0, 0, 1]\nunit = 1\n", "unit"),
@@ -154,7 +198,8 @@ BAD = {
     ),
     "own like none": (
         ROW.replace("star catalogue", "xyz"),
-        "[[contributor]] 1 ('xyz'): The starter has no such name, and a contributor of your own must state ecss_class, "
+        "[[contributor]] 1 ('xyz'): The starter has no such name, and a contributor of your own "
+        "must state ecss_class, "
         "interpretation, absorbed_by_alignment as well.",
     ),
     "own that does not apply, but with a word for it": (
@@ -172,17 +217,35 @@ BAD = {
     ),
     "mistyped": (ROW.replace("star catalogue", "star catalog"), "did you mean 'star catalogue'?"),
     "mistyped, of a uniform error": (
-        ROW.replace("star catalogue", "launch and setling shift").replace("sigma_arcsec", "half_width_arcsec"),
+        ROW.replace("star catalogue", "launch and setling shift").replace(
+            "sigma_arcsec", "half_width_arcsec"
+        ),
         "did you mean 'launch and settling shift'?",
     ),
-    "mistyped, everything stated": (ROW.replace("star catalogue", "star catalogues") + OWN, "did you mean"),
-    "posterior's, in capitals": (ROW.replace("star catalogue", "Centroid Noise (NEA)"), "filled by the posterior"),
-    "own without class": (ROW.replace("star catalogue", "polish"), "('polish'): The starter has no such name"),
+    "mistyped, everything stated": (
+        ROW.replace("star catalogue", "star catalogues") + OWN,
+        "did you mean",
+    ),
+    "posterior's, in capitals": (
+        ROW.replace("star catalogue", "Centroid Noise (NEA)"),
+        "filled by the posterior",
+    ),
+    "own without class": (
+        ROW.replace("star catalogue", "polish"),
+        "('polish'): The starter has no such name",
+    ),
     "own like one": (
         ROW.replace("star catalogue", "star catalogue noise") + 'ecss_class = "other"\n',
-        "did you mean 'star catalogue'? The starter has no such name, and a contributor of your own must state interpr",
+        (
+            "did you mean 'star catalogue'? The starter has no such name, and a contributor of "
+            "your "
+            "own must state interpr"
+        ),
     ),
-    "too large": (ROW.replace("0.2", "1e308"), "write a number of arcsec from 0 to 1296000, a full turn"),
+    "too large": (
+        ROW.replace("0.2", "1e308"),
+        "write a number of arcsec from 0 to 1296000, a full turn",
+    ),
     "too large for a float": (
         ROW.replace("0.2", "1" + 400 * "0"),
         "write a number of arcsec from 0 to 1296000, a full turn",
@@ -196,7 +259,10 @@ BAD = {
         LIMIT.replace("10.0", "1e9"),
         "write a positive number of arcsec, at most 1296000",
     ),
-    "confidence too large": ("[budget]\nconfidence = 1" + 400 * "0", "write a share between 0 and 1"),
+    "confidence too large": (
+        "[budget]\nconfidence = 1" + 400 * "0",
+        "write a share between 0 and 1",
+    ),
     "no toml": ("[[contributor]\n", "is not valid TOML"),
     "no table": ("contributor = [1]\n", "is no table"),
 }
@@ -280,7 +346,9 @@ def example(root: Path) -> str:
 def test_the_documented_example_loads(root: Path, tmp_path: Path) -> None:
     found = load_budget_file(written(tmp_path, example(root)))
     assert len(found.requirements) == 3 and found.title.startswith("Star tracker")
-    assert {row.name for row in found.contributors} - {entry.name for entry in FROM_FILE} == {"polishing residual"}
+    assert {row.name for row in found.contributors} - {entry.name for entry in FROM_FILE} == {
+        "polishing residual"
+    }
     expected = {entry.name: entry for entry in FROM_FILE}
     for row in found.contributors:
         if row.name in expected:
@@ -291,7 +359,10 @@ def test_the_documented_keys_are_all_there_are(root: Path) -> None:
     from starcal_uq.budgeting.file import CONTRIBUTOR_KEYS, REQUIREMENT_KEYS
 
     page = (root / "docs" / "how-to" / "budget.md").read_text(encoding="utf-8")
-    for heading, keys in (("Keys of a contributor", CONTRIBUTOR_KEYS), ("Keys of a requirement", REQUIREMENT_KEYS)):
+    for heading, keys in (
+        ("Keys of a contributor", CONTRIBUTOR_KEYS),
+        ("Keys of a requirement", REQUIREMENT_KEYS),
+    ):
         table = page.split(f"## {heading}", 1)[1].split("##", 1)[0]
         listed = [line.split("`")[1] for line in table.splitlines() if line.startswith("| `")]
         assert sorted(listed) == sorted(keys)
@@ -299,7 +370,9 @@ def test_the_documented_keys_are_all_there_are(root: Path) -> None:
 
 def test_frames_are_rotations_that_requirements_name(tmp_path: Path) -> None:
     half = math.sqrt(0.5)
-    text = f"[frame.payload]\nrotation = [0.0, {half}, 0.0, {half}]\n" + LIMIT + 'frame = "payload"\n'
+    text = (
+        f"[frame.payload]\nrotation = [0.0, {half}, 0.0, {half}]\n" + LIMIT + 'frame = "payload"\n'
+    )
     found = load_budget_file(written(tmp_path, text))
     # A quarter turn about Y: the payload's X is the sensor's Z.
     np.testing.assert_allclose(found.frames["payload"][0], [0.0, 0.0, 1.0], atol=1e-9)
@@ -311,7 +384,9 @@ def test_frames_are_rotations_that_requirements_name(tmp_path: Path) -> None:
         "[[1, 0, 0], [0, 1.000004, 0], [0, 0, 1]]",
         "[[1, 0, 0], [0, 0.999996, 0], [0, 0, 1]]",
     ):
-        again = load_budget_file(written(tmp_path, f"[frame.payload]\nrotation = {rotation}\n")).frames["payload"]
+        again = load_budget_file(
+            written(tmp_path, f"[frame.payload]\nrotation = {rotation}\n")
+        ).frames["payload"]
         np.testing.assert_allclose(again @ again.T, np.eye(3), atol=1e-5)
     for rotation, words in (
         ("[[1, 0, 0], [0, 1, 0], [0, 0, -1]]", "mirrors"),
@@ -336,15 +411,24 @@ def test_an_entry_of_the_starter_to_the_letter() -> None:
 
     def entry(*axes: str) -> str:
         words = [
-            "Thermo-elastic distortion: motion of boresight against mounting reference with temperature and its "
+            "Thermo-elastic distortion: motion of boresight against mounting reference with "
+            "temperature and its "
             "gradients over",
             "orbit and season.",
         ]
         keys = [
             *("half_width_arcsec =", 'distribution = "arcsine"', 'ecss_class = "thermo-elastic"'),
-            *('interpretation = "temporal"', 'absorbed_by_alignment = "no"', 'conditions = ""', 'provenance = ""'),
+            *(
+                'interpretation = "temporal"',
+                'absorbed_by_alignment = "no"',
+                'conditions = ""',
+                'provenance = ""',
+            ),
         ]
-        blocks = [["[[contributor]]", 'name = "thermo-elastic distortion"', f'axis = "{a}"', *keys] for a in axes]
+        blocks = [
+            ["[[contributor]]", 'name = "thermo-elastic distortion"', f'axis = "{a}"', *keys]
+            for a in axes
+        ]
         return "#\n".join("".join(f"# {line}\n" for line in block) for block in (words, *blocks))
 
     rows = [not_assessed(each, axis) for each in FROM_FILE for axis in AXES]
@@ -353,5 +437,8 @@ def test_an_entry_of_the_starter_to_the_letter() -> None:
     assert f"\n\n{entry('cross-boresight', 'Z')}\n# Drift of focal length and distortion: " in text
     assert "\n# sigma_arcsec =\n" in text.split("# Drift of")[1].split("# Chromatic")[0]
     for known, open_ones in (("roll", "XY"), ("pitch", "YZ"), ("yaw", "XZ")):
-        some = [Contributor(r.name, "other", r.axis, source="file") if r.axis == known else r for r in rows]
+        some = [
+            Contributor(r.name, "other", r.axis, source="file") if r.axis == known else r
+            for r in rows
+        ]
         assert f"\n\n{entry(*open_ones)}\n" in template_text(some)

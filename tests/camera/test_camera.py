@@ -32,7 +32,9 @@ def awkward(distortion: str) -> Camera:
     """A camera none of whose numbers has a short decimal form."""
     n = len(get_model(distortion).coefficients)
     coefficients = tuple(-(10.0**-9.1) / 3**k for k in range(n))
-    return Camera(640, 480, 10.0 / 3.0, math.pi * 7, 1 / 3, -2 / 7, distortion, coefficients, 'é "x"')
+    return Camera(
+        640, 480, 10.0 / 3.0, math.pi * 7, 1 / 3, -2 / 7, distortion, coefficients, 'é "x"'
+    )
 
 
 def write(path: Path, text: str) -> Path:
@@ -43,16 +45,22 @@ def write(path: Path, text: str) -> Path:
 def file_text(**changes: object) -> str:
     """A camera file with keys changed, added, or (None) left out."""
     table: dict[str, object] = {**TABLE, **changes}
-    return "[camera]\n" + "".join(f"{key} = {value!r}\n" for key, value in table.items() if value is not None)
+    return "[camera]\n" + "".join(
+        f"{key} = {value!r}\n" for key, value in table.items() if value is not None
+    )
 
 
 def test_units():
     assert PAPER.focal_px == pytest.approx(70.2262 / 0.012, rel=1e-15)
     assert PAPER.parameter_names == ("x0", "y0", "f", "k1", "k2")
-    np.testing.assert_allclose(PAPER.theta, [500.0, 530.0, 5852.183333333333, 2e-10, -3.5e-15], rtol=1e-15)
+    np.testing.assert_allclose(
+        PAPER.theta, [500.0, 530.0, 5852.183333333333, 2e-10, -3.5e-15], rtol=1e-15
+    )
     assert PAPER.centre_px == (511.5, 511.5)
     # The paper's sensor is one of 10 degrees.
-    assert PAPER.fov_deg[0] == pytest.approx(2 * math.degrees(math.atan(6.144 / 70.2262)), rel=1e-14)
+    assert PAPER.fov_deg[0] == pytest.approx(
+        2 * math.degrees(math.atan(6.144 / 70.2262)), rel=1e-14
+    )
     assert PAPER.fov_deg == pytest.approx((10.0, 10.0), abs=0.01)
 
 
@@ -63,7 +71,16 @@ def test_corner_radius_is_to_the_farthest_corner():
 
 
 def test_contains_the_whole_of_the_edge_pixels():
-    xy = np.array([[-0.5, -0.5], [1023.5, 1023.5], [-0.5001, 5.0], [5.0, 1023.5001], [np.nan, 5.0], [np.inf, 5.0]])
+    xy = np.array(
+        [
+            [-0.5, -0.5],
+            [1023.5, 1023.5],
+            [-0.5001, 5.0],
+            [5.0, 1023.5001],
+            [np.nan, 5.0],
+            [np.inf, 5.0],
+        ]
+    )
     np.testing.assert_array_equal(PAPER.contains(xy), [True, True, False, False, False, False])
     wide = PAPER.replace(height_px=100)
     np.testing.assert_array_equal(wide.contains([[1000.0, 50.0], [50.0, 1000.0]]), [True, False])
@@ -84,7 +101,10 @@ def test_replace_carries_coefficients_by_name():
     tangential = PAPER.replace(distortion="brown_tangential")
     assert tangential.coefficients == (2e-10, -3.5e-15, 0.0, 0.0)
     assert tangential.replace(distortion="k1").coefficients == (2e-10,)
-    assert PAPER.replace(distortion="inverse").coefficients == (0.0, 0.0)  # the same names mean the opposite direction
+    assert PAPER.replace(distortion="inverse").coefficients == (
+        0.0,
+        0.0,
+    )  # the same names mean the opposite direction
     assert PAPER.replace(distortion="none").coefficients == ()
     with pytest.raises(CameraError, match="no attribute 'focal'"):
         PAPER.replace(focal=3.0)
@@ -101,7 +121,14 @@ def test_is_frozen_and_comparable():
 
 def test_numpy_values_become_plain():
     camera = Camera(np.int64(8), np.int32(6), np.float32(2.0), np.float64(3.0), 1, 2)
-    assert [type(v) for v in dataclasses.astuple(camera)[:6]] == [int, int, float, float, float, float]
+    assert [type(v) for v in dataclasses.astuple(camera)[:6]] == [
+        int,
+        int,
+        float,
+        float,
+        float,
+        float,
+    ]
     assert camera.coefficients == (0.0, 0.0)
 
 
@@ -141,11 +168,15 @@ def test_file_states_the_conventions(tmp_path):
     assert "ideal (pinhole) points to distorted" in text
     assert "name" not in text.split("[camera]")[1]
     awkward("inverse").save(tmp_path / "inverse.toml")
-    assert "distorted (measured) points to ideal" in (tmp_path / "inverse.toml").read_text(encoding="utf-8")
+    assert "distorted (measured) points to ideal" in (tmp_path / "inverse.toml").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_file_by_hand(tmp_path):
-    """Whole numbers for floats, a byte order mark and Windows line ends are all fine; defaults fill in."""
+    """Whole numbers for floats, a byte order mark and Windows line ends are all fine; defaults fill
+    in.
+    """
     text = "[camera]\nwidth_px=10\nheight_px=8\npixel_um=5\nfocal_mm=50\nx0_px=4\ny0_px=3\n"
     path = tmp_path / "camera.toml"
     path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
@@ -155,31 +186,58 @@ def test_file_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (file_text(focal_mm=None), "section [camera]: key focal_mm is missing; add the focal length in millimetres"),
+        (
+            file_text(focal_mm=None),
+            "section [camera]: key focal_mm is missing; add the focal length in millimetres",
+        ),
         (
             file_text(focal_mm=None, x0_px=None),
-            "key focal_mm is missing; add the focal length in millimetres, a number from 0.001 to 10000000 (1 more bad",
+            (
+                "key focal_mm is missing; add the focal length in millimetres, a number from 0.001 "
+                "to 10000000 (1 more bad"
+            ),
         ),
         (file_text(colour=1, focal_mm=None, x0_px=None), "(2 more bad keys)."),
         (file_text(focal_m=1), "key focal_m is unknown; did you mean focal_mm?"),
         (file_text(colour="red"), "key colour is unknown; remove it (known: width_px"),
         (
             file_text(k3=1e-20),
-            "key k3 is no coefficient of distortion 'brown' (it has k1, k2); remove it or set distortion to 'brown3'.",
+            (
+                "key k3 is no coefficient of distortion 'brown' (it has k1, k2); remove it or set "
+                "distortion to 'brown3'."
+            ),
         ),
-        (file_text(distortion="none"), "key k1 is no coefficient of distortion 'none' (it has none); remove it"),
-        (file_text(width_px=10.5), "key width_px is 10.5; write the width of the detector in pixels, a whole number"),
+        (
+            file_text(distortion="none"),
+            "key k1 is no coefficient of distortion 'none' (it has none); remove it",
+        ),
+        (
+            file_text(width_px=10.5),
+            "key width_px is 10.5; write the width of the detector in pixels, a whole number",
+        ),
         (file_text(width_px=0), "key width_px is 0; write"),
-        (file_text(focal_mm="long"), "key focal_mm is 'long'; write the focal length in millimetres"),
+        (
+            file_text(focal_mm="long"),
+            "key focal_mm is 'long'; write the focal length in millimetres",
+        ),
         (file_text(pixel_um="true").replace("'true'", "true"), "key pixel_um is True; write"),
         (
             file_text(x0_px=math.inf),
             "key x0_px is inf; write the principal point along x in pixels, a number from -1",
         ),
         (file_text(k1=math.nan), "key k1 is nan; write the coefficient, a number from -1 to 1."),
-        (file_text(distortion="fisheye"), "key distortion: distortion model 'fisheye' is unknown: use one of none, k1"),
-        (file_text(distortion=3), "key distortion is 3; write the name of the distortion model, one of none"),
-        (file_text().replace("[camera]\n", ""), "section [camera] is missing; write [camera] above"),
+        (
+            file_text(distortion="fisheye"),
+            "key distortion: distortion model 'fisheye' is unknown: use one of none, k1",
+        ),
+        (
+            file_text(distortion=3),
+            "key distortion is 3; write the name of the distortion model, one of none",
+        ),
+        (
+            file_text().replace("[camera]\n", ""),
+            "section [camera] is missing; write [camera] above",
+        ),
         ("camera = 3\n", "camera is no section; write [camera]"),
         ("units = 1\n" + file_text(), "units stands outside section [camera]"),
         ("[camera\n", "is not valid TOML"),
@@ -241,11 +299,19 @@ def test_opencv_round_trip_into_a_named_model(distortion):
 
 def test_opencv_scales_by_powers_of_the_focal_length():
     f = PAPER.focal_px
-    np.testing.assert_allclose(PAPER.to_opencv()[1], [2e-10 * f**2, -3.5e-15 * f**4, 0, 0, 0], rtol=1e-15)
+    np.testing.assert_allclose(
+        PAPER.to_opencv()[1], [2e-10 * f**2, -3.5e-15 * f**4, 0, 0, 0], rtol=1e-15
+    )
     camera = PAPER.replace(distortion="brown_tangential", coefficients=(0.0, 0.0, 1e-7, 2e-7))
     np.testing.assert_allclose(camera.to_opencv()[1], [0, 0, 1e-7 * f, 2e-7 * f, 0], rtol=1e-15)
-    assert Camera.from_opencv(PAPER.to_opencv()[0], None, 1024, 1024, 12.0).coefficients == (0.0, 0.0)
-    assert Camera.from_opencv(PAPER.to_opencv()[0], np.zeros((1, 14)), 1024, 1024, 12.0).distortion == "brown"
+    assert Camera.from_opencv(PAPER.to_opencv()[0], None, 1024, 1024, 12.0).coefficients == (
+        0.0,
+        0.0,
+    )
+    assert (
+        Camera.from_opencv(PAPER.to_opencv()[0], np.zeros((1, 14)), 1024, 1024, 12.0).distortion
+        == "brown"
+    )
 
 
 def matrix(fx=5000.0, fy=5000.0, skew=0.0):

@@ -16,9 +16,13 @@ from starcal_uq.core.errors import CameraError, RunFolderError
 
 F = 5116.0
 CAMERAS = {
-    "brown": sc.Camera(1024, 768, 6.9, F * 6.9e-3, 517.3, 389.9, "brown", (0.078 / F**2, 1.5 / F**4)),
+    "brown": sc.Camera(
+        1024, 768, 6.9, F * 6.9e-3, 517.3, 389.9, "brown", (0.078 / F**2, 1.5 / F**4)
+    ),
     "brown3": sc.Camera(2048, 2048, 5.5, 16.0, 1020, 1030, "brown3", (-3e-8, 1e-15, 2e-22)),
-    "tangential": sc.Camera(2048, 1536, 5.5, 16.0, 1020, 730, "brown_tangential", (-3e-8, 1e-15, 2e-7, -1e-7)),
+    "tangential": sc.Camera(
+        2048, 1536, 5.5, 16.0, 1020, 730, "brown_tangential", (-3e-8, 1e-15, 2e-7, -1e-7)
+    ),
     "inverse": sc.Camera(1024, 1024, 15.0, 49.0, 520, 505, "inverse", (2e-8, 1e-15)),
     "none": sc.Camera(640, 480, 10.0, 25.0, 300, 250, "none"),
 }
@@ -26,7 +30,9 @@ OPENCV_LIKE = ("opencv", "ros", "kalibr", "mrcal")
 
 
 def pixels(camera):
-    x, y = np.meshgrid(np.linspace(0, camera.width_px - 1, 9), np.linspace(0, camera.height_px - 1, 7))
+    x, y = np.meshgrid(
+        np.linspace(0, camera.width_px - 1, 9), np.linspace(0, camera.height_px - 1, 7)
+    )
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
@@ -43,14 +49,21 @@ def test_opencv_reads_its_file_and_projects_alike(camera, tmp_path):
     cv2 = pytest.importorskip("cv2")
     made = export_camera(camera, "opencv", tmp_path / "c.yaml")
     storage = cv2.FileStorage(str(made.path), cv2.FILE_STORAGE_READ)
-    matrix, coefficients = storage.getNode("camera_matrix").mat(), storage.getNode("distortion_coefficients").mat()
+    matrix, coefficients = (
+        storage.getNode("camera_matrix").mat(),
+        storage.getNode("distortion_coefficients").mat(),
+    )
     assert int(storage.getNode("image_width").real()) == camera.width_px
     seen = unproject(camera, pixels(camera))
-    theirs = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), matrix, coefficients)[0].reshape(-1, 2)
+    theirs = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), matrix, coefficients)[0].reshape(
+        -1, 2
+    )
     assert largest(theirs - pixels(camera)) <= made.error_px + 1e-9
     # A principal point that counts from the corner of the first pixel would be seen.
     matrix[0, 2] += 0.5
-    moved = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), matrix, coefficients)[0].reshape(-1, 2)
+    moved = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), matrix, coefficients)[0].reshape(
+        -1, 2
+    )
     assert largest(moved - pixels(camera)) > 0.4
 
 
@@ -58,21 +71,31 @@ def test_mrcal_reads_its_files_and_unprojects_alike(tmp_path):
     python = "/usr/bin/python3"
     if not Path(python).exists():
         pytest.skip("mrcal is a package of the system, which has none")
-    made = {name: export_camera(camera, "mrcal", tmp_path / f"{name}.cameramodel") for name, camera in CAMERAS.items()}
+    made = {
+        name: export_camera(camera, "mrcal", tmp_path / f"{name}.cameramodel")
+        for name, camera in CAMERAS.items()
+    }
     for name, camera in CAMERAS.items():
         np.save(tmp_path / f"{name}_xy.npy", pixels(camera))
     code = (
-        "import sys\ntry: import mrcal, numpy as np\nexcept ImportError: sys.exit(77)\nfor name in sys.argv[1:]:\n"
+        "import sys\ntry: import mrcal, numpy as np\nexcept ImportError: sys.exit(77)\nfor name "
+        "in sys.argv[1:]:\n"
         " m = mrcal.cameramodel(f'{name}.cameramodel')\n"
         " v = mrcal.unproject(np.load(f'{name}_xy.npy'), *m.intrinsics(), normalize=True)\n"
         " np.save(f'{name}_v.npy', v); print(*m.imagersize())"
     )
-    done = subprocess.run([python, "-c", code, *CAMERAS], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [python, "-c", code, *CAMERAS], cwd=tmp_path, capture_output=True, text=True
+    )
     if done.returncode == 77:
         pytest.skip("mrcal is a package of the system, which has none")
-    assert done.stdout.split("\n")[:-1] == [f"{c.width_px} {c.height_px}" for c in CAMERAS.values()], done.stderr
+    assert done.stdout.split("\n")[:-1] == [
+        f"{c.width_px} {c.height_px}" for c in CAMERAS.values()
+    ], done.stderr
     for name, camera in CAMERAS.items():
-        off = camera.focal_px * (np.load(tmp_path / f"{name}_v.npy") - unproject(camera, pixels(camera)))
+        off = camera.focal_px * (
+            np.load(tmp_path / f"{name}_v.npy") - unproject(camera, pixels(camera))
+        )
         assert largest(off) <= made[name].error_px + 1e-4, name
 
 
@@ -109,7 +132,8 @@ def test_tetra3_states_the_field_and_distortion_that_it_takes(tmp_path):
     camera = CAMERAS["brown"].data_sheet().replace(coefficients=(0.078 / F**2, 0.0))
     made = export_camera(camera, "tetra3", tmp_path / "c.json")
     stated = json.loads(made.path.read_text())
-    # Its own formula, written again: r_u = r_d (1 - k (2 r_d / w)^2) / (1 - k), and the field of the undistorted width.
+    # Its own formula, written again: r_u = r_d (1 - k (2 r_d / w)^2) / (1 - k), and the field of
+    # the undistorted width.
     k, half = stated["distortion"], camera.width_px / 2.0
     offsets = pixels(camera) - camera.centre_px
     undone = offsets * (1.0 - k * np.sum((offsets / half) ** 2, axis=1, keepdims=True)) / (1.0 - k)
@@ -135,7 +159,11 @@ def test_what_is_written_is_read_again(camera, to, tmp_path):
     back = sc.Camera.load(made.path)
     seen = unproject(camera, pixels(camera))
     assert largest(sc.camera.project(back, seen) - pixels(camera)) <= made.error_px + 1e-8
-    assert (back.width_px, back.height_px, back.pixel_um) == (camera.width_px, camera.height_px, camera.pixel_um)
+    assert (back.width_px, back.height_px, back.pixel_um) == (
+        camera.width_px,
+        camera.height_px,
+        camera.pixel_um,
+    )
     # Terms that the format has are held; others are said to be fitted.
     fitted = camera.distortion == "inverse" or (camera.distortion, to) == ("brown3", "kalibr")
     assert ("fitted" in made.note) == fitted == (made.error_px > 0.0)

@@ -1,4 +1,6 @@
-"""The camera model against OpenCV, against CasADi's own evaluation, and against finite differences."""
+"""The camera model against OpenCV, against CasADi's own evaluation, and against finite
+differences.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ def _grid(cam: Camera, factor: float) -> np.ndarray:
     """Pixels over the detector and out to `factor` times the corner radius."""
     angle = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     radius = np.linspace(0.0, factor * cam.corner_radius_px, 40)
-    ring = np.stack([np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()], axis=1)
+    ring = np.stack(
+        [np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()], axis=1
+    )
     return ring + cam.theta[:2]
 
 
@@ -49,7 +53,13 @@ def test_models_differ_where_they_should():
     cam = camera("brown")
     b = projection.unproject(cam, _grid(cam, 1.0))
     assert (
-        np.max(np.abs(projection.project(cam.replace(coefficients=(0.0, 0.0)), b) - projection.project(cam, b))) > 0.1
+        np.max(
+            np.abs(
+                projection.project(cam.replace(coefficients=(0.0, 0.0)), b)
+                - projection.project(cam, b)
+            )
+        )
+        > 0.1
     )
 
 
@@ -95,9 +105,9 @@ def _shift(cam: Camera, index: int) -> float:
 
 def _predict(model, theta, b):
     bb = np.ascontiguousarray(b)
-    return projection.forward_kernel(model, "value")(bb.shape[1], theta, bb, projection.forward_root(model, theta, bb))[
-        0
-    ]
+    return projection.forward_kernel(model, "value")(
+        bb.shape[1], theta, bb, projection.forward_root(model, theta, bb)
+    )[0]
 
 
 @pytest.mark.parametrize("model", model_names())
@@ -126,7 +136,9 @@ def test_jacobians_and_second_derivatives_against_finite_differences(model):
         assert np.allclose(slope, first[i] * steps[i], rtol=1e-6, atol=1e-7)
         for j in range(p + 3):
             g = unit[j]
-            mixed = (value(unit[i] + g) - value(unit[i] - g) - value(g - unit[i]) + value(-unit[i] - g)) / 4.0
+            mixed = (
+                value(unit[i] + g) - value(unit[i] - g) - value(g - unit[i]) + value(-unit[i] - g)
+            ) / 4.0
             assert np.allclose(mixed, full[i, j] * steps[i] * steps[j], rtol=2e-2, atol=2e-5)
 
 
@@ -140,13 +152,19 @@ def test_backward_jacobian_against_finite_differences(model):
         up, down = cam.theta, cam.theta
         up[i] += h
         down[i] -= h
-        numeric = (projection.unproject_theta(model, up, xy) - projection.unproject_theta(model, down, xy)) / (2 * h)
-        assert np.max(np.abs(numeric - jacobian[:, :, i])) < 2e-6 * np.max(np.abs(jacobian[:, :, i]))
+        numeric = (
+            projection.unproject_theta(model, up, xy) - projection.unproject_theta(model, down, xy)
+        ) / (2 * h)
+        assert np.max(np.abs(numeric - jacobian[:, :, i])) < 2e-6 * np.max(
+            np.abs(jacobian[:, :, i])
+        )
 
 
 @pytest.mark.parametrize("model", ["k1", "inverse"])
 def test_folding_distortion_is_an_error_and_not_a_number(model):
-    cam = camera("brown").replace(distortion=model, coefficients=(-2e-6,) if model == "k1" else (-2e-6, 0.0))
+    cam = camera("brown").replace(
+        distortion=model, coefficients=(-2e-6,) if model == "k1" else (-2e-6, 0.0)
+    )
     fold = projection.fold_radius_px(model, cam.theta, cam.corner_radius_px)
     assert fold == pytest.approx(np.sqrt(1 / (3 * 2e-6)), rel=0.01)
     with pytest.raises(DistortionError, match="folds over"):
@@ -154,7 +172,9 @@ def test_folding_distortion_is_an_error_and_not_a_number(model):
     with pytest.raises(DistortionError, match="folds over"):
         projection.project(cam, [[0.1, 0.1, 1.0]])
     inside = cam.theta[:2] + np.array([[100.0, 50.0]])
-    assert np.allclose(projection.project(cam, projection.unproject(cam, inside)), inside, atol=1e-10)
+    assert np.allclose(
+        projection.project(cam, projection.unproject(cam, inside)), inside, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize(
@@ -168,12 +188,16 @@ def test_folding_distortion_is_an_error_and_not_a_number(model):
     ],
 )
 def test_no_direction_beyond_a_fold(model, k):
-    """Radii of radial models against roots of the polynomial; Newton's method steps over such folds."""
+    """Radii of radial models against roots of the polynomial; Newton's method steps over such
+    folds.
+    """
     theta, xy = np.array([500.0, 530.0, 4000.0, *k]), RNG.uniform(0, 1023, (2000, 2))
     b = projection.unproject_theta(model, theta, xy)
     seen = np.isfinite(b).all(axis=1)
     assert 0.003 < seen.mean() < 0.9
-    np.testing.assert_array_equal(projection.unproject_theta(model, np.tile(theta[:, None], 2000), xy), b)
+    np.testing.assert_array_equal(
+        projection.unproject_theta(model, np.tile(theta[:, None], 2000), xy), b
+    )
     np.testing.assert_array_equal(projection.unproject_jacobian(model, theta, xy)[0], b)
     if model == "brown_tangential":
         fold = projection.fold_radius_px(model, theta, 2000.0)
@@ -181,7 +205,9 @@ def test_no_direction_beyond_a_fold(model, k):
         return
     terms = np.array([1.0, *(k[j] * (2 * j + 3) for j in range(len(k)))])
     roots = np.roots(terms[::-1])
-    fold = np.sqrt(min(root.real for root in roots if abs(root.imag) < 1e-12 * abs(root) and root.real > 0))
+    fold = np.sqrt(
+        min(root.real for root in roots if abs(root.imag) < 1e-12 * abs(root) and root.real > 0)
+    )
     rim = fold * np.polyval(np.array([1.0, *k])[::-1], fold**2)
     radius = np.hypot(*(xy - theta[:2]).T)
     np.testing.assert_array_equal(seen, radius < (fold if model == "inverse" else rim))
@@ -189,23 +215,38 @@ def test_no_direction_beyond_a_fold(model, k):
 
 @pytest.mark.parametrize("model", ["k1", "brown", "brown3", "brown_tangential", "inverse"])
 def test_a_fold_is_where_a_dense_scan_has_it(model):
-    """Random coefficients, some of which fold over a stretch of a few px only; in one direction, and in all of them."""
+    """Random coefficients, some of which fold over a stretch of a few px only; in one direction,
+    and in all of them.
+    """
     rng, reach, folds = np.random.default_rng(7), 700.0, 0
     radius = np.linspace(0.0, reach, 4001)[1:]
-    angle = np.zeros(1) if get_model(model).radial else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    angle = (
+        np.zeros(1)
+        if get_model(model).radial
+        else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    )
     rays = np.array([np.cos(angle), np.sin(angle)])
     points = (rays[:, :, None] * radius).reshape(2, -1)
     for _ in range(40):
-        sizes = [10.0 ** rng.uniform(-2.0, 0.3) / reach ** (c.order - 1) for c in get_model(model).coefficients]
+        sizes = [
+            10.0 ** rng.uniform(-2.0, 0.3) / reach ** (c.order - 1)
+            for c in get_model(model).coefficients
+        ]
         theta = np.array([0.0, 0.0, 4000.0, *rng.choice([-1.0, 1.0], len(sizes)) * sizes])
         with np.errstate(all="ignore"):
-            determinant = projection.newton_kernel(model)(points.shape[1], theta, points, points)[1][0]
+            determinant = projection.newton_kernel(model)(points.shape[1], theta, points, points)[
+                1
+            ][0]
         bad = determinant.reshape(angle.size, -1) <= 0.0
         first = np.where(bad.any(axis=1), radius[np.argmax(bad, axis=1)], np.inf)
-        assert projection.fold_radius_px(model, theta, reach) == pytest.approx(np.min(first), abs=0.4)
+        assert projection.fold_radius_px(model, theta, reach) == pytest.approx(
+            np.min(first), abs=0.4
+        )
         for where, clear in ((np.minimum(first, reach) - 1.0, True), (first + 1.0, False)):
             some = np.isfinite(where)
-            assert (projection.before_fold(model, theta, where[some] * rays[:, some]) == clear).all()
+            assert (
+                projection.before_fold(model, theta, where[some] * rays[:, some]) == clear
+            ).all()
         folds += int(np.isfinite(first).any())
     assert 3 < folds < 40
 
@@ -215,8 +256,12 @@ def test_where_a_bound_excludes_folds_there_are_none() -> None:
     xy = rng.uniform(0.0, [1024.0, 768.0], (200, 2))
     said = []
     for k1 in -np.geomspace(1e-9, 1e-5, 25):
-        thetas = np.array([[500.0, 380.0, 4000.0, k1, 0.0], [520.0, 390.0, 4010.0, 0.5 * k1, 0.1 * k1**2]])
-        whole = all(np.isfinite(projection.unproject_theta("brown", theta, xy)).all() for theta in thetas)
+        thetas = np.array(
+            [[500.0, 380.0, 4000.0, k1, 0.0], [520.0, 390.0, 4010.0, 0.5 * k1, 0.1 * k1**2]]
+        )
+        whole = all(
+            np.isfinite(projection.unproject_theta("brown", theta, xy)).all() for theta in thetas
+        )
         said.append(projection.cannot_fold("brown", thetas, xy))
         assert whole or not said[-1]
     assert said[0]

@@ -1,4 +1,6 @@
-"""The command line as a user meets it: whole runs, JSON, help, and one sentence for every mistake."""
+"""The command line as a user meets it: whole runs, JSON, help, and one sentence for every
+mistake.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,23 @@ from tests.helpers.scenes import observations
 
 
 def test_run_writes_everything_and_ends_with_its_summary(painting_cli, inputs, tmp_path):
-    status, out, err = painting_cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", *SMALL)
+    status, out, err = painting_cli(
+        "run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", *SMALL
+    )
     assert status in (0, 1)
     for heading in ("Calibration", "posterior ± 1 sigma", "Attitude error", "Report:"):
         assert heading in out
     assert "Neither time nor observer velocity was declared" in err
     run = sc.runs.RunFolder(tmp_path / "run")
-    for path in (run.observations, run.camera, run.calibration, run.posterior, run.coupling, run.attitude, run.report):
+    for path in (
+        run.observations,
+        run.camera,
+        run.calibration,
+        run.posterior,
+        run.coupling,
+        run.attitude,
+        run.report,
+    ):
         assert path.stat().st_size > 0, path
     page = run.report.read_text(encoding="utf-8")
     assert page.lstrip().lower().startswith("<!doctype html>")
@@ -40,8 +52,13 @@ def test_run_writes_everything_and_ends_with_its_summary(painting_cli, inputs, t
     found = sc.Run(run.path).verdict
     assert verdict == document("verdict", found, status) == found.to_dict()
     assert verdict["headline"] in " ".join(out.split())
-    assert [check["name"] for check in verdict["checks"]] == [c.name for c in sc.Run(run.path).verdict.checks]
-    assert all(check["remedy"] or check["advice"] or check["level"] == "pass" for check in verdict["checks"])
+    assert [check["name"] for check in verdict["checks"]] == [
+        c.name for c in sc.Run(run.path).verdict.checks
+    ]
+    assert all(
+        check["remedy"] or check["advice"] or check["level"] == "pass"
+        for check in verdict["checks"]
+    )
     # The same seed repeats the posterior bit for bit, step by step too.
     painting_cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "again")
     painting_cli("sample", "again", *SMALL)
@@ -50,11 +67,20 @@ def test_run_writes_everything_and_ends_with_its_summary(painting_cli, inputs, t
 
 
 def test_steps_one_by_one_with_json(cli, inputs):
-    status, out, _ = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--json")
+    status, out, _ = cli(
+        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--json"
+    )
     assert status == 0
     table = json.loads(out)["calibration"]
     assert table["status"] == "CONVERGED"
-    assert [row["parameter"] for row in table["parameters"]] == ["x0", "y0", "f", "k1", "k2", "sigma"]
+    assert [row["parameter"] for row in table["parameters"]] == [
+        "x0",
+        "y0",
+        "f",
+        "k1",
+        "k2",
+        "sigma",
+    ]
     status, out, _ = cli("coupling", "run")
     assert status == 0
     assert "what not knowing the others costs" in out
@@ -66,7 +92,11 @@ def test_steps_one_by_one_with_json(cli, inputs):
     assert 0.9 < json.loads(out)["coupling"]["parameters"][0]["contraction"] <= 1.0
     status, out, _ = cli("propagate", "run", "--json", "--draws", "60")
     assert status == 0
-    assert {row["axis"] for row in json.loads(out)["attitude"]["contributors"]} >= {"pitch", "yaw", "roll"}
+    assert {row["axis"] for row in json.loads(out)["attitude"]["contributors"]} >= {
+        "pitch",
+        "yaw",
+        "roll",
+    }
     status, out, _ = cli("report", "run", "--json")
     assert status == 0
     assert json.loads(out)["report"] == "run/report.html"
@@ -86,7 +116,9 @@ def test_new_sampling_removes_what_the_old_one_led_to(cli, inputs, tmp_path):
 
 
 def test_simulate_writes_a_table_that_calibrates(cli, inputs, tmp_path):
-    status, out, _ = cli("simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30, "--seed", 5)
+    status, out, _ = cli(
+        "simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30, "--seed", 5
+    )
     assert status == 0
     assert "30 frames" in out
     first = (tmp_path / "obs.parquet").read_bytes()
@@ -111,7 +143,17 @@ def test_demo_ends_with_the_table_of_truth_and_the_report(cli, tmp_path):
 
 @pytest.mark.parametrize(
     "command",
-    [(), ("demo",), ("simulate",), ("calibrate",), ("sample",), ("coupling",), ("propagate",), ("report",), ("run",)],
+    [
+        (),
+        ("demo",),
+        ("simulate",),
+        ("calibrate",),
+        ("sample",),
+        ("coupling",),
+        ("propagate",),
+        ("report",),
+        ("run",),
+    ],
 )
 def test_help_teaches(cli, command):
     status, out, _ = cli(*command, "--help")
@@ -120,15 +162,30 @@ def test_help_teaches(cli, command):
     assert len(out.splitlines()) > 8
 
 
-def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_command_that_writes_it(cli, inputs):
+def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_command_that_writes_it(
+    cli, inputs
+):
     out = cli("run", "--help")[1]
-    panels = ("Options", "How a camera is estimated", "What belongs to images alone", "How a posterior is sampled")
+    panels = (
+        "Options",
+        "How a camera is estimated",
+        "What belongs to images alone",
+        "How a posterior is sampled",
+    )
     places = [out.index(f" {words} ") for words in panels]
-    assert places == sorted(places) and places[1] < out.index("--noise") < places[2] < out.index("--gain") < places[3]
+    assert (
+        places == sorted(places)
+        and places[1] < out.index("--noise") < places[2] < out.index("--gain") < places[3]
+    )
     status, _, err = cli("calibrate", inputs / "obs.csv", "site/camera.toml", "-o", "run")
-    assert status == 2 and "site/camera.toml': does not exist; check the path, or starcal-uq new camera" in err
+    assert (
+        status == 2
+        and "site/camera.toml': does not exist; check the path, or starcal-uq new camera" in err
+    )
     assert "starcal-uq new" not in cli("calibrate", inputs / "obs.csv", "mine.toml", "-o", "run")[2]
-    said = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--only-frames", "a")[2]
+    said = cli(
+        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--only-frames", "a"
+    )[2]
     assert "is no list of frame numbers" in said
 
 
@@ -156,7 +213,9 @@ def _drop_column(folder):
 def _short_frame(folder):
     path = folder / "obs.csv"
     lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[:3] + [line for line in lines[3:] if not line.startswith("0,")]) + "\n")
+    path.write_text(
+        "\n".join(lines[:3] + [line for line in lines[3:] if not line.startswith("0,")]) + "\n"
+    )
 
 
 def _duplicate_star(folder):
@@ -196,8 +255,14 @@ MISTAKES = {
     "too few stars": (_short_frame, ["obs.csv", "frame 0"]),
     "duplicate star": (_duplicate_star, ["obs.csv", "line 3"]),
     "declination of 91": (_cells(4, "dec_deg", "91.0"), ["obs.csv", "line 4", "dec_deg", "91"]),
-    "unknown key": (_text("camera.toml", "[camera]", "[camera]\nfocal_length = 70.0"), ["camera.toml", "focal_length"]),
-    "missing key": (_text("camera.toml", "focal_mm =", "# focal_mm ="), ["camera.toml", "focal_mm"]),
+    "unknown key": (
+        _text("camera.toml", "[camera]", "[camera]\nfocal_length = 70.0"),
+        ["camera.toml", "focal_length"],
+    ),
+    "missing key": (
+        _text("camera.toml", "focal_mm =", "# focal_mm ="),
+        ["camera.toml", "focal_mm"],
+    ),
     "missing section": (_text("camera.toml", "[camera]", "[kamera]"), ["camera.toml", "camera"]),
     "broken TOML": (_text("camera.toml", "[camera]", "[camera"), ["camera.toml"]),
     "empty file": (lambda folder: (folder / "obs.csv").write_text(""), ["obs.csv", "empty"]),
@@ -231,7 +296,9 @@ def test_output_that_exists_is_kept(cli, inputs, tmp_path):
     assert status == 2
     assert "--force" in err
     assert files(tmp_path) == before
-    status, _, _ = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--force")
+    status, _, _ = cli(
+        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--force"
+    )
     assert status == 0
     assert (tmp_path / "run" / "mine.txt").read_text() == "keep me"
 
@@ -265,7 +332,9 @@ def test_wrong_calls_end_with_status_2(cli, arguments, words):
 )
 def test_wrong_options_are_named(cli, inputs, tmp_path, option, value, words):
     before = files(tmp_path)
-    status, _, err = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", option, value)
+    status, _, err = cli(
+        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", option, value
+    )
     assert status == 2
     assert words in err
     assert files(tmp_path) == before
@@ -300,7 +369,9 @@ def test_a_calibration_that_fails_leaves_no_folder(cli, inputs, tmp_path):
     import dataclasses
 
     # Right ascensions keep the rows distinct; the declinations belong to other stars.
-    wrong = dataclasses.replace(obs, dec_deg=-obs.dec_deg[shuffled], ra_deg=obs.ra_deg, star_id=None)
+    wrong = dataclasses.replace(
+        obs, dec_deg=-obs.dec_deg[shuffled], ra_deg=obs.ra_deg, star_id=None
+    )
     wrong.save(inputs / "wrong.csv")
     status, _, err = cli("calibrate", inputs / "wrong.csv", inputs / "camera.toml", "-o", "run")
     assert status == 2
@@ -327,10 +398,23 @@ def test_declared_directions_and_renamed_columns(cli, inputs):
 
 
 def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
-    made = ("simulate", inputs / "camera.toml", "-o", "frames", "--frames", "50", "--min-stars", "5", "--max-mag", "7")
+    made = (
+        "simulate",
+        inputs / "camera.toml",
+        "-o",
+        "frames",
+        "--frames",
+        "50",
+        "--min-stars",
+        "5",
+        "--max-mag",
+        "7",
+    )
     status, out, err = cli(*made, "--partition-frames", "20", "--workers", "0")
     assert (status, out.split(" stars ")[1]) == (0, "in 50 frames, 3 files: frames\n"), err
-    status, out, err = cli("calibrate", "frames", inputs / "camera.toml", "-o", "run", "--workers", "0")
+    status, out, err = cli(
+        "calibrate", "frames", inputs / "camera.toml", "-o", "run", "--workers", "0"
+    )
     assert status == 0 and "in 50 frames" in out, err
     assert cli("sample", "run", *SMALL)[0] in (0, 1)
     for words, arguments in (
@@ -339,7 +423,10 @@ def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
             "needs a folder of partitions",
             ("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "no", "--workers", "2"),
         ),
-        ("--screen needs one table", ("calibrate", "frames", inputs / "camera.toml", "-o", "no", "--screen")),
+        (
+            "--screen needs one table",
+            ("calibrate", "frames", inputs / "camera.toml", "-o", "no", "--screen"),
+        ),
         ("not empty; name another", (*made, "--partition-frames", "20", "--seed", "9")),
     ):
         status, _, err = cli(*arguments)
@@ -365,10 +452,16 @@ def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
 
 
 def test_the_starter_camera_looks_through_the_centre_of_its_detector(cli, tmp_path):
-    """The centre of the first pixel is (0, 0), so that of a detector lies half a pixel before half its width."""
+    """The centre of the first pixel is (0, 0), so that of a detector lies half a pixel before half
+    its width.
+    """
     assert cli("new", "camera")[0] == 0
     camera = sc.Camera.load(tmp_path / "camera.toml")
-    assert (camera.x0_px, camera.y0_px) == (0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)) == (511.5, 511.5)
+    assert (
+        (camera.x0_px, camera.y0_px)
+        == (0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1))
+        == (511.5, 511.5)
+    )
     # Control: the start that the paper prints stays what it is.
     assert sc.paper.paper_start().x0_px == 512.0
 
@@ -376,7 +469,12 @@ def test_the_starter_camera_looks_through_the_centre_of_its_detector(cli, tmp_pa
 def test_the_example_is_written_into_a_folder(cli, tmp_path):
     status, out, _ = cli("new", "example")
     assert status == 0 and "starcal-uq run esa/stars.ecsv esa/camera.toml -o RUN" in out
-    assert {path.name for path in (tmp_path / "esa").iterdir()} == {"NOTICE", "camera.toml", "site.toml", "stars.ecsv"}
+    assert {path.name for path in (tmp_path / "esa").iterdir()} == {
+        "NOTICE",
+        "camera.toml",
+        "site.toml",
+        "stars.ecsv",
+    }
     status, _, err = cli("new", "example")
     assert status == 2 and "exists already" in err
 
@@ -385,28 +483,55 @@ def test_python_runs_the_package_and_shells_complete_its_commands():
     command = [sys.executable, "-m", "starcal_uq"]
     told = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     assert told.stdout.startswith("starcal-uq ")
-    words = {"_STARCAL_UQ_COMPLETE": "complete_bash", "COMP_WORDS": "starcal-uq cal", "COMP_CWORD": "1"}
-    code = "import sys; sys.argv = ['starcal-uq']; from starcal_uq.cli.app import program; program()"
-    told = subprocess.run([sys.executable, "-c", code], env={**os.environ, **words}, capture_output=True, text=True)
+    words = {
+        "_STARCAL_UQ_COMPLETE": "complete_bash",
+        "COMP_WORDS": "starcal-uq cal",
+        "COMP_CWORD": "1",
+    }
+    code = (
+        "import sys; sys.argv = ['starcal-uq']; from starcal_uq.cli.app import program; program()"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, **words}, capture_output=True, text=True
+    )
     assert told.stdout.split() == ["calibrate"]
 
 
 @pytest.mark.slow
 def test_a_run_with_priors_goes_to_the_end(tmp_path, cli):
-    c = campaign(np.random.default_rng(0), n_frames=3, stars_per_frame=4, field_deg=2.0, sigma_px=0.2)
-    obs, camera = sc.Observations(**c.columns), sc.Camera(**c.camera_toml()).replace(distortion="none")
+    c = campaign(
+        np.random.default_rng(0), n_frames=3, stars_per_frame=4, field_deg=2.0, sigma_px=0.2
+    )
+    obs, camera = (
+        sc.Observations(**c.columns),
+        sc.Camera(**c.camera_toml()).replace(distortion="none"),
+    )
     obs.save(tmp_path / "obs.csv")
     camera.save(tmp_path / "camera.toml")
     (tmp_path / "priors.toml").write_text("[priors]\nprincipal_point_px = 10.0\n")
-    command = ["run", tmp_path / "obs.csv", tmp_path / "camera.toml", "-o", tmp_path / "run", "--in-space"]
+    command = [
+        "run",
+        tmp_path / "obs.csv",
+        tmp_path / "camera.toml",
+        "-o",
+        tmp_path / "run",
+        "--in-space",
+    ]
     sampling = ["--ensembles", "2", "--walkers", "14", "--steps", "40"]
     status, _, err = cli(*command, *sampling)
-    assert status == 2 and "do not determine" in err and not (tmp_path / "run" / "calibration.json").exists()
+    assert (
+        status == 2
+        and "do not determine" in err
+        and not (tmp_path / "run" / "calibration.json").exists()
+    )
     status, out, err = cli(*command, *sampling, "--priors", tmp_path / "priors.toml")
     assert status in (0, 1), err
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text("utf-8"))
     assert "estimation (warning, singular)" in " ".join(out.split())
-    assert any("there the posterior is that of the priors" in check["sentence"] for check in verdict["checks"])
+    assert any(
+        "there the posterior is that of the priors" in check["sentence"]
+        for check in verdict["checks"]
+    )
     # Two checks ask for more steps, one of them for ten times as many: one command.
     assert sum(" sample " in command for command in verdict["commands"]) == 1
     assert (tmp_path / "run" / "report.html").exists()

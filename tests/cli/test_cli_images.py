@@ -29,7 +29,12 @@ def frames(tmp_path_factory):
     folder = tmp_path_factory.mktemp("frames")
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     sc.simulation.render_frames(
-        stars, sc.paper.paper_camera(), folder, n_frames=N_IMAGES, seed=3, times_utc=["2026-11-25T00:00:00"] * N_IMAGES
+        stars,
+        sc.paper.paper_camera(),
+        folder,
+        n_frames=N_IMAGES,
+        seed=3,
+        times_utc=["2026-11-25T00:00:00"] * N_IMAGES,
     )
     return folder
 
@@ -37,19 +42,30 @@ def frames(tmp_path_factory):
 def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
     sc.paper.paper_camera().save(tmp_path / "truth.toml")
     sc.paper.paper_start().save(tmp_path / "camera.toml")
-    status, out, _ = cli("simulate", "truth.toml", "-o", "obs.parquet", "--frames", 4, "--images", "img", "--seed", 1)
+    status, out, _ = cli(
+        "simulate", "truth.toml", "-o", "obs.parquet", "--frames", 4, "--images", "img", "--seed", 1
+    )
     assert status == 0
     assert len(list((tmp_path / "img").glob("*.fits"))) == 4
     status, out, err = cli("centroid", "img", "-o", "centroids.parquet", "--camera", "camera.toml")
     assert status == 0, err
-    status, out, _ = cli("identify", "centroids.parquet", "camera.toml", "-o", "found.csv", "--max-mag", 6, "--json")
+    status, out, _ = cli(
+        "identify", "centroids.parquet", "camera.toml", "-o", "found.csv", "--max-mag", 6, "--json"
+    )
     assert status == 0
     document = json.loads(out)
     assert [frame["status"] for frame in document["frames"]] == ["identified"] * 4
-    found, truth = sc.load_observations(tmp_path / "found.csv"), sc.load_observations(tmp_path / "obs.parquet")
+    found, truth = (
+        sc.load_observations(tmp_path / "found.csv"),
+        sc.load_observations(tmp_path / "obs.parquet"),
+    )
     right = set(zip(truth.frame.tolist(), truth.star_id.tolist(), strict=True))
     # Stars within six sigma of the edge are in the images but not in the table.
-    wrong = [pair for pair in zip(found.frame.tolist(), found.star_id.tolist(), strict=True) if pair not in right]
+    wrong = [
+        pair
+        for pair in zip(found.frame.tolist(), found.star_id.tolist(), strict=True)
+        if pair not in right
+    ]
     assert len(wrong) <= 0.03 * found.n_stars
     # The stars tell the camera as well.
     status, out, err = cli("identify", "centroids.parquet", "-o", "alone.csv", "--max-mag", 6)
@@ -60,7 +76,10 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
     assert sc.Camera.load(tmp_path / "alone.toml").pixel_um is None
     alone = sc.load_observations(tmp_path / "alone.csv")
     pairs = set(zip(alone.frame.tolist(), alone.star_id.tolist(), strict=True))
-    assert len(pairs.intersection(zip(found.frame.tolist(), found.star_id.tolist(), strict=True))) > 0.9 * found.n_stars
+    assert (
+        len(pairs.intersection(zip(found.frame.tolist(), found.star_id.tolist(), strict=True)))
+        > 0.9 * found.n_stars
+    )
     status, _, err = cli("run", "found.csv", "-o", "run")
     assert status == 2
     assert "needs the nominal camera" in err
@@ -69,7 +88,9 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
 @pytest.mark.usefixtures("centroids_once")
 @pytest.mark.parametrize("timed", [True, False])
 def test_the_commands_one_by_one_give_what_run_gives(cli, frames, tmp_path, timed):
-    """To the last bit: centroid, identify and calibrate beside the steps of `run` up to its calibration."""
+    """To the last bit: centroid, identify and calibrate beside the steps of `run` up to its
+    calibration.
+    """
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     if not timed:
         for path in sorted(frames.glob("*.fits")):
@@ -114,14 +135,19 @@ def test_run_from_images_to_report(cli, frames, tmp_path):
 
 
 def _frames_are_shown(cli, run, images):
-    """In the report, with their pixels, and by `inspect`, which says so where the images have moved."""
+    """In the report, with their pixels, and by `inspect`, which says so where the images have
+    moved.
+    """
     report = run.report.read_text("utf-8")
     assert report.count("<figcaption>\n<h4>") == 12
     assert report.count("data:image/jpeg;base64,") == 12
     assert "12 frames of 16" in report
     held = sc.Run(run.path)
     table = held.frames.to_dataframe()
-    assert table["n_detected"].sum() == sc.images.Centroids.load(run.path / "centroids.parquet").n_stars
+    assert (
+        table["n_detected"].sum()
+        == sc.images.Centroids.load(run.path / "centroids.parquet").n_stars
+    )
     assert table["n_identified"].sum() == held.observations.n_stars
     assert table["n_matched"].sum() == sum(row.n_last for row in held.images.rows)
     # Whatever screening has left out is marked, with its reason.
@@ -132,7 +158,10 @@ def _frames_are_shown(cli, run, images):
     status, out, err = cli("inspect", "run", "--json")
     assert (status, err) == (0, "")
     found = json.loads(out)
-    assert (found["text"], found["page"]) == ("16 frames; 16 of them took part in the calibration.", "run/frames.html")
+    assert (found["text"], found["page"]) == (
+        "16 frames; 16 of them took part in the calibration.",
+        "run/frames.html",
+    )
     assert run.inspection.read_text("utf-8").count("data:image/jpeg") == N_IMAGES
     assert cli("inspect", "run")[0] == 2
     name = held.images.rows[3].image
@@ -152,7 +181,12 @@ def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
     assert status == 2
     assert "--observer-velocity belongs to tables" in err
     (tmp_path / "obs.csv").write_text("frame,x_px,y_px,ra_deg,dec_deg\n")
-    images_only = (("--max-mag", 3), ("--gain", 1), ("--engine", "pyramid"), ("--focal-tolerance", 0.1))
+    images_only = (
+        ("--max-mag", 3),
+        ("--gain", 1),
+        ("--engine", "pyramid"),
+        ("--focal-tolerance", 0.1),
+    )
     for option in images_only:
         status, _, err = cli("run", "obs.csv", "camera.toml", "-o", "run", *option)
         assert status == 2
@@ -161,11 +195,15 @@ def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
 
 
 def test_identify_refuses_the_calibration_of_another_sensor(cli, frames, tmp_path):
-    obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera(), n_frames=20, seed=1)
+    obs = sc.simulate(
+        sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera(), n_frames=20, seed=1
+    )
     sc.Run(tmp_path / "run").calibrate(obs, sc.paper.paper_start(), force=True)
     sc.paper.paper_start().replace(focal_mm=50.0).save(tmp_path / "other.toml")
     assert cli("centroid", frames, "-o", "c.parquet")[0] == 0
-    status, _, err = cli("identify", "c.parquet", "other.toml", "-o", "o.csv", "--calibration", "run")
+    status, _, err = cli(
+        "identify", "c.parquet", "other.toml", "-o", "o.csv", "--calibration", "run"
+    )
     assert status == 2
     assert "one sensor" in err
 
@@ -179,7 +217,10 @@ def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatc
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--max-mag", 6, "--in-space")
     assert status == 2
-    assert f"stars in {N_IMAGES} frames were identified, but they do not determine the camera (it went nowhere.)" in err
+    assert (
+        f"stars in {N_IMAGES} frames were identified, but they do not determine the camera (it "
+        "went nowhere.)"
+    ) in err
     # What was found in the images was said before.
     assert f"stars in {N_IMAGES} frames.\n" in err
     assert "identified, not calibrated" in (tmp_path / "run" / "frames.html").read_text("utf-8")
@@ -247,7 +288,9 @@ def test_real_frames_from_images_to_observations(cli, tmp_path):
         here = (found.frame == frame) & (np.hypot(found.x_px - x, found.y_px - y) < 1.0)
         if here.any():
             n += 1
-            off = np.hypot((found.ra_deg[here][0] - ra) * np.cos(np.radians(dec)), found.dec_deg[here][0] - dec)
+            off = np.hypot(
+                (found.ra_deg[here][0] - ra) * np.cos(np.radians(dec)), found.dec_deg[here][0] - dec
+            )
             # Aberration, 20.5 arcsec at most, is in the one and not in the other.
             assert off * 3600.0 < 25.0, "a wrong identification"
     assert n > 400
@@ -262,9 +305,13 @@ def test_stars_beside_a_neighbour_are_left_out():
     assert 0 < mask.sum() < 0.05 * obs.n_stars
     kept = without_disturbed(obs, stars, truth)
     assert kept.meta["disturbed_stars"] >= mask.sum()
-    # For the others, the nearest neighbour moves the light by less than a fifth of 0.05 px, or is out of reach.
+    # For the others, the nearest neighbour moves the light by less than a fifth of 0.05 px, or is
+    # out of reach.
     distance, index = cKDTree(stars.directions_icrs).query(kept.directions_icrs, k=2)
-    near, flux = distance[:, 1] * truth.focal_px, 10.0 ** (-0.4 * (stars.mag[index[:, 1]] - kept.mag))
+    near, flux = (
+        distance[:, 1] * truth.focal_px,
+        10.0 ** (-0.4 * (stars.mag[index[:, 1]] - kept.mag)),
+    )
     assert np.all((near * flux / (1.0 + flux) <= 0.2 * 0.05 + 1e-9) | (near > 3.99))
     # Wider star images reach farther.
     assert disturbed_stars(obs, stars, truth, psf_sigma_px=3.0).sum() > mask.sum()
@@ -277,7 +324,10 @@ def test_rendered_frames_through_the_whole_chain(tmp_path):
     sc.simulation.render_frames(stars, truth, tmp_path, n_frames=150, seed=11)
     table = sc.images.extract_centroids(tmp_path)
     found = identify_and_calibrate(
-        table, sc.paper.paper_start(), stars, prepare=lambda obs: without_disturbed(obs, stars, truth)
+        table,
+        sc.paper.paper_start(),
+        stars,
+        prepare=lambda obs: without_disturbed(obs, stars, truth),
     )
     cal = found.calibration
     assert found.identification.n_identified == 150
@@ -295,7 +345,9 @@ def test_rendered_frames_through_the_whole_chain(tmp_path):
 @pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
 def test_real_frames_from_images_to_the_report(cli, tmp_path):
     camera = ESA.parent / "esa_tetra3_camera.toml"
-    sc.sky.Site(52.2, 4.42, pressure_hpa=1013.0, temperature_c=20.0, name="Noordwijk").save(tmp_path / "site.toml")
+    sc.sky.Site(52.2, 4.42, pressure_hpa=1013.0, temperature_c=20.0, name="Noordwijk").save(
+        tmp_path / "site.toml"
+    )
     status, _, err = cli("run", ESA, camera, "-o", "run", "--site", "site.toml", "--screen")
     # Warnings only: the pixel phase that correction leaves, and a little with magnitude.
     assert status == 0, err
@@ -306,23 +358,32 @@ def test_real_frames_from_images_to_the_report(cli, tmp_path):
     assert cal.sigma == pytest.approx(1.0, abs=0.1)
     f = cal.theta[2]
     scale = np.array([1.0, 1.0, 1.0, f**2, f**4])
-    independent = np.array([[517.3, 1.0], [389.9, 1.4], [5116.54, 0.28], [0.078, 0.017], [1.5, 1.1]])
+    independent = np.array(
+        [[517.3, 1.0], [389.9, 1.4], [5116.54, 0.28], [0.078, 0.017], [1.5, 1.1]]
+    )
     z = (cal.theta * scale - independent[:, 0]) / np.hypot(cal.sigmas * scale, independent[:, 1])
     assert np.all(np.abs(z) < 2.0), z
     report = run.report.read_text("utf-8")
     assert "Noordwijk" in report
     assert "8 of 8 images used" in report
-    # The control: without the site f is too short, and the report neither believes nor hides it.
-    # A frame without stars, of an odd name, is shown with its reason and the next command, which can be given.
+    # The control: without the site f is too short, and the report neither believes nor hides it. A
+    # frame without stars, of an odd name, is shown with its reason and the next command, which can
+    # be given.
     dark, name = tmp_path / "night", "dark & <cold>.png"
     dark.mkdir()
-    Image.fromarray(np.random.default_rng(1).normal(100.0, 5.0, (768, 1024)).astype(np.uint8)).save(dark / name)
+    Image.fromarray(np.random.default_rng(1).normal(100.0, 5.0, (768, 1024)).astype(np.uint8)).save(
+        dark / name
+    )
     status, _, err = cli("run", ESA, dark, camera, "-o", "bare", "--screen", "--steps", 200)
     assert status == 1
     assert "conditional on refraction" in err
     failed = sc.Run(tmp_path / "bare").frames[name]
     assert (failed.row.outcome, failed.solved) == ("too few stars", False)
-    shown = (tmp_path / "bare" / "report.html").read_text("utf-8").partition("<b>dark &amp; &lt;cold&gt;.png</b>")[2]
+    shown = (
+        (tmp_path / "bare" / "report.html")
+        .read_text("utf-8")
+        .partition("<b>dark &amp; &lt;cold&gt;.png</b>")[2]
+    )
     command = html.unescape(re.search("<b>Next:</b>.*?<code class=.next.>(.*?)</code>", shown)[1])
     status, _, err = cli(*shlex.split(command)[1:])
     assert status in (0, 1), (command, err)

@@ -33,7 +33,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with everything but the questions to the model, which take long."""
     run = sc.Run(tmp_path_factory.mktemp("mission") / "run")
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    obs = sc.simulate(stars, sc.paper.paper_camera(), n_frames=60, min_stars=8, sigma_px=0.05, seed=1)
+    obs = sc.simulate(
+        stars, sc.paper.paper_camera(), n_frames=60, min_stars=8, sigma_px=0.05, seed=1
+    )
     run.calibrate(obs, sc.paper.paper_start(), force=True)
     run.sample(force=True, n_steps=60, seed=1)
     run.propagate(n_draws=60, seed=1)
@@ -42,11 +44,15 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_plans(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plans over fewer attitudes and campaigns: what the options mean does not depend on how many there are."""
+    """Plans over fewer attitudes and campaigns: what the options mean does not depend on how many
+    there are.
+    """
     from starcal_uq.planning import check, design, open_distortion, plan
 
     monkeypatch.setattr(plan, "plan", partial(plan.plan, n_geometries=300, n_campaigns=40))
-    monkeypatch.setattr(design, "choose_frames", partial(design.choose_frames, candidates=300, n_geometries=100))
+    monkeypatch.setattr(
+        design, "choose_frames", partial(design.choose_frames, candidates=300, n_geometries=100)
+    )
     monkeypatch.setattr(check, "check_forecast", partial(check.check_forecast, n_geometries=300))
     for name in ("_SWEEP_GEOMETRIES", "_TRIED_ATTITUDES"):
         monkeypatch.setattr(plan, name, 200)
@@ -106,7 +112,9 @@ def test_violated_requirement_is_named_and_ends_with_status_1(cli, run, tmp_path
 
 def test_run_refuses_a_wrong_budget_file_before_any_work(cli, inputs, tmp_path):
     (tmp_path / "wrong.toml").write_text("[[contributor]]\nname = 3\n")
-    status, _, err = cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "new", "--budget", "wrong.toml")
+    status, _, err = cli(
+        "run", inputs / "obs.csv", inputs / "camera.toml", "-o", "new", "--budget", "wrong.toml"
+    )
     assert status == 2
     assert "wrong.toml" in err
     assert not (tmp_path / "new").exists()
@@ -121,8 +129,12 @@ def test_starter_file_lists_what_is_open_and_loads(cli, run, tmp_path):
     assert status == 0
 
 
-def test_a_budget_is_a_further_result_whose_requirements_are_checks_of_the_run(cli, run, tmp_path, small_budgets):
-    """The line that `--template` prints is followed to the letter, over a budget, a report and a verdict."""
+def test_a_budget_is_a_further_result_whose_requirements_are_checks_of_the_run(
+    cli, run, tmp_path, small_budgets
+):
+    """The line that `--template` prints is followed to the letter, over a budget, a report and a
+    verdict.
+    """
     cli("budget", "run")
     # Control: without a requirement that is violated, nothing failed.
     assert cli("report", "run")[0] == 0
@@ -134,17 +146,29 @@ def test_a_budget_is_a_further_result_whose_requirements_are_checks_of_the_run(c
     # The same file again replaces its own budget.
     status, _, err = cli(*following)
     assert status == 0
-    assert "report.html is older than the budget; run `starcal-uq report run` to make it again" in err
-    assert {path.name for path in run.iterdir()} == before and (run / "report.html").read_bytes() == report
-    # Another file adds a budget; the verdict knows its requirements at once, the report when it is made again.
+    assert (
+        "report.html is older than the budget; run `starcal-uq report run` to make it again" in err
+    )
+    assert {path.name for path in run.iterdir()} == before and (
+        run / "report.html"
+    ).read_bytes() == report
+    # Another file adds a budget; the verdict knows its requirements at once, the report when it is
+    # made again.
     (tmp_path / "mission.toml").write_text(REQUIREMENTS)
     assert cli("budget", "run", "--budget", "mission.toml")[0] == 1
     assert {path.name for path in run.iterdir()} == before | {"budget-1.csv"}
     stated = sc.budgeting.Budget.load(run / "budget-1.csv").provenance["settings"]["file"]
     assert stated == "start.toml"
     document = json.loads((run / "verdict.json").read_text())
-    levels = {check["name"]: check["level"] for check in document["checks"] if check["question"] == "required"}
-    assert levels == {"Requirement 'R-1 impossible'": "fail", "Requirement 'R-2 generous'": "warning"}
+    levels = {
+        check["name"]: check["level"]
+        for check in document["checks"]
+        if check["question"] == "required"
+    }
+    assert levels == {
+        "Requirement 'R-1 impossible'": "fail",
+        "Requirement 'R-2 generous'": "warning",
+    }
     assert document["level"] == "fail" and document["exit_status"] == 1
     assert (run / "report.html").read_bytes() == report
     # As `run` and `demo` end, and as `report` does.
@@ -156,8 +180,14 @@ def test_a_budget_is_a_further_result_whose_requirements_are_checks_of_the_run(c
     assert "Verdict (fail): Violated: requirement 'R-1 impossible'." in out
     assert "Reduce 'centroid noise (NEA)', or relax the limit" in " ".join(out.split())
     page = (run / "report.html").read_text("utf-8")
-    banner, first_page = page[page.index('<div class="verdict') :].split("</header>")[0], page.split('id="appendix"')[0]
-    assert banner.startswith('<div class="verdict fail"') and "requirement &#39;R-1 impossible&#39;" in banner
+    banner, first_page = (
+        page[page.index('<div class="verdict') :].split("</header>")[0],
+        page.split('id="appendix"')[0],
+    )
+    assert (
+        banner.startswith('<div class="verdict fail"')
+        and "requirement &#39;R-1 impossible&#39;" in banner
+    )
     assert "<b>Requirement &#39;R-1 impossible&#39;.</b>" in first_page
     assert "requirement &#39;R-1 impossible&#39; is violated" in first_page
     # What is violated is the mission's: the numbers of the camera stay what they are.
@@ -165,14 +195,28 @@ def test_a_budget_is_a_further_result_whose_requirements_are_checks_of_the_run(c
     assert answer.results["verdict"].headline.endswith("Open: requirement 'R-2 generous'.")
     # All of it belongs to the run, and goes with what it rests on.
     record = json.loads((run / "run.json").read_text())
-    assert record["files"]["budget-1.csv"]["step"] == "budget" and list(record["steps"])[-1] == "report"
+    assert (
+        record["files"]["budget-1.csv"]["step"] == "budget"
+        and list(record["steps"])[-1] == "report"
+    )
 
 
 def test_mission_sky_takes_the_place_of_the_observed_frames(cli, run):
     observed = sc.propagation.AttitudeError.load(run / "attitude.csv")
     cli("budget", "run")
     assert (run / "budget.csv").exists()
-    options = ("--attitudes", "random", "--max-mag", 6.5, "--frames", 200, "--draws", 60, "--json", "--force")
+    options = (
+        "--attitudes",
+        "random",
+        "--max-mag",
+        6.5,
+        "--frames",
+        200,
+        "--draws",
+        60,
+        "--json",
+        "--force",
+    )
     status, out, _ = cli("propagate", "run", *options)
     assert status == 0
     assert "random attitudes" in json.loads(out)["attitude"]["frames"]
@@ -187,7 +231,9 @@ def test_slew_has_a_spectrum(cli, run, tmp_path):
     angle = np.radians(0.3 * time)
     q = {"qx": np.sin(angle / 2), "qy": 0.0 * time, "qz": 0.0 * time, "qw": np.cos(angle / 2)}
     pd.DataFrame({"time_s": time, **q}).to_csv(tmp_path / "slew.csv", index=False)
-    status, out, err = cli("propagate", "run", "--attitudes", "slew.csv", "--rate", 1.0, "--draws", 60, "--force")
+    status, out, err = cli(
+        "propagate", "run", "--attitudes", "slew.csv", "--rate", 1.0, "--draws", 60, "--force"
+    )
     assert status == 0, err
     assert "correlat" in out or "frequenc" in out
     spectrum = sc.propagation.ErrorSpectrum.load(run / "error_spectrum.npz")
@@ -215,7 +261,11 @@ def test_compare_two_runs_and_two_halves(cli, run, tmp_path):
     document = json.loads(out)
     assert document["labels"] == ["cold", "hot"]
     assert document["p_map"] is None
-    for wrong in (("run",), ("run", "again", "--split", "odd-even"), ("run", "again", "--labels", "one")):
+    for wrong in (
+        ("run",),
+        ("run", "again", "--split", "odd-even"),
+        ("run", "again", "--labels", "one"),
+    ):
         status, _, err = cli("compare", *wrong)
         assert status == 2
         assert err.strip()
@@ -243,7 +293,9 @@ def test_plan_before_any_data(cli, run, tmp_path, small_plans):
         needs.append(json.loads(out)["plan"]["needs"][0]["frames"])
     assert needs[0] - needs[1] == pytest.approx(60, abs=30)
     # Centroid noise alone is more than this.
-    status, out, _ = cli("plan", "camera.toml", "--target-arcsec", 0.1, "--scope", "total", "--frames", 30)
+    status, out, _ = cli(
+        "plan", "camera.toml", "--target-arcsec", 0.1, "--scope", "total", "--frames", 30
+    )
     assert status == 1
 
 
@@ -278,7 +330,9 @@ def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path, small_pl
 
 
 def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path, small_plans):
-    sc.paper.paper_start().replace(width_px=512, height_px=512, x0_px=255.5, y0_px=255.5).save(tmp_path / "other.toml")
+    sc.paper.paper_start().replace(width_px=512, height_px=512, x0_px=255.5, y0_px=255.5).save(
+        tmp_path / "other.toml"
+    )
     status, _, err = cli("plan", "other.toml", "--after", "run")
     assert status == 2
     assert "give the file and the run of one sensor" in err
@@ -286,7 +340,9 @@ def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path, small
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     found = []
     for sigma in ((), ("--sigma", 0.5)):
-        status, out, _ = cli("plan", "camera.toml", "--after", "run", "--frames", 100, "--json", *sigma)
+        status, out, _ = cli(
+            "plan", "camera.toml", "--after", "run", "--frames", 100, "--json", *sigma
+        )
         assert status == 0
         found.append(json.loads(out)["plan"]["sigma_px"])
     assert found[0] == pytest.approx(0.05, rel=0.1)
@@ -324,7 +380,9 @@ def test_a_gap_in_a_profile_is_told(cli, run, tmp_path):
     status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--draws", 60, "--force")
     assert status == 2
     assert "the longest gap begins at 19 s" in err
-    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--rate", 0.1, "--draws", 60, "--force")
+    status, _, err = cli(
+        "propagate", "run", "--attitudes", "gap.csv", "--rate", 0.1, "--draws", 60, "--force"
+    )
     assert status == 0
     assert "no attitude between 19 and 5020 s" in err
 
@@ -332,13 +390,22 @@ def test_a_gap_in_a_profile_is_told(cli, run, tmp_path):
 def test_propagate_tells_what_it_found_odd(cli, run, tmp_path):
     cli("budget", "run")
     half = np.radians(np.arange(10.0)) / 2
-    pointings = {"time_s": np.arange(10.0), "qx": np.sin(half), "qy": 0.0, "qz": 0.0, "qw": 1.001 * np.cos(half)}
+    pointings = {
+        "time_s": np.arange(10.0),
+        "qx": np.sin(half),
+        "qy": 0.0,
+        "qz": 0.0,
+        "qw": 1.001 * np.cos(half),
+    }
     pd.DataFrame(pointings).to_csv(tmp_path / "ten.csv", index=False)
     status, _, err = cli("propagate", "run", "--attitudes", "ten.csv", "--draws", 60, "--force")
     assert status == 0
     assert "normalised" in err
     assert "too few for a spectrum" in err
-    assert "note: budget.csv: removed, because it rested on what is replaced; run `starcal-uq budget run`" in err
+    assert (
+        "note: budget.csv: removed, because it rested on what is replaced; run `starcal-uq "
+        "budget run`"
+    ) in err
     assert not (run / "error_spectrum.npz").exists()
     status, _, err = cli("propagate", "run", "--rate", 2)
     assert status == 2

@@ -39,7 +39,9 @@ def test_reproduce_field_writes_a_page_and_tables(cli, tmp_path):
 
 
 def test_filter_then_sample(cli, inputs, tmp_path):
-    status, out, _ = cli("simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30, "--seed", 5)
+    status, out, _ = cli(
+        "simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30, "--seed", 5
+    )
     assert status == 0
     status, out, _ = cli("filter", "obs.parquet", inputs / "camera.toml", "-o", "run")
     assert status == 0
@@ -47,7 +49,11 @@ def test_filter_then_sample(cli, inputs, tmp_path):
     assert len(pd.read_csv(tmp_path / "run" / "history.csv")) == 31
     status, out, _ = cli("sample", "run", "--steps", 40, "--json")
     assert status in (0, 1)
-    assert [row["parameter"] for row in json.loads(out)["posterior"]["parameters"]][:3] == ["x0", "y0", "f"]
+    assert [row["parameter"] for row in json.loads(out)["posterior"]["parameters"]][:3] == [
+        "x0",
+        "y0",
+        "f",
+    ]
     status, _, err = cli("propagate", "run")
     assert status == 2
     assert "holds no observations" in err

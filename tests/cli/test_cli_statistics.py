@@ -16,11 +16,28 @@ from tests.helpers.scenes import camera, observations
 def test_validate_writes_figure_table_and_verdict(cli, inputs, tmp_path, monkeypatch):
     camera().save(tmp_path / "truth.toml")
     status, out, _ = cli(
-        "validate", "truth.toml", "-o", "val", "--replicates", 20, "--frames", 12, "--workers", 1, "--json"
+        "validate",
+        "truth.toml",
+        "-o",
+        "val",
+        "--replicates",
+        20,
+        "--frames",
+        12,
+        "--workers",
+        1,
+        "--json",
     )
     assert status in (0, 1)
     found = json.loads(out)
-    assert {row["quantity"] for row in found["quantities"]} >= {"x0", "f", "k2", "sigma", "pitch", "roll"}
+    assert {row["quantity"] for row in found["quantities"]} >= {
+        "x0",
+        "f",
+        "k2",
+        "sigma",
+        "pitch",
+        "roll",
+    }
     assert found["ok"] is (status == 0)
     for name in ("validation.npz", "validation.csv", "validation.png"):
         assert (tmp_path / "val" / name).stat().st_size > 0
@@ -38,13 +55,27 @@ def test_validate_writes_figure_table_and_verdict(cli, inputs, tmp_path, monkeyp
 
 
 def test_diagnose_stores_its_tables_and_the_report_shows_them(cli, inputs, tmp_path):
-    cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--directions", "apparent")
+    cli(
+        "calibrate",
+        inputs / "obs.csv",
+        inputs / "camera.toml",
+        "-o",
+        "run",
+        "--directions",
+        "apparent",
+    )
     status, out, _ = cli("diagnose", "run", "--starts", 2, "--json")
     assert status == 0
     diagnosis = json.loads(out)["diagnosis"]
     assert all(diagnosis[part] for part in ("misfit", "jackknife", "models", "predictive"))
     assert diagnosis["starts"]["n"] == 2
-    for name in ("diagnosis.json", "misfit.csv", "jackknife.csv", "comparison.csv", "predictive.csv"):
+    for name in (
+        "diagnosis.json",
+        "misfit.csv",
+        "jackknife.csv",
+        "comparison.csv",
+        "predictive.csv",
+    ):
         assert (tmp_path / "run" / name).exists()
     cli("report", "run")
     assert "Misfit" in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
@@ -71,7 +102,9 @@ def test_merge_combines_two_halves(cli, inputs, tmp_path):
 
 def test_a_table_that_holds_its_frames_twice_is_refused(cli, inputs, tmp_path):
     table = pd.read_csv(inputs / "obs.csv")
-    again = table.assign(frame=table["frame"] + 5000, x_px=table["x_px"] + 0.001).drop(index=[3, 50])
+    again = table.assign(frame=table["frame"] + 5000, x_px=table["x_px"] + 0.001).drop(
+        index=[3, 50]
+    )
     pd.concat([table, again]).to_csv(inputs / "twice.csv", index=False)
     status, _, err = cli("calibrate", inputs / "twice.csv", inputs / "camera.toml", "-o", "run")
     assert status == 2
@@ -85,10 +118,15 @@ def test_a_table_that_holds_its_frames_twice_is_refused(cli, inputs, tmp_path):
 
 def test_screen_lists_what_it_left_out(cli, inputs, tmp_path):
     table = pd.read_csv(inputs / "obs.csv")
-    table.loc[5, ["ra_deg", "dec_deg"]] = [(table.loc[5, "ra_deg"] + 40.0) % 360.0, -table.loc[5, "dec_deg"]]
+    table.loc[5, ["ra_deg", "dec_deg"]] = [
+        (table.loc[5, "ra_deg"] + 40.0) % 360.0,
+        -table.loc[5, "dec_deg"],
+    ]
     table.loc[5, "star_id"] = "wrong"
     table.to_csv(inputs / "wrong.csv", index=False)
-    status, _, _ = cli("calibrate", inputs / "wrong.csv", inputs / "camera.toml", "-o", "run", "--screen")
+    status, _, _ = cli(
+        "calibrate", inputs / "wrong.csv", inputs / "camera.toml", "-o", "run", "--screen"
+    )
     assert status == 0
     rejected = pd.read_csv(tmp_path / "run" / "rejected.csv")
     assert "wrong" in set(rejected["star_id"])
@@ -108,11 +146,16 @@ def test_other_likelihoods_from_the_command_line(cli, inputs, tmp_path, likeliho
 def test_unknown_likelihood_is_named(cli, inputs):
     status, _, err = cli("sample", inputs, "--likelihood", "compressed")
     assert status == 2
-    assert "--likelihood 'compressed' is unknown: use one of marginal, pairs, pairs_naive, student_t." in err
+    assert (
+        "--likelihood 'compressed' is unknown: use one of marginal, pairs, pairs_naive, student_t."
+        in err
+    )
 
 
 def test_robust_refinement(cli, inputs, tmp_path):
-    status, _, _ = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--robust")
+    status, _, _ = cli(
+        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--robust"
+    )
     assert status == 0
     cal = sc.Calibration.load(tmp_path / "run" / "calibration.json")
     plain = sc.calibrate(observations(), sc.paper.paper_start())
@@ -120,7 +163,9 @@ def test_robust_refinement(cli, inputs, tmp_path):
     # Sampling takes the likelihood of the calibration unless another is named.
     status, _, _ = cli("sample", "run", "--json", *SMALL)
     assert status in (0, 1)
-    assert sc.Posterior.load(tmp_path / "run" / "posterior.nc").diagnostics.likelihood == "student_t"
+    assert (
+        sc.Posterior.load(tmp_path / "run" / "posterior.nc").diagnostics.likelihood == "student_t"
+    )
 
 
 def test_naive_pairs_warn_and_are_not_to_be_trusted(cli, inputs):

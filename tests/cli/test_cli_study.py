@@ -20,16 +20,28 @@ frames = [50, 200]
 """
 
 
-def test_a_study_from_its_file_to_its_page_and_on(painting_cli, tmp_path: Path, monkeypatch) -> None:
+def test_a_study_from_its_file_to_its_page_and_on(
+    painting_cli, tmp_path: Path, monkeypatch
+) -> None:
     # Figures have tests of their own.
     monkeypatch.setattr("starcal_uq.presentation.pages.studies.study_figures", lambda _study: {})
     (tmp_path / "my.toml").write_text(STUDY, "utf-8")
     status, printed, _ = painting_cli("study", "my.toml", "-o", "out", "--json", "--workers", 0)
     found = json.loads(printed)["study"]
     assert status == 0
-    assert (found["n_cells"], found["n_ok"], found["complete"], found["problems"]) == (2, 2, True, {})
+    assert (found["n_cells"], found["n_ok"], found["complete"], found["problems"]) == (
+        2,
+        2,
+        True,
+        {},
+    )
     assert found["answer"] and found["advice"]
-    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"cells", "study.nc", "study.parquet", "study.toml"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {
+        "cells",
+        "study.nc",
+        "study.parquet",
+        "study.toml",
+    }
     assert (tmp_path / "out" / "study.toml").read_text("utf-8") == STUDY
     assert Path(found["page"]).name == "report.html"
 

@@ -68,7 +68,9 @@ def test_an_interrupted_run_goes_on_bit_for_bit(table, tmp_path, monkeypatch):
     # With other settings it starts again, and nothing of the first goes in.
     shutil.copytree(tmp_path / "run", tmp_path / "other")
     other = filter_run(table, nominal(camera()), tmp_path / "other", method="samaan")
-    assert np.array_equal(other.theta, filter_run(table, nominal(camera()), tmp_path / "o", method="samaan").theta)
+    assert np.array_equal(
+        other.theta, filter_run(table, nominal(camera()), tmp_path / "o", method="samaan").theta
+    )
     resumed = filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
 
     assert np.array_equal(resumed.theta, whole.theta)
@@ -82,7 +84,9 @@ def test_a_state_is_saved_on_the_way(table, tmp_path, monkeypatch):
     saved = []
     save = sc.estimation.RecursiveCalibration.save
     monkeypatch.setattr(
-        sc.estimation.RecursiveCalibration, "save", lambda self, path: (saved.append(self.n_frames), save(self, path))
+        sc.estimation.RecursiveCalibration,
+        "save",
+        lambda self, path: (saved.append(self.n_frames), save(self, path)),
     )
 
     filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)

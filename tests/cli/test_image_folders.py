@@ -1,4 +1,6 @@
-"""Folders of pictures as they come: few stars, other cameras, damaged files, nothing that is a star."""
+"""Folders of pictures as they come: few stars, other cameras, damaged files, nothing that is a
+star.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ def sheet(path, focal_px, model="brown"):
 
 @pytest.fixture
 def noisy_frame(tmp_path):
-    """One frame whose bright stars show so much noise that the terms of its sheet's model are open."""
+    """One frame whose bright stars show so much noise that the terms of its sheet's model are
+    open.
+    """
     rng = np.random.default_rng(2)
     rng.integers(4)
     picture(tmp_path / "frame.tiff", attitude(rng), 6000.0, jitter_px=0.4, max_mag=9.0, seed=2)
@@ -35,7 +39,9 @@ def noisy_frame(tmp_path):
     return tmp_path / "frame.tiff"
 
 
-def test_a_model_that_is_asked_for_is_fitted_whatever_the_sheet_has(cli, noisy_frame, tmp_path, monkeypatch):
+def test_a_model_that_is_asked_for_is_fitted_whatever_the_sheet_has(
+    cli, noisy_frame, tmp_path, monkeypatch
+):
     # What follows the calibration is not asked about.
     monkeypatch.setattr("starcal_uq.cli.run._after_calibration", lambda *_, **__: None)
     monkeypatch.setattr("starcal_uq.cli.run._conclude", lambda run: Answer({"run": run.path}))
@@ -62,7 +68,9 @@ def page_of(folder):
 
 
 def test_a_failed_identification_leaves_a_folder_with_every_frame(cli, tmp_path):
-    """Detections that are no stars, a file that is no image, and too little light: each with its reason."""
+    """Detections that are no stars, a file that is no image, and too little light: each with its
+    reason.
+    """
     rng = np.random.default_rng(5)
     frames = tmp_path / "frames"
     frames.mkdir()
@@ -70,9 +78,13 @@ def test_a_failed_identification_leaves_a_folder_with_every_frame(cli, tmp_path)
         counts = rng.normal(500.0, 10.0, (SIZE, SIZE))
         x, y = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
         for place in rng.uniform(20.0, SIZE - 20.0, (6, 2)):
-            counts += 4000.0 * np.exp(-0.5 * np.sum((np.stack([x, y], axis=-1) - place) ** 2, axis=-1) / 1.2)
+            counts += 4000.0 * np.exp(
+                -0.5 * np.sum((np.stack([x, y], axis=-1) - place) ** 2, axis=-1) / 1.2
+            )
         Image.fromarray(counts.astype(np.uint16)).save(frames / f"noise{k}.tiff")
-    Image.fromarray(rng.normal(500.0, 10.0, (SIZE, SIZE)).astype(np.uint16)).save(frames / "dark.tiff")
+    Image.fromarray(rng.normal(500.0, 10.0, (SIZE, SIZE)).astype(np.uint16)).save(
+        frames / "dark.tiff"
+    )
     (frames / "text.png").write_text("no picture")
     sheet(tmp_path / "camera.toml", 3000.0)
     status, _, err = cli("run", "frames", "camera.toml", "-o", "run", "--max-mag", 5)
@@ -92,7 +104,10 @@ def test_a_failed_identification_leaves_a_folder_with_every_frame(cli, tmp_path)
     status, out, err = cli(*command)
     assert (status, "0 of 3 frames are identified" in out) == (1, True), err
     status, out, _ = cli("inspect", "run", "--force", "--json")
-    assert [frame["outcome"] for frame in json.loads(out)["frames"]][1:3] == ["not identified", "not identified"]
+    assert [frame["outcome"] for frame in json.loads(out)["frames"]][1:3] == [
+        "not identified",
+        "not identified",
+    ]
 
 
 @pytest.mark.slow
@@ -106,10 +121,14 @@ def test_stars_that_do_not_determine_the_camera_are_shown_as_well(cli, tmp_path)
     assert "they do not determine the camera" in err
     assert ">identified, not calibrated<" in page_of(tmp_path / "run")
     # A run of something else takes the place of what has failed.
-    Image.fromarray(rng.normal(500.0, 10.0, (SIZE, SIZE)).astype(np.uint16)).save(tmp_path / "dark.tiff")
+    Image.fromarray(rng.normal(500.0, 10.0, (SIZE, SIZE)).astype(np.uint16)).save(
+        tmp_path / "dark.tiff"
+    )
     status, _, err = cli("run", "dark.tiff", "camera.toml", "-o", "run")
     assert (status, "no frame is identified" in err) == (2, True)
-    assert sorted(path.name for path in (tmp_path / "run").iterdir() if not path.name.startswith(".")) == [
+    assert sorted(
+        path.name for path in (tmp_path / "run").iterdir() if not path.name.startswith(".")
+    ) == [
         "camera.toml",
         "centroids.parquet",
         "frames.html",
@@ -122,13 +141,28 @@ def test_stars_that_do_not_determine_the_camera_are_shown_as_well(cli, tmp_path)
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (("calibrate",), "OBS is missing (stars in pixels): give `starcal-uq calibrate OBS CAMERA -o RUN`."),
+        (
+            ("calibrate",),
+            "OBS is missing (stars in pixels): give `starcal-uq calibrate OBS CAMERA -o RUN`.",
+        ),
         (
             ("run", __file__),
-            "-o RUN is missing (folder for the results): give `starcal-uq run OBS|IMAGES... [CAMERA] -o",
+            (
+                "-o RUN is missing (folder for the results): give `starcal-uq run OBS|IMAGES... "
+                "[CAMERA] -o"
+            ),
         ),
-        (("calibrate", __file__, __file__), "-o RUN is missing (folder for the results): give `starcal-uq calibrate"),
-        (("sample",), "RUN is missing (run folder of `starcal-uq calibrate` or `run`): give `starcal-uq sample RUN`."),
+        (
+            ("calibrate", __file__, __file__),
+            "-o RUN is missing (folder for the results): give `starcal-uq calibrate",
+        ),
+        (
+            ("sample",),
+            (
+                "RUN is missing (run folder of `starcal-uq calibrate` or `run`): give `starcal-uq "
+                "sample RUN`."
+            ),
+        ),
         (("export", __file__), "--to TO is missing (the camera for opencv"),
     ],
 )
@@ -140,7 +174,9 @@ def test_a_call_that_lacks_an_argument_is_answered_with_a_sentence(cli, call, sa
 
 @pytest.fixture
 def mixed_folder(tmp_path):
-    """Five pictures of one camera among what else lies in a folder: two of a longer lens, and what is no picture."""
+    """Five pictures of one camera among what else lies in a folder: two of a longer lens, and what
+    is no picture.
+    """
 
     def made(longer):
         frames = tmp_path / "frames"
@@ -159,7 +195,9 @@ def mixed_folder(tmp_path):
     return made
 
 
-@pytest.mark.parametrize(("longer", "with_sheet"), [pytest.param(1.75, False, marks=pytest.mark.slow), (1.015, True)])
+@pytest.mark.parametrize(
+    ("longer", "with_sheet"), [pytest.param(1.75, False, marks=pytest.mark.slow), (1.015, True)]
+)
 def test_frames_of_another_camera_are_left_out(mixed_folder, tmp_path, longer, with_sheet):
     """One that is found by itself, and one that a sheet's tolerance takes for the same."""
     folder = mixed_folder(longer)
@@ -173,9 +211,17 @@ def test_frames_of_another_camera_are_left_out(mixed_folder, tmp_path, longer, w
         assert why[name].startswith(f"another camera took it: f = {2400.0 * longer:.4g}"[:-1])
     assert "truncated or damaged" in why["cut.tiff"]
     assert why["empty.fits"] == "the file is empty"
-    assert why["raw.nef"].startswith("raw files of cameras need rawpy") or "damaged" in why["raw.nef"]
+    assert (
+        why["raw.nef"].startswith("raw files of cameras need rawpy") or "damaged" in why["raw.nef"]
+    )
     assert why["small.tiff"].startswith("the image is 300 x 300 px")
-    assert [name for name, words in why.items() if not words] == ["0.tiff", "1.tiff", "3.tiff", "4.tiff", "6.tiff"]
+    assert [name for name, words in why.items() if not words] == [
+        "0.tiff",
+        "1.tiff",
+        "3.tiff",
+        "4.tiff",
+        "6.tiff",
+    ]
     # No noise of another lens is in that of the frames.
     assert obs.meta.get("noise_floor_px", 0.0) < 0.1
 
@@ -186,7 +232,10 @@ def test_the_command_for_the_other_camera_works(cli, mixed_folder, tmp_path):
     status, _, err = cli("run", "frames", "-o", "run", "--directions", "apparent", *FAST)
     assert status in (0, 1), err
     notes = [line for line in err.splitlines() if "of another camera" in line]
-    assert [re.search(r"\((.*)\) left out", line)[1] for line in notes] == ["300 x 300 px", "f = 4200 px"]
+    assert [re.search(r"\((.*)\) left out", line)[1] for line in notes] == [
+        "300 x 300 px",
+        "f = 4200 px",
+    ]
     command = shlex.split(notes[1].partition("to calibrate that one: ")[2])
     assert command[:2] == ["starcal-uq", "run"]
     assert command[-4:] == ["--directions", "apparent", "-o", "run-3"]
@@ -194,7 +243,9 @@ def test_the_command_for_the_other_camera_works(cli, mixed_folder, tmp_path):
     assert status in (0, 1), err
     assert sc.Run(tmp_path / "run-3").calibration.camera.focal_px == pytest.approx(4200.0, rel=1e-3)
     frames = sc.Run(tmp_path / "run").frames
-    assert next(frame.row.outcome for frame in frames if frame.row.frame == 2).startswith("another camera took it")
+    assert next(frame.row.outcome for frame in frames if frame.row.frame == 2).startswith(
+        "another camera took it"
+    )
     page = cli("inspect", "run", "--force")
     assert page[0] == 0
     assert "calibrate the frames of that camera by themselves" in page_of(tmp_path / "run")

@@ -1,4 +1,6 @@
-"""Ctrl-C, SIGTERM and SIGKILL of real commands: one sentence, one status, and the same command goes on."""
+"""Ctrl-C, SIGTERM and SIGKILL of real commands: one sentence, one status, and the same command goes
+on.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ from tests.conftest import ROOT
 from tests.helpers.scenes import observations
 
 PROGRAM = (sys.executable, "-c", "from starcal_uq.cli.app import program; program()")
-SENTENCE = "error: interrupted; what was complete is kept: give the same command again, and it goes on."
+SENTENCE = (
+    "error: interrupted; what was complete is kept: give the same command again, and it goes on."
+)
 
 
 def start(folder: Path, *words: object) -> subprocess.Popen[str]:
@@ -77,7 +81,8 @@ def test_a_signal_ends_a_command_with_its_status(
         reached.append("never")
 
     before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    # The name at the top first: it is looked up when it is first asked for, and would be kept as what stands in for it.
+    # The name at the top first: it is looked up when it is first asked for, and would be kept as
+    # what stands in for it.
     monkeypatch.setattr("starcal_uq.simulate", work)
     monkeypatch.setattr("starcal_uq.simulation.frames.simulate", work)
     monkeypatch.setattr(sys, "argv", ["starcal-uq", "demo", "-o", str(tmp_path / "demo")])
@@ -94,7 +99,8 @@ TINY = "--walkers 14 --steps 40 --ensembles 2"
 CLOCK = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ")
 # The column between p-value and quaternion.
 MILLISECONDS = re.compile(rb",[^,\n]*((?:,[^,\n]*){4})$", re.M)
-# Command -> what it is called with, and files that are compared with those of a call that was left alone.
+# Command -> what it is called with, and files that are compared with those of a call that was left
+# alone.
 TABLES = (
     "coupling.csv",
     "attitude.csv",
@@ -113,8 +119,14 @@ LONG = {
     "sample": ("sample out --walkers 32 --steps 1000", ()),
     "calibrate": ("calibrate parts camera.toml --workers 0 -o out", ()),
     "filter": ("filter obs.parquet camera.toml -o out", ("history.csv",)),
-    "reproduce": ("reproduce --replicates 8 --frames 20 --no-study --workers 1 -o out", ("rows.csv", "replicates.csv")),
-    "validate": ("validate camera.toml --replicates 20 --frames 8 --workers 1 -o out", ("validation.csv",)),
+    "reproduce": (
+        "reproduce --replicates 8 --frames 20 --no-study --workers 1 -o out",
+        ("rows.csv", "replicates.csv"),
+    ),
+    "validate": (
+        "validate camera.toml --replicates 20 --frames 8 --workers 1 -o out",
+        ("validation.csv",),
+    ),
 }
 
 
@@ -128,13 +140,17 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sc.simulation.simulate_partitions(
         stars, truth, folder / "parts", n_frames=40, partition_frames=10, seed=1, workers=0
     )
-    sc.simulation.render_frames(stars, truth, folder / "img", n_frames=8, seed=3, times_utc=["2026-11-25T00:00:00"] * 8)
+    sc.simulation.render_frames(
+        stars, truth, folder / "img", n_frames=8, seed=3, times_utc=["2026-11-25T00:00:00"] * 8
+    )
     sc.Run(folder / "calibrated").calibrate(observations(), sc.paper.paper_start())
     return folder
 
 
 def stopped(folder: Path, words: str, number: signal.Signals, n_names: int) -> tuple[int, str]:
-    """Signal all processes of a command once it has made so many names in its folder; status and last words."""
+    """Signal all processes of a command once it has made so many names in its folder; status and
+    last words.
+    """
     before = {path.name for path in (folder / "out").rglob("*")}
     process, seen = start(folder, *words.split()), set()
     while process.poll() is None and len(seen) < n_names:
@@ -165,7 +181,9 @@ def _group(number: int) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", LONG)
-def test_a_command_that_is_stopped_goes_on_to_the_same_result(command: str, given: Path, tmp_path: Path) -> None:
+def test_a_command_that_is_stopped_goes_on_to_the_same_result(
+    command: str, given: Path, tmp_path: Path
+) -> None:
     words, compared = LONG[command]
     for name in ("whole", "stopped"):
         shutil.copytree(given, tmp_path / name)
@@ -176,7 +194,8 @@ def test_a_command_that_is_stopped_goes_on_to_the_same_result(command: str, give
     assert process.communicate(timeout=120) and process.returncode in (0, 1)
     rng = np.random.default_rng(len(command))
     names = len(
-        {path.name for path in (whole / "out").rglob("*")} - {path.name for path in (folder / "out").rglob("*")}
+        {path.name for path in (whole / "out").rglob("*")}
+        - {path.name for path in (folder / "out").rglob("*")}
     )
     statuses = []
     for number in rng.permutation([signal.SIGKILL, signal.SIGTERM, signal.SIGINT]).tolist():
@@ -188,7 +207,11 @@ def test_a_command_that_is_stopped_goes_on_to_the_same_result(command: str, give
             break
         assert status == (-number if number == signal.SIGKILL else 128 + number)
         assert number == signal.SIGKILL or last == SENTENCE
-        temporary = [path.name for path in folder.rglob(".*") if TEMPORARY.match(path.name) and path.name not in left]
+        temporary = [
+            path.name
+            for path in folder.rglob(".*")
+            if TEMPORARY.match(path.name) and path.name not in left
+        ]
         assert number == signal.SIGKILL or not temporary
     assert statuses[0] not in (0, 1)
     if statuses[-1] not in (0, 1):
@@ -196,13 +219,19 @@ def test_a_command_that_is_stopped_goes_on_to_the_same_result(command: str, give
         _, err = process.communicate(timeout=120)
         assert process.returncode in (0, 1) or "is not empty" in err, err
     for name in compared:
-        # But for where the images lie, the time of day in a provenance, and the time that identification took.
-        contents = ((place / "out" / name).read_bytes().replace(bytes(place), b"") for place in (folder, whole))
+        # But for where the images lie, the time of day in a provenance, and the time that
+        # identification took.
+        contents = (
+            (place / "out" / name).read_bytes().replace(bytes(place), b"")
+            for place in (folder, whole)
+        )
         one, other = (CLOCK.sub(b"", content) for content in contents)
         if name == "identification.csv":
             one, other = (MILLISECONDS.sub(rb"\1", content) for content in (one, other))
         assert one == other, name
-    assert {path.name for path in (folder / "out").iterdir()} == {path.name for path in (whole / "out").iterdir()}
+    assert {path.name for path in (folder / "out").iterdir()} == {
+        path.name for path in (whole / "out").iterdir()
+    }
     if command in ("validate", "reproduce"):
         return
     found, wanted = sc.Run(folder / "out"), sc.Run(whole / "out")

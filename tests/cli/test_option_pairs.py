@@ -1,4 +1,6 @@
-"""Options of `run` given together, generated from its declaration: they work, or are refused in words."""
+"""Options of `run` given together, generated from its declaration: they work, or are refused in
+words.
+"""
 
 from __future__ import annotations
 
@@ -60,11 +62,27 @@ VALUES = {
     "--json": (None,),
 }
 # These say how large a run is and where it stands.
-ALWAYS = {"--out": "out", "--force": None, "--ensembles": "2", "--walkers": "16", "--steps": "20", "--draws": "50"}
+ALWAYS = {
+    "--out": "out",
+    "--force": None,
+    "--ensembles": "2",
+    "--walkers": "16",
+    "--steps": "20",
+    "--draws": "50",
+}
 # What a sentence for the command line has no words of: arguments, calls and attributes of Python.
 PYTHON = re.compile(r"[a-z_]+='|[a-z_]+=(True|None)|\bsc\.|obs\.|, not both\.$|\(throw|Traceback")
-# These change which stars are calibrated or where they are, or need a scheduler: wrong directions end no run well.
-OF_THE_DATA = {"--only-frames", "--max-mag", "--column", "--directions", "--site", "--observer-velocity", "--scheduler"}
+# These change which stars are calibrated or where they are, or need a scheduler: wrong directions
+# end no run well.
+OF_THE_DATA = {
+    "--only-frames",
+    "--max-mag",
+    "--column",
+    "--directions",
+    "--site",
+    "--observer-velocity",
+    "--scheduler",
+}
 # Whole runs of the slow test.
 ROWS = 8
 COMBINATIONS = [(name, value) for name, values in VALUES.items() for value in values]
@@ -72,17 +90,26 @@ COMBINATIONS = [(name, value) for name, values in VALUES.items() for value in va
 
 @pytest.fixture
 def tables(tmp_path):
-    """Six frames of twelve stars, without and with all that a table can state, declared, and in two files."""
+    """Six frames of twelve stars, without and with all that a table can state, declared, and in two
+    files.
+    """
     c = campaign(np.random.default_rng(5), n_frames=6, stars_per_frame=12, patch_stars=14)
     columns = dict(c.columns)
     sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)).save(tmp_path / "camera.toml")
-    plain = sc.Observations(**{name: columns[name] for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg")})
+    plain = sc.Observations(
+        **{name: columns[name] for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg")}
+    )
     plain.save(tmp_path / "plain.csv")
     frame = columns["frame"]
-    stated = {"sigma_px": np.full(len(frame), 0.05), "temperature_c": np.linspace(5.0, 25.0, 6)[frame]}
+    stated = {
+        "sigma_px": np.full(len(frame), 0.05),
+        "temperature_c": np.linspace(5.0, 25.0, 6)[frame],
+    }
     times = np.array([f"2026-11-25T02:{minute:02d}:00" for minute in frame])
     sc.Observations(**columns, **stated, time_utc=times).save(tmp_path / "rich.csv")
-    sc.Observations(**columns, meta={"directions": "apparent", "observer": "space"}).save(tmp_path / "space.ecsv")
+    sc.Observations(**columns, meta={"directions": "apparent", "observer": "space"}).save(
+        tmp_path / "space.ecsv"
+    )
     (tmp_path / "parts").mkdir()
     for name, some in (("a", frame < 3), ("b", frame >= 3)):
         plain.select(some).save(tmp_path / "parts" / f"{name}.parquet")
@@ -95,7 +122,9 @@ def tables(tmp_path):
 @pytest.fixture
 def unreported(monkeypatch):
     """Runs whose reports have no figures, which take most of the time and no option."""
-    monkeypatch.setattr(drawing, "draw_figures", lambda _results, names, _progress: dict.fromkeys(names, b"<svg/>"))
+    monkeypatch.setattr(
+        drawing, "draw_figures", lambda _results, names, _progress: dict.fromkeys(names, b"<svg/>")
+    )
 
 
 def command(kind, given):
@@ -111,7 +140,10 @@ def check_ending(words, status, err):
     assert status in (0, 1, 2), (call, status, err)
     if status == 2:
         said = [line for line in err.splitlines() if line.startswith("error: ")]
-        assert len(said) == 1 and err.splitlines()[-1] == said[0] and said[0].endswith("."), (call, err)
+        assert len(said) == 1 and err.splitlines()[-1] == said[0] and said[0].endswith("."), (
+            call,
+            err,
+        )
         # Both worlds are served where a column is named.
         assert not PYTHON.search(said[0].replace(" or columns={...}", "")), (call, said[0])
 
@@ -131,7 +163,8 @@ class ReachedError(BaseException):
 
 @pytest.fixture
 def asked(tables, cli, monkeypatch):
-    """Whether a run begins to calibrate with these options of this kind of table, or else ends with a sentence.
+    """Whether a run begins to calibrate with these options of this kind of table, or else ends with
+    a sentence.
 
     Without reading it, the options alone are judged.
     """
@@ -162,7 +195,10 @@ def different(combination):
 def test_some_pairs_of_options_work_or_are_refused_in_words(asked):
     pairs = [pair for pair in itertools.combinations(COMBINATIONS, 2) if different(pair)]
     rng = np.random.default_rng(1)
-    begun = [asked(rng.choice(KINDS), pairs[place]) for place in rng.choice(len(pairs), 120, replace=False)]
+    begun = [
+        asked(rng.choice(KINDS), pairs[place])
+        for place in rng.choice(len(pairs), 120, replace=False)
+    ]
     # Neither is everything refused, nor nothing.
     assert 20 < np.sum(begun) < 100
     # Controls: these are known.
@@ -194,7 +230,9 @@ def test_a_fault_of_the_program_has_a_status_of_its_own(tables, cli, monkeypatch
 
 @pytest.mark.slow
 def test_runs_with_many_options_together_end_well_too(asked, cli, unreported):
-    """Rows of as many options as can be given together, in random order: hundreds of pairs in a few runs."""
+    """Rows of as many options as can be given together, in random order: hundreds of pairs in a few
+    runs.
+    """
     choices = [choice for choice in COMBINATIONS if choice[0] not in OF_THE_DATA]
     begins = {kind: [choice for choice in choices if asked(kind, [choice])] for kind in KINDS}
     rows, together = [], set()

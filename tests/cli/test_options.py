@@ -1,6 +1,7 @@
 """Every option of every command with every odd value: one sentence that names it, before any work.
 
-Options and their kinds come from the command line's own declaration: a new one is covered by itself.
+Options and their kinds come from the command line's own declaration: a new one is covered by
+itself.
 """
 
 from __future__ import annotations
@@ -65,7 +66,9 @@ def commands():
 
 @pytest.fixture
 def parse(commands, monkeypatch, capsys, tmp_path):
-    """Whether a command accepts its arguments; the sentence with which it refuses them otherwise."""
+    """Whether a command accepts its arguments; the sentence with which it refuses them
+    otherwise.
+    """
     monkeypatch.chdir(tmp_path)
     group = typer.main.get_command(declared.app)
     for folder in ("folder", "RUN", "IMAGES"):
@@ -89,7 +92,12 @@ def parse(commands, monkeypatch, capsys, tmp_path):
         except SystemExit as stop:
             err = capsys.readouterr().err
             line = err.removesuffix("\n")
-            good = line.startswith("error: ") and line.isprintable() and line.endswith(".") and len(line) < 400
+            good = (
+                line.startswith("error: ")
+                and line.isprintable()
+                and line.endswith(".")
+                and len(line) < 400
+            )
             return err if stop.code == 2 and good else f"{stop.code}: {err}"
         raise AssertionError(f"{arguments}: the command neither began nor ended.")
 
@@ -139,7 +147,8 @@ def legitimate(parameter, kind, value):
         return parameter.min <= number <= parameter.max
     if kind is Path:
         return (value in ("missing", CONTROLS) and parameter.name in WRITTEN) or (
-            value == "folder" and parameter.metavar not in ("CAMERA", "SITE", "CENTROIDS", "TOML", "STUDY")
+            value == "folder"
+            and parameter.metavar not in ("CAMERA", "SITE", "CENTROIDS", "TOML", "STUDY")
         )
     return kind is str and parameter.name in {"scheduler", "frames"} and value == "nonsense"
 
@@ -161,7 +170,8 @@ def test_every_option_refuses_odd_values_in_one_sentence(commands, parse):
                 good = (
                     legitimate(parameter, kind, value)
                     if sentence is None
-                    else sentence.startswith("error: ") and any(name in sentence for name in named(parameter))
+                    else sentence.startswith("error: ")
+                    and any(name in sentence for name in named(parameter))
                 )
                 refused, accepted = refused + (sentence is not None), accepted + (sentence is None)
                 if not good:
@@ -175,7 +185,10 @@ def test_memory_that_is_not_there_is_a_sentence(parse, monkeypatch):
         raise MemoryError
 
     monkeypatch.setattr(declared, "app", begin)
-    assert parse("demo") == "error: there is not enough memory for this: ask for fewer draws, frames or samples.\n"
+    assert (
+        parse("demo")
+        == "error: there is not enough memory for this: ask for fewer draws, frames or samples.\n"
+    )
 
 
 def test_control_sentences_and_the_judge_of_accepted_values(commands, parse):
@@ -186,7 +199,8 @@ def test_control_sentences_and_the_judge_of_accepted_values(commands, parse):
         "error: --seed '-1': give a whole number from 0 to 18446744073709551615.\n"
     )
     assert parse("sample", "RUN", "--likelihood", "magic") == (
-        "error: --likelihood 'magic' is unknown: use one of marginal, pairs, pairs_naive, student_t.\n"
+        "error: --likelihood 'magic' is unknown: use one of marginal, pairs, pairs_naive, "
+        "student_t.\n"
     )
 
 
@@ -205,7 +219,9 @@ WORK = {
 
 
 @pytest.mark.slow
-def test_the_least_and_oddest_numbers_that_are_accepted_work_or_are_refused(commands, cli, tmp_path):
+def test_the_least_and_oddest_numbers_that_are_accepted_work_or_are_refused(
+    commands, cli, tmp_path
+):
     camera = sc.paper.paper_start()
     camera.save(tmp_path / "CAMERA.toml")
     obs = observations(n_frames=12, seed=3)
@@ -214,7 +230,9 @@ def test_the_least_and_oddest_numbers_that_are_accepted_work_or_are_refused(comm
     run.calibrate(obs, camera)
     run.sample(seed=0, n_ensembles=2, n_walkers=14, n_steps=20)
     run.propagate(n_draws=50, seed=0)
-    assert cli("simulate", "CAMERA.toml", "-o", "s.csv", "--frames", 3, "--images", "IMAGES")[0] == 0
+    assert (
+        cli("simulate", "CAMERA.toml", "-o", "s.csv", "--frames", 3, "--images", "IMAGES")[0] == 0
+    )
     assert cli("centroid", "IMAGES", "-o", "CENTROIDS.csv")[0] == 0
     tried = 0
     for name, arguments in WORK.items():
@@ -229,7 +247,9 @@ def test_the_least_and_oddest_numbers_that_are_accepted_work_or_are_refused(comm
                     del words[words.index(option) : words.index(option) + 2]
                 status, _, err = cli(name, *words, f"{option}={value}")
                 lines = [line for line in err.splitlines() if line.startswith("error: ")]
-                assert status in (0, 1) or (status == 2 and len(lines) == 1 and lines[0].endswith(".")), (option, err)
+                assert status in (0, 1) or (
+                    status == 2 and len(lines) == 1 and lines[0].endswith(".")
+                ), (option, err)
                 assert "nan" not in " ".join(lines), (option, value, err)
                 tried += 1
     assert tried > 40

@@ -1,4 +1,6 @@
-"""Every remedy that is printed as a command or a call is executed, and none is printed that is not listed here."""
+"""Every remedy that is printed as a command or a call is executed, and none is printed that is not
+listed here.
+"""
 
 from __future__ import annotations
 
@@ -46,12 +48,21 @@ def small(tmp_path_factory):
     NOMINAL.save(folder / "GROUND_CAMERA.toml")
     SITE.save(folder / "SITE.toml")
     altitudes = np.linspace(20.0, 80.0, 12)
-    ground = ground_frames(sc.load_catalogue(max_mag=6.5, epoch=2026.9), altitudes, times=12 * [TIME])
+    ground = ground_frames(
+        sc.load_catalogue(max_mag=6.5, epoch=2026.9), altitudes, times=12 * [TIME]
+    )
     # Of tables without times the remedies give the time as well.
     dataclasses.replace(ground, time_utc=None).save(folder / "GROUND_OBS.csv")
     c = campaign(np.random.default_rng(1), n_frames=12, patch_stars=20, star_sigma_px=0.05)
-    patch, sheet = sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
-    c = campaign(np.random.default_rng(2), n_frames=30, sigma_px=lambda radius, mag, frame: 0.03 * (1.0 + 3.0 * radius))
+    patch, sheet = (
+        sc.Observations(**c.columns),
+        sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)),
+    )
+    c = campaign(
+        np.random.default_rng(2),
+        n_frames=30,
+        sigma_px=lambda radius, mag, frame: 0.03 * (1.0 + 3.0 * radius),
+    )
     uneven = sc.Observations(**c.columns)
     bent = sc.Observations(**campaign(np.random.default_rng(3), n_frames=30).columns)
     patch.save(folder / "PATCH_OBS.csv")
@@ -86,64 +97,91 @@ PHASE = SimpleNamespace(
 )
 
 
-# What makes each function that makes a check find fault; what all of them give to try is executed, or parsed.
+# What makes each function that makes a check find fault; what all of them give to try is executed,
+# or parsed.
 EXAMPLES = {
     "inference.checks._rhat": lambda s: [checks._rhat(changed(s.post, rhat=np.full(6, 1.1)))],
     "inference.checks._effective_draws": lambda s: [
         checks._effective_draws(changed(s.post, ess_tail=np.full(6, 90.0)))
     ],
-    "inference.checks._acceptance": lambda s: [checks._acceptance(changed(s.post, acceptance=np.full(2, 0.01)))],
+    "inference.checks._acceptance": lambda s: [
+        checks._acceptance(changed(s.post, acceptance=np.full(2, 0.01)))
+    ],
     "inference.checks._derived": lambda s: [
-        checks._derived(post, derived_quantities(post)) for post in [dataclasses.replace(s.post, draws=s.drifting)]
+        checks._derived(post, derived_quantities(post))
+        for post in [dataclasses.replace(s.post, draws=s.drifting)]
     ],
     "inference.checks._digits": lambda s: [checks._digits(changed(s.post, mcse=0.1 * s.post.sd))],
     "inference.checks._degrees_of_freedom": lambda s: [
-        checks._degrees_of_freedom(dataclasses.replace(s.post, dof_draws=np.arange(float(len(s.post.draws)))))
+        checks._degrees_of_freedom(
+            dataclasses.replace(s.post, dof_draws=np.arange(float(len(s.post.draws))))
+        )
     ],
     "inference.checks._bounds": lambda s: [
-        checks._bounds(dataclasses.replace(s.post, draws=s.post.draws + shift)) for shift in (1e5 * E[0], 1e-5 * E[3])
+        checks._bounds(dataclasses.replace(s.post, draws=s.post.draws + shift))
+        for shift in (1e5 * E[0], 1e-5 * E[3])
     ],
     "inference.checks._priors": lambda s: [
         checks._priors(dataclasses.replace(s.post, priors=s.post.priors.replace(**priors)))
         for priors in ({"focal_fraction": 1e-6}, {"focal_px": 1.5 * s.post.priors.focal_px})
     ],
     "inference.checks._independent": lambda s: [
-        checks._independent(changed(s.post, **found)) for found in ({"agreement_sd": 2.0}, {"psis_khat": 2.0})
+        checks._independent(changed(s.post, **found))
+        for found in ({"agreement_sd": 2.0}, {"psis_khat": 2.0})
     ],
     "inference.checks._evaluation": lambda s: [
-        checks._evaluation(changed(s.post, compressed_max_difference=value)) for value in (9.0, float("nan"))
+        checks._evaluation(changed(s.post, compressed_max_difference=value))
+        for value in (9.0, float("nan"))
     ],
     "inference.checks._likelihood": lambda s: [checks._likelihood(short_of("pairs_naive", s), ())],
     "inference.named.find_source": lambda s: list(
         sc.sample(
-            s.obs, sc.calibrate(s.obs, s.camera, method="least_squares"), seed=0, likelihood="pairs", **SHORT
+            s.obs,
+            sc.calibrate(s.obs, s.camera, method="least_squares"),
+            seed=0,
+            likelihood="pairs",
+            **SHORT,
         ).diagnostics.checks[:1]
     ),
     "diagnostics.verdict.draws.same_data": lambda s: [
-        draws.same_data(dataclasses.replace(s.post, provenance={"data_sha256": "0"}), s.obs.data_hash)
+        draws.same_data(
+            dataclasses.replace(s.post, provenance={"data_sha256": "0"}), s.obs.data_hash
+        )
     ],
     "diagnostics.verdict.draws.propagation": lambda s: [
         draws.propagation(
             SimpleNamespace(
                 n_draws=50,
                 **dict.fromkeys(("common_arcsec", "rest_arcsec"), np.ones(3)),
-                **dict.fromkeys(("analytic_common_arcsec", "analytic_rest_arcsec"), np.full(3, 9.0)),
+                **dict.fromkeys(
+                    ("analytic_common_arcsec", "analytic_rest_arcsec"), np.full(3, 9.0)
+                ),
             )
         )
     ],
     "diagnostics.verdict.estimate.estimation": lambda s: [
-        estimate.estimation(dataclasses.replace(s.cal, status=status)) for status in Status if not status.ok
+        estimate.estimation(dataclasses.replace(s.cal, status=status))
+        for status in Status
+        if not status.ok
     ],
     "diagnostics.verdict.estimate.determined": lambda s: [
         estimate.determined(
             dataclasses.replace(
                 s.cal,
-                provenance={"fallback": {"model": "brown3", "used": "brown", "because": "the stars are too few"}},
+                provenance={
+                    "fallback": {
+                        "model": "brown3",
+                        "used": "brown",
+                        "because": "the stars are too few",
+                    }
+                },
             )
         )
     ],
     "diagnostics.verdict.estimate.estimators_agree": lambda s: [
-        estimate.estimators_agree(dataclasses.replace(s.cal, pair_theta=s.cal.theta + 99.0 * s.cal.sigmas))
+        estimate.estimators_agree(
+            dataclasses.replace(s.cal, pair_theta=s.cal.theta + 99.0 * s.cal.sigmas)
+        )
     ],
     "diagnostics.verdict.estimate.against_truth": lambda s: [
         estimate.against_truth(s.cal, s.camera.replace(x0_px=900.0), s.post)
@@ -166,14 +204,18 @@ EXAMPLES = {
     ],
     "diagnostics.verdict.estimate.predictive": lambda s: [
         estimate.predictive(
-            SimpleNamespace(statistics=[SimpleNamespace(name="tails", p_value=0.0, extreme=True)], n_draws=500)
+            SimpleNamespace(
+                statistics=[SimpleNamespace(name="tails", p_value=0.0, extreme=True)], n_draws=500
+            )
         )
     ],
     "diagnostics.verdict.estimate.one_camera": lambda s: [
         estimate.one_camera(MixedCameras(2, "the frames are of 2 cameras", "0-5,8"))
     ],
     "diagnostics.verdict.estimate.comparison": lambda s: [
-        estimate.comparison(sc.diagnostics.compare_models(s.bent, sc.calibrate(s.bent, s.sheet, model="none")))
+        estimate.comparison(
+            sc.diagnostics.compare_models(s.bent, sc.calibrate(s.bent, s.sheet, model="none"))
+        )
     ],
     "diagnostics.verdict.estimate.even_noise": lambda s: [
         estimate.even_noise(found)
@@ -182,7 +224,11 @@ EXAMPLES = {
     ],
     "diagnostics.verdict.estimate.jackknife": lambda s: [
         estimate.jackknife(found, inflated, s.post)
-        for found in [dataclasses.replace(s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance)]
+        for found in [
+            dataclasses.replace(
+                s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance
+            )
+        ]
         for inflated in (False, True)
     ],
     "diagnostics.verdict.estimate.stars": lambda s: [
@@ -191,7 +237,10 @@ EXAMPLES = {
     "diagnostics.verdict.observed.directions": lambda s: (
         [
             observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)
-            for meta in ({"directions": "undeclared"}, {"directions": "apparent", "observer": "unknown"})
+            for meta in (
+                {"directions": "undeclared"},
+                {"directions": "apparent", "observer": "unknown"},
+            )
         ]
         + [
             observed.directions(s.obs, s.cal, None, TimeTest(cause, *(4 * [1.0]), "f", 2.0))
@@ -203,7 +252,8 @@ EXAMPLES = {
     ],
     "diagnostics.verdict.observed.noise": lambda s: [
         observed.noise(
-            dataclasses.replace(s.obs, sigma_px=np.full(s.obs.n_stars, stated)), dataclasses.replace(s.cal, **noise)
+            dataclasses.replace(s.obs, sigma_px=np.full(s.obs.n_stars, stated)),
+            dataclasses.replace(s.cal, **noise),
         )
         for stated, noise in (
             (0.05, {"sigma": 9.0}),
@@ -225,16 +275,23 @@ EXAMPLES = {
         )
     ],
     "diagnostics.verdict.observed.coverage": lambda s: [
-        observed.coverage(obs, dataclasses.replace(s.cal, residuals_px=s.cal.residuals_px[: obs.n_stars]))
+        observed.coverage(
+            obs, dataclasses.replace(s.cal, residuals_px=s.cal.residuals_px[: obs.n_stars])
+        )
         for obs in (s.obs.select_frames(s.obs.frame_ids[:3]), s.obs.select(s.obs.x_px < 500.0))
     ],
     "diagnostics.verdict.observed.screening": lambda s: [
-        observed.screening(s.obs.with_meta(screening={"rejected": 0, "of": 9, "blame": "the model is wrong."}))
+        observed.screening(
+            s.obs.with_meta(screening={"rejected": 0, "of": 9, "blame": "the model is wrong."})
+        )
     ],
     "diagnostics.verdict.observed.terms": lambda s: [
         observed.terms(
             dataclasses.replace(
-                s.cal, partitions=SimpleNamespace(richer=[SimpleNamespace(model="brown3", n_terms=1, gain=99.0)])
+                s.cal,
+                partitions=SimpleNamespace(
+                    richer=[SimpleNamespace(model="brown3", n_terms=1, gain=99.0)]
+                ),
             )
         )
     ],
@@ -288,7 +345,9 @@ ARGUMENTS = {
     "method='efficient'": "sc.calibrate(obs, camera, {})",
     "method='griffith'": "sc.calibrate(obs, camera, {})",
     "method='three_stage'": "sc.calibrate(obs, camera, {})",
-    "parameters='all'": "sc.calibrate(obs, camera, method='griffith', recursion=sc.estimation.RecursionOptions({}))",
+    "parameters='all'": (
+        "sc.calibrate(obs, camera, method='griffith', recursion=sc.estimation.RecursionOptions({}))"
+    ),
     "solver='ipopt'": "sc.calibrate(obs, camera, {})",
     "solver='minpack'": "sc.calibrate(obs, camera, {})",
 }
@@ -296,7 +355,10 @@ ARGUMENTS = {
 
 def trees():
     for path in sorted(PACKAGE.rglob("*.py")):
-        yield ".".join(path.relative_to(PACKAGE).with_suffix("").parts), ast.parse(path.read_text(encoding="utf-8"))
+        yield (
+            ".".join(path.relative_to(PACKAGE).with_suffix("").parts),
+            ast.parse(path.read_text(encoding="utf-8")),
+        )
 
 
 def sentences(tree):
@@ -308,11 +370,22 @@ def sentences(tree):
         and isinstance(node.body[0], ast.Expr)
         and isinstance(node.body[0].value, ast.Constant)
     }
-    parts = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    parts = {
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.JoinedStr)
+        for part in node.values
+    }
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
-            yield "".join(str(p.value) if isinstance(p, ast.Constant) else "{}" for p in node.values)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not {id(node)} & (docstrings | parts):
+            yield "".join(
+                str(p.value) if isinstance(p, ast.Constant) else "{}" for p in node.values
+            )
+        elif (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and not {id(node)} & (docstrings | parts)
+        ):
             yield node.value
 
 
@@ -326,7 +399,10 @@ def test_every_check_has_an_example():
                 if name == "Check" or (module == "inference.checks" and name in shared):
                     giving.add(f"{module}.{function.name}")
     # Requirements of a budget have advice alone: tests/cli/test_cli_mission.py.
-    shared = {*(f"inference.checks.{name}" for name in shared), "presentation.words.budgeting._requirement_check"}
+    shared = {
+        *(f"inference.checks.{name}" for name in shared),
+        "presentation.words.budgeting._requirement_check",
+    }
     assert giving - shared == set(EXAMPLES)
 
 
@@ -341,7 +417,8 @@ def remedies(small):
         doubts = [check for check in make(small) if check.level is not Level.PASS]
         assert doubts, f"{name} found no fault"
         for check in doubts:
-            # Something to try: a command, a call, or an order of what to do with instrument or data.
+            # Something to try: a command, a call, or an order of what to do with instrument or
+            # data.
             assert check.remedies or check.advice, f"{name} gives nothing to try: {check}"
             assert not check.advice or re.fullmatch(r"[A-Z].*\.", check.advice), check.advice
             typed = any(remedy.startswith("starcal-uq ") for remedy in check.remedies)
@@ -352,16 +429,26 @@ def remedies(small):
 
 @pytest.fixture
 def execute(small, cli, tmp_path):
-    """Run a command as a user would, on a copy of the files; its words in capitals stand for them."""
+    """Run a command as a user would, on a copy of the files; its words in capitals stand for
+    them.
+    """
 
     def run(command, more="", parse=False):
         folder = tmp_path / f"files{len(list(tmp_path.iterdir()))}"
         shutil.copytree(small.folder, folder)
         words = [*shlex.split(command), *shlex.split(more)]
         ground = "GROUND_" if "SITE" in words else "PATCH_" if "--star-errors" in words else ""
-        files = {"OBS": f"{ground}OBS.csv", "CAMERA": f"{ground}CAMERA.toml", "SITE": "SITE.toml", "FILE": "new.toml"}
+        files = {
+            "OBS": f"{ground}OBS.csv",
+            "CAMERA": f"{ground}CAMERA.toml",
+            "SITE": "SITE.toml",
+            "FILE": "new.toml",
+        }
         files |= {name: name for name in ("RUN", "RUN_A", "RUN_B", "DIR")}
-        words = [str(folder / files[word]) if word in files else TIME if word == "UTC" else word for word in words]
+        words = [
+            str(folder / files[word]) if word in files else TIME if word == "UTC" else word
+            for word in words
+        ]
         if parse:
             typer.main.get_command(app).commands[words[0]].make_context(words[0], words[1:])
             return
@@ -379,7 +466,9 @@ def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
         program, _, command = remedy.partition(" ")
         if program == "starcal-uq":
             words = command.split()
-            more = {"sample": "--ensembles 2 --walkers 14 --steps 20", "plan": "--frames 10"}.get(words[0], "")
+            more = {"sample": "--ensembles 2 --walkers 14 --steps 20", "plan": "--frames 10"}.get(
+                words[0], ""
+            )
             # It takes long; a test of its own executes it.
             execute(command, more, parse=words[0] == "validate")
         else:
@@ -389,7 +478,12 @@ def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
 
 
 def named(pattern):
-    return {match for _, tree in trees() for text in sentences(tree) for match in re.findall(pattern, text)}
+    return {
+        match
+        for _, tree in trees()
+        for text in sentences(tree)
+        for match in re.findall(pattern, text)
+    }
 
 
 def test_every_command_in_a_sentence_can_be_executed(execute, root):
@@ -404,7 +498,9 @@ def test_every_command_in_a_sentence_can_be_executed(execute, root):
 
 
 def test_every_argument_in_a_sentence_can_be_given(small):
-    clauses = named(r"\b(?:evaluation|likelihood|method|solver|parameters|moves|recursion)='[a-z_]+'")
+    clauses = named(
+        r"\b(?:evaluation|likelihood|method|solver|parameters|moves|recursion)='[a-z_]+'"
+    )
     assert clauses == set(ARGUMENTS)
     names = {"sc": sc, "obs": small.obs, "camera": small.camera, "cal": small.cal}
     for clause, call in ARGUMENTS.items():
@@ -415,13 +511,20 @@ def test_start_limit_and_inflation_are_those_of_the_calibration(small, cli, tmp_
     call = ("calibrate", small.folder / "OBS.csv", small.folder / "CAMERA.toml", "-o")
     assert cli(*call, "run", "--start", "focal_mm=71,x0_px=500", "--accept-inflation")[0] == 0
     cal = sc.Run(tmp_path / "run").calibration
-    assert (cal.nominal.focal_mm, cal.nominal.x0_px, cal.nominal.y0_px) == (71.0, 500.0, small.camera.y0_px)
+    assert (cal.nominal.focal_mm, cal.nominal.x0_px, cal.nominal.y0_px) == (
+        71.0,
+        500.0,
+        small.camera.y0_px,
+    )
     assert cal.theta == pytest.approx(small.cal.theta, rel=1e-4)
     factors = cal.provenance["settings"]["inflation"]
     assert max(factors.values()) > 1.0
     assert cal.sigmas == pytest.approx(small.cal.sigmas * list(factors.values()), rel=1e-3)
     for wrong, words in (
-        (("--max-iterations", 1), "start closer to the optimum (--start) or raise max_iterations (--max-iterations)"),
+        (
+            ("--max-iterations", 1),
+            "start closer to the optimum (--start) or raise max_iterations (--max-iterations)",
+        ),
         (("--start", "f=70"), "'f=70' is no start, such as focal_mm=50.2"),
         (("--start", "focal_mm=-1"), "focal"),
     ):
@@ -441,7 +544,9 @@ def test_control_a_remedy_that_names_no_option_is_refused(small, execute):
 
 def test_an_error_of_wrong_stars_ends_with_the_command_that_was_given(small, cli, tmp_path):
     wrong = np.random.default_rng(1).random(small.obs.n_stars) < 0.05
-    dataclasses.replace(small.obs, dec_deg=small.obs.dec_deg + 0.8 * wrong).save(tmp_path / "wrong ones.csv")
+    dataclasses.replace(small.obs, dec_deg=small.obs.dec_deg + 0.8 * wrong).save(
+        tmp_path / "wrong ones.csv"
+    )
     call = ("run", "wrong ones.csv", small.folder / "CAMERA.toml", "-o", "new")
     status, _, err = cli(*call)
     command = re.search(r"`starcal-uq (.*)`", err.splitlines()[-1])[1]

@@ -24,7 +24,9 @@ SLOW = (
 @pytest.fixture
 def call(cli, monkeypatch):
     """The command line without figures."""
-    monkeypatch.setattr(drawing, "draw_figures", lambda _results, names, _progress: dict.fromkeys(names, b"<svg/>"))
+    monkeypatch.setattr(
+        drawing, "draw_figures", lambda _results, names, _progress: dict.fromkeys(names, b"<svg/>")
+    )
     return lambda words: cli(*words)
 
 
@@ -39,7 +41,8 @@ def test_what_is_printed_is_followed_to_its_end(name, call, tmp_path):
         assert [step.options.get("--model") for step in steps] == [None, ("brown_tangential",)]
         assert steps[0].doubts[0] > 0 and steps[-1].doubts[0] == 0
     else:
-        # Where the times are not known no command can be copied, and no other is printed before they are.
+        # Where the times are not known no command can be copied, and no other is printed before
+        # they are.
         assert len(steps) == 1 and "times in UTC and the site" in steps[0].said
 
 
@@ -66,13 +69,17 @@ def test_what_is_printed_for_real_data_is_followed_to_its_end(what, call, tmp_pa
 
 
 def test_errors_of_stars_that_no_catalogue_has_are_no_way_out():
-    """Three frames of one field: what is wrong with the directions looks like an error of each star."""
+    """Three frames of one field: what is wrong with the directions looks like an error of each
+    star.
+    """
     rng = np.random.default_rng(3)
     levels = {}
     for size in (0.1, 5.0):
         c = campaign(rng, n_frames=6, stars_per_frame=25, patch_stars=30, star_sigma_px=size)
         obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
-        cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), star_errors=True)
+        cal = sc.calibrate(
+            obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), star_errors=True
+        )
         levels[size] = stars(sc.diagnostics.star_test(obs, cal))
     assert levels[0.1].level is Level.PASS
     assert levels[5.0].level is Level.FAIL and "--star-errors" in levels[5.0].advice
@@ -84,8 +91,12 @@ def test_a_calibration_alone_is_no_verdict_and_names_the_command_that_makes_one(
     status, out, _ = call(["calibrate", *words, "-o", "alone"])
     assert status == 0 and "No verdict has been made" in out
     told = next(line for line in out.splitlines() if "No verdict" in line).split("What asks: ")[1]
-    assert told.startswith("starcal-uq run ") and "--model k1" in told and told.endswith("-o alone-2")
+    assert (
+        told.startswith("starcal-uq run ") and "--model k1" in told and told.endswith("-o alone-2")
+    )
     # What was given then is given again when its checks ask for more.
     run = sc.Run(tmp_path / "alone")
     commands = run.verdict.commands
-    assert commands and all("--in-space --model" in command and "alone-2" in command for command in commands)
+    assert commands and all(
+        "--in-space --model" in command and "alone-2" in command for command in commands
+    )

@@ -1,4 +1,6 @@
-"""Every command answers with one document of its schema; commands and schemas come from their own declarations."""
+"""Every command answers with one document of its schema; commands and schemas come from their own
+declarations.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,8 @@ from starcal_uq.core.formatting import significant
 from tests.cli.conftest import check_document
 from tests.helpers.outside import campaign
 
-# Calls that end soon, in the order in which they need each other. Others are validated where they are tested:
-# the fixture `cli` holds every document against its schema.
+# Calls that end soon, in the order in which they need each other. Others are validated where they
+# are tested: the fixture `cli` holds every document against its schema.
 CALLS = {
     "new": "camera -o new.toml",
     "simulate": "camera.toml -o made.csv --frames 3",
@@ -51,14 +53,17 @@ ELSEWHERE = {
     "reproduce": "test_cli_paper",
     "reproduce-field": "test_cli_paper",
 }
-# Keys and types of every schema and part as they stand. Where a line has to change, say so in the changelog; where a
-# key goes or changes its type or meaning, raise the version of every schema that holds it.
+# Keys and types of every schema and part as they stand. Where a line has to change, say so in the
+# changelog; where a key goes or changes its type or meaning, raise the version of every schema that
+# holds it.
 RECORDED = Path(__file__).with_name("schemas.txt")
 
 
 def _line(schema):
     types = {key: schemas.type_words(content) for key, content in schema["properties"].items()}
-    return ", ".join(f"{key} {words}" for key, words in types.items() if key not in ("schema", "version"))
+    return ", ".join(
+        f"{key} {words}" for key, words in types.items() if key not in ("schema", "version")
+    )
 
 
 def names():
@@ -83,7 +88,9 @@ def test_schemas_are_schemas_and_say_what_every_key_is(name):
     unsaid = [key for key, kind, _, text in found if not text or kind == "Any"]
     assert not unsaid, unsaid
     # A number has a unit in its name, beside it, or none.
-    assert not [key for key, kind, unit, _ in found if re.search("_(px|arcsec|mm|deg)$", key) and not unit]
+    assert not [
+        key for key, kind, unit, _ in found if re.search("_(px|arcsec|mm|deg)$", key) and not unit
+    ]
 
 
 def test_keys_are_stable_within_a_version():
@@ -134,7 +141,9 @@ def test_errors_are_documents(cli, folder):
 
 
 def test_controls():
-    good = schemas.document("export", {"file": "a", "to": "opencv", "error_px": 0.1, "text": "ok."}, 0)
+    good = schemas.document(
+        "export", {"file": "a", "to": "opencv", "error_px": 0.1, "text": "ok."}, 0
+    )
     schema = schemas.json_schema("export")
     jsonschema.validate(good, schema)
     for wrong in (

@@ -1,4 +1,6 @@
-"""A camera whose pixel pitch nobody states: pixels everywhere, millimetres nowhere, and a way to state it."""
+"""A camera whose pixel pitch nobody states: pixels everywhere, millimetres nowhere, and a way to
+state it.
+"""
 
 from __future__ import annotations
 
@@ -20,20 +22,35 @@ PITCH = 6.9
 
 def camera(pixel_um=None):
     return sc.Camera(
-        1024, 1024, pixel_um, None, 505.0, 521.0, coefficients=(2e-9, 0.0), name="lens of the garden", focal_px=5114.0
+        1024,
+        1024,
+        pixel_um,
+        None,
+        505.0,
+        521.0,
+        coefficients=(2e-9, 0.0),
+        name="lens of the garden",
+        focal_px=5114.0,
     )
 
 
 def texts(folder):
-    """What the files of a folder say, by name, without what only draws or explains the keys of a file."""
+    """What the files of a folder say, by name, without what only draws or explains the keys of a
+    file.
+    """
     for path in sorted(folder.rglob("*")):
         if path.suffix in TEXTS:
             said = html.unescape(STYLE.sub("", path.read_text("utf-8")))
-            yield path.name, "\n".join(line for line in said.splitlines() if not line.startswith("#"))
+            yield (
+                path.name,
+                "\n".join(line for line in said.splitlines() if not line.startswith("#")),
+            )
 
 
 def millimetres(said):
-    """What looks like a length in millimetres, by where it stands, but for the line that says how to state it."""
+    """What looks like a length in millimetres, by where it stands, but for the line that says how
+    to state it.
+    """
     found = {}
     for name, words in said.items():
         bare = words.replace("--pixel-um", "").replace("as pixel_um", "")
@@ -57,7 +74,18 @@ def test_nothing_that_a_run_shows_or_writes_is_in_millimetres(cli, stars, tmp_pa
     status, out, err = cli("run", stars, "camera.toml", "-o", "run", *fast)
     assert status in (0, 1), err
     assert out.count("--pixel-um") == 1
-    for to in ("opencv", "ros", "kalibr", "mrcal", "tetra3", "sip", "latex", "markdown", "covariance", "csv"):
+    for to in (
+        "opencv",
+        "ros",
+        "kalibr",
+        "mrcal",
+        "tetra3",
+        "sip",
+        "latex",
+        "markdown",
+        "covariance",
+        "csv",
+    ):
         assert cli("export", "run", "--to", to, "-o", f"run/exported_{to}.txt")[0] == 0
     said = {"terminal": out + err, **dict(texts(tmp_path / "run"))}
     assert "pixels of unknown pitch" in said["report.html"]
@@ -82,9 +110,15 @@ def test_the_pitch_can_be_stated(cli, stars, tmp_path):
     assert status == 0, err
     # The search for millimetres finds them where there are some.
     assert len(millimetres({"terminal": out})["terminal"]) == 1
-    assert millimetres(dict(texts(tmp_path / "stated"))).keys() >= {"camera.toml", "calibrated.toml"}
+    assert millimetres(dict(texts(tmp_path / "stated"))).keys() >= {
+        "camera.toml",
+        "calibrated.toml",
+    }
     assert "state it with --pixel-um" not in out
-    with_pitch, without = sc.Run(tmp_path / "stated").calibration, sc.Run(tmp_path / "unknown").calibration
+    with_pitch, without = (
+        sc.Run(tmp_path / "stated").calibration,
+        sc.Run(tmp_path / "unknown").calibration,
+    )
     assert with_pitch.camera.focal_px == pytest.approx(without.camera.focal_px, rel=1e-9)
     assert with_pitch.camera.focal_mm == pytest.approx(35.2866, abs=0.01)
     status, _, err = cli("calibrate", stars, "stated/camera.toml", "-o", "x", "--pixel-um", 5)
@@ -109,9 +143,13 @@ def test_a_camera_without_a_pitch_keeps_its_pixels(tmp_path):
     # With a pitch, the focal length in millimetres is what stays where the pitch changes.
     assert stated.replace(pixel_um=2.0 * PITCH).focal_px == pytest.approx(2557.0)
     assert unknown.with_theta(unknown.theta) == unknown
-    with pytest.raises(CameraError, match="the pixel pitch is unknown: give pixel_um as well, or focal_px"):
+    with pytest.raises(
+        CameraError, match="the pixel pitch is unknown: give pixel_um as well, or focal_px"
+    ):
         unknown.replace(focal_mm=35.0)
-    with pytest.raises(CameraError, match="nothing is in millimetres, because the pixel pitch is unknown"):
+    with pytest.raises(
+        CameraError, match="nothing is in millimetres, because the pixel pitch is unknown"
+    ):
         unknown.length_mm(1.0)
     with pytest.raises(StudyError, match="needs the pitch of the camera"):
         camera_of(unknown, {"pixel_um": 5.0})
@@ -122,7 +160,10 @@ def test_a_camera_without_a_pitch_keeps_its_pixels(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ("focal_px = 5114.0\nfocal_mm = 35.0\n", "keys focal_mm and focal_px both state the focal length; remove one."),
+        (
+            "focal_px = 5114.0\nfocal_mm = 35.0\n",
+            "keys focal_mm and focal_px both state the focal length; remove one.",
+        ),
         ("focal_mm = 35.0\n", "key pixel_um is missing; add the pitch of the square pixels"),
         ("pixel_um = 5.0\n", "key focal_mm is missing"),
         ("focal_px = -1\n", "key focal_px is -1; write the focal length in pixels"),

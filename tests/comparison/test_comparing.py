@@ -20,7 +20,12 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.comparison.covariance import difference_rule
 from starcal_uq.comparison.result import CameraComparison
-from starcal_uq.core.errors import CalibrationError, ComparisonError, DistortionError, RunFolderError
+from starcal_uq.core.errors import (
+    CalibrationError,
+    ComparisonError,
+    DistortionError,
+    RunFolderError,
+)
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
@@ -67,7 +72,11 @@ def null_pairs(n: int, seed: int = 0, size_b: float = 1.0) -> list[tuple[Any, An
     return [
         (
             result(truth + ROOT @ rng.standard_normal(5)),
-            result(truth + size_b * (ROOT @ rng.standard_normal(5)), size_b**2 * COVARIANCE, provenance=other()),
+            result(
+                truth + size_b * (ROOT @ rng.standard_normal(5)),
+                size_b**2 * COVARIANCE,
+                provenance=other(),
+            ),
         )
         for _ in range(n)
     ]
@@ -83,7 +92,8 @@ def halves() -> CameraComparison:
     return compare_halves(observations(), nominal(camera()))
 
 
-# --- calibration of the tests -----------------------------------------------------------------------------------------
+# --- calibration of the tests
+# -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["p_map", "p_parameters", "p_worst"])
@@ -119,15 +129,20 @@ def test_a_focal_length_that_changed_is_seen() -> None:
     shift = np.zeros(5)
     shift[2] = 3.0 * np.sqrt(2.0) * SD[2]
     found = [
-        compare(a, SimpleNamespace(**{**vars(b), "theta": b.theta + shift}), **SMALL) for a, b in null_pairs(60, seed=2)
+        compare(a, SimpleNamespace(**{**vars(b), "theta": b.theta + shift}), **SMALL)
+        for a, b in null_pairs(60, seed=2)
     ]
     assert np.mean([f.verdict == "maps differ" for f in found]) > 0.95
-    # The same change along the weakest direction is what noise does all the time, and has less power.
+    # The same change along the weakest direction is what noise does all the time, and has less
+    # power.
     weak = 3.0 * np.sqrt(2.0) * ROOT[:, 2]
     weak_found = [
-        compare(a, SimpleNamespace(**{**vars(b), "theta": b.theta + weak}), **SMALL) for a, b in null_pairs(60, seed=2)
+        compare(a, SimpleNamespace(**{**vars(b), "theta": b.theta + weak}), **SMALL)
+        for a, b in null_pairs(60, seed=2)
     ]
-    assert np.mean([f.verdict != "agree" for f in weak_found]) < np.mean([f.verdict != "agree" for f in found])
+    assert np.mean([f.verdict != "agree" for f in weak_found]) < np.mean(
+        [f.verdict != "agree" for f in found]
+    )
 
 
 def test_an_estimated_noise_counts() -> None:
@@ -141,7 +156,8 @@ def test_an_estimated_noise_counts() -> None:
     assert few.rms_arcsec == known.rms_arcsec
 
 
-# --- the numbers ------------------------------------------------------------------------------------------------------
+# --- the numbers
+# --------------------------------------------------------------------------------------------------
 
 
 def test_rotation_and_map_are_what_was_put_in() -> None:
@@ -153,7 +169,10 @@ def test_rotation_and_map_are_what_was_put_in() -> None:
     assert found.largest_arcsec < 0.02 * arcsec
     # The rotation brings the directions of B onto those of A.
     xy = np.array([[100.0, 200.0], [900.0, 700.0]])
-    a, b = (unproject(camera("brown").with_theta(t), xy) for t in (found_theta(found, "a"), found_theta(found, "b")))
+    a, b = (
+        unproject(camera("brown").with_theta(t), xy)
+        for t in (found_theta(found, "a"), found_theta(found, "b"))
+    )
     rotation = exp_rotation(found.rotation_arcsec / ARCSEC)
     np.testing.assert_allclose(a @ rotation.T, b, atol=3e-6)
     assert np.abs(a - b).max() > 1e-4
@@ -165,9 +184,11 @@ def found_theta(found: CameraComparison, which: str) -> np.ndarray:
 
 def test_map_of_a_focal_length_is_radial() -> None:
     truth = camera("brown").theta
-    found = compare(result(truth), result(truth * np.array([1, 1, 1 + 1e-4, 1, 1]), provenance=other()))
-    # A longer focal length sees a pixel closer to the axis: inwards, in proportion to the radius. From edge to edge, as
-    # the best rotation shifts all points alike.
+    found = compare(
+        result(truth), result(truth * np.array([1, 1, 1 + 1e-4, 1, 1]), provenance=other())
+    )
+    # A longer focal length sees a pixel closer to the axis: inwards, in proportion to the radius.
+    # From edge to edge, as the best rotation shifts all points alike.
     across = found.difference_px[12, -1, 0] - found.difference_px[12, 0, 0]
     assert across == pytest.approx(-1e-4 * 1024, rel=0.01)
     down = found.difference_arcsec[-1, 12, 1] - found.difference_arcsec[0, 12, 1]
@@ -182,10 +203,14 @@ def test_uncertainties_are_those_of_draws() -> None:
     many = null_comparisons()
     lengths = np.array([np.sum(f.difference_arcsec**2, axis=-1) for f in many])
     np.testing.assert_allclose(np.sqrt(lengths.mean(axis=0)), many[0].sigma_arcsec, rtol=0.15)
-    assert np.sqrt(lengths.mean(axis=0)).mean() == pytest.approx(many[0].sigma_arcsec.mean(), rel=0.05)
+    assert np.sqrt(lengths.mean(axis=0)).mean() == pytest.approx(
+        many[0].sigma_arcsec.mean(), rel=0.05
+    )
     rotations = np.array([f.rotation_arcsec for f in many])
     np.testing.assert_allclose(rotations.std(axis=0), many[0].rotation_sigma_arcsec, rtol=0.12)
-    assert np.sqrt(np.mean([f.rms_arcsec**2 for f in many])) == pytest.approx(many[0].expected_rms_arcsec, rel=0.06)
+    assert np.sqrt(np.mean([f.rms_arcsec**2 for f in many])) == pytest.approx(
+        many[0].expected_rms_arcsec, rel=0.06
+    )
 
 
 def test_order_changes_signs_only() -> None:
@@ -204,15 +229,22 @@ def test_no_difference_at_all() -> None:
     assert found.verdict == "agree"
 
 
-# --- which covariance -------------------------------------------------------------------------------------------------
+# --- which covariance
+# -------------------------------------------------------------------------------------------------
 
 
 @lru_cache
 def calibrated(model: str = "brown", method: str = "efficient", part: str = "all") -> Calibration:
-    obs = {"all": observations(), "odd": split_frames(observations())[0], "even": split_frames(observations())[1]}[part]
+    obs = {
+        "all": observations(),
+        "odd": split_frames(observations())[0],
+        "even": split_frames(observations())[1],
+    }[part]
     return calibrate(
         obs,
-        nominal(camera()).replace(distortion=model, coefficients=(0.0,) * len(camera(model).coefficients)),
+        nominal(camera()).replace(
+            distortion=model, coefficients=(0.0,) * len(camera(model).coefficients)
+        ),
         method=method,
     )
 
@@ -232,8 +264,14 @@ def calibrated(model: str = "brown", method: str = "efficient", part: str = "all
         (("brown", "three_stage", "all"), ("brown", "three_stage", "odd"), "B within A", None, "neither estimate"),
     ],
 )  # fmt: skip
-def test_rule_follows_from_what_the_data_share(a: Any, b: Any, data: str, signs: Any, words: str) -> None:
-    tables = {"all": observations(), "odd": split_frames(observations())[0], "even": split_frames(observations())[1]}
+def test_rule_follows_from_what_the_data_share(
+    a: Any, b: Any, data: str, signs: Any, words: str
+) -> None:
+    tables = {
+        "all": observations(),
+        "odd": split_frames(observations())[0],
+        "even": split_frames(observations())[1],
+    }
     pair = tables[a[2]], tables[b[2]]
     rule = difference_rule(calibrated(*a), calibrated(*b), ("A", "B"), None, pair)
     assert (rule.data, rule.signs) == (data, signs)
@@ -259,7 +297,10 @@ def test_partly_shared_data_have_no_p_value() -> None:
     assert difference_rule(a, b, ("A", "B"), True, None).data == "same"
     # Merged runs that have one run in common; a prior made from the other run's data.
     merged = {"merge": {"parts": [{"data_sha256": ["a" * 64]}, {"data_sha256": ["c" * 64]}]}}
-    assert difference_rule(a, result(b.theta, provenance=merged), ("A", "B"), None, None).data == "overlapping"
+    assert (
+        difference_rule(a, result(b.theta, provenance=merged), ("A", "B"), None, None).data
+        == "overlapping"
+    )
     prior = GaussianPriors.__new__(GaussianPriors)
     object.__setattr__(prior, "source", {"data_sha256": ["a" * 64]})
     chained = result(b.theta, provenance=other(), priors=prior)
@@ -272,7 +313,8 @@ def test_an_inefficient_estimate_is_tested_on_the_map_alone() -> None:
     assert np.isnan(found.p_parameters)
     assert np.isnan(found.p_worst)
     assert any("only the map is tested" in message for message in found.messages)
-    # The difference of two estimates from the same data is smaller than their independent errors would make it.
+    # The difference of two estimates from the same data is smaller than their independent errors
+    # would make it.
     apart = compare(calibrated("brown", "three_stage"), calibrated(), same_data=False, **SMALL)
     assert found.expected_rms_arcsec < 0.7 * apart.expected_rms_arcsec
 
@@ -283,12 +325,13 @@ def test_other_models_are_compared_by_their_directions() -> None:
     assert found.parameter_names == ("x0", "y0", "f")
     assert any("distortion models differ" in message for message in found.messages)
     assert found.verdict == "agree"
-    # A pinhole cannot follow the distortion; that is not in its covariance and must not pass for chance.
+    # A pinhole cannot follow the distortion; that is not in its covariance and must not pass for
+    # chance.
     pinhole = compare(calibrated("none", part="odd"), calibrated(part="even"), **SMALL)
     assert pinhole.verdict == "maps differ"
     assert pinhole.p_map < 1e-6
-    # A pixel of distortion given to ideal points, and taken from distorted ones: where both are known very well, they
-    # cannot agree, whatever their parameters.
+    # A pixel of distortion given to ideal points, and taken from distorted ones: where both are
+    # known very well, they cannot agree, whatever their parameters.
     sharp = 1e-8 * COVARIANCE
     apart = compare(
         result(camera("inverse").theta, sharp, camera=camera("inverse")),
@@ -300,7 +343,8 @@ def test_other_models_are_compared_by_their_directions() -> None:
     assert "p < 10⁻¹²" in apart.text
 
 
-# --- halves, files, words ---------------------------------------------------------------------------------------------
+# --- halves, files, words
+# ---------------------------------------------------------------------------------------------
 
 
 def test_splits_share_nothing_and_lose_nothing() -> None:
@@ -311,13 +355,18 @@ def test_splits_share_nothing_and_lose_nothing() -> None:
         assert sorted([*a.frame_ids, *b.frame_ids]) == list(obs.frame_ids)
         assert shared_frames(a, b) == 0
     assert list(split_frames(obs)[0].frame_ids) == list(obs.frame_ids[::2])
-    assert split_frames(obs, "halves")[0].frame_ids.max() < split_frames(obs, "halves")[1].frame_ids.min()
+    assert (
+        split_frames(obs, "halves")[0].frame_ids.max()
+        < split_frames(obs, "halves")[1].frame_ids.min()
+    )
     three = split_frames(obs.select_frames(obs.frame_ids[:3]), "random", seed=1)
     assert (three[0].n_frames, three[1].n_frames) == (2, 1)
     # Frames are known by what they hold, not by their numbers.
     renumbered = dataclasses.replace(obs, frame=obs.frame + 1000)
     assert shared_frames(obs, renumbered) == 60
-    with pytest.raises(ComparisonError, match="split 'thirds' is unknown: use one of odd-even, halves, random"):
+    with pytest.raises(
+        ComparisonError, match="split 'thirds' is unknown: use one of odd-even, halves, random"
+    ):
         split_frames(obs, "thirds")
     with pytest.raises(ComparisonError, match="cannot be split in two"):
         split_frames(obs.select_frames(obs.frame_ids[:1]))
@@ -333,7 +382,9 @@ def test_halves_of_one_run_agree() -> None:
     assert "Odd frames and even frames agree" in found.text
     with pytest.raises(CalibrationError, match="stars"):
         obs = observations()
-        compare_halves(obs.select(obs.frame < obs.frame_ids[2]).select(few_stars()), nominal(camera()))
+        compare_halves(
+            obs.select(obs.frame < obs.frame_ids[2]).select(few_stars()), nominal(camera())
+        )
 
 
 def few_stars() -> np.ndarray:
@@ -369,7 +420,12 @@ def test_page_tables_and_file(tmp_path: Path) -> None:
     assert json.dumps(loaded.to_dict()) == json.dumps(found.to_dict())
     assert_same(found, loaded)
     table = found.to_dataframe()
-    assert list(table["quantity"][:4]) == ["rotation, pitch", "rotation, yaw", "rotation, roll", "map, rms"]
+    assert list(table["quantity"][:4]) == [
+        "rotation, pitch",
+        "rotation, yaw",
+        "rotation, roll",
+        "map, rms",
+    ]
     row = table[table["quantity"] == "map, rms"].iloc[0]
     assert row["p_value"] == found.p_map
     assert row["ratio"] == found.rms_arcsec / found.expected_rms_arcsec
@@ -401,7 +457,9 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
 def write_run(path: Path, part: str) -> RunFolder:
     run = RunFolder(path).create()
     calibrated(part=part).save(run.calibration)
-    table = observations() if part == "all" else split_frames(observations())[0 if part == "odd" else 1]
+    table = (
+        observations() if part == "all" else split_frames(observations())[0 if part == "odd" else 1]
+    )
     table.save(run.observations, force=True)
     return run
 
@@ -411,7 +469,10 @@ def test_run_folders(tmp_path: Path) -> None:
         write_run(tmp_path / part, part)
     found = compare_runs(tmp_path / "odd", tmp_path / "even", **SMALL)
     assert (found.labels, found.data, found.verdict) == (("odd", "even"), "independent", "agree")
-    assert compare_runs(tmp_path / "odd", tmp_path / "all", labels=("x", "y"), **SMALL).data == "A within B"
+    assert (
+        compare_runs(tmp_path / "odd", tmp_path / "all", labels=("x", "y"), **SMALL).data
+        == "A within B"
+    )
     split = compare_split(tmp_path / "all", **SMALL)
     np.testing.assert_allclose(split.theta_a, found.theta_a, rtol=1e-9)
     with pytest.raises(ComparisonError, match="both runs are the same folder"):
@@ -434,7 +495,9 @@ def test_what_cannot_be_compared_is_refused() -> None:
         compare(a, a, level=2.0)
     with pytest.raises(DistortionError, match="folds over"):
         compare(a, result(truth * np.array([1, 1, 1, -1e4, 1])))
-    pitch = compare(a, result(truth, camera=camera("brown", pixel_um=10.0), provenance=other()), **SMALL)
+    pitch = compare(
+        a, result(truth, camera=camera("brown", pixel_um=10.0), provenance=other()), **SMALL
+    )
     assert any("pixel pitch differs (12 and 10 µm)" in message for message in pitch.messages)
 
 
@@ -462,7 +525,8 @@ def test_posteriors_are_compared_by_their_means() -> None:
     by_mean, by_estimate = compare(wide, b, **SMALL), compare(a, b, **SMALL)
     assert by_mean.p_map == by_estimate.p_map
     assert by_mean.rms_arcsec == by_estimate.rms_arcsec
-    # A posterior by another likelihood is not efficient, so that on the same data nothing tells the covariance.
+    # A posterior by another likelihood is not efficient, so that on the same data nothing tells the
+    # covariance.
     wide.diagnostics.likelihood = "pairs"
     assert difference_rule(wide, a, ("A", "B"), None, None).signs == (1.0, -1.0)
     a.provenance["settings"]["likelihood"] = "student_t"
@@ -481,7 +545,8 @@ def test_tables_of_false_alarms_and_power(capsys: pytest.CaptureFixture[str]) ->
     assert rows[-1].endswith("| 1.00 | 1.00 | 1.00 |")
 
 
-# --- whole campaigns --------------------------------------------------------------------------------------------------
+# --- whole campaigns
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -491,16 +556,27 @@ def test_p_values_of_whole_campaigns_are_uniform() -> None:
     from starcal_uq.sky.catalogue import load_catalogue
 
     stars, truth = load_catalogue(max_mag=6.0, epoch=2026.9), camera("brown")
-    start, richer = nominal(truth), nominal(truth).replace(distortion="brown3", coefficients=(0.0, 0.0, 0.0))
+    start, richer = (
+        nominal(truth),
+        nominal(truth).replace(distortion="brown3", coefficients=(0.0, 0.0, 0.0)),
+    )
     p = []
     for seed in range(0, 400, 2):
         first, second = (
-            simulate(stars, truth, n_frames=60, min_stars=8, sigma_px=0.05, seed=7000 + seed + i) for i in range(2)
+            simulate(stars, truth, n_frames=60, min_stars=8, sigma_px=0.05, seed=7000 + seed + i)
+            for i in range(2)
         )
         a, b, c = calibrate(first, start), calibrate(second, start), calibrate(first, richer)
-        apart, nested, mixed = compare(a, b, **SMALL), compare(a, c, **SMALL), compare(b, c, **SMALL)
+        apart, nested, mixed = (
+            compare(a, b, **SMALL),
+            compare(a, c, **SMALL),
+            compare(b, c, **SMALL),
+        )
         naive = compare(a, c, same_data=False, **SMALL)
-        p.append([f.p_parameters for f in (apart, nested, mixed, naive)] + [f.p_map for f in (apart, nested, mixed)])
+        p.append(
+            [f.p_parameters for f in (apart, nested, mixed, naive)]
+            + [f.p_map for f in (apart, nested, mixed)]
+        )
     values = np.array(p)
     for column in (0, 1, 2, 4, 5, 6):
         assert kstest(values[:, column], "uniform").pvalue > 0.005, column

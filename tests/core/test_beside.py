@@ -73,11 +73,17 @@ def test_an_error_here_ends_the_process_there():
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="kills a process as Unix does")
 def test_nothing_is_left_of_a_caller_that_is_killed(tmp_path):
     program = (
-        "import os, signal, starcal_uq.core.beside as b; b.processors = lambda: 2; other = b.Beside().__enter__(); "
+        "import os, signal, starcal_uq.core.beside as b; b.processors = lambda: 2; other = "
+        "b.Beside().__enter__(); "
         "other.call(os.getpid); os.kill(os.getpid(), signal.SIGKILL)"
     )
     root = os.path.dirname(os.path.dirname(starcal_uq.__file__))
-    subprocess.run([sys.executable, "-c", program], cwd=root, env={**os.environ, "TMPDIR": str(tmp_path)}, check=False)
+    subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=root,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        check=False,
+    )
     until = time.monotonic() + 60.0
     while list(tmp_path.iterdir()) and time.monotonic() < until:
         time.sleep(0.05)

@@ -1,4 +1,6 @@
-"""Work spread over processes: order, sums, and what happens when a scheduler or a worker is not there."""
+"""Work spread over processes: order, sums, and what happens when a scheduler or a worker is not
+there.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,12 @@ def test_results_come_in_order_and_are_kept_one_by_one() -> None:
     seen: list[tuple[int, float]] = []
     steps: list[tuple[int, int]] = []
     with cluster(workers=0) as one:
-        found = one.map(share, range(5), keep=lambda *pair: seen.append(pair), progress=lambda *n: steps.append(n))
+        found = one.map(
+            share,
+            range(5),
+            keep=lambda *pair: seen.append(pair),
+            progress=lambda *n: steps.append(n),
+        )
     assert found == [share(n) for n in range(5)] == [value for _, value in seen]
     assert steps == [(n + 1, 5) for n in range(5)]
 
@@ -61,7 +68,10 @@ def test_sums_are_those_of_one_fixed_tree() -> None:
 def test_no_scheduler_is_said_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("starcal_uq.core.cluster._CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://here"):
-        with pytest.raises(ClusterError, match="no Dask scheduler answers there; start one"), cluster(address):
+        with (
+            pytest.raises(ClusterError, match="no Dask scheduler answers there; start one"),
+            cluster(address),
+        ):
             pass
 
 
@@ -75,9 +85,9 @@ def several() -> Iterator[Cluster]:
 def test_processes_give_the_bits_of_one(several: Cluster) -> None:
     numbers = list(range(40))
     steps: list[tuple[int, int]] = []
-    assert several.reduce(share, numbers, total, progress=lambda *n: steps.append(n)) == Cluster().reduce(
-        share, numbers, total
-    )
+    assert several.reduce(
+        share, numbers, total, progress=lambda *n: steps.append(n)
+    ) == Cluster().reduce(share, numbers, total)
     assert steps[-1] == (40, 40)
     assert several.map(share, numbers) == [share(n) for n in numbers]
     with pytest.raises(ClusterError, match=r"^number 2 fails.$"):

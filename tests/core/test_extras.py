@@ -68,9 +68,17 @@ NEEDS: dict[str, tuple[str, str, Callable[[Path], Any]]] = {
     "ASDF files": ("asdf", "asdf", partial(export, "asdf")),
     "cameras for tetra3rs": ("tetra3rs", "tetra3rs", partial(export, "tetra3rs")),
     "compiled kernels": ("numba", "compiled", lambda _: compiled.use("numba")),
-    "Dask schedulers": ("distributed", "cluster", lambda _: on_processes(scheduler="tcp://127.0.0.1:1")),
+    "Dask schedulers": (
+        "distributed",
+        "cluster",
+        lambda _: on_processes(scheduler="tcp://127.0.0.1:1"),
+    ),
     "executed notebooks": ("ipykernel", "notebook", partial(executed, iter([]))),
-    "several processes over one set of files": ("distributed", "cluster", lambda _: on_processes(workers=2)),
+    "several processes over one set of files": (
+        "distributed",
+        "cluster",
+        lambda _: on_processes(workers=2),
+    ),
 }
 
 
@@ -84,7 +92,11 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
     with pytest.raises(MissingExtraError, match=re.escape(words)) as error:
         ask(tmp_path)
     assert str(error.value).endswith(".")
-    assert {path.suffix for path in tmp_path.iterdir()} <= {".fits", ".ecsv", ".nef"}  # nothing half written
+    assert {path.suffix for path in tmp_path.iterdir()} <= {
+        ".fits",
+        ".ecsv",
+        ".nef",
+    }  # nothing half written
 
 
 def test_what_needs_no_extra_does_not_ask_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +113,13 @@ def test_a_command_ends_with_status_2(
 ) -> None:
     hide(monkeypatch, "astropy")
     (tmp_path / "night.fits").write_bytes(b"SIMPLE  ")
-    arguments = ["run", str(tmp_path / "night.fits"), str(PREVIOUS / "camera.toml"), "-o", str(tmp_path / "run")]
+    arguments = [
+        "run",
+        str(tmp_path / "night.fits"),
+        str(PREVIOUS / "camera.toml"),
+        "-o",
+        str(tmp_path / "run"),
+    ]
     monkeypatch.setattr(sys, "argv", ["starcal-uq", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()

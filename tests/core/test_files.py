@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 
 import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_write_bytes, cell_content, cell_text, flushed_together, write_csv
+from starcal_uq.core.files import (
+    atomic_write_bytes,
+    cell_content,
+    cell_text,
+    flushed_together,
+    write_csv,
+)
 from starcal_uq.runs.folder import RunFolder
 from tests.helpers.mutants import _observations
 
@@ -57,7 +63,9 @@ def test_names_of_stars_come_back(tmp_path: Path, ending: str) -> None:
     assert ending != "csv" or (b",=" not in text and b",@" not in text and b",-1+1" not in text)
 
 
-def test_files_of_a_step_are_on_the_disk_before_they_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_of_a_step_are_on_the_disk_before_they_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     done: list[str] = []
     flush, rename = os.fsync, os.replace
 

@@ -40,7 +40,14 @@ def test_digits_end_at_the_second_digit_of_sigma(value, sigma, text):
 
 def test_decimals_follow_the_rounded_sigma():
     """0.0996 rounds to 0.10, so two decimals are enough."""
-    assert [decimals_for(s) for s in (0.0994, 0.0996, 1.0, 12.0, 0.0, math.inf)] == [3, 2, 1, 0, 0, 0]
+    assert [decimals_for(s) for s in (0.0994, 0.0996, 1.0, 12.0, 0.0, math.inf)] == [
+        3,
+        2,
+        1,
+        0,
+        0,
+        0,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -74,7 +81,22 @@ def test_units_and_words():
     assert count(17927) == "17\N{NARROW NO-BREAK SPACE}927"
     assert plural(1, "frame") == "1 frame"
     ps = (0.314, 4.3e-68, 0.0, 1.0, math.nan)
-    assert [p_words(p) for p in ps] == ["p = 0.31", "p < 10⁻¹²", "p < 10⁻¹²", "p = 1.0", "p not known"]
-    assert [p_words(p, 1 / 500) for p in (0.0, 0.002, 1.0)] == ["p < 0.002", "p = 0.0020", "p > 0.998"]
+    assert [p_words(p) for p in ps] == [
+        "p = 0.31",
+        "p < 10⁻¹²",
+        "p < 10⁻¹²",
+        "p = 1.0",
+        "p not known",
+    ]
+    assert [p_words(p, 1 / 500) for p in (0.0, 0.002, 1.0)] == [
+        "p < 0.002",
+        "p = 0.0020",
+        "p > 0.998",
+    ]
     assert plural(0, "frame") == "0 frames"
-    assert [join_words(w) for w in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == ["", "a", "a and b", "a, b and c"]
+    assert [join_words(w) for w in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == [
+        "",
+        "a",
+        "a and b",
+        "a, b and c",
+    ]

@@ -1,4 +1,6 @@
-"""Results of a command replace those of before all at once, and one process at a time writes into a folder."""
+"""Results of a command replace those of before all at once, and one process at a time writes into a
+folder.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,12 @@ from starcal_uq.core.manifest import alone, making, read_manifest
 from starcal_uq.core.store import UNFINISHED, Kept
 from tests.helpers.crashes import losses_of_power, small_files, snapshots
 
-OLD = {"page.html": "old", "table.csv": "old, 1", "figures/one.png": "old, 2", "figures/gone.png": "old, 3"}
+OLD = {
+    "page.html": "old",
+    "table.csv": "old, 1",
+    "figures/one.png": "old, 2",
+    "figures/gone.png": "old, 3",
+}
 NEW = {"page.html": "new", "table.csv": "new, 1", "figures/one.png": "new, 2", "more.csv": "new, 4"}
 MINE = {"notes.txt": "mine", "figures/mine.png": "mine"}
 
@@ -28,7 +35,9 @@ def write(folder: Path, files: Mapping[str, str]) -> None:
         atomic_write_text(folder / name, text)
 
 
-def make(folder: Path, files: Mapping[str, str], *, force: bool = False, stop: bool = False) -> None:
+def make(
+    folder: Path, files: Mapping[str, str], *, force: bool = False, stop: bool = False
+) -> None:
     with making(folder, "command", "page.html", force=force) as stage:
         Kept(folder, {"seed": 1}).keep([(0, "done")])
         write(stage, files)
@@ -37,7 +46,9 @@ def make(folder: Path, files: Mapping[str, str], *, force: bool = False, stop: b
 
 
 def content(folder: Path) -> dict[str, str]:
-    """All files but those that are hidden and the record, which puts the others in their places when it is read."""
+    """All files but those that are hidden and the record, which puts the others in their places
+    when it is read.
+    """
     read_manifest(folder)
     files = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
     return {
@@ -64,8 +75,11 @@ def test_at_every_moment_there_are_the_old_results_or_the_new_ones(tmp_path: Pat
     assert not all(content(state / "out") in (OLD | MINE, NEW | MINE) for state in states[1:-1])
 
 
-def after_losses_of_power(folder: Path, kept: Path, flush: Callable[[int, Path], bool]) -> list[bool]:
-    """Whether each state that a loss of power may leave while results are replaced holds the old ones or the new ones.
+def after_losses_of_power(
+    folder: Path, kept: Path, flush: Callable[[int, Path], bool]
+) -> list[bool]:
+    """Whether each state that a loss of power may leave while results are replaced holds the old
+    ones or the new ones.
 
     `flush` says of each call that flushes a folder, by its number, whether it is made.
     """
@@ -99,15 +113,19 @@ def is_whole(state: Mapping[str, bytes], place: Path) -> bool:
 
 def test_after_a_loss_of_power_there_are_the_old_results_or_the_new_ones(tmp_path: Path) -> None:
     made: list[Path] = []
-    good = after_losses_of_power(tmp_path / "out", tmp_path / "states", lambda _, path: not made.append(path))
+    good = after_losses_of_power(
+        tmp_path / "out", tmp_path / "states", lambda _, path: not made.append(path)
+    )
     assert len(good) > 20 and all(good)
-    # Control: each call that flushes a folder is needed. The second one of the folder itself is for disks that change
-    # the order of names within one folder, which these states do not do.
+    # Control: each call that flushes a folder is needed. The second one of the folder itself is for
+    # disks that change the order of names within one folder, which these states do not do.
     named = [path.relative_to(tmp_path / "out").as_posix() for path in made]
     assert named == [".step", ".step/figures", ".", ".", "figures"]
     for left_out in (0, 1, 2, 4):
         place = tmp_path / str(left_out)
-        good = after_losses_of_power(place / "out", place / "states", lambda number, _, out=left_out: number != out)
+        good = after_losses_of_power(
+            place / "out", place / "states", lambda number, _, out=left_out: number != out
+        )
         assert not all(good), f"{named[left_out]} need not be flushed"
 
 
@@ -127,7 +145,10 @@ def test_an_interrupt_keeps_what_is_done_and_the_results_of_before(tmp_path: Pat
 
 def test_a_full_disk_leaves_the_results_of_before(tmp_path: Path) -> None:
     make(tmp_path / "out", OLD)
-    with small_files(20_000), pytest.raises(RunFolderError, match=r"cannot be written .*free space"):
+    with (
+        small_files(20_000),
+        pytest.raises(RunFolderError, match=r"cannot be written .*free space"),
+    ):
         make(tmp_path / "out", NEW | {"table.csv": "1" * 30_000}, force=True)
     assert content(tmp_path / "out") == OLD
 
@@ -145,7 +166,10 @@ def test_files_of_others_are_neither_replaced_nor_mixed(tmp_path: Path) -> None:
     make(folder, NEW, force=True)
     assert content(folder) == NEW
     with (
-        pytest.raises(RunFolderError, match=r"out: holds the results of another command, with which .* name another"),
+        pytest.raises(
+            RunFolderError,
+            match=r"out: holds the results of another command, with which .* name another",
+        ),
         making(folder, "other", "page.html", force=True),
     ):
         pass
@@ -158,7 +182,10 @@ def test_one_writes_and_others_are_refused(tmp_path: Path) -> None:
     folder, refused = tmp_path / "out", []
 
     def other() -> None:
-        with pytest.raises(RunFolderError, match=r"out: another process is writing there; wait for it, or end it\.$"):
+        with pytest.raises(
+            RunFolderError,
+            match=r"out: another process is writing there; wait for it, or end it\.$",
+        ):
             make(folder, NEW)
         refused.append(True)
 

@@ -1,4 +1,6 @@
-"""Whatever a file holds, its loader lets out a result or the package's own error of one sentence."""
+"""Whatever a file holds, its loader lets out a result or the package's own error of one
+sentence.
+"""
 
 from __future__ import annotations
 
@@ -55,15 +57,21 @@ def test_no_damage_escapes_a_loader(bench: Bench, name: str) -> None:
 
 
 def readers() -> Iterator[str]:
-    """Public functions and class methods of all typed stubs that are named as readers, or take a path."""
-    wings = {"": sc} | {name: getattr(sc, name) for name in sc.__all__ if inspect.ismodule(getattr(sc, name))}
+    """Public functions and class methods of all typed stubs that are named as readers, or take a
+    path.
+    """
+    wings = {"": sc} | {
+        name: getattr(sc, name) for name in sc.__all__ if inspect.ismodule(getattr(sc, name))
+    }
     for wing, module in wings.items():
         for name in getattr(module, "__all__", ()):
             value = getattr(module, name)
             prefix = f"{wing}." if wing else ""
             if inspect.isclass(value):
                 for own, method in vars(value).items():
-                    if isinstance(method, classmethod | staticmethod) and _reads(own, method.__func__):
+                    if isinstance(method, classmethod | staticmethod) and _reads(
+                        own, method.__func__
+                    ):
                         yield f"{prefix}{name}.{own}"
             elif inspect.isfunction(value) and _reads(name, value):
                 yield f"{prefix}{name}"
@@ -91,7 +99,9 @@ def _members(data: bytes, **changed: bytes | None) -> bytes:
         content = {info.filename: archive.read(info) for info in archive.infolist()}
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, member in (content | {f"{name}.npy": member for name, member in changed.items()}).items():
+        for name, member in (
+            content | {f"{name}.npy": member for name, member in changed.items()}
+        ).items():
             if member is not None:
                 archive.writestr(name, member)
     return stream.getvalue()
@@ -112,7 +122,9 @@ def _npy(array: Any) -> bytes:
 def _declared(shape: tuple[int, ...]) -> bytes:
     """The header of an array, without its content."""
     stream = io.BytesIO()
-    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(
+        stream, {"descr": "<f8", "fortran_order": False, "shape": shape}
+    )
     return stream.getvalue()
 
 
@@ -139,7 +151,9 @@ def _null(table: Any) -> Any:
 
 
 def _meta(key: bytes, text: bytes | None) -> Callable[[bytes], bytes]:
-    return _parquet(lambda table: table.replace_schema_metadata({} if text is None else {key: text}))
+    return _parquet(
+        lambda table: table.replace_schema_metadata({} if text is None else {key: text})
+    )
 
 
 def _hdf5(change: Callable[[Any], None]) -> Callable[[bytes], bytes]:
@@ -161,7 +175,9 @@ def _nan_draw(file: Any) -> None:
 
 
 def _other_names(file: Any) -> None:
-    file.attrs["record"] = file.attrs["record"].replace('"parameter_names": ["x0"', '"parameter_names": ["text"')
+    file.attrs["record"] = file.attrs["record"].replace(
+        '"parameter_names": ["x0"', '"parameter_names": ["text"'
+    )
 
 
 def _huge_draws(file: Any) -> None:
@@ -189,15 +205,31 @@ def _many_names(data: bytes) -> bytes:
     return (head + meta + "\n".join(lines) + "\n" + rest).encode()
 
 
-_CAMERA = b"[camera]\nwidth_px = 1024\nheight_px = 1024\npixel_um = 12.0\nx0_px = 1\ny0_px = 1\nfocal_mm = %s\n"
+_CAMERA = (
+    b"[camera]\nwidth_px = 1024\nheight_px = 1024\npixel_um = 12.0\nx0_px = 1\ny0_px = "
+    b"1\nfocal_mm = %s\n"
+)
 _DEEP = "[" * 100_000 + "]" * 100_000
 CALIBRATE = r"; run `starcal-uq calibrate` again\.$"
 SAMPLE = r"; run `starcal-uq sample RUN --force` again\.$"
-# What once ended in a traceback, in a wrong reason, or in numbers: the file, what was done to it, and the sentence.
+# What once ended in a traceback, in a wrong reason, or in numbers: the file, what was done to it,
+# and the sentence.
 ONCE = [
-    ("camera.toml", lambda d: _CAMERA % (b"[" * 3000 + b"]" * 3000), "nests its values too deeply; write plain tables"),
-    ("camera.toml", lambda d: _CAMERA % (b"{a=" * 3000 + b"1" + b"}" * 3000), "nests its values too deeply"),
-    ("camera.toml", lambda d: _CAMERA % (b"1" * 5000), "holds a number with too many digits; correct it"),
+    (
+        "camera.toml",
+        lambda d: _CAMERA % (b"[" * 3000 + b"]" * 3000),
+        "nests its values too deeply; write plain tables",
+    ),
+    (
+        "camera.toml",
+        lambda d: _CAMERA % (b"{a=" * 3000 + b"1" + b"}" * 3000),
+        "nests its values too deeply",
+    ),
+    (
+        "camera.toml",
+        lambda d: _CAMERA % (b"1" * 5000),
+        "holds a number with too many digits; correct it",
+    ),
     ("camera.toml", lambda d: _CAMERA % (b"1" * 4000), r"focal_mm is 1{1,60}\.\.\.1+; write"),
     ("camera.toml", lambda d: _CAMERA % b'"\\u0007"', "focal_mm is '\\\\x07'; write"),
     ("sensor.toml", lambda d: b"[sensor]\n" + b"1" * 5000 + b" = 2\n", r"key 1+\.\.\.1+"),
@@ -205,7 +237,11 @@ ONCE = [
     ("calibration.npz", lambda d: d[:3000], r"\(it is damaged or cut off\)" + CALIBRATE),
     ("calibration.npz", _flipped, CALIBRATE),
     ("calibration.npz", lambda d: b"not an archive", r"\(it is damaged or cut off\)" + CALIBRATE),
-    ("calibration.npz", lambda d: _members(d, quaternions=None), r"\(quaternions is missing\)" + CALIBRATE),
+    (
+        "calibration.npz",
+        lambda d: _members(d, quaternions=None),
+        r"\(quaternions is missing\)" + CALIBRATE,
+    ),
     (
         "calibration.npz",
         lambda d: _members(d, theta=_declared((10**12,))),
@@ -216,8 +252,16 @@ ONCE = [
         lambda d: _members(d, theta=_declared((2**62, 4))),
         r"\(theta declares another size than it has\)",
     ),
-    ("calibration.npz", lambda d: _members(d, theta=_npy(np.array([{}]))), r"\(theta holds Python objects\)"),
-    ("calibration.npz", lambda d: _members(d, theta=_npy(np.ones(5) + 1j)), r"\(theta does not hold what it should\)"),
+    (
+        "calibration.npz",
+        lambda d: _members(d, theta=_npy(np.array([{}]))),
+        r"\(theta holds Python objects\)",
+    ),
+    (
+        "calibration.npz",
+        lambda d: _members(d, theta=_npy(np.ones(5) + 1j)),
+        r"\(theta does not hold what it should\)",
+    ),
     (
         "calibration.npz",
         lambda d: _members(d, theta=_npy(np.full(5, np.nan))),
@@ -230,7 +274,11 @@ ONCE = [
     ),
     ("calibration.json", lambda d: b"", r"\(the file is empty\)" + CALIBRATE),
     ("calibration.json", lambda d: d[: len(d) // 2], r"\(line \d+ is no JSON\)" + CALIBRATE),
-    ("calibration.json", lambda d: _DEEP.encode(), r"\(its values are nested too deeply\)" + CALIBRATE),
+    (
+        "calibration.json",
+        lambda d: _DEEP.encode(),
+        r"\(its values are nested too deeply\)" + CALIBRATE,
+    ),
     ("diagnosis.json", lambda d: _DEEP.encode(), "nested too deeply"),
     ("images.json", lambda d: b"[1, 2]", r"\(the document is \[1, 2\], not a table\)"),
     (
@@ -248,7 +296,11 @@ ONCE = [
         _hdf5(_huge_draws),
         r"\(it declares 8e\+12 bytes of content, far more",
     ),
-    ("study.nc", _hdf5(lambda f: f.pop("status")), r"\(status is missing\); run `starcal-uq study` again\.$"),
+    (
+        "study.nc",
+        _hdf5(lambda f: f.pop("status")),
+        r"\(status is missing\); run `starcal-uq study` again\.$",
+    ),
     ("study.nc", _hdf5(lambda f: f.pop("max_mag")), r"\(max_mag is missing\)"),
     ("study.nc", _hdf5(_one_for_another), r"\(n_frames is not along cell\)"),
     (
@@ -259,7 +311,11 @@ ONCE = [
     (
         "study.toml",
         lambda d: re.sub(rb"seeds = .*", b"seeds = " + b"9" * 30, d),
-        r"section \[study\]: key seeds is 9+; write a whole number from 1 to 1000000, or a list of them\.$",
+        (
+            r"section \[study\]: key seeds is 9+; write a whole number from 1 to 1000000, or a "
+            r"list "
+            r"of them\.$"
+        ),
     ),
     (
         "validation.npz",
@@ -267,35 +323,75 @@ ONCE = [
         r"\(n_ranked is -\d+, no number of draws\); run `starcal-uq validate CAMERA`",
     ),
     ("comparison.json", lambda d: re.sub(rb'"worst_ratio": [^,}]*', b'"worst_ratio": 0', d), None),
-    ("checkpoint.npz", lambda d: _members(d, place=_npy(np.zeros(2) + 1j)), "the draws are made again"),
-    ("checkpoint.npz", lambda d: _members(d, place=_npy(np.zeros(2, "M8[s]"))), "the draws are made again"),
+    (
+        "checkpoint.npz",
+        lambda d: _members(d, place=_npy(np.zeros(2) + 1j)),
+        "the draws are made again",
+    ),
+    (
+        "checkpoint.npz",
+        lambda d: _members(d, place=_npy(np.zeros(2, "M8[s]"))),
+        "the draws are made again",
+    ),
     (
         "tiles.fits",
         lambda d: d.replace(b"NAXIS2  =                   40", b"NAXIS2  =                    0"),
         "the image has no pixels; leave it out",
     ),
     ("checkpoint.npz", lambda d: _members(d, key=None), "the draws are made again"),
-    ("run.json", lambda d: d.replace(b'"gone": []', b'"gone": ["../kept.csv"]'), "of the run names a file elsewhere"),
-    ("run.json", lambda d: d.replace(b'"stage": ""', b'"stage": "/tmp"'), "of the run names a file elsewhere"),
+    (
+        "run.json",
+        lambda d: d.replace(b'"gone": []', b'"gone": ["../kept.csv"]'),
+        "of the run names a file elsewhere",
+    ),
+    (
+        "run.json",
+        lambda d: d.replace(b'"stage": ""', b'"stage": "/tmp"'),
+        "of the run names a file elsewhere",
+    ),
     ("checkpoint.npz", lambda d: d[:200], "the draws are made again"),
     (
         "observations.parquet",
         _parquet(_null),
         "row 1, column frame: the value is missing; fill it in or remove the row",
     ),
-    ("observations.parquet", _parquet(lambda t: t.append_column("frame", t.column(0))), "column frame occurs twice"),
-    ("observations.parquet", _meta(b"starcal_uq", b"{"), r"\(line 1 is no JSON\); write it again\.$"),
+    (
+        "observations.parquet",
+        _parquet(lambda t: t.append_column("frame", t.column(0))),
+        "column frame occurs twice",
+    ),
+    (
+        "observations.parquet",
+        _meta(b"starcal_uq", b"{"),
+        r"\(line 1 is no JSON\); write it again\.$",
+    ),
     ("observations.parquet", _meta(b"starcal_uq", b"\xff"), r"\(its text is not UTF-8\)"),
     ("observations.parquet", _meta(b"starcal_uq", b"[1]"), r"\(its metadata are no table\)"),
     ("observations.parquet", _meta(b"starcal_uq", _DEEP.encode()), "nested too deeply"),
     ("observations.parquet", _meta(b"other", b"{"), None),
-    ("stream.parquet", _parquet(lambda t: t.append_column("x_px", t.column(1))), "column x_px occurs twice"),
+    (
+        "stream.parquet",
+        _parquet(lambda t: t.append_column("x_px", t.column(1))),
+        "column x_px occurs twice",
+    ),
     ("part.parquet", _meta(b"starcal_uq", b"1.5"), r"\(its metadata are no table\)"),
-    ("centroids.parquet", _meta(b"starcal_uq_centroids", None), "the list of frames is missing; give a table"),
+    (
+        "centroids.parquet",
+        _meta(b"starcal_uq_centroids", None),
+        "the list of frames is missing; give a table",
+    ),
     ("centroids.parquet", _meta(b"starcal_uq_centroids", b"{}"), r"\(frames is missing\)"),
     ("profile.parquet", lambda d: b"", r"\(the file is empty\)"),
-    ("observations.ecsv", _header_only, "the table has a header but no rows; give a table with observations"),
-    ("observations.ecsv", lambda d: d.replace(b"datatype:", b"datatipe:"), "the ECSV header is not valid YAML"),
+    (
+        "observations.ecsv",
+        _header_only,
+        "the table has a header but no rows; give a table with observations",
+    ),
+    (
+        "observations.ecsv",
+        lambda d: d.replace(b"datatype:", b"datatipe:"),
+        "the ECSV header is not valid YAML",
+    ),
     ("catalogue.ecsv", _header_only, "holds no stars"),
     ("centroids.ecsv", lambda d: d.split(b"\n")[0] + b"\n", "is not a readable table"),
     ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"of those in the file \(\\x07, x\)"),
@@ -305,7 +401,11 @@ ONCE = [
         lambda d: d.replace(b"NAXIS   =                    2", b"NAXIS   = " + b"9" * 20),
         "its header states NAXIS as 9+",
     ),
-    ("state.npz", lambda d: _members(d, header=None), r"\(header is missing\); give a file written by"),
+    (
+        "state.npz",
+        lambda d: _members(d, header=None),
+        r"\(header is missing\); give a file written by",
+    ),
 ]
 
 
@@ -322,14 +422,18 @@ def test_what_once_went_wrong_is_one_sentence(
     assert re.search(words, outcome.detail), outcome.detail
 
 
-def test_what_is_packed_is_bounded_before_it_is_unpacked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_packed_is_bounded_before_it_is_unpacked(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(files, "_MODEST_BYTES", 2**16)
     outcome = bench.judged(BY_FILE["catalogue.csv.gz"], gzip.compress(bytes(2**20)))
     assert outcome.kind == "refused" and "far more than it can hold" in outcome.detail
     sample = BY_FILE["calibration.npz"]
     outcome = bench.judged(sample, _members(bench.valid(sample)[0], extra=bytes(2**20)))
     assert outcome.kind == "refused" and "far more than it can hold" in outcome.detail
-    outcome = bench.judged(BY_FILE["observations.ecsv"], _many_names(bench.valid(BY_FILE["observations.ecsv"])[0]))
+    outcome = bench.judged(
+        BY_FILE["observations.ecsv"], _many_names(bench.valid(BY_FILE["observations.ecsv"])[0])
+    )
     assert outcome.kind == "refused" and "far more than it can hold" in outcome.detail
 
 

@@ -31,7 +31,9 @@ def test_a_notebook_gets_one_output_that_is_replaced(monkeypatch: pytest.MonkeyP
     assert "a &lt;step&gt;" in shown[0][2]["text/html"]
 
 
-@pytest.mark.parametrize(("terminal", "said"), [(True, "\rstep 1 of 900\rstep 900 of 900\n"), (False, "")])
+@pytest.mark.parametrize(
+    ("terminal", "said"), [(True, "\rstep 1 of 900\rstep 900 of 900\n"), (False, "")]
+)
 def test_a_terminal_gets_one_line_and_a_file_nothing(
     terminal: bool, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

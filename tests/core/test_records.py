@@ -1,4 +1,6 @@
-"""The codec of results: what goes in comes out to the last bit, and what it does not know is refused."""
+"""The codec of results: what goes in comes out to the last bit, and what it does not know is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -53,14 +55,28 @@ def whole() -> Whole:
     flags, numbers = np.array([True, False]), np.array([[2**62, -1]])
     free = {"seed": 7, "versions": {"numpy": "2"}, "none": None, "list": [1, 2.5, "x"]}
     table = {"x": (0.1 + 0.2, 1.0)}
-    return Whole(parts, (3, "x"), "b", (0.1, 0.2), flags, numbers, float("nan"), table, Part("p", np.zeros(0)), free)
+    return Whole(
+        parts,
+        (3, "x"),
+        "b",
+        (0.1, 0.2),
+        flags,
+        numbers,
+        float("nan"),
+        table,
+        Part("p", np.zeros(0)),
+        free,
+    )
 
 
 def same(a: Whole, b: Whole) -> None:
     for one, other in zip((*a.parts, a.part), (*b.parts, b.part), strict=True):
         assert one is not None and other is not None
         assert (one.name, one.status) == (other.name, other.status)
-        assert one.values.tobytes() == other.values.tobytes() and one.values.shape == other.values.shape
+        assert (
+            one.values.tobytes() == other.values.tobytes()
+            and one.values.shape == other.values.shape
+        )
     assert (a.pair, a.kind, a.noise, a.table, a.free) == (b.pair, b.kind, b.noise, b.table, b.free)
     assert np.isnan(b.largest)
     for name in ("flags", "numbers"):
@@ -131,7 +147,10 @@ def test_what_is_wrong_in_a_document_is_named(change: AnyDict, words: str) -> No
 
 def test_damaged_files_are_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "whole.npz"
-    with pytest.raises(RunFolderError, match=r"whole\.npz: cannot be read \(No such file or directory\); make it\.$"):
+    with pytest.raises(
+        RunFolderError,
+        match=r"whole\.npz: cannot be read \(No such file or directory\); make it\.$",
+    ):
         read(Whole, path, "whole 1", **WORDS)
     write(whole(), path, "whole 1")
     data = path.read_bytes()
@@ -145,5 +164,7 @@ def test_damaged_files_are_one_sentence(tmp_path: Path) -> None:
     text = tmp_path / "whole.json"
     for content in ("", "[]", "{", '{"parts": []}', "\x00"):
         text.write_text(content, encoding="utf-8")
-        with pytest.raises(RunFolderError, match=r"whole\.json: is not a record \(.*\); make it\.$"):
+        with pytest.raises(
+            RunFolderError, match=r"whole\.json: is not a record \(.*\); make it\.$"
+        ):
             read_json(Whole, text, **WORDS)

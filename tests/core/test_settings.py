@@ -1,4 +1,6 @@
-"""Limits of settings: every public function refuses what lies outside, with the sentence of the command line."""
+"""Limits of settings: every public function refuses what lies outside, with the sentence of the
+command line.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,12 @@ import pytest
 import tomli_w
 
 import starcal_uq as sc
-from starcal_uq.budgeting.file import BUDGET_KEYS, CONTRIBUTOR_KEYS, REQUIREMENT_KEYS, load_budget_file
+from starcal_uq.budgeting.file import (
+    BUDGET_KEYS,
+    CONTRIBUTOR_KEYS,
+    REQUIREMENT_KEYS,
+    load_budget_file,
+)
 from starcal_uq.core import settings
 from starcal_uq.core.errors import SettingError, StarcalError
 from starcal_uq.core.settings import LIMITS, Limit, bounded
@@ -31,7 +38,11 @@ def public_functions():
         wing = importlib.import_module(".".join(stub.parent.relative_to(PACKAGE.parent).parts))
         for name in re.findall(r"import \w+ as (\w+)", stub.read_text()):
             public = getattr(wing, name)
-            members = inspect.getmembers(public, inspect.isfunction) if inspect.isclass(public) else [("", public)]
+            members = (
+                inspect.getmembers(public, inspect.isfunction)
+                if inspect.isclass(public)
+                else [("", public)]
+            )
             for member, function in members:
                 if inspect.isfunction(function) and not member.startswith("_"):
                     yield f"{name}.{member}".rstrip("."), function
@@ -41,26 +52,37 @@ def test_every_public_function_refuses_settings_outside_their_limits():
     """Before it looks at anything else: other arguments are missing here."""
     found = set()
     for name, function in public_functions():
-        # An array of one number for each star, and the Julian year of a catalogue, are judged where they are read.
+        # An array of one number for each star, and the Julian year of a catalogue, are judged where
+        # they are read.
         for setting in set(inspect.signature(function).parameters) & set(LIMITS) - {"sigma_px"}:
             limit = LIMITS[setting]
             for odd in (limit.low - 1, 10**30, -(10**30), float("nan"), float("inf"), "three"):
-                with pytest.raises(SettingError, match=f"^{setting} is .*: give a (whole )?number from "):
+                with pytest.raises(
+                    SettingError, match=f"^{setting} is .*: give a (whole )?number from "
+                ):
                     function(**{setting: odd})
             found.add((name, setting))
-    assert len(found) > 60 and {("sample", "seed"), ("simulate", "n_frames"), ("Run.propagate", "seed")} <= found
+    assert (
+        len(found) > 60
+        and {("sample", "seed"), ("simulate", "n_frames"), ("Run.propagate", "seed")} <= found
+    )
 
 
 def test_errors_of_settings_are_errors_of_values():
-    with pytest.raises(ValueError, match=r"^seed is -1: give a whole number from 0 to 18446744073709551615\.$"):
+    with pytest.raises(
+        ValueError, match=r"^seed is -1: give a whole number from 0 to 18446744073709551615\.$"
+    ):
         sc.simulate(None, None, seed=-1)
-    with pytest.raises(StarcalError, match="n_frames is 0: give a whole number from 1 to 1000000000"):
+    with pytest.raises(
+        StarcalError, match="n_frames is 0: give a whole number from 1 to 1000000000"
+    ):
         sc.simulate(None, None, n_frames=0)
 
 
 def test_counts_that_no_memory_holds_are_refused_before_it_is_taken(monkeypatch):
     with pytest.raises(
-        SettingError, match=r"^n_frames=1000000000, min_stars=10000: the result needs 5.6e\+05 GB of memory"
+        SettingError,
+        match=r"^n_frames=1000000000, min_stars=10000: the result needs 5.6e\+05 GB of memory",
     ):
         sc.simulate(None, None, n_frames=10**9, min_stars=10**4)
     settings.check_memory("n_steps=1", 8.0)
@@ -71,7 +93,12 @@ def test_counts_that_no_memory_holds_are_refused_before_it_is_taken(monkeypatch)
 
 def test_numbers_of_any_type_are_judged_and_others_left_alone():
     whole, real = Limit(1, 9), Limit(0.5, 2.0, whole=False)
-    assert all(map(whole.holds, (1, 9, np.int64(3), (1, 2), [9], None, np.arange(3), np.random.SeedSequence(1))))
+    assert all(
+        map(
+            whole.holds,
+            (1, 9, np.int64(3), (1, 2), [9], None, np.arange(3), np.random.SeedSequence(1)),
+        )
+    )
     assert not any(map(whole.holds, (0, 10, 3.0, np.float64(3.0), "3", (1, 0), np.int8(-1))))
     assert all(map(real.holds, (0.5, 1, np.float32(2.0), None)))
     assert not any(map(real.holds, (np.nan, np.inf, 0.4999, "1", [1.0, 3.0])))
@@ -103,7 +130,9 @@ STUDY = {"study": {"geometries": 20}, "observation": {"frames": 20}, "sweep": {"
 
 
 def study_files():
-    """A study with an odd number under each key that holds one, wherever that may stand; with its name."""
+    """A study with an odd number under each key that holds one, wherever that may stand; with its
+    name.
+    """
     camera = sc.paper.paper_camera().to_dict()
 
     def file(**tables):
@@ -113,7 +142,11 @@ def study_files():
     keys = [name for name, key in _STUDY.keys.items() if {"ge", "le"} <= set(key.bounds)]
     for odd in ODD:
         for name in numbers:
-            yield name, odd, file(observation={"frames": 20} | {name: odd}, sweep={"direction_mas": [1.0]})
+            yield (
+                name,
+                odd,
+                file(observation={"frames": 20} | {name: odd}, sweep={"direction_mas": [1.0]}),
+            )
             yield name, odd, file(sweep={name: [odd]})
             for spacing in ("linear", "log"):
                 for end in ("start", "stop"):
@@ -130,13 +163,19 @@ def study_files():
 
 
 def test_odd_numbers_in_a_study_are_refused_in_a_sentence_or_make_sense():
-    """Every key and axis that is declared; what is let through gives cells that are whole numbers apart finite."""
+    """Every key and axis that is declared; what is let through gives cells that are whole numbers
+    apart finite.
+    """
     refused, taken = set(), []
     for name, odd, content in study_files():
         try:
             made = StudyDefinition.from_dict(content)
         except StarcalError as error:
-            assert re.match(r"study[:,] .*[.?]$", str(error)) and "\n" not in str(error), (name, odd, str(error))
+            assert re.match(r"study[:,] .*[.?]$", str(error)) and "\n" not in str(error), (
+                name,
+                odd,
+                str(error),
+            )
             assert len(str(error)) < 400
             refused.add((name, odd))
         else:
@@ -164,14 +203,27 @@ def test_cells_at_the_limits_of_an_axis_have_numbers_or_a_reason(name):
 def test_odd_numbers_in_a_budget_are_refused_in_a_sentence_or_make_sense(tmp_path):
     rows = {
         "budget": {"confidence": 0.9},
-        "contributor": [{"name": "a", "ecss_class": "BIAS", "axis": "X", "mean_arcsec": 1.0, "sigma_arcsec": 1.0}],
+        "contributor": [
+            {
+                "name": "a",
+                "ecss_class": "BIAS",
+                "axis": "X",
+                "mean_arcsec": 1.0,
+                "sigma_arcsec": 1.0,
+            }
+        ],
         "requirement": [{"name": "r", "axis": "X", "limit_arcsec": 1.0, "confidence": 0.9}],
     }
     own = {"interpretation": "mixed", "absorbed_by_alignment": "no", "provenance": "p"}
     rows["contributor"][0] |= own
     keys = {"budget": BUDGET_KEYS, "contributor": CONTRIBUTOR_KEYS, "requirement": REQUIREMENT_KEYS}
     path, refused = tmp_path / "budget.toml", set()
-    floats = [(table, key) for table, known in keys.items() for key, kind in known.items() if kind.kind is float]
+    floats = [
+        (table, key)
+        for table, known in keys.items()
+        for key, kind in known.items()
+        if kind.kind is float
+    ]
     for table, key in floats:
         for odd in ODD:
             content = copy.deepcopy(rows)
@@ -184,7 +236,9 @@ def test_odd_numbers_in_a_budget_are_refused_in_a_sentence_or_make_sense(tmp_pat
             try:
                 made = load_budget_file(path)
             except StarcalError as error:
-                assert re.match(rf"{path}, .*: key {key} is .*\.$", str(error)) and "\n" not in str(error)
+                assert re.match(rf"{path}, .*: key {key} is .*\.$", str(error)) and "\n" not in str(
+                    error
+                )
                 refused.add((key, odd))
             else:
                 assert all(abs(r.mean_arcsec) + r.sigma_arcsec < 1e7 for r in made.contributors)

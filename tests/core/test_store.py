@@ -1,4 +1,6 @@
-"""Results that are kept while a command is under way: every bit of them, found by what they depend on."""
+"""Results that are kept while a command is under way: every bit of them, found by what they depend
+on.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,15 @@ def same(found: list[Found], wanted: list[Found]) -> bool:
 
 def _parts(found: list[Found]) -> list[Any]:
     return [
-        [one.number, one.words, type(one), array.tobytes(), str(array.dtype), array.shape, repr(rest)]
+        [
+            one.number,
+            one.words,
+            type(one),
+            array.tobytes(),
+            str(array.dtype),
+            array.shape,
+            repr(rest),
+        ]
         for one in found
         for array, rest in (one.values.values(),)
     ]

@@ -1,4 +1,6 @@
-"""Tasks over processes: the same results for any number of them, Ctrl-C, and what cannot be sent to them."""
+"""Tasks over processes: the same results for any number of them, Ctrl-C, and what cannot be sent to
+them.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,12 @@ EXPECTED = [(index**2, "1") for index in range(30)]
 def test_results_come_in_order_whoever_computes_them(workers: int) -> None:
     calls: list[tuple[int, int]] = []
     found = run_tasks(
-        numbered, 30, caller="f", chunk=4, workers=workers, progress=lambda *numbers: calls.append(numbers)
+        numbered,
+        30,
+        caller="f",
+        chunk=4,
+        workers=workers,
+        progress=lambda *numbers: calls.append(numbers),
     )
     assert found == (EXPECTED, False)
     assert calls[-1] == (30, 30)
@@ -34,14 +41,18 @@ def test_interrupt_keeps_what_is_done(workers: int) -> None:
         if done >= 8:
             signal.raise_signal(signal.SIGINT)
 
-    found, interrupted = run_tasks(numbered, 2000, caller="f", chunk=2, workers=workers, progress=press)
+    found, interrupted = run_tasks(
+        numbered, 2000, caller="f", chunk=2, workers=workers, progress=press
+    )
     assert interrupted
     assert 8 <= len(found) < 2000
     assert found[:8] == EXPECTED[:8]
 
 
 def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path: Path, root: Path) -> None:
-    """The processes import the script, which starts processes; without care both wait for each other forever."""
+    """The processes import the script, which starts processes; without care both wait for each
+    other forever.
+    """
     script = tmp_path / "script.py"
     script.write_text(
         "from starcal_uq.core.tasks import run_tasks\n"
@@ -50,7 +61,12 @@ def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path: Path, root: Pat
     )
     environment = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, timeout=120, check=False, env=environment
+        [sys.executable, script],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        env=environment,
     )
     assert done.returncode == 1
     assert 'call validate below `if __name__ == "__main__":`' in done.stderr

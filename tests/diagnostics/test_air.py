@@ -1,4 +1,6 @@
-"""Refraction that is missing from the directions is found in the residuals; what looks like it is not."""
+"""Refraction that is missing from the directions is found in the residuals; what looks like it is
+not.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +15,27 @@ from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.air import air_test
 from starcal_uq.diagnostics.verdict import observed
 from starcal_uq.diagnostics.verdict.judge import judge
-from tests.helpers.outside import campaign, cap, frame_at, random_unit, through_air, zeniths_of_frames
+from tests.helpers.outside import (
+    campaign,
+    cap,
+    frame_at,
+    random_unit,
+    through_air,
+    zeniths_of_frames,
+)
 
 LATITUDE, LONGITUDE = 38.0, -70.0
 
 
-def night(seed: int, *, air=1.0, focal=0.0, skew=0.0, drift=0.0, hours=3.0, above=True, n_frames=10):
-    """Frames of a night, without the package: catalogue directions, pixels as seen through `air` of the standard one.
+def night(
+    seed: int, *, air=1.0, focal=0.0, skew=0.0, drift=0.0, hours=3.0, above=True, n_frames=10
+):
+    """Frames of a night, without the package: catalogue directions, pixels as seen through `air` of
+    the standard one.
 
-    `focal` is the relative spread of the focal length over frames, `skew` the error in px of the axes' scale at the
-    corner, `drift` that of the scale over the night; without `above` the camera looks anywhere.
+    `focal` is the relative spread of the focal length over frames, `skew` the error in px of the
+    axes' scale at the corner, `drift` that of the scale over the night; without `above` the camera
+    looks anywhere.
     """
     rng = np.random.default_rng(seed)
     seconds = np.sort(rng.uniform(0.0, 3600.0 * hours, n_frames))
@@ -51,7 +64,10 @@ def night(seed: int, *, air=1.0, focal=0.0, skew=0.0, drift=0.0, hours=3.0, abov
         tangent = np.sqrt(1.0 / sine**2 - 1.0)
         raised = np.radians((58.276 * tangent - 0.0824 * tangent**3) / 3600.0)
         upwards = zenith - sine[:, None] * seen
-        r = seen - air * np.tan(raised)[:, None] * upwards / np.linalg.norm(upwards, axis=1)[:, None]
+        r = (
+            seen
+            - air * np.tan(raised)[:, None] * upwards / np.linalg.norm(upwards, axis=1)[:, None]
+        )
         r /= np.linalg.norm(r, axis=1)[:, None]
         time = (datetime(2026, 11, 13, 12) + timedelta(seconds=float(seconds[frame]))).isoformat()
         ra, dec = np.degrees(np.arctan2(r[:, 1], r[:, 0])) % 360.0, np.degrees(np.arcsin(r[:, 2]))
@@ -94,7 +110,9 @@ PATCH = {"n_frames": 60, "patch_stars": 40, "star_sigma_px": 0.03}
 
 
 def bent(px, bend):
-    """A shift of so many px, by the position in the field, in units of the half diagonal, and the frame."""
+    """A shift of so many px, by the position in the field, in units of the half diagonal, and the
+    frame.
+    """
     return lambda uv, xy, mag, frame: px * bend(*(uv / 724.0), frame)
 
 
@@ -109,7 +127,9 @@ def smear(uv):
 
 
 def outside(seed, *, air=None, star_errors=False, noise="common", meta=None, **options):
-    """Frames without times from the simulator of another make, calibrated; `air` is where the zenith is."""
+    """Frames without times from the simulator of another make, calibrated; `air` is where the
+    zenith is.
+    """
     rng = np.random.default_rng([seed, 26])
     c = campaign(rng, **{"n_frames": 30} | options)
     if air == "one":
@@ -119,10 +139,16 @@ def outside(seed, *, air=None, star_errors=False, noise="common", meta=None, **o
         c = through_air(c, np.broadcast_to(zenith, (len(c.attitudes), 3)))
     elif air is not None:
         turned = air == "each"
-        c = through_air(c, zeniths_of_frames(rng, c, (20.0, 60.0) if turned else (45.0, 45.0), turned))
+        c = through_air(
+            c, zeniths_of_frames(rng, c, (20.0, 60.0) if turned else (45.0, 45.0), turned)
+        )
     obs = sc.Observations(**c.columns, meta={"directions": "apparent"} | (meta or {}))
     camera = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
-    return c, obs, sc.calibrate(obs, camera, star_errors=star_errors, noise=noise, duplicates="keep")
+    return (
+        c,
+        obs,
+        sc.calibrate(obs, camera, star_errors=star_errors, noise=noise, duplicates="keep"),
+    )
 
 
 @pytest.mark.parametrize("star_errors", [False, True])
@@ -146,7 +172,9 @@ def test_in_space_there_is_no_air():
         assert air_test(obs.with_meta(observer=observer), cal) is None
 
 
-@pytest.mark.parametrize("options", [{}, {"sigma_px": 0.1}, {"field_deg": 5.0}, {"field_deg": 30.0}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"sigma_px": 0.1}, {"field_deg": 5.0}, {"field_deg": 30.0}], ids=str
+)
 def test_refraction_of_frames_without_times(options):
     c, obs, cal = outside(2, air="each", meta={"observer": "unknown"}, **options)
     found = air_test(obs, cal)
@@ -167,16 +195,24 @@ LOOKALIKES = {
     "frames of their own shape": {
         "displaced": bent(0.05, lambda u, v, frame: np.array([u, -v]) * np.sin(2.4 * frame**2))
     },
-    "drift of f": {"displaced": bent(0.3, lambda u, v, frame: np.array([u, v]) * (frame / 30.0 - 0.5))},
+    "drift of f": {
+        "displaced": bent(0.3, lambda u, v, frame: np.array([u, v]) * (frame / 30.0 - 0.5))
+    },
     "radial": {"displaced": bent(1.0, lambda u, v, frame: np.array([u, v]) * np.hypot(u, v) ** 6)},
-    "decentred": {"displaced": bent(0.5, lambda u, v, frame: np.array([3.0 * u**2 + v**2, 2.0 * u * v]))},
-    "waves": {"displaced": bent(0.1, lambda u, v, frame: np.array([np.sin(9.0 * v), np.cos(8.0 * u)]))},
+    "decentred": {
+        "displaced": bent(0.5, lambda u, v, frame: np.array([3.0 * u**2 + v**2, 2.0 * u * v]))
+    },
+    "waves": {
+        "displaced": bent(0.1, lambda u, v, frame: np.array([np.sin(9.0 * v), np.cos(8.0 * u)]))
+    },
     "noise at the edge": {"sigma_px": edge},
     "noise of the axes": {"displaced": lambda uv, xy, mag, frame: smear(uv)},
 }
 
 
-@pytest.mark.parametrize("where", [{}, {"patch_stars": 40}, {"pointings": 1, "drift_px": 3.3}], ids=str)
+@pytest.mark.parametrize(
+    "where", [{}, {"patch_stars": 40}, {"pointings": 1, "drift_px": 3.3}], ids=str
+)
 @pytest.mark.parametrize("name", LOOKALIKES)
 def test_without_times_what_is_not_refraction_is_not_named(name, where):
     _, obs, cal = outside(3, **LOOKALIKES[name], **where)
@@ -201,7 +237,9 @@ def test_thinner_air_is_air():
     assert air_test(obs, cal).is_air
 
 
-@pytest.mark.parametrize("options", [{}, {"focal": 3e-4}, {"skew": 0.5}, {"drift": 0.5}, {"above": False}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"focal": 3e-4}, {"skew": 0.5}, {"drift": 0.5}, {"above": False}], ids=str
+)
 def test_what_is_not_refraction_is_not_named(options):
     obs, cal, _ = night(3, air=0.0, **options)
     found = air_test(obs, cal)
@@ -212,15 +250,22 @@ def test_what_is_not_refraction_is_not_named(options):
 def test_real_frames(real_data):
     camera = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
     path = real_data / "esa_tetra3_observations.csv"
-    for columns, is_air in ((None, True), ({"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}, False)):
+    for columns, is_air in (
+        (None, True),
+        ({"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}, False),
+    ):
         obs = sc.load_observations(path, camera, columns=columns)
         obs = replace(obs, time_utc=np.full(obs.n_stars, "2019-07-29T20:47:26"))
         found = air_test(obs, sc.calibrate(obs, camera))
         assert found.is_air == is_air
         if is_air:
-            # A fit of another program says 52.0 degrees, and 2.2 px in standard air; f follows the density.
+            # A fit of another program says 52.0 degrees, and 2.2 px in standard air; f follows the
+            # density.
             assert abs(found.latitude_deg - 52.0) < 2.0 * found.latitude_std_deg
-            assert found.f_px == pytest.approx(2.2, abs=2.2 * found.amplitude_std) and found.amplitude_std < 0.15
+            assert (
+                found.f_px == pytest.approx(2.2, abs=2.2 * found.amplitude_std)
+                and found.amplitude_std < 0.15
+            )
 
 
 @pytest.mark.slow

@@ -1,4 +1,6 @@
-"""A richer model that the data do not prefer is a choice, no misfit: campaigns of a second make, with and without."""
+"""A richer model that the data do not prefer is a choice, no misfit: campaigns of a second make,
+with and without.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +45,14 @@ def assessed(seed: int, n_frames: int, **options: Any) -> SimpleNamespace:
     weights, _ = alignment_weights(frames.noise_covariance)
     together = np.einsum("nij,njp->ip", weights, frames.response)
     parts = (together[None], frames.response - together)
-    common, rest = (np.sqrt(np.mean(np.einsum("kip,pq,kiq->ki", r, cal.covariance, r), axis=0)) * ARCSEC for r in parts)
+    common, rest = (
+        np.sqrt(np.mean(np.einsum("kip,pq,kiq->ki", r, cal.covariance, r), axis=0)) * ARCSEC
+        for r in parts
+    )
     zero, nothing = np.zeros(3), np.full((5, 4), np.nan)
-    error = AttitudeError(zero, common, rest, nothing, nothing, zero, common, rest, 2, n_frames, seen=obs, aligned=obs)
+    error = AttitudeError(
+        zero, common, rest, nothing, nothing, zero, common, rest, 2, n_frames, seen=obs, aligned=obs
+    )
     diagnosis: Any = SimpleNamespace(
         misfit=misfit_tests(obs, cal),
         jackknife=jackknife_frames(obs, cal),
@@ -53,26 +60,37 @@ def assessed(seed: int, n_frames: int, **options: Any) -> SimpleNamespace:
         theta=cal.theta.tolist(),
     )
     made = with_misfit(error, diagnosis, post, obs)
-    return SimpleNamespace(c=c, obs=obs, cal=cal, post=post, diagnosis=diagnosis, bare=error, error=made)
+    return SimpleNamespace(
+        c=c, obs=obs, cal=cal, post=post, diagnosis=diagnosis, bare=error, error=made
+    )
 
 
 def inflation(error: AttitudeError) -> float:
     """Headline over the model's figure, the largest of common rotation and rest about any axis."""
-    return float(np.max(error.with_misfit_found_arcsec[1:3, :3] / error.if_model_holds_arcsec[1:3, :3]))
+    return float(
+        np.max(error.with_misfit_found_arcsec[1:3, :3] / error.if_model_holds_arcsec[1:3, :3])
+    )
 
 
 def with_every_model(run: SimpleNamespace) -> AttitudeError:
-    """The error if every model that is not rejected counted in full, as if the data preferred it."""
+    """The error if every model that is not rejected counted in full, as if the data preferred
+    it.
+    """
     found = run.diagnosis.comparison
     scores = tuple(dataclasses.replace(s, preferred=1.0) for s in found.scores)
-    diagnosis = SimpleNamespace(**{**vars(run.diagnosis), "comparison": dataclasses.replace(found, scores=scores)})
+    diagnosis = SimpleNamespace(
+        **{**vars(run.diagnosis), "comparison": dataclasses.replace(found, scores=scores)}
+    )
     return with_misfit(run.bare, diagnosis, run.post, run.obs)  # type: ignore[arg-type]
 
 
 def check(runs: list[SimpleNamespace]) -> None:
     above = sum(inflation(run.error) > 1.05 for run in runs)
     every = sum(inflation(with_every_model(run)) > 1.05 for run in runs)
-    print(f"\n{runs[0].obs.n_frames} frames: {above} of {len(runs)} inflated, {every} if every model counted")
+    print(
+        f"\n{runs[0].obs.n_frames} frames: {above} of {len(runs)} inflated, {every} if every "
+        "model counted"
+    )
     # At most so many as 5 % give in 99 of 100 cases.
     assert above <= stats.binom.ppf(0.99, len(runs), 0.05), above
     # Control: the noise of terms that nothing asks for inflates most runs.
@@ -112,9 +130,13 @@ def test_the_choice_is_stated_wherever_the_error_is() -> None:
     found = run.error.misfit
     assert found.choice_models == ("brown_tangential",) and not found.reasons
     sentence = "'brown_tangential' predicts about as well as the fitted model"
-    assert sentence in run.error.text and sentence in " ".join(limits(run.obs, run.cal, attitude=run.error))
+    assert sentence in run.error.text and sentence in " ".join(
+        limits(run.obs, run.cal, attitude=run.error)
+    )
     table = run.error.to_dataframe().set_index(["contributor", "axis"])["choice_of_model_arcsec"]
-    np.testing.assert_array_equal(table.loc["calibration, common rotation"].to_numpy()[:3], found.choice_common_arcsec)
+    np.testing.assert_array_equal(
+        table.loc["calibration, common rotation"].to_numpy()[:3], found.choice_common_arcsec
+    )
     assert "choice of model" in str(run.error._repr_html_())
     untested = dataclasses.replace(run.error, misfit=None)
     assert np.isnan(untested.choice_of_model_arcsec).all() and sentence not in untested.text

@@ -1,4 +1,6 @@
-"""Jackknife, comparison of models, replicated data and other starts; each with a case that must turn out otherwise."""
+"""Jackknife, comparison of models, replicated data and other starts; each with a case that must
+turn out otherwise.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def cal(obs):
 
 
 def clustered(obs, seed=0):
-    """Every frame with an error of its own in scale and shape, which independent noise does not have."""
+    """Every frame with an error of its own in scale and shape, which independent noise does not
+    have.
+    """
     rng = np.random.default_rng(seed)
     offset = obs.xy - camera().theta[:2]
     stretch = np.repeat(3e-4 * rng.standard_normal((obs.n_frames, 3)), obs.stars_per_frame, axis=0)
@@ -45,7 +49,8 @@ def clustered(obs, seed=0):
     return dataclasses.replace(obs, x_px=obs.x_px + shift[:, 0], y_px=obs.y_px + shift[:, 1])
 
 
-# --- jackknife -------------------------------------------------------------------------------------------------------
+# --- jackknife
+# --------------------------------------------------------------------------------------------------
 
 
 def test_one_step_equals_refitting_without_a_frame(obs, cal):
@@ -62,7 +67,10 @@ def test_one_step_equals_refitting_with_stated_noise_and_few_frames():
     obs = with_sigmas(observations(n_frames=60, sigma_px=0.0)).select_frames(range(12))
     cal = sc.calibrate(obs, sc.paper.paper_start())
     found = jackknife_frames(obs, cal)
-    refits = [sc.calibrate(obs.select(obs.frame != k), sc.paper.paper_start()).theta for k in obs.frame_ids]
+    refits = [
+        sc.calibrate(obs.select(obs.frame != k), sc.paper.paper_start()).theta
+        for k in obs.frame_ids
+    ]
     scatter = np.array(refits) - np.mean(refits, axis=0)
     exact = np.sqrt(np.sum(scatter**2, axis=0) * 11 / 12)
     assert np.sqrt(np.diag(found.jackknife_covariance)) == pytest.approx(exact, rel=0.05)
@@ -80,7 +88,9 @@ def test_jackknife_p_values_are_nominal_and_clusters_are_found():
         one = sc.simulate(stars, camera(), n_frames=30, min_stars=10, sigma_px=0.05, seed=300 + i)
         p.append(jackknife_frames(one, sc.calibrate(one, sc.paper.paper_start())).p_values)
         if i < 10:
-            found = jackknife_frames(bad := clustered(one, i), sc.calibrate(bad, sc.paper.paper_start()))
+            found = jackknife_frames(
+                bad := clustered(one, i), sc.calibrate(bad, sc.paper.paper_start())
+            )
             wrong.append(found.p_values.min())
             ratios.append(found.ratio[2])
     p = np.array(p)
@@ -92,7 +102,9 @@ def test_jackknife_p_values_are_nominal_and_clusters_are_found():
 
 
 def linear_frames(rng, designs):
-    """Normal equations of frames (n_k, p) under independent noise; no camera, no code of the package."""
+    """Normal equations of frames (n_k, p) under independent noise; no camera, no code of the
+    package.
+    """
     p = designs[0].shape[1]
     e = [rng.standard_normal(len(h)) for h in designs]
     return FrameNormals(
@@ -108,7 +120,9 @@ def linear_frames(rng, designs):
 
 
 def uncorrected_alarm(found):
-    """The test of before: the leave-one-out scatter against chi-square, as if the fit took nothing up."""
+    """The test of before: the leave-one-out scatter against chi-square, as if the fit took nothing
+    up.
+    """
     ratio, dof = found.jackknife_ratio, np.maximum(found.effective_frames - 1.0, 1.0)
     return np.any((stats.chi2.sf(dof * ratio**2, dof) * len(ratio) < 0.01) & (ratio > 1.1))
 
@@ -117,7 +131,10 @@ def uncorrected_alarm(found):
 def test_frame_scatter_is_nominal_with_few_uneven_frames(k):
     rng = np.random.default_rng(k)
     spread = np.array([1.0, 1.0, 1.0, 0.5, 0.2])
-    designs = [rng.standard_normal((rng.integers(9, 30), 5)) * spread * rng.uniform(0.5, 1.5) for _ in range(k)]
+    designs = [
+        rng.standard_normal((rng.integers(9, 30), 5)) * spread * rng.uniform(0.5, 1.5)
+        for _ in range(k)
+    ]
     names = SimpleNamespace(parameter_names=tuple("abcde"))
     data = SimpleNamespace(n_frames=k, frame_ids=np.arange(k))
     found = [jackknife_frames(data, names, linear_frames(rng, designs)) for _ in range(400)]
@@ -125,14 +142,19 @@ def test_frame_scatter_is_nominal_with_few_uneven_frames(k):
     # Three moments are right, so that the tail, not each quantile, is nominal.
     assert np.all(np.abs(np.mean(p < 0.05, axis=0) - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 / 400))
     assert np.mean(p.min(axis=1) * 5 < 0.01) < 0.01 + 3.0 * np.sqrt(0.01 * 0.99 / 400)
-    assert np.mean([f.ratio**2 for f in found], axis=0) == pytest.approx(1.0, abs=6.0 * np.sqrt(2.0 / (k - 1) / 400))
-    # The control: without the correction of leverage, alarms are several times as frequent as stated.
+    assert np.mean([f.ratio**2 for f in found], axis=0) == pytest.approx(
+        1.0, abs=6.0 * np.sqrt(2.0 / (k - 1) / 400)
+    )
+    # The control: without the correction of leverage, alarms are several times as frequent as
+    # stated.
     assert np.mean([uncorrected_alarm(f) for f in found]) > (0.03 if k < 20 else 0.015)
 
 
 @pytest.mark.slow
 def test_accepted_inflation_covers_what_formal_errors_do_not():
-    """Truth within the interval: formal errors fail for frames with errors of their own, inflated ones do not."""
+    """Truth within the interval: formal errors fail for frames with errors of their own, inflated
+    ones do not.
+    """
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     formal, inflated = [], []
     for i in range(60):
@@ -169,7 +191,9 @@ def test_accepting_inflation_is_on_record_and_never_shrinks(obs, cal):
 
 
 def test_every_step_of_a_run_has_the_inflation_that_was_accepted(obs, tmp_path):
-    """Common rotation and verdict of draws with an accepted inflation; those of formal errors are the control."""
+    """Common rotation and verdict of draws with an accepted inflation; those of formal errors are
+    the control.
+    """
     bad, common, checks = clustered(obs), {}, {}
     for name, accept in (("formal", False), ("accepted", True)):
         run = sc.Run(tmp_path / name)
@@ -188,19 +212,26 @@ def test_every_step_of_a_run_has_the_inflation_that_was_accepted(obs, tmp_path):
     factors = jackknife_frames(bad, sc.calibrate(bad, sc.paper.paper_start())).factors
     assert min(common["accepted"][:2] / common["formal"][:2]) > 1.1 and max(factors) > 1.5
     assert checks["formal"].level is Level.WARN and "--accept-inflation" in checks["formal"].remedy
-    assert checks["accepted"].level is Level.PASS and "has multiplied" in checks["accepted"].sentence
+    assert (
+        checks["accepted"].level is Level.PASS and "has multiplied" in checks["accepted"].sentence
+    )
     # Draws of a version before have the formal errors.
     old = sc.Run(tmp_path / "accepted")
-    record = {name: value for name, value in old.posterior.provenance.items() if name != "inflation"}
+    record = {
+        name: value for name, value in old.posterior.provenance.items() if name != "inflation"
+    }
     post = dataclasses.replace(old.posterior, provenance=record)
     verdict = judge(old.observations, old.calibration, post, diagnosis=old.diagnosis)
     check = next(c for c in verdict.checks if c.name == "Jackknife over frames")
     assert (
-        check.level is Level.WARN and "sample RUN --force" in check.remedy and "not that of the draws" in check.sentence
+        check.level is Level.WARN
+        and "sample RUN --force" in check.remedy
+        and "not that of the draws" in check.sentence
     )
 
 
-# --- comparison of models --------------------------------------------------------------------------------------------
+# --- comparison of models
+# --------------------------------------------------------------------------------------------
 
 
 def test_importance_sampling_and_the_closed_form_agree(obs, cal):
@@ -223,7 +254,9 @@ def test_a_sample_of_frames_beside_the_closed_form_compares_as_all_do(obs, cal, 
 
 
 def test_closed_form_is_the_ratio_of_evidences(obs, cal):
-    """p(y_k | others) = p(y) / p(others): evidences of the linear model, computed without any of its formulas."""
+    """p(y_k | others) = p(y) / p(others): evidences of the linear model, computed without any of
+    its formulas.
+    """
     from scipy.special import gammaln
 
     normals = FrameNormals.at(obs.select_frames(range(12)), cal)
@@ -270,7 +303,8 @@ def test_a_superfluous_term_is_called_so_and_the_shift_is_stated():
     assert np.hypot(*other.common_arcsec[:2]) == pytest.approx(moved, rel=0.05)
 
 
-# --- replicated data, other starts, the whole -------------------------------------------------------------------------
+# --- replicated data, other starts, the whole
+# -------------------------------------------------------------------------
 
 
 def test_replicates_look_like_data_of_the_model_and_unlike_others(obs, cal):
@@ -280,17 +314,23 @@ def test_replicates_look_like_data_of_the_model_and_unlike_others(obs, cal):
     tails = dataclasses.replace(obs, x_px=obs.x_px + residuals[0], y_px=obs.y_px + residuals[1])
     bad = predictive_check(tails, sc.calibrate(tails, sc.paper.paper_start()), n_draws=300)
     assert {s.name for s in bad.statistics if s.extreme} >= {"excess kurtosis"}
-    truth = camera("brown3").replace(coefficients=(2e-10, -3.5e-15, 8.0 / camera().corner_radius_px ** 7))
+    truth = camera("brown3").replace(
+        coefficients=(2e-10, -3.5e-15, 8.0 / camera().corner_radius_px ** 7)
+    )
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     bent = sc.simulate(stars, truth, n_frames=300, min_stars=10, sigma_px=0.05, seed=1)
     ring = predictive_check(bent, sc.calibrate(bent, sc.paper.paper_start()), n_draws=200)
-    assert ring.statistics[3].name.startswith("radial pattern") and ring.statistics[3].p_value < 0.05
+    assert (
+        ring.statistics[3].name.startswith("radial pattern") and ring.statistics[3].p_value < 0.05
+    )
 
 
 def test_replicates_on_some_frames_say_so(obs, cal, monkeypatch):
     monkeypatch.setattr("starcal_uq.diagnostics.predictive._MAX_STARS", 500)
     some = predictive_check(obs, cal, n_draws=100)
-    assert some.of_frames == obs.n_frames and some.n_frames == pytest.approx(500 * obs.n_frames / obs.n_stars, abs=1)
+    assert some.of_frames == obs.n_frames and some.n_frames == pytest.approx(
+        500 * obs.n_frames / obs.n_stars, abs=1
+    )
     assert f"on {some.n_frames} of {obs.n_frames} frames" in some.text
     assert not any(s.extreme for s in some.statistics)
 
@@ -330,7 +370,11 @@ def test_half_of_a_diagnosis_may_be_found_elsewhere(obs, cal):
 
     def plain(found):
         # NaN is not NaN.
-        return json.dumps(to_plain([found.misfit, found.starts, found.stars, found.air, found.cameras, found.times]))
+        return json.dumps(
+            to_plain(
+                [found.misfit, found.starts, found.stars, found.air, found.cameras, found.times]
+            )
+        )
 
     options = {"models": (), "n_starts": 1, "seed": 3}
     assert plain(diagnose(obs, cal, **options, apart=lambda: None)) == plain(apart)
@@ -346,14 +390,23 @@ def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, t
     assert sc.Run(run.path).diagnosis is None
     steps = []
     whole = sc.Run(run.path)
-    found = whole.diagnose(models=("k1",), n_starts=1, progress=lambda done, total: steps.append((done, total)))
+    found = whole.diagnose(
+        models=("k1",), n_starts=1, progress=lambda done, total: steps.append((done, total))
+    )
     assert steps == [(i, 4) for i in range(1, 5)]
-    assert {path.name for path in run.path.iterdir()} >= {run.diagnosis.name, *DIAGNOSIS_TABLES.values()}
+    assert {path.name for path in run.path.iterdir()} >= {
+        run.diagnosis.name,
+        *DIAGNOSIS_TABLES.values(),
+    }
     again = whole.diagnosis
     assert json.dumps(to_plain(again)) == json.dumps(to_plain(found))
     assert isinstance(again, Diagnosis) and isinstance(again.jackknife, Jackknife)
-    assert isinstance(again.comparison, ModelComparison) and isinstance(again.predictive, PredictiveCheck)
-    assert all(word in again._repr_html_() for word in ("Misfit", "Jackknife", "Models", "predictive"))
+    assert isinstance(again.comparison, ModelComparison) and isinstance(
+        again.predictive, PredictiveCheck
+    )
+    assert all(
+        word in again._repr_html_() for word in ("Misfit", "Jackknife", "Models", "predictive")
+    )
     with (run.path / DIAGNOSIS_TABLES["comparison"]).open() as stream:
         assert {row["model"] for row in csv.DictReader(stream)} == {"k1", "brown"}
     # The control: the diagnosis of another estimate is not shown with this one.
@@ -374,7 +427,8 @@ def test_two_frames_have_no_jackknife_but_a_diagnosis(obs):
     assert found.jackknife is None and found.comparison is None and found.starts is None
 
 
-# --- real stars ------------------------------------------------------------------------------------------------------
+# --- real stars
+# --------------------------------------------------------------------------------------------------
 
 
 def test_real_stars_need_no_k2_and_show_the_phase_of_the_pixels(real_data, capsys):
@@ -399,7 +453,8 @@ def test_real_stars_need_no_k2_and_show_the_phase_of_the_pixels(real_data, capsy
     assert found.misfit.found()[0].name == "error with the pixel phase in x"
     smooth = [t for t in found.misfit.tests if t.dof and not t.against.startswith("pixel phase")]
     assert all(t.p_holm > 0.05 for t in smooth)
-    # The control: with neither refraction nor aberration in the directions, the shape of the field is wrong too.
+    # The control: with neither refraction nor aberration in the directions, the shape of the field
+    # is wrong too.
     raw = sc.load_observations(path, start)
     wrong = diagnose(raw, sc.calibrate(raw, start), models=(), n_starts=0).misfit
     assert next(t for t in wrong.tests if t.name == "scale and skew of the axes").p_holm < 1e-4

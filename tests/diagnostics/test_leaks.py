@@ -1,7 +1,8 @@
-"""A smooth misfit of the field with scales of every frame's own, on a sensor of a second make: what attitudes it costs.
+"""A smooth misfit of the field with scales of every frame's own, on a sensor of a second make: what
+attitudes it costs.
 
-Directions that attitudes imitate, such as a principal point that drifts over the frames, must not turn what the fit of
-another shape leaves over into arcminutes.
+Directions that attitudes imitate, such as a principal point that drifts over the frames, must not
+turn what the fit of another shape leaves over into arcminutes.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ SCALES = np.linspace(-680e-6, 270e-6, 9)
 
 
 def smooth(seed: int, rms_px: float) -> Callable[[FloatArray], FloatArray]:
-    """Shifts (2, n) of stars at (2, n) px from the middle: waves at least as long as two thirds of the field."""
+    """Shifts (2, n) of stars at (2, n) px from the middle: waves at least as long as two thirds of
+    the field.
+    """
     rng = np.random.default_rng(seed)
     waves = rng.uniform(0.5, 1.5, (2, 8, 2)) * rng.choice([-1, 1], (2, 8, 2)) * 2.0 * np.pi / WIDTH
     phases, heights = rng.uniform(0.0, 2.0 * np.pi, (2, 8, 1)), rng.standard_normal((2, 8, 1))
@@ -42,8 +45,12 @@ def smooth(seed: int, rms_px: float) -> Callable[[FloatArray], FloatArray]:
     return lambda uv: size * shift(uv)
 
 
-def frames(seed: int, scales: FloatArray, *, misfit: int, sigma_px: float = 0.0, rms_px: float = 0.2) -> Campaign:
-    """About 134 stars a frame on a detector of 1280 by 960 px, with the field pattern number `misfit`."""
+def frames(
+    seed: int, scales: FloatArray, *, misfit: int, sigma_px: float = 0.0, rms_px: float = 0.2
+) -> Campaign:
+    """About 134 stars a frame on a detector of 1280 by 960 px, with the field pattern number
+    `misfit`.
+    """
     bent = smooth(misfit, rms_px)
 
     def displaced(uv: FloatArray, xy: FloatArray, mag: FloatArray, frame: int) -> FloatArray:
@@ -68,7 +75,9 @@ def frames(seed: int, scales: FloatArray, *, misfit: int, sigma_px: float = 0.0,
 
 @dataclass(frozen=True)
 class Errors:
-    """Stated and true errors by the misfit, arcsec, each across the boresight per axis and in roll (2,)."""
+    """Stated and true errors by the misfit, arcsec, each across the boresight per axis and in roll
+    (2,).
+    """
 
     rest: FloatArray
     true_rest: FloatArray
@@ -81,11 +90,15 @@ def both(values: FloatArray) -> FloatArray:
 
 
 def errors(seed: int, scales: FloatArray = SCALES, rms_px: float = 0.2) -> Errors:
-    """The truth is that of the same frames without noise, aligned on 40 others with the same misfit."""
+    """The truth is that of the same frames without noise, aligned on 40 others with the same
+    misfit.
+    """
     options: dict[str, Any] = {"misfit": seed, "rms_px": rms_px}
     c, clean = (frames(seed, scales, sigma_px=sigma, **options) for sigma in (0.13, 0.0))
     others = frames(seed + 5000, np.resize(scales, 40), **options)
-    obs, aligned = (sc.Observations(**one.columns, meta={"directions": "apparent"}) for one in (c, others))
+    obs, aligned = (
+        sc.Observations(**one.columns, meta={"directions": "apparent"}) for one in (c, others)
+    )
     sheet = sc.Camera(
         width_px=WIDTH,
         height_px=HEIGHT,
@@ -103,7 +116,18 @@ def errors(seed: int, scales: FloatArray = SCALES, rms_px: float = 0.2) -> Error
     )
     zero, nothing = np.zeros(3), np.full((5, 4), np.nan)
     bare = AttitudeError(
-        zero, zero, zero, nothing, nothing, zero, zero, zero, 2, len(scales), seen=obs, aligned=aligned
+        zero,
+        zero,
+        zero,
+        nothing,
+        nothing,
+        zero,
+        zero,
+        zero,
+        2,
+        len(scales),
+        seen=obs,
+        aligned=aligned,
     )
     found = with_misfit(bare, diagnosis, post, obs).misfit
     assert found is not None
@@ -130,7 +154,8 @@ def one_frame(seeds: range) -> None:
     # A single frame is one draw of what its pattern does to it: many of them have a size.
     runs = [errors(seed, np.zeros(1)) for seed in seeds]
     rest, true_rest, common, true_common = (
-        rms([getattr(run, name) for run in runs]) for name in ("rest", "true_rest", "common", "true_common")
+        rms([getattr(run, name) for run in runs])
+        for name in ("rest", "true_rest", "common", "true_common")
     )
     print(f"\nrest {rest}, true {true_rest}; common {common}, true {true_common}")
     assert_within_two(rest, true_rest)
@@ -140,7 +165,9 @@ def one_frame(seeds: range) -> None:
 def test_one_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     one_frame(range(12))
     # Control: without a prior, what attitudes and parameters imitate is divided by nearly nothing.
-    monkeypatch.setattr(pattern, "_prior_variance", lambda matrix, raw, slope, variance: 1e6 * variance)
+    monkeypatch.setattr(
+        pattern, "_prior_variance", lambda matrix, raw, slope, variance: 1e6 * variance
+    )
     with pytest.raises(AssertionError):
         one_frame(range(6))
 
@@ -155,6 +182,9 @@ def test_many_single_frames() -> None:
 def test_many_campaigns_with_scales_of_their_own(n_frames: int) -> None:
     runs = [errors(seed, np.linspace(-680e-6, 270e-6, n_frames)) for seed in range(20)]
     ratios = np.array([run.rest / run.true_rest for run in runs])
-    print(f"\n{n_frames} frames, stated over true rest, across and roll: {ratios.min(axis=0)} to {ratios.max(axis=0)}")
+    print(
+        f"\n{n_frames} frames, stated over true rest, across and roll: {ratios.min(axis=0)} to "
+        f"{ratios.max(axis=0)}"
+    )
     for run in runs:
         assert_within_two(run.rest, run.true_rest)

@@ -1,4 +1,6 @@
-"""The level of a check follows what a misfit does, on a sensor of a second make with the misfit planted in it."""
+"""The level of a check follows what a misfit does, on a sensor of a second make with the misfit
+planted in it.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +38,8 @@ def drift(relative: float) -> Displacement:
     return shift
 
 
-# Staring, the stars of one field are the same magnitudes at the same places whenever it comes round. A drift averages
-# out over frames, not over the stars of a frame.
+# Staring, the stars of one field are the same magnitudes at the same places whenever it comes
+# round. A drift averages out over frames, not over the stars of a frame.
 PLANTED: dict[str, dict[str, Any]] = {
     "magnitude, small": {"displaced": magnitude(0.015)},
     "drift, small": {"displaced": drift(5e-5)},
@@ -66,7 +68,10 @@ LEVELS = {"small": Level.WARN, "large": Level.FAIL}
 def test_a_check_fails_where_numbers_are_off_and_warns_where_residuals_know(planted: str) -> None:
     run = judged(planted, 200)
     assert run.check.level is run.verdict.level is LEVELS[planted.split()[-1]], run.check
-    assert "of the standard deviation" in run.check.sentence or "the stated standard deviation" in run.check.sentence
+    assert (
+        "of the standard deviation" in run.check.sentence
+        or "the stated standard deviation" in run.check.sentence
+    )
 
 
 @pytest.mark.slow
@@ -77,7 +82,11 @@ def test_levels_and_coverage_go_together(planted: str) -> None:
     expected = LEVELS[planted.split()[-1]]
     right = [run for run in runs if run.verdict.level is expected]
     held = np.mean(np.concatenate([run.held for run in right]))
-    print(f"\n{planted}: {len(right)} of {len(runs)} runs {expected.value}, their 95 % intervals hold {held:.0%}")
-    # What averages out over the frames by luck has done no harm, and is warned of however large it is.
+    print(
+        f"\n{planted}: {len(right)} of {len(runs)} runs {expected.value}, their 95 % intervals "
+        f"hold {held:.0%}"
+    )
+    # What averages out over the frames by luck has done no harm, and is warned of however large it
+    # is.
     assert len(right) >= (13 if expected is Level.WARN else 10)
     assert held > 0.88 if expected is Level.WARN else held < 0.8

@@ -1,4 +1,6 @@
-"""Tests for structure in the residuals: false alarms of refitted data sets, power, and tests that must go wrong."""
+"""Tests for structure in the residuals: false alarms of refitted data sets, power, and tests that
+must go wrong.
+"""
 
 from __future__ import annotations
 
@@ -39,23 +41,35 @@ def moved(obs, shift):
 
 @lru_cache(maxsize=1)
 def null():
-    """p-values of every test over simulated and refitted data sets without an error; and the overall ones."""
+    """p-values of every test over simulated and refitted data sets without an error; and the
+    overall ones.
+    """
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     found = [
         refit(sc.simulate(stars, camera(), n_frames=25, min_stars=9, sigma_px=0.05, seed=7000 + i))
         for i in range(N_NULL)
     ]
     names = [test.name for test in found[0].tests]
-    return names, np.array([[t.p_value for t in f.tests] for f in found]), np.array([f.p_value for f in found])
+    return (
+        names,
+        np.array([[t.p_value for t in f.tests] for f in found]),
+        np.array([f.p_value for f in found]),
+    )
 
 
 @pytest.mark.parametrize("stated", [False, True])
 def test_cells_are_summed_as_columns_would_be(stated):
-    obs = with_sigmas(observations("brown", n_frames=6)) if stated else observations("brown", n_frames=6)
+    obs = (
+        with_sigmas(observations("brown", n_frames=6))
+        if stated
+        else observations("brown", n_frames=6)
+    )
     part = MarginalLikelihood(obs, "brown")
     theta = camera("brown").theta
     state, _ = part.profile(theta)
-    columns = _Columns.of(shapes(obs, camera("brown")), View.of(part, state, theta, slice(0, obs.n_stars)))
+    columns = _Columns.of(
+        shapes(obs, camera("brown")), View.of(part, state, theta, slice(0, obs.n_stars))
+    )
     many, few = columns.all(), state.attitude
     flat, by_star = many.reshape(len(many), -1), np.einsum("ixn,qxn->iqn", few, many)
     for ours, theirs in (
@@ -71,20 +85,27 @@ def test_false_alarms_are_nominal_after_refitting():
     assert len(names) == 19
     n = len(p)
     for alpha in (0.01, 0.05, 0.2):
-        # Over all tests together; they are correlated, so the error is taken from the scatter over data sets.
+        # Over all tests together; they are correlated, so the error is taken from the scatter over
+        # data sets.
         shares = np.mean(p < alpha, axis=1)
         assert np.mean(shares) == pytest.approx(alpha, abs=4.0 * np.std(shares) / np.sqrt(n) + 1e-3)
         assert np.mean(overall < alpha) <= alpha + 4.0 * np.sqrt(alpha / n)
     for j, name in enumerate(names):
         assert stats.kstest(p[:, j], "uniform").pvalue > 1e-4, name
-        assert np.mean(p[:, j] < 0.05) == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / n)), name
+        assert np.mean(p[:, j] < 0.05) == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / n)), (
+            name
+        )
 
 
 def test_control_shapes_that_the_fit_absorbed_are_not_nominal():
-    """Without the projection the same statistic is far from uniform: the fit has taken up most of these shapes."""
+    """Without the projection the same statistic is far from uniform: the fit has taken up most of
+    these shapes.
+    """
     obs = observations(n_frames=25)
     cal = sc.calibrate(obs, sc.paper.paper_start())
-    family = next(s for s in shapes(obs, cal.camera) if s.name.startswith("smooth pattern over radius"))
+    family = next(
+        s for s in shapes(obs, cal.camera) if s.name.startswith("smooth pattern over radius")
+    )
     likelihood = MarginalLikelihood(obs, "brown")
     state, _ = likelihood.profile(cal.theta)
     h = likelihood.derivatives(cal.theta, state)
@@ -99,7 +120,9 @@ def test_control_shapes_that_the_fit_absorbed_are_not_nominal():
         e = likelihood.project_out(state, rng.standard_normal((1, 2, obs.n_stars)))[0].ravel()
         e -= fitted @ (fitted.T @ e)
         explained, rest = np.sum((naive.T @ e) ** 2), cal.dof - family.size
-        p.append(stats.f.sf(explained / family.size / ((e @ e - explained) / rest), family.size, rest))
+        p.append(
+            stats.f.sf(explained / family.size / ((e @ e - explained) / rest), family.size, rest)
+        )
     assert stats.kstest(p, "uniform").pvalue < 1e-10
     assert np.mean(np.array(p) < 0.05) < 0.01
 
@@ -119,9 +142,13 @@ def test_no_structure_in_data_of_the_model():
     assert found.p_value > 0.05 and found.found() == ()
 
 
-@pytest.mark.parametrize(("model", "term", "value"), [("brown3", "k3", 1.0), ("brown_tangential", "p2", -0.06)])
+@pytest.mark.parametrize(
+    ("model", "term", "value"), [("brown3", "k3", 1.0), ("brown_tangential", "p2", -0.06)]
+)
 def test_score_tests_estimate_the_term_that_is_missing(model, term, value):
-    """The amplitude is that of the richer model: the same as fitting it, and right within its error."""
+    """The amplitude is that of the richer model: the same as fitting it, and right within its
+    error.
+    """
     names = list(camera(model).parameter_names[3:])
     base = camera("brown")
     order = 7 if term == "k3" else 2
@@ -145,16 +172,21 @@ def test_score_tests_estimate_the_term_that_is_missing(model, term, value):
         # The move that it announces is the one that fitting the term makes.
         move = np.abs(rich.theta[:5] - poor.theta) / poor.sigmas
         assert test.moved_sigma == pytest.approx(move.max(), rel=0.1)
-        assert test.moved_name == poor.parameter_names[int(move.argmax())] and test.moved_sigma > 3.0
+        assert (
+            test.moved_name == poor.parameter_names[int(move.argmax())] and test.moved_sigma > 3.0
+        )
 
 
 def test_a_pattern_of_the_detectable_size_is_found_nine_times_in_ten():
-    """Sums of squares of noise and a pattern of the announced size, drawn without the package; the control is half."""
+    """Sums of squares of noise and a pattern of the announced size, drawn without the package; the
+    control is half.
+    """
     found = refit(observations(n_frames=30))
     test, rng = named(found, "decentring"), np.random.default_rng(8)
     limit = stats.f.isf(ALPHA / len(found.tests), test.dof, test.dof_residual)
     for strength, low, high in ((1.0, 0.88, 0.92), (0.5, 0.0, 0.4)):
-        # Twice the number of stars times the mean square is the pattern's sum of squares, here in units of the noise.
+        # Twice the number of stars times the mean square is the pattern's sum of squares, here in
+        # units of the noise.
         root = np.sqrt(2 * found.n_stars) * strength * test.detectable_px / found.sigma
         squares = (root + rng.standard_normal(20_000)) ** 2 + rng.chisquare(test.dof - 1, 20_000)
         f = squares / test.dof / (rng.chisquare(test.dof_residual, 20_000) / test.dof_residual)
@@ -180,7 +212,9 @@ def _angles(r):
 
 
 def test_what_the_data_hardly_tell_apart_is_said_to_be_so():
-    """On one patch of sky, aberration is nearly a focal length; errors of stars make its test reject."""
+    """On one patch of sky, aberration is nearly a focal length; errors of stars make its test
+    reject.
+    """
     c = campaign(np.random.default_rng(1), n_frames=60, patch_stars=40, star_sigma_px=0.03)
     obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
     cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
@@ -197,7 +231,9 @@ def test_what_the_data_hardly_tell_apart_is_said_to_be_so():
     cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
     test = named(misfit_tests(obs, cal), "aberration")
     assert test.moved_std < 1.0
-    sentence = misfit(dataclasses.replace(found, tests=(dataclasses.replace(test, p_holm=1e-9),)), cal).sentence
+    sentence = misfit(
+        dataclasses.replace(found, tests=(dataclasses.replace(test, p_holm=1e-9),)), cal
+    ).sentence
     assert "more than noise" in sentence and "hardly tell" not in sentence
 
 
@@ -209,7 +245,9 @@ def test_drift_follows_time_where_there_is_time_and_temperature_where_there_is_t
     times = np.array([f"2026-11-21T{m // 60:02d}:{m % 60:02d}:00" for m in clock])
     offset = obs.xy.T - camera().theta[:2, None]
     growth = 0.5 / camera().focal_px * (2.0 * clock / clock.max() - 1.0)
-    timed = dataclasses.replace(moved(obs, offset * growth), time_utc=times, temperature_c=20.0 + 0.1 * clock)
+    timed = dataclasses.replace(
+        moved(obs, offset * growth), time_utc=times, temperature_c=20.0 + 0.1 * clock
+    )
     found = refit(timed)
     drift = named(found, "linear drift")
     assert drift.against == "time"
@@ -241,7 +279,9 @@ def test_every_model_is_tested_for_the_terms_it_lacks(model):
     found = refit(observations(model, n_frames=30), model)
     text = " ".join(test.name for test in found.tests)
     for name in ("k1", "k2", "k3", "p1", "p2"):
-        assert (f"{name}," in text or f"{name})" in text) == (name not in camera(model).parameter_names)
+        assert (f"{name}," in text or f"{name})" in text) == (
+            name not in camera(model).parameter_names
+        )
     assert found.p_value > 1e-3
 
 
@@ -294,12 +334,20 @@ def test_regimes_are_written_between_their_markers(monkeypatch, tmp_path, capsys
     page.write_text("before\n<!-- misfit regimes -->\n<!-- /misfit regimes -->\nafter\n")
     monkeypatch.setattr(regimes, "ROOT", tmp_path)
     for frames in (5, 3):
-        assert regimes.main(["--only", f"scatter of {frames} f", "--runs", "2", "--processes", "0", "--write"]) == 0
+        assert (
+            regimes.main(
+                ["--only", f"scatter of {frames} f", "--runs", "2", "--processes", "0", "--write"]
+            )
+            == 0
+        )
     assert "Alarm (nominal 1 %)" in capsys.readouterr().out
     text = page.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "--seed 1 --write" in text
     # Rows keep the order of the registry, whatever was run last, and another run replaces its own.
-    assert [row["Regime"] for row in regimes.stored("misfit")] == ["scatter of 3 frames", "scatter of 5 frames"]
+    assert [row["Regime"] for row in regimes.stored("misfit")] == [
+        "scatter of 3 frames",
+        "scatter of 5 frames",
+    ]
 
 
 @pytest.mark.slow

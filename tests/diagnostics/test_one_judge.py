@@ -1,4 +1,6 @@
-"""Draws are judged once: what a posterior says of itself is what verdict, report and exit status say."""
+"""Draws are judged once: what a posterior says of itself is what verdict, report and exit status
+say.
+"""
 
 from __future__ import annotations
 
@@ -24,16 +26,24 @@ from tests.helpers.scenes import observations
 
 @pytest.fixture(scope="module")
 def short():
-    """60 frames, their calibration, and posteriors of runs that are too short to be sure of, by seed."""
+    """60 frames, their calibration, and posteriors of runs that are too short to be sure of, by
+    seed.
+    """
     obs = observations(n_frames=60)
     cal = sc.calibrate(obs, sc.paper.paper_start())
     return obs, cal, lambda seed: sc.sample(obs, cal, seed=seed, n_steps=20)
 
 
 def two_judges_of_before(post):
-    """What `diagnostics.ok` and the report decided on when each had criteria of its own; both shared the others."""
+    """What `diagnostics.ok` and the report decided on when each had criteria of its own; both
+    shared the others.
+    """
     d = post.diagnostics
-    shared = np.nanmax(d.rhat) < 1.01 and min(np.nanmin(d.ess_bulk), np.nanmin(d.ess_tail)) > 400 and d.psis_khat < 0.7
+    shared = (
+        np.nanmax(d.rhat) < 1.01
+        and min(np.nanmin(d.ess_bulk), np.nanmin(d.ess_tail)) > 400
+        and d.psis_khat < 0.7
+    )
     differ = max(d.agreement_mean, d.agreement_sd)
     of_draws = differ <= 0.05 + 4.0 * np.sqrt(1.0 / np.nanmin(d.ess_bulk) + 1.0 / d.psis_ess)
     return shared and of_draws, shared and differ <= 0.05
@@ -63,7 +73,10 @@ def test_posterior_and_verdict_agree_on_short_runs(short):
 @pytest.mark.slow
 def test_posterior_and_verdict_agree_on_forty_short_runs(short):
     before, today = agreements(short, range(40))
-    print(f"\ndisagreements in 40 short runs: {before.count(False)} with two judges, {today.count(False)} with one")
+    print(
+        f"\ndisagreements in 40 short runs: {before.count(False)} with two judges, "
+        f"{today.count(False)} with one"
+    )
     assert all(today)
     assert before.count(False) >= 3
 
@@ -72,9 +85,13 @@ def test_posterior_and_verdict_agree_on_forty_short_runs(short):
 def disputed(short):
     """Draws that fail a check: an importance estimate far from them."""
     post = short[2](0)
-    changed = dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, agreement_mean=0.9))
+    changed = dataclasses.replace(
+        post, diagnostics=dataclasses.replace(post.diagnostics, agreement_mean=0.9)
+    )
     checks = check_draws(changed)
-    return dataclasses.replace(changed, diagnostics=dataclasses.replace(changed.diagnostics, checks=checks))
+    return dataclasses.replace(
+        changed, diagnostics=dataclasses.replace(changed.diagnostics, checks=checks)
+    )
 
 
 def test_every_reader_shows_the_same_checks(short, disputed, monkeypatch, tmp_path):
@@ -93,12 +110,21 @@ def test_every_reader_shows_the_same_checks(short, disputed, monkeypatch, tmp_pa
         assert check.sentence in terminal and check.value in terminal
         assert check.name in html
     disputed.save(tmp_path / "posterior.nc")
-    assert sc.Posterior.load(tmp_path / "posterior.nc").diagnostics.checks == disputed.diagnostics.checks
+    assert (
+        sc.Posterior.load(tmp_path / "posterior.nc").diagnostics.checks
+        == disputed.diagnostics.checks
+    )
 
 
 def test_checks_are_data():
     check = Check(
-        "R-hat", Question.CONVERGED, Level.FAIL, "1.2", "< 1.01", "Ensembles disagree.", "sc.sample(obs, cal)"
+        "R-hat",
+        Question.CONVERGED,
+        Level.FAIL,
+        "1.2",
+        "< 1.01",
+        "Ensembles disagree.",
+        "sc.sample(obs, cal)",
     )
     assert from_plain(Check, json.loads(json.dumps(to_plain(check)))) == check
     assert str(check).startswith("fail: R-hat, 1.2 (asked for: < 1.01). ")
@@ -113,18 +139,27 @@ def test_numbers_are_judged_with_their_monte_carlo_error(short):
     d = post.diagnostics
     slack = 4.0 * np.sqrt(1.0 / np.min(d.ess_bulk) + 1.0 / d.psis_ess)
     for factor, level in ((0.99, Level.PASS), (1.01, Level.FAIL)):
-        other = dataclasses.replace(post, diagnostics=dataclasses.replace(d, agreement_sd=(0.05 + slack) * factor))
+        other = dataclasses.replace(
+            post, diagnostics=dataclasses.replace(d, agreement_sd=(0.05 + slack) * factor)
+        )
         (check,) = (check for check in check_draws(other) if check.name == "Independent posterior")
         assert check.level is level
 
 
 def test_what_a_run_was_made_with_is_no_remedy():
-    both = f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model') or {CALIBRATE} --robust"
+    both = (
+        f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model') or {CALIBRATE} "
+        "--robust"
+    )
     asked = Check("A", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Uneven.", both)
     words = ("run", "obs.csv", "camera.toml", "--noise")
     found = Place("r", (*words, "model")).exact(asked)
     # Student-t tails and a noise model exclude each other.
-    assert found.remedy == "" and "made with --noise model already" in found.advice and "--robust" in found.advice
+    assert (
+        found.remedy == ""
+        and "made with --noise model already" in found.advice
+        and "--robust" in found.advice
+    )
     alone = Place("r", ("run", "obs.csv", "camera.toml", "--robust")).exact(asked)
     assert alone.remedy == "" and alone.advice.endswith("the run was made with --robust already.")
     tried = (Tried({"--noise": ("model",)}, 1, 0),)
@@ -132,30 +167,55 @@ def test_what_a_run_was_made_with_is_no_remedy():
     assert fresh.remedies == ("starcal-uq run obs.csv camera.toml --robust -o r --force",)
     # Another value of the option takes its place; no option at all is something else.
     first, *rest = Place("r", (*words, "common")).exact(asked).remedies
-    assert first == "starcal-uq run obs.csv camera.toml --noise model -o r --force" and len(rest) == 2
+    assert (
+        first == "starcal-uq run obs.csv camera.toml --noise model -o r --force" and len(rest) == 2
+    )
     whole = dataclasses.replace(asked, remedy=CALIBRATE)
     assert Place("r", (*words, "model")).exact(whole).remedy.endswith("--noise model -o r --force")
 
 
 def test_remedies_name_the_files_of_the_run():
-    """By the command that made the run where there was one, else by what the run holds; calls in Python stay."""
+    """By the command that made the run where there was one, else by what the run holds; calls in
+    Python stay.
+    """
     check = Check("Outliers", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Wrong stars.", SCREEN)
-    made = Place("/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--noise", "model")).exact(check)
+    made = Place(
+        "/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--noise", "model")
+    ).exact(check)
     assert made.remedies == (
-        "starcal-uq run /data/obs.csv /data/camera.toml --noise model --screen -o '/a b/run' --force",
+        (
+            "starcal-uq run /data/obs.csv /data/camera.toml --noise model --screen -o '/a b/run' "
+            "--force"
+        ),
         "sc.estimation.screen(obs, camera)",
     )
     steps = Place("/run or that").exact(check)
     files = "'/run or that/observations.parquet' '/run or that/camera.toml' -o '/run or that-2'"
     assert steps.remedies[0] == f"starcal-uq run {files} --screen --force"
-    assert Place("r").command("starcal-uq sample RUN --force --steps 400") == "starcal-uq sample r --force --steps 400"
-    images = Place("r", ("run", "/data/images", "--screen")).command(f"{FROM_IMAGES} --site SITE:52.2,7.4")
+    assert (
+        Place("r").command("starcal-uq sample RUN --force --steps 400")
+        == "starcal-uq sample r --force --steps 400"
+    )
+    images = Place("r", ("run", "/data/images", "--screen")).command(
+        f"{FROM_IMAGES} --site SITE:52.2,7.4"
+    )
     new = "starcal-uq new site --near 52.2 7.4 -o r-site.toml --force"
-    assert images == f"{new} && starcal-uq run /data/images --screen --site r-site.toml -o r --force"
+    assert (
+        images == f"{new} && starcal-uq run /data/images --screen --site r-site.toml -o r --force"
+    )
     apparent = Place("r", ("run", "obs.csv", "camera.toml", "--directions", "apparent"))
-    made = "starcal-uq run obs.csv camera.toml --directions catalogue --site r-site.toml -o r --force"
+    made = (
+        "starcal-uq run obs.csv camera.toml --directions catalogue --site r-site.toml -o r --force"
+    )
     assert apparent.command(f"{CALIBRATE} --site SITE:52.2,7.4") == f"{new} && {made}"
     # Where nothing tells the place, there is no command to copy.
-    assert apparent.exact(dataclasses.replace(check, remedy=f"{CALIBRATE} --site SITE")).remedy == ""
+    assert (
+        apparent.exact(dataclasses.replace(check, remedy=f"{CALIBRATE} --site SITE")).remedy == ""
+    )
     # Without stars there is nothing to calibrate on.
-    assert Place("r", observations=False).exact(check).remedies[0].startswith("starcal-uq calibrate OBS CAMERA -o r")
+    assert (
+        Place("r", observations=False)
+        .exact(check)
+        .remedies[0]
+        .startswith("starcal-uq calibrate OBS CAMERA -o r")
+    )

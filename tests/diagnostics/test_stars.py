@@ -1,4 +1,6 @@
-"""Errors that stars bring along, held against a star sensor of a second make; the control has none."""
+"""Errors that stars bring along, held against a star sensor of a second make; the control has
+none.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from tests.helpers.outside import campaign
 
 
 def patch(seed, star_sigma_px, **options):
-    """Sixty frames on one patch of forty stars, calibrated as if stars had no errors of their own."""
+    """Sixty frames on one patch of forty stars, calibrated as if stars had no errors of their
+    own.
+    """
     rng = np.random.default_rng([seed, 5])
     c = campaign(rng, n_frames=60, patch_stars=40, star_sigma_px=star_sigma_px, **options)
     obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
@@ -30,7 +34,9 @@ def patch(seed, star_sigma_px, **options):
 def squared(c, cal, covariance):
     """Squared error over what a covariance says, 1 on average where it is right."""
     error = (c.theta - cal.theta) / cal.sigmas
-    return float(error @ np.linalg.solve(covariance / np.outer(cal.sigmas, cal.sigmas), error)) / len(error)
+    return float(
+        error @ np.linalg.solve(covariance / np.outer(cal.sigmas, cal.sigmas), error)
+    ) / len(error)
 
 
 def test_errors_of_stars_are_found_and_none_where_there_are_none():
@@ -57,7 +63,9 @@ def test_the_jackknife_leaves_a_star_out_as_another_fit_would():
     for star in np.argsort(np.bincount(numbers))[[-1, -5]]:
         # Frames keep three stars or more without it.
         rest = sc.calibrate(obs.select(numbers != star), cal.nominal)
-        assert steps[star] / cal.sigmas == pytest.approx((rest.theta - cal.theta) / cal.sigmas, abs=0.02)
+        assert steps[star] / cal.sigmas == pytest.approx(
+            (rest.theta - cal.theta) / cal.sigmas, abs=0.02
+        )
         assert np.max(np.abs(steps[star] / cal.sigmas)) > 0.1
 
 
@@ -66,7 +74,9 @@ def test_stars_are_told_apart_by_direction_or_by_name():
     named = star_numbers(obs, c.theta[2])
     # Apparent places drift by a quarter of a pixel from the first frame to the last.
     drift = np.degrees(0.004 / c.theta[2]) * obs.frame
-    columns = {k: v for k, v in c.columns.items() if k != "star_id"} | {"dec_deg": obs.dec_deg + drift}
+    columns = {k: v for k, v in c.columns.items() if k != "star_id"} | {
+        "dec_deg": obs.dec_deg + drift
+    }
     nameless = star_numbers(sc.Observations(**columns), c.theta[2])
     assert np.array_equal(named[:, None] == named, nameless[:, None] == nameless)
     # Numbers that start again in every frame are no names of stars.
@@ -85,7 +95,9 @@ def test_without_recurring_stars_the_test_says_so():
 
 @pytest.mark.slow
 def test_false_alarms_and_power_are_as_stated():
-    """On one geometry, refitted linearly: 400 draws of noise, with and without errors of the stars."""
+    """On one geometry, refitted linearly: 400 draws of noise, with and without errors of the
+    stars.
+    """
     _, obs, cal = patch(7, 0.0)
     rng = np.random.default_rng(7)
     likelihood = MarginalLikelihood(obs, "brown")
@@ -93,7 +105,10 @@ def test_false_alarms_and_power_are_as_stated():
     z = StarModel(obs, cal.theta[2]).sums()
     shift = z.columns(likelihood, state, slice(None))
     model = obs.xy - state.e.T
-    h = likelihood.project_out(state, likelihood.derivatives(cal.theta, state)).reshape(5, -1) * cal.sigmas[:, None]
+    h = (
+        likelihood.project_out(state, likelihood.derivatives(cal.theta, state)).reshape(5, -1)
+        * cal.sigmas[:, None]
+    )
     p_values = {0.0: [], 0.01: [], 0.03: []}
     for tau in p_values:
         for _ in range(400 if tau == 0.0 else 40):
@@ -113,7 +128,9 @@ def test_false_alarms_and_power_are_as_stated():
 
 @pytest.mark.slow
 def test_the_size_found_gives_the_right_covariance():
-    found = [(c, cal, star_test(obs, cal)) for c, obs, cal in (patch(200 + i, 0.03) for i in range(20))]
+    found = [
+        (c, cal, star_test(obs, cal)) for c, obs, cal in (patch(200 + i, 0.03) for i in range(20))
+    ]
     # The control: the stated covariance is far too small.
     assert np.mean([squared(c, cal, test.formal_covariance) for c, cal, test in found]) > 1.6
     assert 0.5 < np.mean([squared(c, cal, test.model_covariance) for c, cal, test in found]) < 1.5

@@ -1,4 +1,6 @@
-"""A wrong time is named by what it does to the directions; good tables, however hard, are not blamed."""
+"""A wrong time is named by what it does to the directions; good tables, however hard, are not
+blamed.
+"""
 
 from __future__ import annotations
 
@@ -30,23 +32,32 @@ def earth(days):
     longitude = np.radians(280.46 + 0.9856474 * days + 1.915 * np.sin(anomaly))
     perihelion, tilt = np.radians(282.9), np.radians(23.439)
     along = 29.785 * np.array(
-        [np.sin(longitude) + 0.0167 * np.sin(perihelion), -np.cos(longitude) - 0.0167 * np.cos(perihelion)]
+        [
+            np.sin(longitude) + 0.0167 * np.sin(perihelion),
+            -np.cos(longitude) - 0.0167 * np.cos(perihelion),
+        ]
     )
     return np.array([along[0], along[1] * np.cos(tilt), along[1] * np.sin(tilt)])
 
 
 @lru_cache(maxsize=4)
 def seen(seed, *, n_frames=30, field_deg=12.0, sigma_px=0.05, years=0.0, air=0.0):
-    """A table of catalogue directions and true times, pixels as a moving observer saw them; the proper motion alone is
-    of the package's catalogue."""
+    """A table of catalogue directions and true times, pixels as a moving observer saw them; the
+    proper motion alone is of the package's catalogue.
+    """
     rng = np.random.default_rng(seed)
     focal, half = 512.0 / np.tan(np.radians(0.5 * field_deg)), 724.0
     table, now = (CATALOGUE.at_epoch(EPOCH + late).directions_icrs for late in (0.0, years))
     rows = []
     while len(rows) < n_frames:
         days = DAYS + 0.125 * len(rows) / n_frames
-        sidereal, latitude = np.radians(280.46062 + 360.98564737 * days + LONGITUDE), np.radians(LATITUDE)
-        zenith = np.array([*(np.cos(latitude) * np.array([np.cos(sidereal), np.sin(sidereal)])), np.sin(latitude)])
+        sidereal, latitude = (
+            np.radians(280.46062 + 360.98564737 * days + LONGITUDE),
+            np.radians(LATITUDE),
+        )
+        zenith = np.array(
+            [*(np.cos(latitude) * np.array([np.cos(sidereal), np.sin(sidereal)])), np.sin(latitude)]
+        )
         where = rng.standard_normal(3)
         where /= np.linalg.norm(where)
         if air and where @ zenith < 0.5:
@@ -73,9 +84,19 @@ def seen(seed, *, n_frames=30, field_deg=12.0, sigma_px=0.05, years=0.0, air=0.0
             r = table[near[inside]].T
             ra, dec = np.degrees(np.arctan2(r[1], r[0])) % 360.0, np.degrees(np.arcsin(r[2]))
             time = (datetime(2000, 1, 1, 12) + timedelta(days=days)).isoformat(timespec="seconds")
-            rows.append((np.full(len(inside), len(rows)), *xy[:, inside], ra, dec, np.full(len(inside), time)))
+            rows.append(
+                (
+                    np.full(len(inside), len(rows)),
+                    *xy[:, inside],
+                    ra,
+                    dec,
+                    np.full(len(inside), time),
+                )
+            )
     names = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "time_utc")
-    obs = sc.Observations(**dict(zip(names, map(np.concatenate, zip(*rows, strict=True)), strict=True)))
+    obs = sc.Observations(
+        **dict(zip(names, map(np.concatenate, zip(*rows, strict=True)), strict=True))
+    )
     return obs, sc.Camera(1024, 1024, 10.0, 0.0101 * focal, 511.5, 511.5)
 
 
@@ -91,7 +112,12 @@ SLIPS = {
     "J2000": ({"years": 26.9}, make_apparent, "epoch", 26.9),
     "a century": ({"years": -100.0}, make_apparent, "epoch", -100.0),
     "undeclared": ({}, lambda obs: replace(obs, time_utc=None), "no aberration", None),
-    "wrongly declared": ({}, lambda obs: obs.with_meta(directions="apparent"), "no aberration", None),
+    "wrongly declared": (
+        {},
+        lambda obs: obs.with_meta(directions="apparent"),
+        "no aberration",
+        None,
+    ),
     "twice": (
         {},
         lambda obs: make_apparent(make_apparent(obs).with_meta(directions="catalogue")),
@@ -123,20 +149,26 @@ def test_a_fit_that_fails_by_a_wrong_time_says_so(sigma_px, n_frames, years):
     obs, camera = seen(2, n_frames=n_frames, field_deg=2.0, sigma_px=sigma_px, years=years)
     with pytest.raises(CalibrationError, match="do not determine x0 and y0: more frames") as caught:
         sc.calibrate(make_apparent(obs), camera, model="brown")
-    told = "First, by proper motion the stars are those of an epoch 100 ± 7.5 years earlier" in str(caught.value)
+    told = "First, by proper motion the stars are those of an epoch 100 ± 7.5 years earlier" in str(
+        caught.value
+    )
     # Too much noise is the fault of no time.
     assert told == ("First" in str(caught.value)) == bool(years)
 
 
 def field(seed, *, twice, dated=True, **options):
-    """Frames of another make with directions that are apparent, or aberrated once more; calibrated."""
+    """Frames of another make with directions that are apparent, or aberrated once more;
+    calibrated.
+    """
     c = campaign(np.random.default_rng([seed, 6]), **{"n_frames": 25} | options)
     shown = aberrated(c, earth(DAYS)) if twice else c
     columns = dict(shown.columns)
     if dated:
         columns["time_utc"] = np.full(len(columns["frame"]), "2026-11-13T12:00:00")
     obs = sc.Observations(**columns, meta={"directions": "apparent", "observer": "space"})
-    cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), duplicates="keep")
+    cal = sc.calibrate(
+        obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), duplicates="keep"
+    )
     return c, obs, cal
 
 
@@ -150,7 +182,9 @@ def test_f_of_one_field_rests_on_aberration(dated):
     _, again, wrong = field(8, twice=True, dated=dated, **STARING)
     moved = abs(wrong.theta[2] - cal.theta[2])
     # Without times it is the largest of the year.
-    assert moved == pytest.approx(found.f_px, rel=0.05) if dated else moved < found.f_px < 1.5 * moved
+    assert (
+        moved == pytest.approx(found.f_px, rel=0.05) if dated else moved < found.f_px < 1.5 * moved
+    )
     assert found.f_sigma == pytest.approx(found.f_px / cal.sigmas[2]) and found.f_sigma > 1.5
     assert time_test(again, wrong) is None
     for table, made in ((obs, cal), (again, wrong)):
@@ -199,7 +233,11 @@ HARD = ("", "focal", "drift", "shape", "stars", "wrong", "tails")
 
 def blamed(seed, kind, **conditions):
     obs, camera = seen(seed, **conditions)
-    obs = hard(make_apparent(obs, site=SITE if conditions.get("air") else None), kind, np.random.default_rng(seed))
+    obs = hard(
+        make_apparent(obs, site=SITE if conditions.get("air") else None),
+        kind,
+        np.random.default_rng(seed),
+    )
     return time_test(obs, sc.calibrate(obs, camera, duplicates="keep"))
 
 
@@ -213,6 +251,10 @@ def test_control_a_right_time_is_not_blamed(kind):
 def test_control_no_good_table_is_blamed(kind):
     for seed in range(10, 18):
         rng = np.random.default_rng(seed)
-        field, noise, n = rng.choice([5.0, 12.0, 25.0]), rng.choice([0.02, 0.1, 0.3]), int(rng.choice([3, 8, 25]))
+        field, noise, n = (
+            rng.choice([5.0, 12.0, 25.0]),
+            rng.choice([0.02, 0.1, 0.3]),
+            int(rng.choice([3, 8, 25])),
+        )
         found = blamed(seed, kind, n_frames=n, field_deg=field, sigma_px=noise, air=float(seed % 2))
         assert found is None, found

@@ -1,4 +1,6 @@
-"""Validation finds right uncertainties right and wrong ones wrong, the same for any number of workers."""
+"""Validation finds right uncertainties right and wrong ones wrong, the same for any number of
+workers.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,23 @@ import starcal_uq as sc
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.errors import CatalogueError, PriorError, RunFolderError, SamplingError, SettingError
+from starcal_uq.core.errors import (
+    CatalogueError,
+    PriorError,
+    RunFolderError,
+    SamplingError,
+    SettingError,
+)
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD, Replication, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
 from starcal_uq.maths.intervals import binomial_interval
-from starcal_uq.maths.ranks import counts_below, evaluation_points, uniformity_band, uniformity_p_value
+from starcal_uq.maths.ranks import (
+    counts_below,
+    evaluation_points,
+    uniformity_band,
+    uniformity_p_value,
+)
 from starcal_uq.presentation.figures.diagnostics import plot_validation
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.simulation.frames import Campaign
@@ -26,7 +39,8 @@ from tests.helpers import validation_controls as controls
 from tests.helpers.same import assert_same
 from tests.helpers.scenes import camera, nominal
 
-# Starts are draws of the Laplace approximation, which is nearly the posterior here: little has to be forgotten.
+# Starts are draws of the Laplace approximation, which is nearly the posterior here: little has to
+# be forgotten.
 LIGHT = {"n_steps": 20, "n_burn": 10}
 QUANTITIES = ("x0", "y0", "f", "k1", "k2", "sigma", "log_likelihood", "pitch", "yaw", "roll")
 
@@ -65,7 +79,9 @@ def remembering(function):
 
 @pytest.fixture(scope="module")
 def remembered():
-    """Studies of one camera and seed that differ in the likelihood only share their simulations and calibrations."""
+    """Studies of one camera and seed that differ in the likelihood only share their simulations and
+    calibrations.
+    """
     return {
         "starcal_uq.simulation.frames.simulate": remembering(sc.simulate),
         "starcal_uq.diagnostics.validation.replicates.calibrate": remembering(sc.calibrate),
@@ -111,7 +127,8 @@ def test_band_and_p_value_say_the_same_and_are_exact():
         below += p_values[-1] < 0.05
         assert left == (p_values[-1] < 0.05)
     assert below == outside
-    # Counts are discrete, so that the band holds at least 95 %; four standard errors of the simulation.
+    # Counts are discrete, so that the band holds at least 95 %; four standard errors of the
+    # simulation.
     assert 0.015 < outside / 400 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 400)
     assert np.mean(p_values) == pytest.approx(0.5, abs=0.06)
 
@@ -121,11 +138,14 @@ def test_points_divide_the_ranks(n_values):
     k = evaluation_points(n_values)
     assert n_values % k == 0
     assert 1 < k <= 128
-    assert counts_below(np.arange(n_values), n_values).tolist() == [i * n_values // k for i in range(1, k)]
+    assert counts_below(np.arange(n_values), n_values).tolist() == [
+        i * n_values // k for i in range(1, k)
+    ]
 
 
 @pytest.mark.parametrize(
-    "transform", [lambda u: 0.5 + 0.8 * (u - 0.5), lambda u: u**1.2, lambda u: np.where(u < 0.5, u**1.5, u)]
+    "transform",
+    [lambda u: 0.5 + 0.8 * (u - 0.5), lambda u: u**1.2, lambda u: np.where(u < 0.5, u**1.5, u)],
 )
 def test_ranks_that_are_not_uniform_are_found(transform):
     u = (np.arange(1000) + 0.5) / 1000
@@ -144,7 +164,9 @@ def test_binomial_interval():
 
 
 def test_draws_are_those_that_users_get(stars):
-    """A replicate's moments agree with those of `sample` on its data, within what the number of draws leaves open."""
+    """A replicate's moments agree with those of `sample` on its data, within what the number of
+    draws leaves open.
+    """
     settings = study(n_frames=40, n_steps=200)
     outcome = run_replicate(settings, stars, 3)
     noise = np.random.SeedSequence(settings.seed, spawn_key=(3,)).spawn(3)[1]
@@ -177,7 +199,9 @@ def test_attitude_errors_are_what_quest_finds(stars):
 
     def attitudes(theta):
         b = unproject_theta("brown", theta, obs.xy)
-        return sc.attitude.quest(b, obs.directions_icrs, obs.frame_starts, covariance=False).quaternions
+        return sc.attitude.quest(
+            b, obs.directions_icrs, obs.frame_starts, covariance=False
+        ).quaternions
 
     found = ARCSEC * left_error(attitudes(cal.theta), attitudes(truth.theta)).mean(axis=0)
     linear = ARCSEC * cal.rotation_per_theta @ (cal.theta - truth.theta)
@@ -206,7 +230,8 @@ def test_right_uncertainties_pass(good):
 @pytest.mark.parametrize("model", ["none", "brown_tangential"])
 def test_other_models_pass_with_truths_from_the_prior(stars, model):
     truth = camera(model)
-    # A tenth of the default: decentring of several px makes another minimum, in which a calibration can end.
+    # A tenth of the default: decentring of several px makes another minimum, in which a calibration
+    # can end.
     priors = narrow_priors(truth, 0.05).replace(distortion_corner_px=0.1)
     settings = dataclasses.replace(study(model, n_frames=20), truth="prior", priors=priors)
     found = validate_study(settings, stars, 25, workers=0)
@@ -215,7 +240,9 @@ def test_other_models_pass_with_truths_from_the_prior(stars, model):
     assert not any(f.rejected for f in found.findings), found.text
     # The truths are what the priors say.
     expected = found.priors
-    z = (found.truth[:, :-1] - expected.mean(expected.names[:-1])) / expected.sd(expected.names[:-1])
+    z = (found.truth[:, :-1] - expected.mean(expected.names[:-1])) / expected.sd(
+        expected.names[:-1]
+    )
     assert np.abs(z.mean(axis=0)).max() < 4 / np.sqrt(25)
     assert np.log(found.truth[:, -1] / 0.05).std() == pytest.approx(0.2, rel=0.45)
 
@@ -265,10 +292,15 @@ def test_few_replicates_are_no_verdict(stars, same_data):
 
 
 def test_failed_replicates_are_counted_and_explained(good):
-    reasons = ("the calibration did not end well (SINGULAR): add frames.",) * 2 + ("another reason.",)
+    reasons = ("the calibration did not end well (SINGULAR): add frames.",) * 2 + (
+        "another reason.",
+    )
     found = dataclasses.replace(good, failures=reasons)
     assert not found.ok
-    assert "3 of 103 replicates gave no result, 2 of them because the calibration did not end well" in found.text
+    assert (
+        "3 of 103 replicates gave no result, 2 of them because the calibration did not end well"
+        in found.text
+    )
 
 
 def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
@@ -277,7 +309,8 @@ def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
 
     monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail)
     with pytest.raises(
-        sc.errors.CalibrationError, match="no replicate gave a result; the commonest reason: the stars do not"
+        sc.errors.CalibrationError,
+        match="no replicate gave a result; the commonest reason: the stars do not",
     ):
         validate_study(study(), stars, 3, workers=0)
 
@@ -301,20 +334,35 @@ def test_some_failures_leave_the_other_replicates(stars, monkeypatch):
 
 
 def _same(a, b):
-    for name in ("replicate", "truth", "ranks", "covered", "error", "sd", "nees", "compression_error"):
+    for name in (
+        "replicate",
+        "truth",
+        "ranks",
+        "covered",
+        "error",
+        "sd",
+        "nees",
+        "compression_error",
+    ):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def test_workers_do_not_change_a_bit_and_progress_is_told(stars):
     settings, calls = study(seed=11), []
     alone = validate_study(settings, stars, 6, workers=0)
-    both = validate_study(settings, stars, 6, workers=2, progress=lambda done, total: calls.append((done, total)))
+    both = validate_study(
+        settings, stars, 6, workers=2, progress=lambda done, total: calls.append((done, total))
+    )
     _same(alone, both)
     assert calls[-1] == (6, 6)
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
     # A longer run begins with the shorter one.
-    np.testing.assert_array_equal(validate_study(settings, stars, 4, workers=0).ranks, alone.ranks[:4])
-    assert not np.array_equal(validate_study(study(seed=12), stars, 4, workers=0).ranks, alone.ranks[:4])
+    np.testing.assert_array_equal(
+        validate_study(settings, stars, 4, workers=0).ranks, alone.ranks[:4]
+    )
+    assert not np.array_equal(
+        validate_study(study(seed=12), stars, 4, workers=0).ranks, alone.ranks[:4]
+    )
 
 
 def test_interrupt_keeps_what_is_done(stars):
@@ -328,7 +376,9 @@ def test_interrupt_keeps_what_is_done(stars):
     assert found.interrupted
     assert 3 <= found.n_replicates < 200
     assert f"interrupted after {found.n_replicates} of 200" in found.text
-    np.testing.assert_array_equal(found.ranks[0], validate_study(settings, stars, 1, workers=0).ranks[0])
+    np.testing.assert_array_equal(
+        found.ranks[0], validate_study(settings, stars, 1, workers=0).ranks[0]
+    )
 
 
 def test_an_interrupted_validation_goes_on_with_what_it_kept(tmp_path):
@@ -338,10 +388,16 @@ def test_an_interrupted_validation_goes_on_with_what_it_kept(tmp_path):
         if done == 2:
             signal.raise_signal(signal.SIGINT)
 
-    assert sc.validate(camera(), n_replicates=4, keep=tmp_path, progress=press, **settings).interrupted
+    assert sc.validate(
+        camera(), n_replicates=4, keep=tmp_path, progress=press, **settings
+    ).interrupted
     told = []
     resumed = sc.validate(
-        camera(), n_replicates=4, keep=tmp_path, progress=lambda done, _: told.append(done), **settings
+        camera(),
+        n_replicates=4,
+        keep=tmp_path,
+        progress=lambda done, _: told.append(done),
+        **settings,
     )
     assert told == [3, 4]
     _same(resumed, sc.validate(camera(), n_replicates=4, **settings))
@@ -372,7 +428,9 @@ def test_validate_from_the_camera_alone():
     assert (found.nominal.x0_px, found.nominal.y0_px) == (511.5, 511.5)
     assert found.provenance["seed"] == 3
     assert found.provenance["settings"]["n_frames"] == 12
-    np.testing.assert_array_equal(found.truth[:, :-1], np.tile(sc.paper.paper_camera().theta, (2, 1)))
+    np.testing.assert_array_equal(
+        found.truth[:, :-1], np.tile(sc.paper.paper_camera().theta, (2, 1))
+    )
 
 
 @pytest.mark.parametrize(
@@ -405,7 +463,9 @@ def test_a_field_without_stars_says_so():
 def test_priors_that_make_no_camera_say_so(stars):
     priors = narrow_priors(camera(), 0.05).replace(principal_point_centre_px=(-5000.0, 0.0))
     with pytest.raises(PriorError, match="narrow the prior"):
-        validate_study(dataclasses.replace(study(), truth="prior", priors=priors), stars, 1, workers=0)
+        validate_study(
+            dataclasses.replace(study(), truth="prior", priors=priors), stars, 1, workers=0
+        )
 
 
 def test_save_and_load_lose_nothing(good, tmp_path):
@@ -450,7 +510,9 @@ def test_figure_shows_curves_bands_and_coverage(good):
 
 
 def test_log_likelihood_is_one_of_the_quantities(good):
-    """The joint log likelihood lies half a chi-square of p + 1 below its maximum, at the truth as at draws."""
+    """The joint log likelihood lies half a chi-square of p + 1 below its maximum, at the truth as
+    at draws.
+    """
     at = QUANTITIES.index(LOG_LIKELIHOOD)
     assert good.units[at] == "nat"
     assert good.sd[:, at].mean() == pytest.approx(np.sqrt(6 / 2), rel=0.05)

@@ -1,4 +1,6 @@
-"""The uncertainties of the paper's sensor, measured: coverage, squared errors and ranks, and what must fail."""
+"""The uncertainties of the paper's sensor, measured: coverage, squared errors and ranks, and what
+must fail.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ COVERED = ("x0", "y0", "f", "k1", "k2", "sigma", "pitch", "yaw", "roll")
 
 @pytest.fixture(scope="module")
 def fixed():
-    """1000 replicates of 50 frames of the paper's camera: NEES/p is known to 0.02, a coverage to 0.007."""
+    """1000 replicates of 50 frames of the paper's camera: NEES/p is known to 0.02, a coverage to
+    0.007.
+    """
     return validate(sc.paper.paper_camera(), n_replicates=1000, seed=1)
 
 
@@ -29,7 +33,10 @@ def calibration_ratio(found):
 
 def show(name, found):
     """Measured values, for those who run the tests with -s."""
-    print(f"\n{name}: {found.text}\n{found.to_dataframe().to_string(float_format=lambda v: f'{v:.4g}')}")
+    print(
+        f"\n{name}: "
+        f"{found.text}\n{found.to_dataframe().to_string(float_format=lambda v: f'{v:.4g}')}"
+    )
     print(f"NEES/p = {found.nees_ratio:.4f} (calibration {calibration_ratio(found):.4f})")
 
 
@@ -63,15 +70,19 @@ def few_frames(**options):
 
 
 def excess(found):
-    """Mean ratio of squared errors by the draws to those by the calibration, which leaves the sampler's part."""
+    """Mean ratio of squared errors by the draws to those by the calibration, which leaves the
+    sampler's part.
+    """
     return np.exp(np.mean(np.log(found.nees / found.nees_calibration)))
 
 
 def test_biased_moves_are_found():
-    """emcee's DESnookerMove: as half of the moves it makes squared errors 1.23 times too large, as a fifth 1.10.
+    """emcee's DESnookerMove: as half of the moves it makes squared errors 1.23 times too large, as
+    a fifth 1.10.
 
-    A validation sees the first among two hundred replicates. The second, a popular mixture, shows in half as many where
-    the draws are held against the calibration of the same data, which takes away the luck of these data.
+    A validation sees the first among two hundred replicates. The second, a popular mixture, shows
+    in half as many where the draws are held against the calibration of the same data, which takes
+    away the luck of these data.
     """
     sizes = {"n_walkers": 64, "n_steps": 100, "n_burn": 60, "thin": 10}
     stars = sc.load_catalogue(max_mag=6.0)
@@ -83,7 +94,8 @@ def test_biased_moves_are_found():
     assert excess(found) > 1.15
     # The moves without it are right, but for the 2 % of few draws.
     popular, without = (
-        validate_study(few_frames(moves=moves, **sizes), stars, 100) for moves in (controls.snooker, controls.evolution)
+        validate_study(few_frames(moves=moves, **sizes), stars, 100)
+        for moves in (controls.snooker, controls.evolution)
     )
     print(f"excess of a fifth {excess(popular):.3f}, without {excess(without):.3f}")
     assert excess(without) < 1.05
@@ -91,7 +103,9 @@ def test_biased_moves_are_found():
 
 
 def test_noise_understated_by_a_tenth_is_found_by_coverage():
-    found = validate_study(few_frames(assumed_sigma_px=0.045, n_steps=40), sc.load_catalogue(max_mag=6.0), 500)
+    found = validate_study(
+        few_frames(assumed_sigma_px=0.045, n_steps=40), sc.load_catalogue(max_mag=6.0), 500
+    )
     show("sigma understated", found)
     assert not found.ok
     assert found.nees_ratio > 1.15

@@ -1,4 +1,6 @@
-"""Every check of the verdict, turned to its other outcome; the test for patterns against its nominal false alarms."""
+"""Every check of the verdict, turned to its other outcome; the test for patterns against its
+nominal false alarms.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,12 @@ from starcal_uq.core.status import Check, Level, Question
 from starcal_uq.diagnostics.diagnose import diagnose
 from starcal_uq.diagnostics.models import REJECT_P
 from starcal_uq.diagnostics.pattern import Pattern
-from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, of_heard, residual_scale
+from starcal_uq.diagnostics.residuals import (
+    bin_residuals,
+    normalised_residuals,
+    of_heard,
+    residual_scale,
+)
 from starcal_uq.diagnostics.verdict import estimate
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.judge import judge
@@ -31,7 +38,9 @@ from tests.helpers.scenes import camera, observations, with_sigmas
 def run():
     obs = observations(n_frames=120)
     cal = sc.calibrate(obs, sc.paper.paper_start())
-    return SimpleNamespace(obs=obs, cal=cal, post=sc.sample(obs, cal, seed=1, n_steps=100), truth=camera())
+    return SimpleNamespace(
+        obs=obs, cal=cal, post=sc.sample(obs, cal, seed=1, n_steps=100), truth=camera()
+    )
 
 
 def outcome(name: str, obs, cal, post=None, truth=None):
@@ -40,11 +49,15 @@ def outcome(name: str, obs, cal, post=None, truth=None):
 
 def judged(post):
     """Changed draws with the checks that sampling would have made of them."""
-    return dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, checks=check_draws(post)))
+    return dataclasses.replace(
+        post, diagnostics=dataclasses.replace(post.diagnostics, checks=check_draws(post))
+    )
 
 
 def with_diagnostics(post, **changes):
-    return judged(dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, **changes)))
+    return judged(
+        dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, **changes))
+    )
 
 
 def test_a_good_run_passes_every_check(run):
@@ -52,8 +65,13 @@ def test_a_good_run_passes_every_check(run):
     assert verdict.level is Level.PASS, verdict.at(Level.FAIL) + verdict.at(Level.WARN)
     assert len(verdict.checks) == 18
     # Requirements belong to a budget, which is not here.
-    assert {check.question for check in verdict.checks} == {Question.CONVERGED, Question.TRUSTWORTHY}
-    assert all(check.sentence.endswith(".") and check.value and check.bound for check in verdict.checks)
+    assert {check.question for check in verdict.checks} == {
+        Question.CONVERGED,
+        Question.TRUSTWORTHY,
+    }
+    assert all(
+        check.sentence.endswith(".") and check.value and check.bound for check in verdict.checks
+    )
     assert "every check passed" in verdict.headline
 
 
@@ -66,7 +84,9 @@ def test_a_good_run_passes_every_check(run):
     ],
 )
 def test_a_requirement_of_the_budget_is_part_of_the_verdict(run, level, words):
-    required = Check("Requirement 'R-1'", Question.REQUIRED, level, "2 arcsec", "at most 1 arcsec", "It is so.")
+    required = Check(
+        "Requirement 'R-1'", Question.REQUIRED, level, "2 arcsec", "at most 1 arcsec", "It is so."
+    )
     verdict = judge(run.obs, run.cal, run.post, run.truth, requirements=[required])
     assert verdict.level is level and verdict.level.exit_status == (level is Level.FAIL)
     assert words in verdict.headline and verdict.of(Question.REQUIRED) == (required,)
@@ -109,7 +129,9 @@ def with_draws(post, change):
 
 
 def test_derived_quantities_have_diagnostics_of_their_own(run):
-    """The rotation that the first ensemble implies is another one, although no diagnostic of a parameter says so."""
+    """The rotation that the first ensemble implies is another one, although no diagnostic of a
+    parameter says so.
+    """
     quarter = len(run.post.draws) // run.post.n_ensembles
 
     def shift(draws):
@@ -143,7 +165,9 @@ def test_digits_that_monte_carlo_error_reaches_warn(run):
 
 
 def test_a_posterior_of_other_data_fails(run):
-    other = dataclasses.replace(run.post, provenance={**run.post.provenance, "data_sha256": "0" * 64})
+    other = dataclasses.replace(
+        run.post, provenance={**run.post.provenance, "data_sha256": "0" * 64}
+    )
     assert outcome("Data of the posterior", run.obs, run.cal, other).level is Level.FAIL
 
 
@@ -163,14 +187,23 @@ class TestDiagnosis:
         verdict = judge(run.obs, run.cal, diagnosis=found)
         assert verdict.level is Level.PASS, verdict.at(Level.WARN) + verdict.at(Level.FAIL)
         names = {check.name for check in verdict.checks}
-        assert names >= {"Unexplained structure", "Jackknife over frames", "Distortion model", "Other starts"}
+        assert names >= {
+            "Unexplained structure",
+            "Jackknife over frames",
+            "Distortion model",
+            "Other starts",
+        }
         assert "Posterior predictive check" in names
-        assert all(check.sentence.endswith(".") and check.value and check.bound for check in verdict.checks)
+        assert all(
+            check.sentence.endswith(".") and check.value and check.bound for check in verdict.checks
+        )
         assert not any(s.startswith("The model") for s in limits(run.obs, run.cal, diagnosis=found))
 
     def reject(self, found, start, p):
         tests = tuple(
-            dataclasses.replace(t, p_value=p, p_holm=p, statistic=20.0, size_px=0.02 if t.dof else t.size_px)
+            dataclasses.replace(
+                t, p_value=p, p_holm=p, statistic=20.0, size_px=0.02 if t.dof else t.size_px
+            )
             if t.name.startswith(start)
             else t
             for t in found.misfit.tests
@@ -180,10 +213,24 @@ class TestDiagnosis:
     def test_structure_warns_or_fails_by_what_it_does(self, run, found):
         weak = self.check(run, self.reject(found, "decentring", 0.005), "Unexplained structure")
         strong = self.check(run, self.reject(found, "decentring", 1e-6), "Unexplained structure")
-        phase = self.check(run, self.reject(found, "error with the pixel phase in x", 1e-9), "Unexplained structure")
-        noise = self.check(run, self.reject(found, "noise that changes with mag", 1e-9), "Evenness of the noise")
-        assert [c.level for c in (weak, strong, phase, noise)] == [Level.WARN, Level.FAIL, Level.WARN, Level.WARN]
-        assert "decentring" in strong.sentence and "moves directions over the field by" in strong.sentence
+        phase = self.check(
+            run,
+            self.reject(found, "error with the pixel phase in x", 1e-9),
+            "Unexplained structure",
+        )
+        noise = self.check(
+            run, self.reject(found, "noise that changes with mag", 1e-9), "Evenness of the noise"
+        )
+        assert [c.level for c in (weak, strong, phase, noise)] == [
+            Level.WARN,
+            Level.FAIL,
+            Level.WARN,
+            Level.WARN,
+        ]
+        assert (
+            "decentring" in strong.sentence
+            and "moves directions over the field by" in strong.sentence
+        )
         assert "moves no parameter" in phase.sentence
         # The same shapes, once the fit has taken up so much of them that a parameter is off.
         for taken, level in ((0.5, Level.WARN), (2.0, Level.FAIL)):
@@ -197,29 +244,45 @@ class TestDiagnosis:
                 frame_covariance=np.zeros((3, 3)),
                 variance=1.0,
             )
-            changed = dataclasses.replace(changed, misfit=dataclasses.replace(changed.misfit, pattern=pattern))
+            changed = dataclasses.replace(
+                changed, misfit=dataclasses.replace(changed.misfit, pattern=pattern)
+            )
             check = self.check(run, changed, "Unexplained structure")
             assert check.level is level and f"y0 by {significant(taken)}" in check.sentence
 
     def test_frames_that_disagree_warn_with_the_factor(self, run, found):
-        scatter = dataclasses.replace(found.jackknife, sandwich_covariance=4.0 * found.jackknife.formal_covariance)
-        check = self.check(run, dataclasses.replace(found, jackknife=scatter), "Jackknife over frames")
+        scatter = dataclasses.replace(
+            found.jackknife, sandwich_covariance=4.0 * found.jackknife.formal_covariance
+        )
+        check = self.check(
+            run, dataclasses.replace(found, jackknife=scatter), "Jackknife over frames"
+        )
         assert check.level is Level.WARN
         assert "up to 2.00" in check.sentence
 
     def test_a_rejected_model_fails(self, run, found):
-        poor = dataclasses.replace(found, comparison=dataclasses.replace(found.comparison, fitted="k1"))
+        poor = dataclasses.replace(
+            found, comparison=dataclasses.replace(found.comparison, fitted="k1")
+        )
         check = self.check(run, poor, "Distortion model")
         assert check.level is Level.FAIL and "use 'brown'" in check.sentence
 
     def test_replicates_and_starts(self, run, found):
         odd = dataclasses.replace(found.predictive.statistics[1], p_value=0.0)
         predictive = dataclasses.replace(found.predictive, statistics=(odd,))
-        check = self.check(run, dataclasses.replace(found, predictive=predictive), "Posterior predictive check")
+        check = self.check(
+            run, dataclasses.replace(found, predictive=predictive), "Posterior predictive check"
+        )
         assert check.level is Level.WARN and "largest residual" in check.sentence
-        for change, level in (({"better": 1, "same": 1}, Level.FAIL), ({"same": 1, "failed": 1}, Level.WARN)):
+        for change, level in (
+            ({"better": 1, "same": 1}, Level.FAIL),
+            ({"same": 1, "failed": 1}, Level.WARN),
+        ):
             starts = dataclasses.replace(found.starts, **change)
-            assert self.check(run, dataclasses.replace(found, starts=starts), "Other starts").level is level
+            assert (
+                self.check(run, dataclasses.replace(found, starts=starts), "Other starts").level
+                is level
+            )
 
     def test_a_structure_is_a_limit(self, run, found):
         bent = self.reject(found, "decentring", 1e-6)
@@ -239,7 +302,9 @@ def test_an_estimate_that_did_not_converge_fails_with_its_remedy(run):
 
 
 def test_estimators_that_disagree_fail(run):
-    shifted = run.cal.theta + 6.0 * np.sqrt(np.diag(run.cal.pair_covariance)) * np.array([0, 0, 1, 0, 0])
+    shifted = run.cal.theta + 6.0 * np.sqrt(np.diag(run.cal.pair_covariance)) * np.array(
+        [0, 0, 1, 0, 0]
+    )
     check = outcome("Two estimators", run.obs, dataclasses.replace(run.cal, pair_theta=shifted))
     assert check.level is Level.FAIL
     assert "(f)" in check.value
@@ -250,7 +315,9 @@ def test_undeclared_directions_warn_with_the_size_of_the_effect(run, declared):
     obs = dataclasses.replace(run.obs, meta={**run.obs.meta, "directions": declared})
     check = outcome("Catalogue directions", obs, run.cal)
     assert check.level is Level.WARN
-    assert ("Neither time nor observer velocity was declared" in check.sentence) == (declared == "undeclared")
+    assert ("Neither time nor observer velocity was declared" in check.sentence) == (
+        declared == "undeclared"
+    )
     # 20.5 arcsec of aberration times the field's diagonal of 0.246 rad.
     assert "5.0 arcsec" in check.sentence
 
@@ -267,10 +334,15 @@ def test_outliers_warn_and_are_located(run):
     check = outcome("Outliers", run.obs, dataclasses.replace(run.cal, residuals_px=residuals))
     assert check.level is Level.WARN
     assert check.value.startswith("2 stars")
-    assert f"frame {run.obs.frame[5]}" in check.sentence or f"frame {run.obs.frame[400]}" in check.sentence
+    assert (
+        f"frame {run.obs.frame[5]}" in check.sentence
+        or f"frame {run.obs.frame[400]}" in check.sentence
+    )
 
 
-@pytest.mark.parametrize(("sigma", "level"), [(0.05, Level.PASS), (2.0, Level.WARN), (0.0001, Level.WARN)])
+@pytest.mark.parametrize(
+    ("sigma", "level"), [(0.05, Level.PASS), (2.0, Level.WARN), (0.0001, Level.WARN)]
+)
 def test_noise_must_be_that_of_centroids(run, sigma, level):
     cal = dataclasses.replace(run.cal, sigma=sigma)
     assert outcome("Centroid noise per axis", run.obs, cal).level is level
@@ -289,11 +361,21 @@ def test_few_frames_and_an_empty_corner_warn(run):
 
 def test_a_tight_prior_is_named(run):
     tight = run.post.priors.replace(focal_fraction=1e-5)
-    check = outcome("Influence of the priors", run.obs, run.cal, judged(dataclasses.replace(run.post, priors=tight)))
+    check = outcome(
+        "Influence of the priors",
+        run.obs,
+        run.cal,
+        judged(dataclasses.replace(run.post, priors=tight)),
+    )
     assert check.level is Level.WARN
     assert check.value.endswith("(f)")
     far = run.post.priors.replace(focal_px=run.post.priors.focal_px * 1.5)
-    check = outcome("Influence of the priors", run.obs, run.cal, judged(dataclasses.replace(run.post, priors=far)))
+    check = outcome(
+        "Influence of the priors",
+        run.obs,
+        run.cal,
+        judged(dataclasses.replace(run.post, priors=far)),
+    )
     assert check.level is Level.WARN
 
 
@@ -312,11 +394,14 @@ def test_a_pattern_in_the_residuals_is_found_and_sized(run):
 def test_wrong_stars_of_a_robust_estimate_are_no_pattern(run):
     rng = np.random.default_rng(2)
     wrong = rng.random(run.obs.n_stars) < 0.05
-    obs = dataclasses.replace(run.obs, dec_deg=run.obs.dec_deg + 0.8 * wrong * rng.choice([-1.0, 1.0], run.obs.n_stars))
+    obs = dataclasses.replace(
+        run.obs, dec_deg=run.obs.dec_deg + 0.8 * wrong * rng.choice([-1.0, 1.0], run.obs.n_stars)
+    )
     cal = sc.calibrate(obs, sc.paper.paper_start(), likelihood="student_t")
     assert outcome("Pattern in the residuals", obs, cal).level is Level.PASS
     assert outcome("Outliers", obs, cal).level is not Level.PASS
-    # A pattern of the others is found, and their mean is one with the wrong stars where no tails were asked for.
+    # A pattern of the others is found, and their mean is one with the wrong stars where no tails
+    # were asked for.
     pattern = 0.05 * np.stack([np.sin(obs.x_px / 200.0), np.cos(obs.y_px / 200.0)], axis=1)
     bent = dataclasses.replace(cal, residuals_px=cal.residuals_px + pattern)
     assert bin_residuals(bent, obs).pattern_px == pytest.approx(0.05 / np.sqrt(2.0), rel=0.2)
@@ -324,22 +409,31 @@ def test_wrong_stars_of_a_robust_estimate_are_no_pattern(run):
     assert outcome("Pattern in the residuals", obs, plain).level is Level.FAIL
     # So it is with the tests of the model, in frames that keep three stars.
     first = obs.frame == obs.frame_ids[0]
-    obs = dataclasses.replace(obs, dec_deg=run.obs.dec_deg + 0.8 * (wrong & ~first | first & (np.cumsum(first) == 3)))
+    obs = dataclasses.replace(
+        obs, dec_deg=run.obs.dec_deg + 0.8 * (wrong & ~first | first & (np.cumsum(first) == 3))
+    )
     obs = obs.select(~first | (np.cumsum(first) <= 3))
     cal = sc.calibrate(obs, sc.paper.paper_start(), likelihood="student_t")
     assert of_heard(obs, cal)[0].n_frames < obs.n_frames
-    tests, control = (sc.diagnostics.misfit_tests(obs, c) for c in (cal, dataclasses.replace(cal, provenance={})))
+    tests, control = (
+        sc.diagnostics.misfit_tests(obs, c) for c in (cal, dataclasses.replace(cal, provenance={}))
+    )
     assert estimate.misfit(tests, cal).level is estimate.even_noise(tests).level is Level.PASS
     assert estimate.even_noise(control).level is Level.WARN
 
 
 def test_the_pattern_test_raises_no_more_false_alarms_than_it_says(run):
-    """Residuals that are noise alone, 400 times: the share of p below 5 % is 5 % within its own error."""
+    """Residuals that are noise alone, 400 times: the share of p below 5 % is 5 % within its own
+    error.
+    """
     rng = np.random.default_rng(5)
     scale = residual_scale(run.cal, run.obs)[:, None]
     p = [
         bin_residuals(
-            dataclasses.replace(run.cal, residuals_px=scale * rng.standard_normal((run.obs.n_stars, 2))), run.obs
+            dataclasses.replace(
+                run.cal, residuals_px=scale * rng.standard_normal((run.obs.n_stars, 2))
+            ),
+            run.obs,
         ).p_value
         for _ in range(400)
     ]
@@ -370,14 +464,22 @@ def test_limits_name_the_largest_term_and_the_coupling(run):
     nothing = np.full((5, 4), np.nan)
     error = AttitudeError(*sizes, nothing, nothing, *sizes, n_draws=300, n_frames=100)
     sentences = limits(run.obs, run.cal, sc.coupling(run.post), error)
-    assert "common rotation, one constant, exceeds centroid noise: 5.5 arcsec if the model holds" in sentences[0]
-    assert "what remains is 0.020 arcsec if the model holds (with the misfit found: not assessed)" in sentences[0]
+    assert (
+        "common rotation, one constant, exceeds centroid noise: 5.5 arcsec if the model holds"
+        in sentences[0]
+    )
+    assert (
+        "what remains is 0.020 arcsec if the model holds (with the misfit found: not assessed)"
+        in sentences[0]
+    )
     found = MisfitFound(1.0, np.zeros(3), np.array([0.5, 0.5, 7.0]))
     tested = limits(run.obs, run.cal, attitude=dataclasses.replace(error, misfit=found))[0]
     assert "what remains is 0.50 arcsec with the misfit found (0.020 if the model holds)" in tested
     assert "k1 trades against k2" in sentences[1] or "f trades against" in sentences[1]
     small = dataclasses.replace(error, common_arcsec=np.full(3, 0.1))
-    assert "centroid noise of a single frame dominates" in limits(run.obs, run.cal, attitude=small)[0]
+    assert (
+        "centroid noise of a single frame dominates" in limits(run.obs, run.cal, attitude=small)[0]
+    )
 
 
 def test_propagation_that_departs_from_first_order_warns(run):
@@ -392,17 +494,34 @@ def test_propagation_that_departs_from_first_order_warns(run):
 
 
 def test_false_alarms_add_up_to_less_than_five_and_one_per_cent():
-    """By design, whatever the data are; the levels of before (5 % for structure alone) are the control."""
+    """By design, whatever the data are; the levels of before (5 % for structure alone) are the
+    control.
+    """
     warns = [estimate.MISFIT_P, estimate.JACKKNIFE_P, estimate.STAR_P, PATTERN_P, OUTLIER_P]
-    fails = [estimate.MISFIT_FAIL_P, estimate.STAR_FAIL_P, PATTERN_P, estimate.ESTIMATORS_P, estimate.TRUTH_P, REJECT_P]
+    fails = [
+        estimate.MISFIT_FAIL_P,
+        estimate.STAR_FAIL_P,
+        PATTERN_P,
+        estimate.ESTIMATORS_P,
+        estimate.TRUTH_P,
+        REJECT_P,
+    ]
     assert sum(warns) < 0.05 < sum(warns) - estimate.MISFIT_P + 0.05
     assert sum(fails) < 0.01
 
 
 def test_the_smallest_effect_that_few_data_show_is_said(run, found):
-    few = dataclasses.replace(found.jackknife, effective_frames=found.jackknife.effective_frames / 20.0)
-    words, fewer = (estimate.sensitivity(d) for d in (found, dataclasses.replace(found, jackknife=few)))
-    assert "120 frames" in words and "smooth pattern over radius" in words and words.endswith("less may be there.")
+    few = dataclasses.replace(
+        found.jackknife, effective_frames=found.jackknife.effective_frames / 20.0
+    )
+    words, fewer = (
+        estimate.sensitivity(d) for d in (found, dataclasses.replace(found, jackknife=few))
+    )
+    assert (
+        "120 frames" in words
+        and "smooth pattern over radius" in words
+        and words.endswith("less may be there.")
+    )
     ratio = [float(w.split("make sigma ")[1].split(" times")[0]) for w in (words, fewer)]
     assert 1.0 < ratio[0] < 1.6 < ratio[1]
 

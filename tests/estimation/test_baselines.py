@@ -1,4 +1,6 @@
-"""Least squares, Samaan's and Griffith's method: same call, same result, covariances that hold, and streams."""
+"""Least squares, Samaan's and Griffith's method: same call, same result, covariances that hold, and
+streams.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,11 @@ def test_every_method_on_every_model(model, stated, method, options):
         )
     elif method == "griffith":
         assert [stage.name for stage in cal.stages] == ["filter"]
-        assert cal.stages[0].trajectory.shape == cal.stages[0].sigmas.shape == (obs.n_frames + 1, len(cal.theta))
+        assert (
+            cal.stages[0].trajectory.shape
+            == cal.stages[0].sigmas.shape
+            == (obs.n_frames + 1, len(cal.theta))
+        )
 
 
 def test_least_squares_is_stage_one():
@@ -91,25 +97,36 @@ def test_least_squares_prints_the_focal_length_of_the_paper():
     obs = observations(n_frames=1000, seed=2017)
     cal = sc.calibrate(obs, sc.paper.paper_start(), method="least_squares")
     assert cal.camera.focal_mm == pytest.approx(70.211, abs=1e-3)
-    # Control: the other reading of the distortion, from measured to ideal points, goes to the other side.
+    # Control: the other reading of the distortion, from measured to ideal points, goes to the other
+    # side.
     inverse = camera("inverse").replace(coefficients=camera("brown").coefficients)
-    other = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), inverse, n_frames=300, sigma_px=0.05, seed=1)
-    assert sc.calibrate(other, sc.paper.paper_start(), method="least_squares").camera.focal_mm > 70.235
+    other = sc.simulate(
+        sc.load_catalogue(max_mag=6.0, epoch=2026.9), inverse, n_frames=300, sigma_px=0.05, seed=1
+    )
+    assert (
+        sc.calibrate(other, sc.paper.paper_start(), method="least_squares").camera.focal_mm > 70.235
+    )
 
 
 def test_samaan_decouples_what_griffith_with_all_parameters_couples():
     obs = observations(n_frames=300)
-    samaan, griffith = run(obs, sc.paper.paper_start(), "samaan"), run(obs, sc.paper.paper_start(), "griffith", ALL)
+    samaan, griffith = (
+        run(obs, sc.paper.paper_start(), "samaan"),
+        run(obs, sc.paper.paper_start(), "griffith", ALL),
+    )
     truth = camera().theta
     assert np.max(np.abs(griffith.theta - truth) / griffith.sigmas) < 4.0
-    # The optics have absorbed the distortion, and k1 comes out several times too large, by any sigma.
+    # The optics have absorbed the distortion, and k1 comes out several times too large, by any
+    # sigma.
     assert 3.0 < samaan.theta[3] / truth[3] < 16.0
     assert np.abs(samaan.theta[3] - truth[3]) / samaan.sigmas[3] > 20.0
     optics = run(obs, sc.paper.paper_start(), "griffith")
     assert np.max(np.abs(samaan.theta[:3] - optics.theta) / optics.sigmas) < 0.01
 
 
-@pytest.mark.parametrize(("method", "options"), [("samaan", None), ("griffith", None), ("griffith", ALL)])
+@pytest.mark.parametrize(
+    ("method", "options"), [("samaan", None), ("griffith", None), ("griffith", ALL)]
+)
 @pytest.mark.parametrize("stated", [False, True])
 def test_a_stream_gives_what_the_table_gives(method, options, stated):
     obs = observations(n_frames=200)
@@ -122,7 +139,9 @@ def test_a_stream_gives_what_the_table_gives(method, options, stated):
         # An iterator is read once: its sums come to the final optics to first order.
         bound = 1e-6 if twice or method == "griffith" else 0.5
         assert np.max(np.abs(cal.theta - table.theta) / table.sigmas) < bound
-        assert np.allclose(cal.sigmas, table.sigmas, rtol=1e-6 if twice or method == "griffith" else 0.03)
+        assert np.allclose(
+            cal.sigmas, table.sigmas, rtol=1e-6 if twice or method == "griffith" else 0.03
+        )
         assert cal.sigma == pytest.approx(table.sigma, rel=2e-3)
         assert cal.chi2 == pytest.approx(table.chi2, rel=4e-3)
         assert (cal.dof, cal.n_stars, cal.n_frames) == (table.dof, table.n_stars, table.n_frames)
@@ -133,13 +152,18 @@ def test_a_stream_gives_what_the_table_gives(method, options, stated):
             unit = np.sqrt(np.diag(table.information))
             assert np.max(np.abs(cal.information - table.information) / np.outer(unit, unit)) < 0.03
         turned = table.rotation_per_theta * table.sigmas
-        assert np.max(np.abs(cal.rotation_per_theta * table.sigmas - turned)) < 0.02 * np.max(np.abs(turned))
+        assert np.max(np.abs(cal.rotation_per_theta * table.sigmas - turned)) < 0.02 * np.max(
+            np.abs(turned)
+        )
         assert np.allclose(np.diag(cal.attitude_noise), np.diag(table.attitude_noise), rtol=5e-3)
 
 
 def test_the_likelihood_of_a_stream_is_that_of_the_table():
     obs = observations(n_frames=200)
-    table, stream = (run(source, sc.paper.paper_start(), "griffith", ALL) for source in (obs, iter(one_by_one(obs))))
+    table, stream = (
+        run(source, sc.paper.paper_start(), "griffith", ALL)
+        for source in (obs, iter(one_by_one(obs)))
+    )
     rng = np.random.default_rng(0)
     z = rng.normal(size=(50, 5))
     theta = table.theta + z @ table.compressed.whitening.T
@@ -185,7 +209,10 @@ def test_a_mirror_is_seen(method):
     # Of a list of frames the first ones are looked at.
     with pytest.raises(CalibrationError, match="the image is mirrored"):
         run(one_by_one(mirrored), sc.paper.paper_start(), method)
-    assert run(one_by_one(mirrored), sc.paper.paper_start(), method, throw=False).status is Status.INCONSISTENT
+    assert (
+        run(one_by_one(mirrored), sc.paper.paper_start(), method, throw=False).status
+        is Status.INCONSISTENT
+    )
     rng = np.random.default_rng(0)
     mixed = rng.permutation(obs.n_stars)
     wrong = dataclasses.replace(obs, ra_deg=obs.ra_deg[mixed], dec_deg=obs.dec_deg[mixed])
@@ -206,7 +233,9 @@ def test_what_is_refused():
     with pytest.raises(CalibrationError, match="no frame yet"):
         sc.calibrate([], sc.paper.paper_start(), method="griffith")
     for method in ("least_squares", "samaan", "griffith"):
-        with pytest.raises(CalibrationError, match="likelihood='student_t' needs method='efficient'"):
+        with pytest.raises(
+            CalibrationError, match="likelihood='student_t' needs method='efficient'"
+        ):
             sc.calibrate(obs, sc.paper.paper_start(), method=method, likelihood="student_t")
         three = obs.select(np.isin(np.arange(obs.n_stars), [0, 1, 2]))
         with pytest.raises(CalibrationError, match="3 stars in 1 frames"):
@@ -223,7 +252,9 @@ def test_a_source_that_changes_is_found_out():
             self.reads += 1
             return iter(frames if self.reads == 1 else frames[:-1])
 
-    with pytest.raises(CalibrationError, match="gave 60 frames at first and 59 when it was read again"):
+    with pytest.raises(
+        CalibrationError, match="gave 60 frames at first and 59 when it was read again"
+    ):
         sc.calibrate(Leaking(), sc.paper.paper_start(), method="samaan")
 
 
@@ -253,7 +284,8 @@ def test_a_drifting_focal_length_is_followed(method, options):
     for frame in drifting(0.05):
         step = steps.update(frame)
     assert abs(step.theta[2] - final) < 4.0 * step.sigmas[2] + 0.5
-    # Control: a filter that takes the camera as constant stays behind by half of the drift, and does not know it.
+    # Control: a filter that takes the camera as constant stays behind by half of the drift, and
+    # does not know it.
     still = RecursiveCalibration(nominal(camera("none")), method)
     for frame in drifting(0.05):
         stays = still.update(frame)
@@ -285,12 +317,16 @@ N_REPLICATES = 300
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["griffith", "samaan"])
 def test_the_filter_is_right_where_its_model_is(method):
-    """Without distortion, full covariance: estimate, sigmas and the filter's own claim agree with the spread."""
+    """Without distortion, full covariance: estimate, sigmas and the filter's own claim agree with
+    the spread.
+    """
     truth = camera("none")
     found, sigmas, claimed = replicates(truth, nominal(truth), method, None, N_REPLICATES)
     errors = found - truth.theta
     for widths in (sigmas, claimed):
-        assert np.all(np.abs(variance_ratio(errors, widths) - 1.0) < 0.3), variance_ratio(errors, widths)
+        assert np.all(np.abs(variance_ratio(errors, widths) - 1.0) < 0.3), variance_ratio(
+            errors, widths
+        )
         coverage = np.mean(np.abs(errors / widths) < 1.96, axis=0)
         assert (coverage > 0.91).all(), coverage
         assert (coverage < 0.985).all(), coverage
@@ -299,12 +335,16 @@ def test_the_filter_is_right_where_its_model_is(method):
 
 @pytest.mark.slow
 def test_pairs_taken_as_independent_claim_too_little():
-    """The historical covariance claims a third of its spread; the sigmas of the result are those of the spread."""
+    """The historical covariance claims a third of its spread; the sigmas of the result are those of
+    the spread.
+    """
     truth = camera("none")
     options = RecursionOptions(pair_covariance="diagonal")
     found, sigmas, claimed = replicates(truth, nominal(truth), "griffith", options, N_REPLICATES)
     errors = found - truth.theta
-    assert np.all(np.abs(variance_ratio(errors, sigmas) - 1.0) < 0.3), variance_ratio(errors, sigmas)
+    assert np.all(np.abs(variance_ratio(errors, sigmas) - 1.0) < 0.3), variance_ratio(
+        errors, sigmas
+    )
     assert (variance_ratio(errors, claimed) > 5.0).all()
     assert (np.mean(np.abs(errors / claimed) < 1.96, axis=0) < 0.6).all()
 
@@ -312,7 +352,9 @@ def test_pairs_taken_as_independent_claim_too_little():
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["least_squares", "samaan", "griffith"])
 def test_sigmas_are_the_spread_although_distortion_is_ignored(method):
-    found, sigmas, claimed = replicates(camera(), sc.paper.paper_start(), method, None, N_REPLICATES)
+    found, sigmas, claimed = replicates(
+        camera(), sc.paper.paper_start(), method, None, N_REPLICATES
+    )
     errors = found - np.mean(found, axis=0)
     ratio = variance_ratio(errors, sigmas)
     assert np.all(np.abs(ratio - 1.0) < 0.35), ratio
@@ -342,9 +384,13 @@ class TestDownstream:
         for likelihood in ("marginal", "pairs"):
             posterior = sc.sample(obs, cal, seed=1, n_steps=40, likelihood=likelihood)
             assert not posterior.diagnostics.ok
-            assert any("ignores the distortion" in check.sentence for check in posterior.diagnostics.checks)
+            assert any(
+                "ignores the distortion" in check.sentence for check in posterior.diagnostics.checks
+            )
         honest = sc.sample(obs, sc.calibrate(obs, nominal(truth)), seed=1)
-        assert not any("ignores the distortion" in check.sentence for check in honest.diagnostics.checks)
+        assert not any(
+            "ignores the distortion" in check.sentence for check in honest.diagnostics.checks
+        )
 
     @pytest.mark.parametrize(
         ("method", "stream", "given", "likelihood", "words"),

@@ -1,4 +1,6 @@
-"""Frames of several cameras in one table are told by their own focal lengths; frames of one are not."""
+"""Frames of several cameras in one table are told by their own focal lengths; frames of one are
+not.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from tests.helpers.outside import campaign
 
 
 def mixed(seed: int, ratio: float, second: int, n_frames: int = 10, **options):
-    """Observations whose last frames are of a camera with a focal length `ratio` times as long, and a data sheet."""
+    """Observations whose last frames are of a camera with a focal length `ratio` times as long, and
+    a data sheet.
+    """
     rng = np.random.default_rng(seed)
     own = {"stars_per_frame": 12, "sigma_px": 0.1, "corner_px": (3.0, -1.0)} | options
     field = 2.0 * np.degrees(np.arctan(np.tan(np.radians(7.5)) / ratio))
@@ -24,7 +28,11 @@ def mixed(seed: int, ratio: float, second: int, n_frames: int = 10, **options):
         other = campaign(rng, n_frames=second, field_deg=field, **own).columns
         other["frame"] = other["frame"] + n_frames - second
         columns = {name: np.concatenate([columns[name], other[name]]) for name in columns}
-    return sc.Observations(**columns), sc.Camera(**c.camera_toml(0.03), coefficients=(0.0, 0.0)), c.theta[2]
+    return (
+        sc.Observations(**columns),
+        sc.Camera(**c.camera_toml(0.03), coefficients=(0.0, 0.0)),
+        c.theta[2],
+    )
 
 
 @pytest.mark.parametrize(("ratio", "second"), [(1.4, 4), (1.4, 1), (1.01, 4), (0.5, 5)])
@@ -45,7 +53,8 @@ def test_three_cameras():
     apart = 2.0 * third.xy - third.xy.mean(axis=0)
     inside = np.all((apart > 0.0) & (apart < 1023.0), axis=1)
     columns = {
-        name: np.concatenate([getattr(obs, name), getattr(third, name)[inside]]) for name in ("ra_deg", "dec_deg")
+        name: np.concatenate([getattr(obs, name), getattr(third, name)[inside]])
+        for name in ("ra_deg", "dec_deg")
     }
     frame = np.concatenate([obs.frame, third.frame[inside] + 10])
     xy = np.concatenate([obs.xy, apart[inside]])
@@ -55,7 +64,10 @@ def test_three_cameras():
 
 def test_a_failing_calibration_names_the_cameras_and_the_frames_to_take():
     obs, camera, _ = mixed(0, 1.4, 4)
-    with pytest.raises(CalibrationError, match=r"of 2 cameras.* in frames 0-5 and .* in frames 6-9.*--only-frames 0-5"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"of 2 cameras.* in frames 0-5 and .* in frames 6-9.*--only-frames 0-5",
+    ):
         sc.calibrate(obs, camera)
     assert sc.calibrate(obs.in_ranges([(0, 5)]), camera).status.ok
 
@@ -70,7 +82,13 @@ def test_a_calibration_of_two_like_cameras_fails_a_check():
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"stars_per_frame": 5}, {"sigma_px": 1.0}, {"corner_px": (30.0, -10.0)}, {"frame_focal": 1e-3}],
+    [
+        {},
+        {"stars_per_frame": 5},
+        {"sigma_px": 1.0},
+        {"corner_px": (30.0, -10.0)},
+        {"frame_focal": 1e-3},
+    ],
     ids=str,
 )
 def test_frames_of_one_camera_stay_together(options):

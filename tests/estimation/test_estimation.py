@@ -1,4 +1,6 @@
-"""Calibration: every solver on every scene, statuses, results that save themselves, and the paper's numbers."""
+"""Calibration: every solver on every scene, statuses, results that save themselves, and the paper's
+numbers.
+"""
 
 from __future__ import annotations
 
@@ -45,13 +47,20 @@ def test_three_stages_as_the_paper_describes_them():
     assert np.array_equal(cal.theta, cal.pair_theta)
     assert np.array_equal(cal.covariance, cal.pair_covariance)
     efficient = sc.calibrate(obs, sc.paper.paper_start())
-    assert [stage.name for stage in efficient.stages] == ["optics", "distortion", "all", "refinement"]
+    assert [stage.name for stage in efficient.stages] == [
+        "optics",
+        "distortion",
+        "all",
+        "refinement",
+    ]
     # The paper's estimator pays for weighting pairs alike.
     assert (cal.sigmas > efficient.sigmas).all()
 
 
 def test_distortion_ignored_moves_the_focal_length_below_the_truth():
-    """Eq. 14 read as ideal to distorted reproduces the paper's stage 1 (70.2122 mm in its Table 2)."""
+    """Eq. 14 read as ideal to distorted reproduces the paper's stage 1 (70.2122 mm in its
+    Table 2).
+    """
     obs = observations(n_frames=300)
     cal = sc.calibrate(obs, sc.paper.paper_start())
     focal_mm = cal.stages[0].theta[2] * 0.012
@@ -75,7 +84,9 @@ def test_residuals_and_attitudes_are_those_of_the_estimate():
 
 
 def test_stated_noise_is_used():
-    """Stars with large stated noise must count less: the estimate is better than without the column."""
+    """Stars with large stated noise must count less: the estimate is better than without the
+    column.
+    """
     clean = observations(n_frames=60, sigma_px=0.0)
     errors, claimed, unweighted = [], [], []
     for seed in range(40):
@@ -85,7 +96,9 @@ def test_stated_noise_is_used():
         claimed.append(cal.sigmas)
         # These hardly change from seed to seed: ten give their mean.
         if seed < 10:
-            unweighted.append(sc.calibrate(dataclasses.replace(obs, sigma_px=None), sc.paper.paper_start()).sigmas)
+            unweighted.append(
+                sc.calibrate(dataclasses.replace(obs, sigma_px=None), sc.paper.paper_start()).sigmas
+            )
     assert (np.mean(claimed, axis=0) < 0.65 * np.mean(unweighted, axis=0)).all()
     ratio = np.std(errors, axis=0) / np.mean(claimed, axis=0)
     bound = 4.0 / np.sqrt(2 * 40)
@@ -114,7 +127,9 @@ def test_repeats_bit_for_bit():
 
 @pytest.mark.parametrize("k1", [-2e-7, -8e-8, 8e-8, 2e-7])
 def test_distortion_of_tens_of_pixels(k1):
-    """The fit without distortion then lands hundreds of pixels off the axis; the result must not stay there."""
+    """The fit without distortion then lands hundreds of pixels off the axis; the result must not
+    stay there.
+    """
     truth = camera("brown").replace(coefficients=(k1, 0.0))
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     obs = sc.simulate(stars, truth, n_frames=60, min_stars=8, sigma_px=0.05, seed=3)
@@ -169,7 +184,9 @@ def test_ipopt_keeps_the_principal_point_on_the_detector():
     obs = observations(n_frames=60, sigma_px=3.0)
     few = obs.select_frames(obs.frame_ids[:3])
     cam = nominal(camera())
-    stage = joint_stage(PairObjective(StarFrames.from_observations(few), "brown"), cam, cam.theta, "ipopt", 300)
+    stage = joint_stage(
+        PairObjective(StarFrames.from_observations(few), "brown"), cam, cam.theta, "ipopt", 300
+    )
     limits = constraints_for(cam, 5)
     assert (stage.theta >= limits.lower - 1e-6).all()
     assert (stage.theta <= limits.upper + 1e-6).all()
@@ -211,9 +228,11 @@ def _replicates(seeds, sigma_claimed=1.0):
 
 @pytest.mark.slow
 def test_the_spread_over_seeds_is_the_sigma_that_is_reported():
-    """Paper's set-up: variance ratios 0.8-1.2 and coverage 91-98 %, against sigma and Cramer-Rao bound.
+    """Paper's set-up: variance ratios 0.8-1.2 and coverage 91-98 %, against sigma and Cramer-Rao
+    bound.
 
-    400 seeds rather than 200: with 200 a right 95 % interval leaves 98 % once in ninety times for each parameter.
+    400 seeds rather than 200: with 200 a right 95 % interval leaves 98 % once in ninety times for
+    each parameter.
     """
     errors, sigmas, pair_errors, pair_sigmas = _replicates(range(400))
     for e, s in ((errors, sigmas), (pair_errors, pair_sigmas)):
@@ -228,7 +247,8 @@ def test_the_spread_over_seeds_is_the_sigma_that_is_reported():
     # Negative control: sigmas understated to the size that naive pairs claim do not pass.
     naive = sigmas / 2.5
     assert (np.mean(np.abs(errors / naive) < 1.96, axis=0) < 0.91).all()
-    # Cramer-Rao bound of the true noise, by an independent path: the information at the truth scaled to 0.05 px.
+    # Cramer-Rao bound of the true noise, by an independent path: the information at the truth
+    # scaled to 0.05 px.
     assert np.allclose(np.mean(sigmas, axis=0), [0.14, 0.14, 0.026, 0.36e-10, 0.068e-15], rtol=0.06)
 
 
@@ -239,6 +259,11 @@ def test_intervals_without_sampling_are_students_and_stand_in_the_table():
     assert cal.interval() == pytest.approx(np.stack([cal.theta - half, cal.theta + half], axis=1))
     assert half[0] > 1.01 * 1.96 * cal.sigmas[0], "the normal interval, the control, is shorter"
     low, high = cal.sigma_interval()
-    assert stats.chi2.cdf(cal.dof * cal.sigma**2 / np.array([high, low]) ** 2, cal.dof) == pytest.approx([0.025, 0.975])
+    assert stats.chi2.cdf(
+        cal.dof * cal.sigma**2 / np.array([high, low]) ** 2, cal.dof
+    ) == pytest.approx([0.025, 0.975])
     table = cal.to_dataframe()
-    assert table["low"].to_numpy()[:5] == pytest.approx(cal.interval()[:, 0]) and table["high"].iloc[-1] == high
+    assert (
+        table["low"].to_numpy()[:5] == pytest.approx(cal.interval()[:, 0])
+        and table["high"].iloc[-1] == high
+    )

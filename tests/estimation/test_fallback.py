@@ -1,4 +1,6 @@
-"""A model that the data do not determine: the richest that they do is fitted, what is asked for is refused."""
+"""A model that the data do not determine: the richest that they do is fitted, what is asked for is
+refused.
+"""
 
 from dataclasses import replace
 
@@ -17,7 +19,13 @@ from tests.helpers.outside import Campaign, campaign
 
 def few_stars(seed: int, **options) -> Campaign:
     """Three frames of five stars in a field of 3 degrees."""
-    own = {"n_frames": 3, "stars_per_frame": 5, "field_deg": 3.0, "corner_px": (0.0, 0.0), "sigma_px": 0.1}
+    own = {
+        "n_frames": 3,
+        "stars_per_frame": 5,
+        "field_deg": 3.0,
+        "corner_px": (0.0, 0.0),
+        "sigma_px": 0.1,
+    }
     return campaign(np.random.default_rng(seed), **own | options)
 
 
@@ -47,7 +55,8 @@ def test_asking_for_the_simpler_model_removes_no_condition():
     taken, asked = sc.calibrate(obs, camera), sc.calibrate(obs, camera, model="none")
     assert np.array_equal(taken.theta, asked.theta)
     assert estimate.determined(asked) == estimate.determined(taken)
-    # Data that determine the rest, and a sheet that states a camera without distortion, leave no condition.
+    # Data that determine the rest, and a sheet that states a camera without distortion, leave no
+    # condition.
     plenty, sheet = given(few_stars(0, n_frames=10, stars_per_frame=20, field_deg=15.0))
     assert estimate.determined(sc.calibrate(plenty, sheet, model="none")) is None
     assert estimate.determined(sc.calibrate(obs, camera.replace(distortion="none"))) is None
@@ -62,18 +71,32 @@ def test_sigmas_are_those_without_the_coma_of_a_distortion_that_may_be_none():
     formal = np.sqrt(np.diag(symmetric_inverse(cal.information)))
     np.testing.assert_allclose(cal.sigmas / formal, factors, rtol=1e-6)
     check = estimate.determined(cal)
-    assert check.level is Level.WARN and check.remedy == PLAN and "without its coma" in fallback_words(cal)
+    assert (
+        check.level is Level.WARN
+        and check.remedy == PLAN
+        and "without its coma" in fallback_words(cal)
+    )
     assert np.array_equal(sc.calibrate(obs, camera, model="brown").theta, cal.theta)
     # Draws are as wide.
-    short = {"seed": 0, "n_ensembles": 2, "n_walkers": 16, "n_steps": 60, "evaluation": "compressed"}
-    narrow = replace(cal, provenance={k: v for k, v in cal.provenance.items() if k != "without_coma"})
+    short = {
+        "seed": 0,
+        "n_ensembles": 2,
+        "n_walkers": 16,
+        "n_steps": 60,
+        "evaluation": "compressed",
+    }
+    narrow = replace(
+        cal, provenance={k: v for k, v in cal.provenance.items() if k != "without_coma"}
+    )
     wide, as_found = (sc.sample(None, c, **short).sd for c in (cal, narrow))
     assert np.all(wide[:2] > 1.1 * as_found[:2])
 
 
 def test_what_is_asked_for_is_refused_with_the_model_that_converges():
     obs, camera = given(few_stars(OPEN))
-    with pytest.raises(CalibrationError, match=r"do not determine .*'none' converges \(--model none, or") as caught:
+    with pytest.raises(
+        CalibrationError, match=r"do not determine .*'none' converges \(--model none, or"
+    ) as caught:
         sc.calibrate(obs, camera, model="brown")
     assert caught.value.status is Status.SINGULAR and caught.value.undetermined
     assert sc.calibrate(obs, camera, model="brown", throw=False).status is Status.SINGULAR
@@ -87,7 +110,8 @@ def test_a_model_that_the_data_determine_stays():
 
 
 @pytest.mark.parametrize(
-    ("model", "n_stars", "used"), [("brown", 4, ("none", "k1")), ("brown_tangential", 5, ("brown", "k1"))]
+    ("model", "n_stars", "used"),
+    [("brown", 4, ("none", "k1")), ("brown_tangential", 5, ("brown", "k1"))],
 )
 def test_too_few_stars_for_a_model(model, n_stars, used):
     obs, camera = given(few_stars(0, n_frames=1, stars_per_frame=n_stars, field_deg=15.0), model)
@@ -131,7 +155,10 @@ def test_priors_determine_what_the_data_leave_open():
     assert np.all(np.abs(post.mean[:3] - c.theta[:3]) < 4.0 * post.sd[:3])
     # Of the point it knows what the priors say, of f what the stars do.
     assert post.sd[:2] == pytest.approx([10.0, 10.0], rel=0.2) and post.sd[2] < 5.0
-    assert estimate.estimation(cal, post).level is Level.WARN and estimate.estimation(cal).level is Level.FAIL
+    assert (
+        estimate.estimation(cal, post).level is Level.WARN
+        and estimate.estimation(cal).level is Level.FAIL
+    )
 
 
 @pytest.mark.slow
@@ -168,7 +195,8 @@ def test_noise_in_the_distortion_of_a_narrow_field_tells_no_principal_point(monk
     assert np.sqrt(np.mean(z**2)) < 1.3
     # Believed, it does: many estimates come with sigmas that are too small.
     monkeypatch.setattr(
-        "starcal_uq.estimation.undetermined._without_coma", lambda covariance, told, size: np.ones(len(told))
+        "starcal_uq.estimation.undetermined._without_coma",
+        lambda covariance, told, size: np.ones(len(told)),
     )
     models, z = narrow_fields(40)
     kept = np.array(models) == "brown"
@@ -183,7 +211,9 @@ NOISY = (
 
 
 def noisy(model: str | None, n: int = 40) -> np.ndarray:
-    """Whether x0, y0, f, and k1, k2 where fitted, lie in their 95 % intervals: tables with 5 px of noise."""
+    """Whether x0, y0, f, and k1, k2 where fitted, lie in their 95 % intervals: tables with 5 px of
+    noise.
+    """
     inside = []
     for options in NOISY:
         for seed in range(n):

@@ -1,4 +1,5 @@
-"""Tests of runs against each other: their p-values are uniform when nothing differs, and not when something does.
+"""Tests of runs against each other: their p-values are uniform when nothing differs, and not when
+something does.
 
 The same runs are looked at as pairs and as triples: fast ones of 12 frames, many of 5.
 """
@@ -26,18 +27,25 @@ def calibrated(seed: int, n_frames: int = 12, shift_f_px: float = 0.0) -> Calibr
     camera = scenes.camera()
     theta = camera.theta.copy()
     theta[2] += shift_f_px
-    obs = simulate(scenes.catalogue(), camera.with_theta(theta), n_frames=n_frames, min_stars=8, seed=seed)
+    obs = simulate(
+        scenes.catalogue(), camera.with_theta(theta), n_frames=n_frames, min_stars=8, seed=seed
+    )
     return calibrate(obs, NOMINAL)
 
 
 def shift_p_values(n: int, shift_f_px: float = 0.0, n_frames: int = 12) -> np.ndarray:
     """Two runs each, of which the second may have moved."""
-    pairs = ((calibrated(5000 + 2 * i, n_frames), calibrated(5001 + 2 * i, n_frames, shift_f_px)) for i in range(n))
+    pairs = (
+        (calibrated(5000 + 2 * i, n_frames), calibrated(5001 + 2 * i, n_frames, shift_f_px))
+        for i in range(n)
+    )
     return np.array([shift_test(before, after).p_value for before, after in pairs])
 
 
 def merge_p_values(n: int, shift_f_px: float = 0.0, n_frames: int = 12) -> np.ndarray:
-    """Three runs each, of which the last may have moved: all together, the second against the others, the noise."""
+    """Three runs each, of which the last may have moved: all together, the second against the
+    others, the noise.
+    """
     found = []
     for i in range(n):
         runs = [calibrated(5000 + 3 * i + k, n_frames, shift_f_px * (k == 2)) for k in range(3)]

@@ -1,4 +1,6 @@
-"""A measurement counts once: images measured again are found, exposures of one sky are not taken for them."""
+"""A measurement counts once: images measured again are found, exposures of one sky are not taken
+for them.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ def night(seed: int = 1, n_frames: int = 16) -> Campaign:
 
 def together(*tables: dict[str, np.ndarray]) -> sc.Observations:
     """Rows of several tables, columns that one lacks left out."""
-    return sc.Observations(**{name: np.concatenate([t[name] for t in tables]) for name in tables[-1]})
+    return sc.Observations(
+        **{name: np.concatenate([t[name] for t in tables]) for name in tables[-1]}
+    )
 
 
 def table(c: Campaign) -> sc.Observations:
@@ -48,7 +52,9 @@ def calibrated(seed: int = 1, n_frames: int = 16) -> Calibration:
 @lru_cache
 def doubled(eta: float = 0.1, origin_px: float = 0.0) -> sc.Observations:
     rng = np.random.default_rng(5)
-    return together(night().columns, measured_again(rng, night().columns, eta * SIGMA, origin_px=origin_px))
+    return together(
+        night().columns, measured_again(rng, night().columns, eta * SIGMA, origin_px=origin_px)
+    )
 
 
 def test_every_frame_twice_is_refused_left_out_or_kept() -> None:
@@ -66,7 +72,8 @@ def test_every_frame_twice_is_refused_left_out_or_kept() -> None:
     assert rest.provenance["dropped_frames"] == list(range(1000, 1016))
     assert np.all(np.abs(rest.theta - calibrated().theta) < 1e-6 * calibrated().sigmas)
     assert weighed(obs, rest).n_frames == 16
-    # Judged is what was calibrated: with what was left out, each residual would be 1.4 times too many sigmas.
+    # Judged is what was calibrated: with what was left out, each residual would be 1.4 times too
+    # many sigmas.
     alone = normalised_residuals(calibrated(), table(night()))
     assert np.allclose(normalised_residuals(rest, obs), alone, atol=1e-4)
     # The old behaviour, which counts all twice: sigmas that are 0.7 times too small.
@@ -82,20 +89,28 @@ def test_exposures_of_one_sky_are_not_taken_for_one() -> None:
     # One of its exposures again, though it has noise of its own from the others: found.
     again = {name: values[stare.columns["frame"] == 7] for name, values in stare.columns.items()}
     more = together(stare.columns, measured_again(np.random.default_rng(3), again, 0.1 * SIGMA))
-    with pytest.raises(RepeatedFramesError, match="frame 1000 holds the same measurement as frame 7:"):
+    with pytest.raises(
+        RepeatedFramesError, match="frame 1000 holds the same measurement as frame 7:"
+    ):
         sc.calibrate(more, camera(stare))
 
 
 def test_runs_that_share_frames_are_not_merged_unawares(tmp_path: Path) -> None:
     a, sheet = night(), camera(night())
-    fresh, part = night(2), {name: values[a.columns["frame"] >= 10] for name, values in a.columns.items()}
+    fresh, part = (
+        night(2),
+        {name: values[a.columns["frame"] >= 10] for name, values in a.columns.items()},
+    )
     shared = measured_again(np.random.default_rng(4), part, 0.1 * SIGMA)
     second = together(fresh.columns, shared)
     runs = [sc.Run(tmp_path / name) for name in ("a", "b", "fresh")]
     for run, obs in zip(runs, (table(a), second, table(fresh)), strict=True):
         run.calibrate(obs, sheet)
     one, two = runs[0].calibration, runs[1].calibration
-    with pytest.raises(RepeatedFramesError, match="run 2: frame 1005 holds the same measurement as frame 10 of run 1"):
+    with pytest.raises(
+        RepeatedFramesError,
+        match="run 2: frame 1005 holds the same measurement as frame 10 of run 1",
+    ):
         merge([one, two])
     with pytest.raises(RepeatedFramesError, match="and 5 more of its 22 frames"):
         merge_runs([run.path for run in runs[:2]])
@@ -108,7 +123,8 @@ def test_runs_that_share_frames_are_not_merged_unawares(tmp_path: Path) -> None:
     assert (found.data, found.tested) == ("overlapping", False)
     assert "6 frames" in found.rule
     assert sc.compare(one, runs[2].calibration, n=5, n_draws=50).data == "independent"
-    # Runs of a version without fingerprints: said where there is nothing else, found where observations are.
+    # Runs of a version without fingerprints: said where there is nothing else, found where
+    # observations are.
     old = [dataclasses.replace(cal, fingerprints=None) for cal in (one, two)]
     assert "cannot be checked" in sc.compare(*old, n=5, n_draws=50).rule
     assert any("cannot be checked" in words for words in consistency_of(merge(old)).messages)
@@ -121,7 +137,8 @@ def test_runs_that_share_frames_are_not_merged_unawares(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("eta", "origin_px", "found"), [(0.0, 0.0, 1.0), (0.1, 0.5, 1.0), (0.2, 0.0, 1.0), (0.3, 0.0, 0.7)]
+    ("eta", "origin_px", "found"),
+    [(0.0, 0.0, 1.0), (0.1, 0.5, 1.0), (0.2, 0.0, 1.0), (0.3, 0.0, 0.7)],
 )
 def test_images_measured_again_are_found(eta: float, origin_px: float, found: float) -> None:
     cal = sc.calibrate(doubled(eta, origin_px), camera(night()), duplicates="keep")
@@ -138,11 +155,29 @@ def test_images_measured_again_are_found(eta: float, origin_px: float, found: fl
         {"pointings": 10, "n_frames": 100, "drift_px": 0.3},
         {"pointings": 10, "n_frames": 20, "star_sigma_px": SIGMA},
         {"pointings": 10, "n_frames": 100, "star_sigma_px": 4.0 * SIGMA},
-        {"pointings": 10, "n_frames": 20, "sigma_px": lambda radius, mag, frame: 0.02 * 10.0 ** (0.35 * (mag - 4.0))},
-        {"pointings": 10, "n_frames": 20, "sigma_px": lambda radius, mag, frame: 0.02 + 0.08 * (frame % 2)},
+        {
+            "pointings": 10,
+            "n_frames": 20,
+            "sigma_px": lambda radius, mag, frame: 0.02 * 10.0 ** (0.35 * (mag - 4.0)),
+        },
+        {
+            "pointings": 10,
+            "n_frames": 20,
+            "sigma_px": lambda radius, mag, frame: 0.02 + 0.08 * (frame % 2),
+        },
         {"pointings": 10, "n_frames": 20, "corner_px": (60.0, -30.0)},
     ],
-    ids=["pairs", "few stars", "stare", "drift", "star errors", "large star errors", "magnitudes", "frames", "misfit"],
+    ids=[
+        "pairs",
+        "few stars",
+        "stare",
+        "drift",
+        "star errors",
+        "large star errors",
+        "magnitudes",
+        "frames",
+        "misfit",
+    ],
 )
 def test_no_exposures_are_called_one(options: dict[str, object]) -> None:
     for seed in range(8):
@@ -163,7 +198,9 @@ def marks(place: np.ndarray, errors: np.ndarray) -> Fingerprints:
 
 
 def test_noise_of_their_own_tells_pairs_apart_whatever_its_size() -> None:
-    """300 pointings with two exposures each, noise of 0.01 to 0.2 px; the control shares 99 % of its variance."""
+    """300 pointings with two exposures each, noise of 0.01 to 0.2 px; the control shares 99 % of
+    its variance.
+    """
     rng = np.random.default_rng(6)
     n, m = 300, 8
     place = np.repeat(rng.uniform(50.0, 950.0, (n, m, 2)), 2, axis=0)
@@ -175,9 +212,13 @@ def test_noise_of_their_own_tells_pairs_apart_whatever_its_size() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("m", "least"), [(5, (1.0, 0.9, 0.7)), (8, (1.0, 0.98, 0.9)), (12, (1.0, 0.99, 0.95))])
+@pytest.mark.parametrize(
+    ("m", "least"), [(5, (1.0, 0.9, 0.7)), (8, (1.0, 0.98, 0.9)), (12, (1.0, 0.99, 0.95))]
+)
 def test_power_and_false_alarms(m: int, least: tuple[float, float, float]) -> None:
-    """500 pointings: images measured again to within eta sigma, and two exposures that share some of their error."""
+    """500 pointings: images measured again to within eta sigma, and two exposures that share some
+    of their error.
+    """
     rng = np.random.default_rng(m)
     n = 500
     place = np.repeat(rng.uniform(50.0, 950.0, (n, m, 2)), 2, axis=0)
@@ -193,7 +234,9 @@ def test_power_and_false_alarms(m: int, least: tuple[float, float, float]) -> No
         for _ in range(4):
             common = np.repeat(rng.standard_normal((n, m, 2)), 2, axis=0)
             own = rng.standard_normal((2 * n, m, 2))
-            alarms += len(repeats(marks(place, 0.05 * (np.sqrt(share) * common + np.sqrt(1.0 - share) * own))))
+            alarms += len(
+                repeats(marks(place, 0.05 * (np.sqrt(share) * common + np.sqrt(1.0 - share) * own)))
+            )
         print(f"{m} stars, share {share:g}: {alarms} of {4 * n}")
         # Where nearly all of the error is common, two exposures are hardly more than one.
         assert (alarms > 0) == (share == 0.9)

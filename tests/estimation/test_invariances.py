@@ -1,4 +1,6 @@
-"""What must not change an estimate, or changes it in a known way: axes of sky and detector, orders, names, units."""
+"""What must not change an estimate, or changes it in a known way: axes of sky and detector, orders,
+names, units.
+"""
 
 from functools import cache
 
@@ -21,7 +23,9 @@ def columns():
 
 
 def calibrated(columns, how, origin_px=0.0, scale=1.0):
-    """The calibration of a detector whose pixels are counted from elsewhere, or are `scale` times as many."""
+    """The calibration of a detector whose pixels are counted from elsewhere, or are `scale` times
+    as many.
+    """
     options = {"likelihood": how} if how == "student_t" else {"method": how}
     centre = scale * 0.5 * (SIZE - 1) + origin_px
     camera = sc.Camera(round(scale * SIZE), round(scale * SIZE), 10.0 / scale, 39.0, centre, centre)
@@ -79,33 +83,53 @@ def mirror_of_sky_and_detector(columns, rng):
 
 def pixels_counted_from_elsewhere(columns, rng):
     moved = {name: columns[name] + SHIFT for name in ("x_px", "y_px")}
-    return columns | moved, {"origin_px": SHIFT}, {"x0": lambda x: x + SHIFT, "y0": lambda y: y + SHIFT}
+    return (
+        columns | moved,
+        {"origin_px": SHIFT},
+        {"x0": lambda x: x + SHIFT, "y0": lambda y: y + SHIFT},
+    )
 
 
 def smaller_pixels(columns, rng):
     finer = {name: SCALE * columns[name] for name in ("x_px", "y_px")}
     powers = {"x0": 1, "y0": 1, "f": 1, "k1": -2, "k2": -4}
-    return columns | finer, {"scale": SCALE}, {n: lambda v, p=p: v * SCALE**p for n, p in powers.items()}
+    return (
+        columns | finer,
+        {"scale": SCALE},
+        {n: lambda v, p=p: v * SCALE**p for n, p in powers.items()},
+    )
 
 
 CHANGES = (
-    *(another_sky, sky_at_the_pole, stars_in_another_order, frames_of_other_numbers, both_axes_turned_round),
+    *(
+        another_sky,
+        sky_at_the_pole,
+        stars_in_another_order,
+        frames_of_other_numbers,
+        both_axes_turned_round,
+    ),
     *(mirror_of_sky_and_detector, pixels_counted_from_elsewhere, smaller_pixels),
 )
 
 
 def moved(columns, reference, how, change):
-    """How far a change moves the estimate from where it should, in sigma, and what it multiplies the sigmas by."""
+    """How far a change moves the estimate from where it should, in sigma, and what it multiplies
+    the sigmas by.
+    """
     theta, sigmas = reference(how)
     other, options, laws = change(columns, np.random.default_rng(5))
     found, stated = calibrated(other, how, **options)
     names = ("x0", "y0", "f", "k1", "k2")
-    wanted = np.array([laws.get(name, float)(value) for name, value in zip(names, theta, strict=True)])
+    wanted = np.array(
+        [laws.get(name, float)(value) for name, value in zip(names, theta, strict=True)]
+    )
     slope = np.array([abs(laws.get(n, float)(1.0) - laws.get(n, float)(0.0)) for n in names])
     return np.max(np.abs(found - wanted) / (slope * sigmas)), stated / (slope * sigmas)
 
 
-@pytest.mark.parametrize("how", ["efficient", "three_stage", pytest.param("student_t", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "how", ["efficient", "three_stage", pytest.param("student_t", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("change", CHANGES)
 def test_estimate_and_sigma_follow(columns, reference, how, change):
     distance, ratio = moved(columns, reference, how, change)
@@ -121,7 +145,8 @@ def test_other_names_of_frames_in_the_same_order_change_no_bit(columns, referenc
 
 
 def stretched_in_one_axis(columns, rng):
-    # The control: stretched by a thousandth along one axis, which no camera of square pixels can follow.
+    # The control: stretched by a thousandth along one axis, which no camera of square pixels can
+    # follow.
     return columns | {"x_px": 1.001 * columns["x_px"]}, {}, {}
 
 

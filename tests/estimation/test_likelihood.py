@@ -34,7 +34,10 @@ def _information_scale(matrix):
 
 
 def test_attitudes_are_searched_from_where_it_was_said(monkeypatch):
-    likelihood, theta = MarginalLikelihood(with_sigmas(observations(n_frames=20)), "brown"), camera().theta
+    likelihood, theta = (
+        MarginalLikelihood(with_sigmas(observations(n_frames=20)), "brown"),
+        camera().theta,
+    )
     assert likelihood.rotations is None and likelihood.last_sums is None
     assert likelihood.kernels == "numpy"
     best = likelihood.profile(theta)[0].rotations
@@ -43,7 +46,9 @@ def test_attitudes_are_searched_from_where_it_was_said(monkeypatch):
         return np.linalg.norm(rotations - best, axis=(1, 2))
 
     # QUEST on the stars' own noise begins nearer than on one noise for all.
-    plain = MarginalLikelihood(dataclasses.replace(likelihood.frames, weight=None), "brown").start_rotations(theta)
+    plain = MarginalLikelihood(
+        dataclasses.replace(likelihood.frames, weight=None), "brown"
+    ).start_rotations(theta)
     assert np.median(off(likelihood.start_rotations(theta))) < 0.5 * np.median(off(plain))
     sums, attitudes = likelihood.sums(theta)
     likelihood.use_sums(sums, attitudes)
@@ -51,7 +56,9 @@ def test_attitudes_are_searched_from_where_it_was_said(monkeypatch):
     assert np.max(off(likelihood.rotations)) < 1e-9
     # They serve the compressed likelihood at their own point alone.
     known = []
-    monkeypatch.setattr(module, "gram_sums", lambda *given: known.append(given[-1]) or gram_sums(*given))
+    monkeypatch.setattr(
+        module, "gram_sums", lambda *given: known.append(given[-1]) or gram_sums(*given)
+    )
     for point in (theta, theta + np.array([1e-3, 0.0, 0.0, 0.0, 0.0])):
         compress(likelihood, point, symmetric_inverse(sums.normal.matrix))
     assert known == [(sums, attitudes), None]
@@ -61,7 +68,10 @@ def test_attitudes_are_searched_from_where_it_was_said(monkeypatch):
 
 
 def test_derivatives_are_whitened_and_no_model_is_likeliest_where_it_is_not_finite():
-    likelihood, theta = MarginalLikelihood(with_sigmas(observations(n_frames=20)), "brown"), camera().theta
+    likelihood, theta = (
+        MarginalLikelihood(with_sigmas(observations(n_frames=20)), "brown"),
+        camera().theta,
+    )
     state, _ = likelihood.profile(theta)
     # A principal point shifts every star, in units of its own noise.
     along, across = likelihood.derivatives(theta, state)[0]
@@ -84,7 +94,9 @@ def test_profile_is_the_least_squares_attitude_of_every_frame():
             b = obs.directions_icrs[rows] @ (exp_rotation(phi) @ rotation).T
             return ((obs.xy[rows] - project(cam, b)) / obs.sigma_px[rows, None]).ravel()
 
-        solution = least_squares(residual, np.full(3, 1e-5), method="lm", x_scale=1e-6, xtol=1e-14, ftol=1e-14)
+        solution = least_squares(
+            residual, np.full(3, 1e-5), method="lm", x_scale=1e-6, xtol=1e-14, ftol=1e-14
+        )
         total += 2.0 * solution.cost
         # Cross-boresight to 1e-9 rad; roll is weaker by the width of the field.
         assert np.max(np.abs(solution.x)) < 1e-7
@@ -137,9 +149,12 @@ def _compare(obs, model, bound):
     z = rng.standard_normal((30, p))
     z *= (rng.uniform(0, 3, 30) / np.linalg.norm(z, axis=1))[:, None]
     theta = cal.theta + z @ compressed.whitening.T
-    difference = compressed.log_likelihood(theta, cal.sigma) - [exact.log_likelihood(t, cal.sigma) for t in theta]
+    difference = compressed.log_likelihood(theta, cal.sigma) - [
+        exact.log_likelihood(t, cal.sigma) for t in theta
+    ]
     assert np.max(np.abs(difference)) < bound
-    # Control: without the second-derivative columns the likelihood is worse, so they matter and are right.
+    # Control: without the second-derivative columns the likelihood is worse, so they matter and are
+    # right.
     if model == "brown" and obs.n_frames == 10:
         gram = compressed.gram.copy()
         gram[1 + p :] = 0.0
@@ -147,7 +162,9 @@ def _compare(obs, model, bound):
         import dataclasses
 
         linear = dataclasses.replace(compressed, gram=gram)
-        worse = linear.log_likelihood(theta, cal.sigma) - [exact.log_likelihood(t, cal.sigma) for t in theta]
+        worse = linear.log_likelihood(theta, cal.sigma) - [
+            exact.log_likelihood(t, cal.sigma) for t in theta
+        ]
         assert np.max(np.abs(worse)) > 3 * np.max(np.abs(difference))
 
 
@@ -157,13 +174,18 @@ def test_slope_of_the_determinant_is_that_along_the_parameters(model):
     import dataclasses
 
     plain = observations(model, n_frames=8, sigma_px=0.0)
-    obs = dataclasses.replace(plain, sigma_px=np.random.default_rng(1).uniform(0.02, 0.1, len(plain)))
+    obs = dataclasses.replace(
+        plain, sigma_px=np.random.default_rng(1).uniform(0.02, 0.1, len(plain))
+    )
     exact, theta = MarginalLikelihood(obs, model), camera(model).theta
     whitening = 3.0 * scaled_cholesky(symmetric_inverse(exact.evaluate(theta).matrix))
     rotations = exact.start_rotations(theta)
     slope = gram_sums(exact.frames, model, theta, whitening, rotations).log_determinant_slope
     ahead, behind = (
-        [np.sum(exact.profile(theta + sign * column, rotations)[0].log_determinant) for column in whitening.T]
+        [
+            np.sum(exact.profile(theta + sign * column, rotations)[0].log_determinant)
+            for column in whitening.T
+        ]
         for sign in (0.5, -0.5)
     )
     assert np.allclose(slope, np.subtract(ahead, behind), rtol=0, atol=5e-4 * np.max(np.abs(slope)))
@@ -171,13 +193,18 @@ def test_slope_of_the_determinant_is_that_along_the_parameters(model):
 
 @pytest.mark.parametrize("model", ["brown", "brown_tangential"])
 def test_gram_is_that_of_columns_without_what_attitudes_reproduce(model):
-    exact, theta = MarginalLikelihood(with_sigmas(observations(model, n_frames=8)), model), camera(model).theta
+    exact, theta = (
+        MarginalLikelihood(with_sigmas(observations(model, n_frames=8)), model),
+        camera(model).theta,
+    )
     whitening = scaled_cholesky(symmetric_inverse(exact.evaluate(theta).matrix))
     block = _Expansion(model, theta, whitening).block(exact.frames, exact.start_rotations(theta))
     state, _ = exact.profile(theta, block.rotations)
     columns = exact.project_out(state, block.columns).reshape(len(block.columns), -1)
     scale = 1.0 / np.linalg.norm(columns, axis=1)
-    difference = (block.gram(exact.frames, len(theta)) - columns @ columns.T) * np.outer(scale, scale)
+    difference = (block.gram(exact.frames, len(theta)) - columns @ columns.T) * np.outer(
+        scale, scale
+    )
     assert np.max(np.abs(difference)) < 1e-6
     # Control: attitudes reproduce a large part of some second derivatives.
     raw = np.linalg.norm(block.columns.reshape(len(columns), -1), axis=1)
@@ -192,9 +219,13 @@ def test_moved_and_scaled_are_the_same_function():
     after = moved(before, theta[0], turned)
     assert np.allclose(after.gram, after.gram.T, rtol=1e-12)
     assert np.ptp(before.log_likelihood(theta, cal.sigma)) > 3.0
-    assert np.allclose(after.log_likelihood(theta, cal.sigma), before.log_likelihood(theta, cal.sigma), atol=1e-7)
+    assert np.allclose(
+        after.log_likelihood(theta, cal.sigma), before.log_likelihood(theta, cal.sigma), atol=1e-7
+    )
     unit, sigma = 0.04, np.linspace(0.03, 0.09, 40)
-    difference = scaled(before, unit).log_likelihood(theta, sigma / unit) - before.log_likelihood(theta, sigma)
+    difference = scaled(before, unit).log_likelihood(theta, sigma / unit) - before.log_likelihood(
+        theta, sigma
+    )
     expected = before.dof * np.log(unit) + 3.0 * before.n_frames * np.log(unit)
     assert np.allclose(difference, expected, atol=1e-7)
 
@@ -207,8 +238,12 @@ def test_combined_estimates_have_the_sum_of_the_precisions():
     precisions = [symmetric_inverse(matrix) for matrix in covariances]
     expected = symmetric_inverse(sum(precisions))
     scale = 1.0 / np.sqrt(np.diag(expected))
-    assert np.allclose(covariance * np.outer(scale, scale), expected * np.outer(scale, scale), atol=1e-6)
-    shift = expected @ sum(p @ (theta - thetas[0]) for p, theta in zip(precisions, thetas, strict=True))
+    assert np.allclose(
+        covariance * np.outer(scale, scale), expected * np.outer(scale, scale), atol=1e-6
+    )
+    shift = expected @ sum(
+        p @ (theta - thetas[0]) for p, theta in zip(precisions, thetas, strict=True)
+    )
     assert np.allclose((mean - thetas[0]) * scale, shift * scale, atol=1e-4)
 
 
@@ -218,15 +253,23 @@ def test_compressed_adds_over_frames_and_survives_a_round_trip():
     whole = cal.compressed
     parts = [
         compress(
-            MarginalLikelihood(obs.select_frames(ids), "brown"), whole.theta_hat, whole.whitening @ whole.whitening.T
+            MarginalLikelihood(obs.select_frames(ids), "brown"),
+            whole.theta_hat,
+            whole.whitening @ whole.whitening.T,
         )
         for ids in (obs.frame_ids[:25], obs.frame_ids[25:])
     ]
-    assert np.allclose(sum(part.gram for part in parts), whole.gram, rtol=1e-6, atol=1e-7 * whole.gram.max() * 1e-3)
-    assert sum(part.log_determinant for part in parts) == pytest.approx(whole.log_determinant, rel=1e-12)
+    assert np.allclose(
+        sum(part.gram for part in parts), whole.gram, rtol=1e-6, atol=1e-7 * whole.gram.max() * 1e-3
+    )
+    assert sum(part.log_determinant for part in parts) == pytest.approx(
+        whole.log_determinant, rel=1e-12
+    )
     again = from_plain(CompressedLikelihood, to_plain(whole))
     assert np.array_equal(again.gram, whole.gram)
-    assert np.array_equal(again.log_likelihood(cal.theta[None], 0.05), whole.log_likelihood(cal.theta[None], 0.05))
+    assert np.array_equal(
+        again.log_likelihood(cal.theta[None], 0.05), whole.log_likelihood(cal.theta[None], 0.05)
+    )
 
 
 def test_scaling_the_stated_noise_only_rescales_sigma():
@@ -243,10 +286,14 @@ def test_scaling_the_stated_noise_only_rescales_sigma():
 
 
 def test_derivatives_of_the_compressed_sum_of_squares():
-    """Of any expansion: that of an estimate has next to no slope, and bends by second derivatives alone."""
+    """Of any expansion: that of an estimate has next to no slope, and bends by second derivatives
+    alone.
+    """
     rng = np.random.default_rng(4)
     root = rng.standard_normal((30, 21))
-    compressed = CompressedLikelihood(np.zeros(5), np.eye(5), root.T @ root, 0.0, np.zeros(5), 100, 50, 5)
+    compressed = CompressedLikelihood(
+        np.zeros(5), np.eye(5), root.T @ root, 0.0, np.zeros(5), 100, 50, 5
+    )
     slope, hessian = _derivatives(compressed)
     unit = 1e-3 * np.eye(5)
 
@@ -254,17 +301,28 @@ def test_derivatives_of_the_compressed_sum_of_squares():
         return compressed.sum_of_squares(np.atleast_2d(z))[0]
 
     steps = [(value(e) - value(-e)) / 2e-3 for e in unit]
-    bends = [[(value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / 4e-6 for a in unit] for b in unit]
+    bends = [
+        [(value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / 4e-6 for a in unit]
+        for b in unit
+    ]
     np.testing.assert_allclose(slope, steps, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(hessian, bends, rtol=1e-3, atol=1e-2)
 
 
 def test_the_optimum_of_an_expansion_from_where_it_curves_the_wrong_way():
-    """A residual of ten that falls with the square: the full Hessian has a negative direction, Gauss-Newton's none."""
+    """A residual of ten that falls with the square: the full Hessian has a negative direction,
+    Gauss-Newton's none.
+    """
     residuals = np.array(
-        [[10.0, -1.0, 0.0, -0.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 1.0, 0.0, 0.0, 0.0]]
+        [
+            [10.0, -1.0, 0.0, -0.5, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+            [0.5, 0.0, 1.0, 0.0, 0.0, 0.0],
+        ]
     )
-    compressed = CompressedLikelihood(np.zeros(2), np.eye(2), residuals.T @ residuals, 0.0, np.zeros(2), 100, 50, 5)
+    compressed = CompressedLikelihood(
+        np.zeros(2), np.eye(2), residuals.T @ residuals, 0.0, np.zeros(2), 100, 50, 5
+    )
     assert np.linalg.eigvalsh(_derivatives(compressed)[1])[0] < 0.0
     found = optimum(compressed)
     best = minimize(lambda z: compressed.sum_of_squares(z[None])[0], [3.0, -0.5], tol=1e-12)

@@ -1,4 +1,6 @@
-"""Merged runs are what a calibration on all stars gives, and runs of different cameras are told apart."""
+"""Merged runs are what a calibration on all stars gives, and runs of different cameras are told
+apart.
+"""
 
 from __future__ import annotations
 
@@ -33,16 +35,27 @@ NOMINAL = scenes.nominal(scenes.camera())
 
 
 @lru_cache(maxsize=64)
-def simulated(seed: int, n_frames: int = 12, shift_f_px: float = 0.0, sigma_px: float = 0.05) -> Observations:
+def simulated(
+    seed: int, n_frames: int = 12, shift_f_px: float = 0.0, sigma_px: float = 0.05
+) -> Observations:
     camera = scenes.camera()
     theta = camera.theta.copy()
     theta[2] += shift_f_px
     stars = load_catalogue(max_mag=6.0, epoch=2026.9)
-    return simulate(stars, camera.with_theta(theta), n_frames=n_frames, min_stars=8, sigma_px=sigma_px, seed=seed)
+    return simulate(
+        stars,
+        camera.with_theta(theta),
+        n_frames=n_frames,
+        min_stars=8,
+        sigma_px=sigma_px,
+        seed=seed,
+    )
 
 
 @lru_cache(maxsize=64)
-def calibrated(seed: int, n_frames: int = 12, shift_f_px: float = 0.0, sigma_px: float = 0.05) -> Calibration:
+def calibrated(
+    seed: int, n_frames: int = 12, shift_f_px: float = 0.0, sigma_px: float = 0.05
+) -> Calibration:
     return calibrate(simulated(seed, n_frames, shift_f_px, sigma_px), NOMINAL)
 
 
@@ -69,7 +82,10 @@ def test_moving_the_point_of_expansion_changes_no_value(model: str) -> None:
     rng = np.random.default_rng(1)
     p = len(cal.theta)
     matrix = cal.compressed.whitening @ (np.eye(p) + 0.3 * rng.standard_normal((p, p)))
-    whitening = np.linalg.cholesky(matrix @ matrix.T / np.outer(cal.sigmas, cal.sigmas)) * cal.sigmas[:, None]
+    whitening = (
+        np.linalg.cholesky(matrix @ matrix.T / np.outer(cal.sigmas, cal.sigmas))
+        * cal.sigmas[:, None]
+    )
     there = moved(cal.compressed, cal.theta + 2.0 * cal.sigmas * rng.standard_normal(p), whitening)
     theta = points(cal)
     before, after = (c.log_likelihood(theta, cal.sigma) for c in (cal.compressed, there))
@@ -84,7 +100,9 @@ def test_optimum_of_a_compressed_likelihood_is_the_calibration() -> None:
     away = moved(cal.compressed, cal.theta + 3.0 * cal.sigmas, cal.compressed.whitening)
     best = optimum(away)
     assert np.all(np.abs(best.theta - cal.compressed.theta_hat) < 1e-4 * cal.sigmas)
-    assert np.allclose(best.covariance / np.outer(cal.sigmas, cal.sigmas), cal.correlation, atol=1e-4)
+    assert np.allclose(
+        best.covariance / np.outer(cal.sigmas, cal.sigmas), cal.correlation, atol=1e-4
+    )
     product = best.information @ best.covariance * np.outer(cal.sigmas, 1.0 / cal.sigmas)
     assert np.allclose(product, np.eye(5), atol=1e-6)
     assert best.sigma == pytest.approx(cal.sigma, rel=1e-6)
@@ -104,11 +122,24 @@ def test_two_halves_give_the_whole(stated: bool) -> None:
     assert merged.sigma == pytest.approx(whole.sigma, rel=1e-6)
     assert merged.sigma_std == pytest.approx(whole.sigma_std, rel=1e-6)
     assert merged.chi2 == pytest.approx(whole.chi2, rel=1e-6)
-    assert (merged.dof, merged.n_stars, merged.n_frames) == (whole.dof, whole.n_stars, whole.n_frames)
+    assert (merged.dof, merged.n_stars, merged.n_frames) == (
+        whole.dof,
+        whole.n_stars,
+        whole.n_frames,
+    )
     assert merged.sigma_name == whole.sigma_name
-    assert np.allclose(merged.information * scale, whole.information * scale, atol=2e-3 * whole.n_frames)
-    assert np.allclose(merged.rotation_per_theta * whole.sigmas, whole.rotation_per_theta * whole.sigmas, atol=1e-8)
-    assert np.allclose(merged.attitude_noise, whole.attitude_noise, rtol=1e-3, atol=1e-3 * whole.attitude_noise.max())
+    assert np.allclose(
+        merged.information * scale, whole.information * scale, atol=2e-3 * whole.n_frames
+    )
+    assert np.allclose(
+        merged.rotation_per_theta * whole.sigmas, whole.rotation_per_theta * whole.sigmas, atol=1e-8
+    )
+    assert np.allclose(
+        merged.attitude_noise,
+        whole.attitude_noise,
+        rtol=1e-3,
+        atol=1e-3 * whole.attitude_noise.max(),
+    )
     assert np.max(np.abs(merged.residuals_px - whole.residuals_px)) < 1e-5
     assert np.max(np.abs(merged.quaternions - whole.quaternions)) < 1e-7
     z = (merged.pair_theta - whole.pair_theta) / np.sqrt(np.diag(whole.pair_covariance))
@@ -135,7 +166,9 @@ def test_own_noise_is_that_of_stars_which_state_it() -> None:
     common = merge(runs, noise="common")
     assert consistency_of(common).noise_p_value < 1e-6
     assert any("differ in noise" in message for message in consistency_of(common).messages)
-    obs = join_observations([simulated(1), simulated(2, sigma_px=0.2)], ["a", "b"], [run.sigma for run in runs])
+    obs = join_observations(
+        [simulated(1), simulated(2, sigma_px=0.2)], ["a", "b"], [run.sigma for run in runs]
+    )
     whole = calibrate(obs, NOMINAL)
     merged = merge(runs, obs, noise="own")
     assert merged.sigma_name == "sigma_scale"
@@ -145,7 +178,9 @@ def test_own_noise_is_that_of_stars_which_state_it() -> None:
     assert np.max(np.abs(merged.residuals_px - whole.residuals_px)) < 1e-3
     theta = points(merged)
     exact = MarginalLikelihood(obs, "brown")
-    difference = merged.compressed.log_likelihood(theta, 1.1) - [exact.log_likelihood(t, 1.1) for t in theta]
+    difference = merged.compressed.log_likelihood(theta, 1.1) - [
+        exact.log_likelihood(t, 1.1) for t in theta
+    ]
     assert np.max(np.abs(difference)) < 0.02
     assert np.array_equal(merged.theta, merge(runs, obs).theta)
     # One noise for all is the worse estimate when they differ by a factor of four.
@@ -272,7 +307,8 @@ def test_tables_of_different_kinds_are_refused_or_filled() -> None:
 
 
 def test_another_camera_is_told_apart() -> None:
-    # 0.15 px of 5852: one marginal sigma of f, but five along the direction that the stars see best.
+    # 0.15 px of 5852: one marginal sigma of f, but five along the direction that the stars see
+    # best.
     runs = [calibrated(11, 50), calibrated(12, 50, 0.15)]
     with pytest.raises(CalibrationError, match="do not show the same camera"):
         merge(runs)
@@ -308,7 +344,8 @@ def test_total_of_one_part_is_the_part() -> None:
     assert np.allclose(value, cal.compressed.log_likelihood(theta, 0.05), rtol=0.0, atol=1e-6)
 
 
-# --- runs of unequal noise --------------------------------------------------------------------------------------------
+# --- runs of unequal noise
+# --------------------------------------------------------------------------------------------
 
 
 def old_p_value(runs: list[Optimum]) -> float:
@@ -320,18 +357,30 @@ def old_p_value(runs: list[Optimum]) -> float:
     return float(fdtrc(*dof, between / dof[0] / (own / dof[1])))
 
 
-@pytest.mark.parametrize(("noise", "dof"), [((1.0, 1.0), (200, 30)), ((1.0, 5.0), (200, 30)), ((1.0, 2.0), (10, 40))])
-def test_agreement_is_tested_at_any_ratio_of_noises(noise: tuple[float, float], dof: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("noise", "dof"), [((1.0, 1.0), (200, 30)), ((1.0, 5.0), (200, 30)), ((1.0, 2.0), (10, 40))]
+)
+def test_agreement_is_tested_at_any_ratio_of_noises(
+    noise: tuple[float, float], dof: tuple[int, int]
+) -> None:
     rng = np.random.default_rng(7)
     sigma, nu, p = np.array(noise), np.array(dof, dtype=float), 5
-    root = np.array([np.eye(p) + 0.4 * rng.standard_normal((p, p)) for _ in nu]) * np.sqrt(nu)[:, None, None]
+    root = (
+        np.array([np.eye(p) + 0.4 * rng.standard_normal((p, p)) for _ in nu])
+        * np.sqrt(nu)[:, None, None]
+    )
     unit = root @ root.transpose(0, 2, 1)
     new, old = [], []
     for _ in range(1000):
-        away = np.linalg.solve(root.transpose(0, 2, 1), rng.standard_normal((2, p, 1)))[..., 0] * sigma[:, None]
+        away = (
+            np.linalg.solve(root.transpose(0, 2, 1), rng.standard_normal((2, p, 1)))[..., 0]
+            * sigma[:, None]
+        )
         variance = sigma**2 * rng.chisquare(nu) / nu
         for information, values in ((unit / variance[:, None, None], new), (unit, old)):
-            mean = np.linalg.solve(information.sum(axis=0), np.einsum("rij,rj->i", information, away))
+            mean = np.linalg.solve(
+                information.sum(axis=0), np.einsum("rij,rj->i", information, away)
+            )
             square = float(np.einsum("ri,rij,rj", away - mean, information, away - mean))
             pooled = float(fdtrc(p, nu.sum(), square / p / (nu @ variance / nu.sum())))
             values.append(welch_james(square, information, nu)[2] if values is new else pooled)
@@ -343,12 +392,19 @@ def test_agreement_is_tested_at_any_ratio_of_noises(noise: tuple[float, float], 
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1.0, 5.0])
 def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
-    """100 pairs of runs from outside, the smaller with more noise: uniform p, and errors of the stated size."""
+    """100 pairs of runs from outside, the smaller with more noise: uniform p, and errors of the
+    stated size.
+    """
     new, old, squares = [], [], []
     for seed in range(100):
         runs, truth = [], np.zeros(5)
         for part, (frames, sigma) in enumerate(((10, 0.05), (4, 0.05 * ratio))):
-            c = campaign(np.random.default_rng((seed, part)), n_frames=frames, stars_per_frame=12, sigma_px=sigma)
+            c = campaign(
+                np.random.default_rng((seed, part)),
+                n_frames=frames,
+                stars_per_frame=12,
+                sigma_px=sigma,
+            )
             sheet = Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
             runs.append(calibrate(Observations(**c.columns), sheet))
             truth = c.theta
@@ -358,8 +414,10 @@ def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
         away = (merged.theta - truth) / merged.sigmas
         squares.append(float(away @ np.linalg.solve(merged.correlation, away)) / 5.0)
     print(
-        f"ratio {ratio:g}: KS {kstest(new, 'uniform').pvalue:.2g}, before {kstest(old, 'uniform').pvalue:.2g}; below "
-        f"0.001: {np.sum(np.less(new, 1e-3))}, before {np.sum(np.less(old, 1e-3))}; NEES/p {np.mean(squares):.3f}"
+        f"ratio {ratio:g}: KS {kstest(new, 'uniform').pvalue:.2g}, before "
+        f"{kstest(old, 'uniform').pvalue:.2g}; below "
+        f"0.001: {np.sum(np.less(new, 1e-3))}, before {np.sum(np.less(old, 1e-3))}; NEES/p "
+        f"{np.mean(squares):.3f}"
     )
     assert kstest(new, "uniform").pvalue > 0.01
     # Five degrees of freedom each: the mean of 100 has a standard error of 0.063.

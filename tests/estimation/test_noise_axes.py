@@ -1,7 +1,7 @@
 """Noise that differs between the axes of the detector: found, fitted, and in what follows from it.
 
-Tables and true attitude errors come from the simulator of `tests.helpers.outside`, which shares no code with the
-package.
+Tables and true attitude errors come from the simulator of `tests.helpers.outside`, which shares no
+code with the package.
 """
 
 import numpy as np
@@ -84,7 +84,11 @@ def test_attitude_noise_is_that_of_the_axes(covariance):
     # One noise for both axes is found to be wrong, and so is its attitude noise.
     common, found, stated = by_noise["common"]
     check = even_noise(found)
-    assert check.level is Level.WARN and "--noise model" in check.remedy and "along x as along y" in check.sentence
+    assert (
+        check.level is Level.WARN
+        and "--noise model" in check.remedy
+        and "along x as along y" in check.sentence
+    )
     assert np.max(np.abs(np.log(stated / true))) > 0.25
     # What differs is weighed: the same stars tell more.
     assert np.all(cal.sigmas < 0.9 * common.sigmas)
@@ -100,7 +104,10 @@ def test_axes_go_with_compressed_likelihoods_and_plans():
     c = observed(SMEARED, 2, n_frames=40)
     obs, camera = given(c)
     whole = sc.calibrate(obs, camera, noise="model")
-    halves = [sc.calibrate(obs.select_frames(ids), camera, noise="model") for ids in (np.arange(20), np.arange(20, 40))]
+    halves = [
+        sc.calibrate(obs.select_frames(ids), camera, noise="model")
+        for ids in (np.arange(20), np.arange(20, 40))
+    ]
     merged = merge(halves)
     np.testing.assert_allclose(merged.sigmas, whole.sigmas, rtol=0.1)
     assert np.all(np.abs(merged.theta - whole.theta) < 0.5 * whole.sigmas)
@@ -134,7 +141,9 @@ def test_shapes_are_whitened_as_their_residuals_are():
     columns = misfit._Columns.of(shapes(obs, cal.camera), view)
     every = columns.all()
     flat = every.reshape(len(every), -1)
-    np.testing.assert_allclose(columns.inner(), flat @ flat.T, atol=1e-9 * np.abs(flat @ flat.T).max())
+    np.testing.assert_allclose(
+        columns.inner(), flat @ flat.T, atol=1e-9 * np.abs(flat @ flat.T).max()
+    )
     few = state.attitude
     across = flat @ few.reshape(3, -1).T
     np.testing.assert_allclose(columns.across(few), across, atol=1e-9 * np.abs(across).max())

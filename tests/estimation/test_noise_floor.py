@@ -8,13 +8,20 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.estimation.noise_floor import LEAST_P_VALUE, noise_floor, settle_noise, with_noise_floor
+from starcal_uq.estimation.noise_floor import (
+    LEAST_P_VALUE,
+    noise_floor,
+    settle_noise,
+    with_noise_floor,
+)
 from starcal_uq.estimation.screening.outliers import star_residuals
 from starcal_uq.observations.frames import StarFrames
 from tests.helpers.scenes import camera, nominal, observations
 
 
-def measured(floor_px: float, scale: float = 1.0, seed: int = 0, n_frames: int = 40) -> sc.Observations:
+def measured(
+    floor_px: float, scale: float = 1.0, seed: int = 0, n_frames: int = 40
+) -> sc.Observations:
     """Stars that state from 0.005 to 0.3 px, with that noise, times `scale`, and a floor."""
     obs = observations(n_frames=n_frames, seed=5, sigma_px=1e-9)
     rng = np.random.default_rng(seed)
@@ -37,7 +44,9 @@ def test_floor_and_scale_are_found(floor_px: float, scale: float) -> None:
 
 
 def test_noise_below_the_floor_is_not_blown_up() -> None:
-    """Where stars state far too much, as of JPEG images, the noise is the scatter seen, and no factor is left over."""
+    """Where stars state far too much, as of JPEG images, the noise is the scatter seen, and no
+    factor is left over.
+    """
     settled = settle_noise(obs := measured(0.2, 0.05), sc.calibrate(obs, nominal(camera())))
     assert settled.sigma_px is not None
     assert np.median(settled.sigma_px) == pytest.approx(0.2, rel=0.05)
@@ -46,7 +55,9 @@ def test_noise_below_the_floor_is_not_blown_up() -> None:
 
 def _pulls(cal: sc.Calibration, obs: sc.Observations, chosen: np.ndarray) -> float:
     """Mean squared deleted residual of some stars over what the calibration expects."""
-    found = star_residuals(StarFrames.from_observations(obs), "brown", cal.theta, np.ones(obs.n_stars, bool))
+    found = star_residuals(
+        StarFrames.from_observations(obs), "brown", cal.theta, np.ones(obs.n_stars, bool)
+    )
     return float(np.mean(found.t[chosen]) / (2.0 * cal.sigma**2))
 
 
@@ -60,7 +71,8 @@ def test_errors_are_what_the_covariance_says_once_the_floor_is_known() -> None:
         for cal, squares in ((settled, with_floor), (plain, without)):
             off = cal.theta - truth
             squares.append(off @ np.linalg.solve(cal.covariance, off) / len(off))
-    # A thousand squared errors: one sigma of their mean is 4.5 %. The control is the same stars without a floor.
+    # A thousand squared errors: one sigma of their mean is 4.5 %. The control is the same stars
+    # without a floor.
     assert np.mean(with_floor) == pytest.approx(1.0, abs=0.15)
     assert np.mean(without) > 2.0
 
@@ -70,7 +82,8 @@ def test_noise_as_stated_has_no_floor() -> None:
     for seed in range(40):
         obs = measured(0.0, 1.2, seed, n_frames=12)
         p_values.append(noise_floor(sc.calibrate(obs, nominal(camera())), obs).p_value)
-    # Half of the likelihood ratios are zero, and the others a chi-square: small p-values are as rare as they say.
+    # Half of the likelihood ratios are zero, and the others a chi-square: small p-values are as
+    # rare as they say.
     assert np.mean(np.array(p_values) < 0.1) < 0.25
     assert min(p_values) > LEAST_P_VALUE
     assert np.mean(np.array(p_values) == 1.0) > 0.2
@@ -80,7 +93,10 @@ def test_wrong_stars_make_no_floor() -> None:
     obs = measured(0.0, n_frames=40)
     assert obs.sigma_px is not None
     # As far off as the gate of the identification lets pass.
-    wrong = replace(obs, x_px=np.where(np.arange(obs.n_stars) % 40 == 0, obs.x_px + 7.0 * obs.sigma_px, obs.x_px))
+    wrong = replace(
+        obs,
+        x_px=np.where(np.arange(obs.n_stars) % 40 == 0, obs.x_px + 7.0 * obs.sigma_px, obs.x_px),
+    )
     assert not noise_floor(sc.calibrate(wrong, nominal(camera())), wrong).needed
 
 

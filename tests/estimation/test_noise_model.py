@@ -1,4 +1,6 @@
-"""Noise that varies: the fitted model, the weights that follow from it everywhere, and intervals that hold."""
+"""Noise that varies: the fitted model, the weights that follow from it everywhere, and intervals
+that hold.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def test_the_noise_of_every_star_is_found():
     cal = sc.calibrate(obs, camera, noise="model")
     model = cal.noise_model
     assert {"radius", "magnitude"} <= set(model.terms) and model.frame_dof is not None
-    radius = np.hypot(*(obs.xy - c.theta[:2]).T) / (0.5 * np.hypot(camera.width_px, camera.height_px))
+    radius = np.hypot(*(obs.xy - c.theta[:2]).T) / (
+        0.5 * np.hypot(camera.width_px, camera.height_px)
+    )
     ratio = np.log(model.sigma_px(obs) / all_at_once(radius, obs.mag, obs.frame))
     # 27 numbers a frame tell its noise to 14 %, less what shrinking saves.
     assert np.std(ratio) < 0.14 and abs(np.mean(ratio)) < 0.06
@@ -49,7 +53,9 @@ def test_the_noise_of_every_star_is_found():
     assert cal.sigma_name == "sigma_scale" and cal.sigma == pytest.approx(1.0, abs=0.02)
     assert "at its edge" in cal.text and "in every frame" in cal.text
     # A table that states the shape of the noise leaves the model little to say.
-    stated = sc.Observations(**c.columns | {"sigma_px": 0.5 * all_at_once(radius, obs.mag, obs.frame)})
+    stated = sc.Observations(
+        **c.columns | {"sigma_px": 0.5 * all_at_once(radius, obs.mag, obs.frame)}
+    )
     again = sc.calibrate(stated, camera, noise="model")
     assert not again.noise_model.varies and again.sigma == pytest.approx(2.0, rel=0.1)
 
@@ -58,7 +64,9 @@ def test_even_noise_is_left_as_it_is():
     _, obs, camera = scene(even)
     common, fitted = sc.calibrate(obs, camera), sc.calibrate(obs, camera, noise="model")
     assert not fitted.noise_model.varies
-    assert np.array_equal(common.theta, fitted.theta) and np.array_equal(common.covariance, fitted.covariance)
+    assert np.array_equal(common.theta, fitted.theta) and np.array_equal(
+        common.covariance, fitted.covariance
+    )
     assert weighed(obs, fitted) is obs and fitted.sigma_name == "sigma"
 
 
@@ -72,7 +80,9 @@ def test_every_reader_of_a_run_sees_the_same_weights_and_the_data_stay_what_they
     assert read.observations.data_hash == obs.data_hash == cal.provenance["data_sha256"]
     assert sc.load_observations(read.folder.observations).sigma_px is None
     some = read.observations.select(obs.frame < 3)
-    assert some.data_hash == obs.select(obs.frame < 3).data_hash and len(some.stated_px) == len(some)
+    assert some.data_hash == obs.select(obs.frame < 3).data_hash and len(some.stated_px) == len(
+        some
+    )
     assert read.observations.unweighted.sigma_px is None
     # Calibrated again from what the run gives: the same data, the same model.
     again = sc.calibrate(read.observations, camera, noise="model")
@@ -82,14 +92,20 @@ def test_every_reader_of_a_run_sees_the_same_weights_and_the_data_stay_what_they
     assert np.array_equal(post.draws, sc.sample(read.observations, cal, **draws).draws)
     edge, middle = (noise_model_of(post).at(x, x) for x in (np.array([1023.0]), np.array([512.0])))
     assert edge > 2.0 * middle
-    mission = sc.Observations(**{n: v[obs.frame == 0] for n, v in obs.columns.items()}, meta={"frames": "a mission"})
-    assert np.array_equal(weighed(mission, post).sigma_px, cal.noise_model.at(mission.x_px, mission.y_px, mission.mag))
+    mission = sc.Observations(
+        **{n: v[obs.frame == 0] for n, v in obs.columns.items()}, meta={"frames": "a mission"}
+    )
+    assert np.array_equal(
+        weighed(mission, post).sigma_px, cal.noise_model.at(mission.x_px, mission.y_px, mission.mag)
+    )
 
 
 @pytest.mark.slow
 def test_screening_measures_stars_by_the_noise_where_they_are():
     _, obs, camera = scene(worse_outside, n_frames=60)
-    plain, fitted = (sc.estimation.screen(obs, camera, noise=noise) for noise in ("common", "model"))
+    plain, fitted = (
+        sc.estimation.screen(obs, camera, noise=noise) for noise in ("common", "model")
+    )
     assert plain.model_is_wrong and not fitted.model_is_wrong and fitted.n_rejected == 0
     assert fitted.observations.sigma_px is None and fitted.calibration.noise_model.varies
 
@@ -112,7 +128,9 @@ def test_the_check_says_that_sigma_is_wrong_and_by_how_much():
     check = even_noise(found)
     assert check.level is Level.WARN and "noise='model'" in check.remedy
     k2 = cal.parameter_names.index("k2")
-    assert found.uneven.ratios[k2] > 1.3 and "k2" in check.sentence and "at its edge" in check.sentence
+    assert (
+        found.uneven.ratios[k2] > 1.3 and "k2" in check.sentence and "at its edge" in check.sentence
+    )
     fitted = sc.calibrate(obs, camera, noise="model")
     assert even_noise(misfit_tests(obs, fitted)).level is Level.PASS
     _, obs, camera = scene(even)
@@ -123,7 +141,11 @@ def test_the_test_of_frames_is_nominal_on_even_noise_and_finds_what_varies():
     def p_value(sigma, seed):
         _, obs, camera = scene(sigma, seed, n_frames=12, stars_per_frame=6)
         tests = misfit_tests(obs, sc.calibrate(obs, camera), max_cells=2).tests
-        return next(test.p_value for test in tests if test.name.endswith("frame to frame") and test.is_of_noise)
+        return next(
+            test.p_value
+            for test in tests
+            if test.name.endswith("frame to frame") and test.is_of_noise
+        )
 
     p = [p_value(even, seed) for seed in range(12)]
     assert stats.kstest(p, "uniform").pvalue > 1e-3
@@ -131,7 +153,9 @@ def test_the_test_of_frames_is_nominal_on_even_noise_and_finds_what_varies():
 
 
 def quick(sigma, seed):
-    """Squared z of the parameters (2, p): with one noise, and with the model; started at the truth."""
+    """Squared z of the parameters (2, p): with one noise, and with the model; started at the
+    truth.
+    """
     c, obs, camera = scene(sigma, seed, n_frames=24, stars_per_frame=12)
     camera = camera.with_theta(c.theta)
     plain = MarginalLikelihood(obs, "brown")

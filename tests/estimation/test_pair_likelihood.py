@@ -10,7 +10,13 @@ import pytest
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import model_names
-from starcal_uq.camera.projection import backward_kernel, backward_root, backward_second_kernel, project, second_index
+from starcal_uq.camera.projection import (
+    backward_kernel,
+    backward_root,
+    backward_second_kernel,
+    project,
+    second_index,
+)
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.status import Level
 from starcal_uq.estimation import composite as module
@@ -42,7 +48,9 @@ QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 60, "n_bu
 def build(obs: Any, model: str = "brown", **options: Any) -> tuple[PairLikelihood, Any]:
     cal = calibrate(obs, nominal(camera(model)))
     frames = StarFrames.from_observations(obs)
-    return pair_likelihood(frames, model, cal.pair_theta, chi2=cal.chi2, residual_dof=cal.dof, **options), cal
+    return pair_likelihood(
+        frames, model, cal.pair_theta, chi2=cal.chi2, residual_dof=cal.dof, **options
+    ), cal
 
 
 def relative(matrix: np.ndarray, reference: np.ndarray) -> float:
@@ -59,14 +67,18 @@ def test_second_derivatives_of_directions(model: str) -> None:
     b, db, second = backward_second_kernel(model)(40, theta, pixel, root)
     value, first = backward_kernel(model, True)(40, theta, pixel, root)
     assert np.allclose(b, value, rtol=0, atol=1e-15)
-    assert np.allclose(db, first, rtol=1e-12, atol=1e-12 * np.abs(first).max(axis=(1, 2), keepdims=True))
+    assert np.allclose(
+        db, first, rtol=1e-12, atol=1e-12 * np.abs(first).max(axis=(1, 2), keepdims=True)
+    )
     rows, columns = second_index(len(theta))
     # Steps that move the corner by about a pixel, whatever the parameter's unit.
     step = 1e-5 / np.abs(db).max(axis=(1, 2))
     for k, size in enumerate(step):
         unit = size * np.eye(len(theta))[k]
         up, down = (
-            backward_kernel(model, True)(40, theta + s * unit, pixel, backward_root(model, theta + s * unit, pixel))[1]
+            backward_kernel(model, True)(
+                40, theta + s * unit, pixel, backward_root(model, theta + s * unit, pixel)
+            )[1]
             for s in (1.0, -1.0)
         )
         slope = (up - down) / (2.0 * size)
@@ -78,8 +90,12 @@ def test_second_derivatives_of_directions(model: str) -> None:
 
 @pytest.mark.parametrize("model", model_names())
 @pytest.mark.parametrize("stated", [False, True])
-def test_generalised_least_squares_over_pairs_has_the_marginal_information(model: str, stated: bool) -> None:
-    """With their full covariance the pairs know what the pixels know once attitudes are free: to 1e-8."""
+def test_generalised_least_squares_over_pairs_has_the_marginal_information(
+    model: str, stated: bool
+) -> None:
+    """With their full covariance the pairs know what the pixels know once attitudes are free: to
+    1e-8.
+    """
     obs = observations(model, n_frames=6)
     obs = with_sigmas(obs) if stated else obs
     theta, cam = camera(model).theta, camera(model)
@@ -98,9 +114,14 @@ def test_generalised_least_squares_over_pairs_has_the_marginal_information(model
         noise = np.ones(part.n_stars) if part.weight is None else 1.0 / part.weight
         design = np.zeros((len(i), 2 * part.n_stars))
         for axis in range(2):
-            # Moving a pixel moves its direction as moving the principal point does, the other way round.
-            design[np.arange(len(i)), 2 * i + axis] = -np.sum(db[axis][:, i] * b[:, j], axis=0) * noise[i]
-            design[np.arange(len(i)), 2 * j + axis] = -np.sum(db[axis][:, j] * b[:, i], axis=0) * noise[j]
+            # Moving a pixel moves its direction as moving the principal point does, the other way
+            # round.
+            design[np.arange(len(i)), 2 * i + axis] = (
+                -np.sum(db[axis][:, i] * b[:, j], axis=0) * noise[i]
+            )
+            design[np.arange(len(i)), 2 * j + axis] = (
+                -np.sum(db[axis][:, j] * b[:, i], axis=0) * noise[j]
+            )
         # Of m (m - 1) / 2 pairs 2 m - 3 are independent: their covariance has that rank.
         u, s, _ = np.linalg.svd(design, full_matrices=False)
         rank = 2 * part.n_stars - 3
@@ -123,7 +144,9 @@ def test_gram_equals_the_objective(model: str) -> None:
     difference = found.log_likelihood(theta, sigma) - found.exact_log_likelihood(theta, sigma)
     assert np.ptp(found.log_likelihood(theta, sigma)) > 3.0
     assert np.max(np.abs(difference)) < 0.01
-    assert found.gram[0, 0] * found.tau**2 == pytest.approx(found.objective.cost(found.theta_hat), rel=1e-9)
+    assert found.gram[0, 0] * found.tau**2 == pytest.approx(
+        found.objective.cost(found.theta_hat), rel=1e-9
+    )
 
 
 def test_gram_does_not_depend_on_its_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,25 +175,33 @@ def test_curvature_is_godambes_information(variability: str) -> None:
             True,
         )
         _, laplace = laplace_approximation(start)
-        expected = symmetric_inverse(symmetric_inverse(likelihood.covariance) + priors.precision(priors.names[:-1]))
-        # The naive one is scaled by the expected noise of a pair; the observed noise differs by a few percent.
+        expected = symmetric_inverse(
+            symmetric_inverse(likelihood.covariance) + priors.precision(priors.names[:-1])
+        )
+        # The naive one is scaled by the expected noise of a pair; the observed noise differs by a
+        # few percent.
         assert relative(laplace.covariance, expected) < (0.01 if likelihood.adjusted else 0.1)
     assert found.narrowness > 2.5
-    # One takes V from the model and sigma, and loses the parameters' degrees of freedom when these are integrated.
+    # One takes V from the model and sigma, and loses the parameters' degrees of freedom when these
+    # are integrated.
     theta, objective = cal.pair_theta, found.objective
     expected, more = expected_godambe(objective, theta, np.sqrt(cal.chi2 / cal.dof)), 5
     if variability == "empirical":
         expected, more = objective.godambe(theta), 0
     assert relative(found.covariance, expected) < 1e-12
     assert found.dof == cal.dof + more
-    narrow = np.diag(found.covariance) / np.diag(build(observations(), adjusted=False)[0].covariance)
+    narrow = np.diag(found.covariance) / np.diag(
+        build(observations(), adjusted=False)[0].covariance
+    )
     assert found.narrowness == pytest.approx(np.sqrt(np.mean(narrow)), rel=1e-12)
 
 
 def test_expected_variability_is_what_the_stated_noise_of_each_star_does_to_the_score() -> None:
     """By moving one pixel after the other, where the model fits exactly."""
     exact = observations(n_frames=3, sigma_px=0.0)
-    obs = dataclasses.replace(exact, sigma_px=np.random.default_rng(1).uniform(0.02, 0.1, len(exact)))
+    obs = dataclasses.replace(
+        exact, sigma_px=np.random.default_rng(1).uniform(0.02, 0.1, len(exact))
+    )
     frames, theta, step = StarFrames.from_observations(obs), camera().theta, 1e-3
     objective = PairObjective(frames, "brown")
     v = np.zeros((5, 5))
@@ -180,12 +211,19 @@ def test_expected_variability_is_what_the_stated_noise_of_each_star_does_to_the_
             for sign in (-1.0, 1.0):
                 pixel = frames.pixel.copy()
                 pixel[axis, star] += sign * step
-                scores.append(PairObjective(dataclasses.replace(frames, pixel=pixel), "brown").evaluate(theta).gradient)
+                scores.append(
+                    PairObjective(dataclasses.replace(frames, pixel=pixel), "brown")
+                    .evaluate(theta)
+                    .gradient
+                )
             change = (scores[1] - scores[0]) / (2.0 * step) * obs.sigma_px[star]
             v += np.outer(change, change)
     inverse = symmetric_inverse(objective.evaluate(theta).matrix)
     for factor in (1.0, 1.3):
-        assert relative(expected_godambe(objective, theta, factor), factor**2 * inverse @ v @ inverse) < 1e-4
+        assert (
+            relative(expected_godambe(objective, theta, factor), factor**2 * inverse @ v @ inverse)
+            < 1e-4
+        )
 
 
 def test_scatter_counts_from_fifty_frames_per_parameter_on() -> None:
@@ -224,7 +262,9 @@ def test_intervals_of_the_pair_estimate_cover_with_three_frames() -> None:
     for seed in range(100):
         c = campaign(np.random.default_rng(seed), n_frames=3)
         obs = Observations(**c.columns, meta={"directions": "apparent"})
-        cal = calibrate(obs, Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), method="three_stage")
+        cal = calibrate(
+            obs, Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), method="three_stage"
+        )
         low, high = cal.interval().T
         inside.append((low <= c.theta) & (c.theta <= high))
         spread = PairObjective(StarFrames.from_observations(obs), "brown").godambe(cal.theta)
@@ -234,7 +274,10 @@ def test_intervals_of_the_pair_estimate_cover_with_three_frames() -> None:
 
 
 def test_noise_of_a_pair_is_predicted() -> None:
-    for obs, sigma in ((observations(n_frames=200), 0.05), (with_sigmas(observations(sigma_px=0.0)), 1.0)):
+    for obs, sigma in (
+        (observations(n_frames=200), 0.05),
+        (with_sigmas(observations(sigma_px=0.0)), 1.0),
+    ):
         found, _ = build(obs)
         assert found.tau / found.pair_noise == pytest.approx(sigma, rel=0.06)
 
@@ -245,8 +288,13 @@ def test_stars_other_than_those_of_the_estimate_are_refused() -> None:
     naive = pair_likelihood(frames, "brown", cal.pair_theta, chi2=cal.chi2, residual_dof=cal.dof)
     # One parameter after the other: none is told by the size of its unit.
     for shift in 2.0 * np.diag(np.sqrt(np.diag(naive.covariance))):
-        with pytest.raises(SamplingError, match=r"lies (1\.9|2\.0) standard deviations from the minimum of the pair"):
-            pair_likelihood(frames, "brown", cal.pair_theta + shift, chi2=cal.chi2, residual_dof=cal.dof)
+        with pytest.raises(
+            SamplingError,
+            match=r"lies (1\.9|2\.0) standard deviations from the minimum of the pair",
+        ):
+            pair_likelihood(
+                frames, "brown", cal.pair_theta + shift, chi2=cal.chi2, residual_dof=cal.dof
+            )
 
 
 @pytest.mark.usefixtures("few_importance_draws")
@@ -265,7 +313,10 @@ def test_sampling_pairs() -> None:
     assert post.sigma_draws.mean() == pytest.approx(cal.sigma, rel=0.01)
     assert post.sd[5] == pytest.approx(cal.sigma_std, rel=0.1)
     short = {**QUICK, "n_walkers": 12, "n_steps": 20}
-    both = [sample(obs, cal, **short, likelihood="pairs", evaluation=name) for name in ("compressed", "exact")]
+    both = [
+        sample(obs, cal, **short, likelihood="pairs", evaluation=name)
+        for name in ("compressed", "exact")
+    ]
     assert [post.diagnostics.likelihood_used for post in both] == ["compressed", "exact"]
     # The same random numbers decide, so the draws themselves agree.
     assert np.max(np.abs(both[0].mean - both[1].mean) / post.sd[:5]) < 0.02
@@ -303,7 +354,9 @@ def test_pairs_cover_and_naive_pairs_do_not() -> None:
             information = symmetric_inverse(found.covariance)
             priors = Priors.default(cal.nominal)
             dof = found.dof if adjusted else found.n_pairs
-            start = start_target(found.log_likelihood, priors, found.theta_hat, information, sigma, float(dof), False)
+            start = start_target(
+                found.log_likelihood, priors, found.theta_hat, information, sigma, float(dof), False
+            )
             _, laplace = laplace_approximation(start)
             z = (laplace.mode[:5] - truth.theta) / np.sqrt(np.diag(laplace.covariance)[:5])
             noise = (laplace.mode[5] - np.log(0.05)) / np.sqrt(laplace.covariance[5, 5])
@@ -340,7 +393,9 @@ def test_godambe_is_the_covariance_of_the_pair_estimate() -> None:
 
 
 def test_ignoring_attitudes_spoils_sigma() -> None:
-    """A likelihood that counts 2 m numbers a frame, and not 2 m - 3, has too small a sigma, which does not cover."""
+    """A likelihood that counts 2 m numbers a frame, and not 2 m - 3, has too small a sigma, which
+    does not cover.
+    """
     stars, truth = load_catalogue(max_mag=6.0, epoch=2026.9), camera()
     inside: dict[str, list[bool]] = {"right": [], "wrong": []}
     ratios = []
@@ -361,7 +416,9 @@ def test_ignoring_attitudes_spoils_sigma() -> None:
             _, laplace = laplace_approximation(start)
             # Theta integrated out: its p coordinates scale with sigma.
             log_sigma = laplace.mode[5] + 0.5 * 5.0 / likelihood.dof
-            inside[name].append(abs(log_sigma - np.log(0.05)) < 1.96 * np.sqrt(laplace.covariance[5, 5]))
+            inside[name].append(
+                abs(log_sigma - np.log(0.05)) < 1.96 * np.sqrt(laplace.covariance[5, 5])
+            )
             if name == "wrong":
                 ratios.append(np.exp(log_sigma) / 0.05)
     assert np.mean(inside["right"]) > 0.88

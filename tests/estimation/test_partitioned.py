@@ -1,4 +1,6 @@
-"""Calibration of partitioned observations: that of one table, whatever the partitions and processes."""
+"""Calibration of partitioned observations: that of one table, whatever the partitions and
+processes.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,10 @@ def assert_equal(a: sc.Calibration, b: sc.Calibration, bound: float) -> None:
     np.testing.assert_allclose(a.chi2, b.chi2, rtol=bound)
     unit = np.sqrt(np.outer(np.diag(b.covariance), np.diag(b.covariance)))
     assert np.max(np.abs(a.covariance - b.covariance) / unit) < bound
-    points = b.theta + np.random.default_rng(1).standard_normal((20, len(b.theta))) @ b.compressed.whitening.T
+    points = (
+        b.theta
+        + np.random.default_rng(1).standard_normal((20, len(b.theta))) @ b.compressed.whitening.T
+    )
     likelihoods = [cal.compressed.log_likelihood(points, b.sigma) for cal in (a, b)]
     assert np.max(np.abs(likelihoods[0] - likelihoods[1])) < 1e-6
     for name in ("rotation_per_theta", "attitude_noise"):
@@ -54,15 +59,22 @@ def assert_equal(a: sc.Calibration, b: sc.Calibration, bound: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[sc.Observations, sc.Camera, PartitionedObservations]:
+def small(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[sc.Observations, sc.Camera, PartitionedObservations]:
     obs, camera = sensor(90)
-    return obs, camera, divided(obs, tmp_path_factory.mktemp("small") / "frames", [0, 25, 26, 71, 90])
+    return (
+        obs,
+        camera,
+        divided(obs, tmp_path_factory.mktemp("small") / "frames", [0, 25, 26, 71, 90]),
+    )
 
 
 def test_partitions_give_the_calibration_of_the_table(small, tmp_path: Path) -> None:
     obs, camera, parts = small
     one, many = sc.calibrate(obs, camera), sc.calibrate(parts, camera)
-    # The solver of a table may stop 1e-10 sigma short of the optimum; that of partitions goes to rounding.
+    # The solver of a table may stop 1e-10 sigma short of the optimum; that of partitions goes to
+    # rounding.
     assert_equal(many, one, 1e-9)
     whole = divided(obs, tmp_path / "whole", [0, 90])
     assert_equal(sc.calibrate(whole, camera), many, 1e-11)
@@ -73,7 +85,13 @@ def test_partitions_give_the_calibration_of_the_table(small, tmp_path: Path) -> 
         jackknife_of_all(sc.calibrate(whole, camera)),
     )
     assert frames is not None and of_one is not None and frames.n_frames == own.n_frames == 90
-    for name in ("formal_covariance", "jackknife_covariance", "sandwich_covariance", "dof", "tail_dof"):
+    for name in (
+        "formal_covariance",
+        "jackknife_covariance",
+        "sandwich_covariance",
+        "dof",
+        "tail_dof",
+    ):
         np.testing.assert_allclose(getattr(frames, name), getattr(own, name), rtol=1e-7)
         np.testing.assert_allclose(getattr(frames, name), getattr(of_one, name), rtol=1e-10)
 
@@ -87,14 +105,21 @@ def test_frames_that_disagree_are_found_in_files_that_the_sample_leaves_out(tmp_
             # Every frame of one file has a focal length of its own, by a thousandth.
             table = obs.select((obs.frame >= 35) & (obs.frame < 40))
             scale = 1.0 + 1e-3 * np.random.default_rng(3).standard_normal(5)[table.frame - 35]
-            moved = {"x_px": 512.0 + (table.x_px - 512.0) * scale, "y_px": 512.0 + (table.y_px - 512.0) * scale}
+            moved = {
+                "x_px": 512.0 + (table.x_px - 512.0) * scale,
+                "y_px": 512.0 + (table.y_px - 512.0) * scale,
+            }
             folder = parts.parts[7].path
             sc.Observations(**{**table.columns, **moved}, meta=table.meta).save(folder, force=True)
             parts = sc.observations.open_partitions(parts.folder)
         cal, sample = sc.calibrate(parts, camera, model="brown"), parts.sample()
         assert sample.n_frames == 80 and not np.isin(range(35, 40), sample.frame).any()
         among = jackknife_frames(sample, sc.calibrate(sample, camera))
-        every = sc.diagnose(parts, cal, models=(), n_starts=0).jackknife if bent else jackknife_of_all(cal)
+        every = (
+            sc.diagnose(parts, cal, models=(), n_starts=0).jackknife
+            if bent
+            else jackknife_of_all(cal)
+        )
         assert every is not None and every.n_frames == 100
         found[bent] = among.p_values[2], every.p_values[2]
     assert found[True][0] > 0.01 and min(found[False]) > 0.01 and found[True][1] < 1e-6
@@ -106,7 +131,9 @@ def test_stars_that_state_their_noise(tmp_path: Path) -> None:
     obs = sc.Observations(**{**obs.columns, "sigma_px": sigma}, meta=obs.meta)
     many = sc.calibrate(divided(obs, tmp_path / "frames", [0, 20, 60]), camera)
     assert_equal(many, sc.calibrate(obs, camera), 1e-9)
-    assert many.partitions is not None and many.partitions.stated2 == pytest.approx(np.sum(sigma**2))
+    assert many.partitions is not None and many.partitions.stated2 == pytest.approx(
+        np.sum(sigma**2)
+    )
 
 
 def test_runs_of_partitions_are_merged(small, tmp_path: Path) -> None:
@@ -138,7 +165,9 @@ def test_folders_that_share_a_file_are_not_merged(small, tmp_path: Path) -> None
         frames = sc.observations.open_partitions(tmp_path / f"frames-{name}")
         sc.Run(tmp_path / name).calibrate(frames, camera)
         sc.Run(tmp_path / name).sample(seed=1, n_steps=20)
-    with pytest.raises(CalibrationError, match="b: holds the same observations as a, which would count twice"):
+    with pytest.raises(
+        CalibrationError, match="b: holds the same observations as a, which would count twice"
+    ):
         sc.runs.merge_runs([tmp_path / "a", tmp_path / "b"])
     assert sc.runs.compare_runs(tmp_path / "a", tmp_path / "b").data == "overlapping"
 
@@ -152,7 +181,9 @@ def test_file_with_another_noise_is_found(small, tmp_path: Path) -> None:
     # Every star of the last 30 frames is measured with half as much noise again.
     rng = np.random.default_rng(2)
     extra = np.where(obs.frame >= 60, 0.05 * np.sqrt(1.5**2 - 1.0), 0.0)
-    noisy = {name: obs.columns[name] + extra * rng.standard_normal(len(obs)) for name in ("x_px", "y_px")}
+    noisy = {
+        name: obs.columns[name] + extra * rng.standard_normal(len(obs)) for name in ("x_px", "y_px")
+    }
     table = sc.Observations(**{**obs.columns, **noisy}, meta=obs.meta)
     found = partitions(sc.calibrate(divided(table, tmp_path / "uneven", [0, 30, 60, 90]), camera))
     assert found is not None and found.level.name == "WARN" and "file 3 of 3" in found.sentence
@@ -169,10 +200,13 @@ def test_richer_models_are_fitted_to_all_stars(small, tmp_path: Path) -> None:
         full = camera.replace(distortion=other.model, coefficients=(0.0,) * (2 + other.n_terms))
         one = sc.calibrate(obs, full)
         best = one.stages[-1].theta
-        # One step of Gauss and Newton over 1.5 sigma; their rate of convergence here is a few per cent a step.
+        # One step of Gauss and Newton over 1.5 sigma; their rate of convergence here is a few per
+        # cent a step.
         normal = MarginalLikelihood(obs, other.model).evaluate(other.theta)
         second = other.theta - scaled_inverse(normal.matrix) @ normal.gradient
-        first_error, second_error = (np.max(np.abs(at - best) / one.sigmas) for at in (other.theta, second))
+        first_error, second_error = (
+            np.max(np.abs(at - best) / one.sigmas) for at in (other.theta, second)
+        )
         assert first_error < 0.03 and second_error < 0.05 * max(first_error, 1e-3)
         assert other.gain == pytest.approx((many.chi2 - one.chi2) / variance, abs=0.01)
     check = terms(many)
@@ -210,10 +244,15 @@ def test_frames_are_counted_once(small, tmp_path: Path, monkeypatch: pytest.Monk
     obs, camera, _ = small
     table = obs.select_frames(np.arange(60))
     twice = table.select_frames([7])
-    columns = {name: np.concatenate([table.columns[name], twice.columns[name][::-1]]) for name in table.columns}
+    columns = {
+        name: np.concatenate([table.columns[name], twice.columns[name][::-1]])
+        for name in table.columns
+    }
     columns["frame"][len(table) :] = 60
     doubled = divided(sc.Observations(**columns, meta=obs.meta), tmp_path / "twice", [0, 30, 61])
-    with pytest.raises(RepeatedFramesError, match="frame 60 holds the same measurement as frame 7:"):
+    with pytest.raises(
+        RepeatedFramesError, match="frame 60 holds the same measurement as frame 7:"
+    ):
         sc.calibrate(doubled, camera)
     # Of a larger table the sample may not hold both.
     monkeypatch.setattr("starcal_uq.estimation.calibrate.repeating_frames", lambda *_: np.empty(0))
@@ -224,7 +263,12 @@ def test_frames_are_counted_once(small, tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_what_partitions_cannot_do_is_said(small) -> None:
     obs, camera, parts = small
-    for options in ({"method": "three_stage"}, {"likelihood": "student_t"}, {"noise": "model"}, {"duplicates": "drop"}):
+    for options in (
+        {"method": "three_stage"},
+        {"likelihood": "student_t"},
+        {"noise": "model"},
+        {"duplicates": "drop"},
+    ):
         with pytest.raises(CalibrationError, match="partitioned observations"):
             sc.calibrate(parts, camera, **options)
     with pytest.raises(CalibrationError, match="needs partitioned observations"):
@@ -238,13 +282,17 @@ def test_bad_row_names_its_file(small, tmp_path: Path) -> None:
     bad = obs.select(obs.frame >= 45)
     x = bad.x_px.copy()
     x[3] = np.nan
-    sc.Observations(**{**bad.columns, "x_px": x}, meta=bad.meta).save(parts.parts[1].path, force=True)
+    sc.Observations(**{**bad.columns, "x_px": x}, meta=bad.meta).save(
+        parts.parts[1].path, force=True
+    )
     with pytest.raises(ObservationError, match=r"part1.parquet, row 4, column x_px"):
         sc.calibrate(sc.observations.open_partitions(parts.folder), camera)
 
 
 @pytest.mark.slow
-def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_killed(tmp_path: Path) -> None:
+def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_killed(
+    tmp_path: Path,
+) -> None:
     from distributed import Client, LocalCluster
 
     obs, camera = sensor(1200)
@@ -273,13 +321,16 @@ def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_kill
 
 @pytest.mark.slow
 def test_memory_and_time_grow_with_the_partition_and_the_stars(tmp_path: Path) -> None:
-    """One process whose address space may grow by 300 MB over what its imports take, ten times the frames each time."""
+    """One process whose address space may grow by 300 MB over what its imports take, ten times the
+    frames each time.
+    """
     code = (
         "import resource, sys, time\n"
         "import numpy as np\n"
         "import starcal_uq as sc\n"
         "from starcal_uq.estimation.calibrate import calibrate\n"
-        "camera, start, stars = sc.paper.paper_camera(), sc.paper.paper_start(), sc.load_catalogue(max_mag=6.0)\n"
+        "camera, start, stars = sc.paper.paper_camera(), sc.paper.paper_start(), "
+        "sc.load_catalogue(max_mag=6.0)\n"
         "sc.calibrate(sc.simulate(stars, camera, n_frames=300), start)\n"
         "folder, n = sys.argv[1], int(sys.argv[2])\n"
         "import pyarrow.parquet, distributed\n"
@@ -294,8 +345,10 @@ def test_memory_and_time_grow_with_the_partition_and_the_stars(tmp_path: Path) -
         "assert np.max(np.abs(z)) < 4.5 and cal.n_frames == n, z\n"
         # The limit means something: all of the larger table at once does not fit under it.
         "try:\n"
-        "    whole = [sc.load_observations(part.path) for part in sc.observations.open_partitions(folder).parts]\n"
-        "    columns = {name: np.concatenate([getattr(one, name) for one in whole]) for name in whole[0].columns}\n"
+        "    whole = [sc.load_observations(part.path) for part in "
+        "sc.observations.open_partitions(folder).parts]\n"
+        "    columns = {name: np.concatenate([getattr(one, name) for one in whole]) for name in "
+        "whole[0].columns}\n"
         "    sc.calibrate(sc.Observations(**columns), start)\n"
         "except MemoryError:\n"
         "    print('out of memory')\n"

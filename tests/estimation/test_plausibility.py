@@ -1,4 +1,6 @@
-"""A slip in the table or the camera file is named where a calibration fails, and never where there is none."""
+"""A slip in the table or the camera file is named where a calibration fails, and never where there
+is none.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,16 @@ from tests.helpers.outside import campaign
 
 FIELDS = (8.0, 45.0)
 # Clauses that blame the table or the camera file.
-BLAMES = ("looks like", "look like", "look swapped", "mirrored", "frame number", "ask for", "principal point", "belong")
+BLAMES = (
+    "looks like",
+    "look like",
+    "look swapped",
+    "mirrored",
+    "frame number",
+    "ask for",
+    "principal point",
+    "belong",
+)
 
 
 def seen(field, seed=1, **departures):
@@ -33,7 +44,8 @@ def wrong_share(c, share):
     rng = np.random.default_rng(5)
     wrong = rng.random(len(c.columns["x_px"])) < share
     return {
-        name: np.where(wrong, rng.uniform(0, c.size_px - 1, len(wrong)), c.columns[name]) for name in ("x_px", "y_px")
+        name: np.where(wrong, rng.uniform(0, c.size_px - 1, len(wrong)), c.columns[name])
+        for name in ("x_px", "y_px")
     }
 
 
@@ -43,7 +55,10 @@ def shuffled(values):
 
 # What is done to the columns, and what is then said.
 TABLES = {
-    "hours": (lambda c: {"ra_deg": c["ra_deg"] / 15.0}, "ra_deg looks like hours .*: multiply it by 15"),
+    "hours": (
+        lambda c: {"ra_deg": c["ra_deg"] / 15.0},
+        "ra_deg looks like hours .*: multiply it by 15",
+    ),
     "radians": (
         lambda c: {name: np.radians(c[name]) for name in ("ra_deg", "dec_deg")},
         "ra_deg and dec_deg look like radians .*: multiply them by 180/pi",
@@ -60,23 +75,47 @@ TABLES = {
         lambda c: {"x_px": c["y_px"], "y_px": c["x_px"]},
         r"the image is mirrored: .* \(1023 - x_px\), .* or exchange x_px and y_px",
     ),
-    "x": (lambda c: {"x_px": 1023.0 - c["x_px"]}, "the image is mirrored: count x_px from the right edge"),
-    "y": (lambda c: {"y_px": 1023.0 - c["y_px"]}, "the image is mirrored: .* or y_px from the bottom"),
+    "x": (
+        lambda c: {"x_px": 1023.0 - c["x_px"]},
+        "the image is mirrored: count x_px from the right edge",
+    ),
+    "y": (
+        lambda c: {"y_px": 1023.0 - c["y_px"]},
+        "the image is mirrored: .* or y_px from the bottom",
+    ),
     "frames": (lambda c: {"frame": shuffled(c["frame"])}, "frame numbers"),
     "one frame": (lambda c: {"frame": 0 * c["frame"]}, "all rows have one frame number"),
     "rows": (
-        lambda c: dict(zip(("ra_deg", "dec_deg"), shuffled(np.array([c["ra_deg"], c["dec_deg"]]).T).T, strict=True)),
-        "farther apart in the sky than the camera sees .*: their frame numbers or directions belong to other rows",
+        lambda c: dict(
+            zip(
+                ("ra_deg", "dec_deg"),
+                shuffled(np.array([c["ra_deg"], c["dec_deg"]]).T).T,
+                strict=True,
+            )
+        ),
+        (
+            "farther apart in the sky than the camera sees .*: their frame numbers or directions "
+            "belong to other rows"
+        ),
     ),
 }
 CAMERAS = {
-    "micrometres": (lambda f: {"focal_mm": 1e3 * f}, "focal_mm looks like micrometres .*: divide it by 1000"),
+    "micrometres": (
+        lambda f: {"focal_mm": 1e3 * f},
+        "focal_mm looks like micrometres .*: divide it by 1000",
+    ),
     "pixels": (
         lambda f: {"focal_mm": 100.0 * f},
         "focal_mm looks like pixels .* by the pixel pitch, 0.01",
     ),
-    "pitch": (lambda f: {"pixel_um": 0.01}, r"pixel_um looks like millimetres \(0.01\): multiply it by 1000"),
-    "another": (lambda f: {"focal_mm": 2.2 * f}, "the stars ask for a focal length of about .* mm, not"),
+    "pitch": (
+        lambda f: {"pixel_um": 0.01},
+        r"pixel_um looks like millimetres \(0.01\): multiply it by 1000",
+    ),
+    "another": (
+        lambda f: {"focal_mm": 2.2 * f},
+        "the stars ask for a focal length of about .* mm, not",
+    ),
 }
 
 
@@ -100,7 +139,13 @@ def test_a_slip_is_named(slip, field):
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize(
     ("one", "other"),
-    [("hours", "x and y"), ("radians", "y"), ("hours", "dec in radians"), ("hours", "micrometres"), ("x", "another")],
+    [
+        ("hours", "x and y"),
+        ("radians", "y"),
+        ("hours", "dec in radians"),
+        ("hours", "micrometres"),
+        ("x", "another"),
+    ],
 )
 def test_two_slips_at_once_are_both_named(one, other, field):
     c = seen(field)
@@ -110,7 +155,9 @@ def test_two_slips_at_once_are_both_named(one, other, field):
         columns |= second(columns)
     else:
         camera = sheet(c, **second(camera.focal_mm))
-    reason = plausibility.find_reason(sc.Observations(**columns), camera, Status.MAX_ITERATIONS) or ""
+    reason = (
+        plausibility.find_reason(sc.Observations(**columns), camera, Status.MAX_ITERATIONS) or ""
+    )
     assert re.search(f"{said}.*; and .*{more.replace(', ra_deg does not', '')}", reason), reason
 
 
@@ -167,18 +214,25 @@ def test_from_a_wrong_focal_length_the_right_one_is_found_or_the_slip_named(slip
 def test_wrong_stars_and_noise_are_told_apart(field):
     c = seen(field)
     half = sc.Observations(**(c.columns | wrong_share(c, 0.5)))
-    with pytest.raises(CalibrationError, match=r"about (4|5)\d % of the stars do not fit the others .* --screen"):
+    with pytest.raises(
+        CalibrationError, match=r"about (4|5)\d % of the stars do not fit the others .* --screen"
+    ):
         sc.calibrate(half, sheet(c))
     most = sc.Observations(**(c.columns | wrong_share(c, 0.9)))
     with pytest.raises(CalibrationError, match=r"fit no common attitude|identify them again"):
         sc.estimation.screen(most, sheet(c))
     noisy = seen(field, sigma_px=12.0)
-    with pytest.raises(CalibrationError, match=r"the stars scatter by about 1\d px around their attitudes"):
+    with pytest.raises(
+        CalibrationError, match=r"the stars scatter by about 1\d px around their attitudes"
+    ):
         sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy))
-    # Five pixels are noise that a wide field bears; a narrow one no longer tells the principal point from the pointing.
+    # Five pixels are noise that a wide field bears; a narrow one no longer tells the principal
+    # point from the pointing.
     noisy = seen(field, sigma_px=5.0)
     if field > 20.0:
-        assert sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy)).sigma == pytest.approx(5.0, rel=0.1)
+        assert sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy)).sigma == pytest.approx(
+            5.0, rel=0.1
+        )
     else:
         with pytest.raises(CalibrationError, match=r"the data do not determine x0: more frames"):
             sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy), model="brown")
@@ -214,7 +268,12 @@ def test_control_no_slip_is_blamed_on_good_tables_that_are_hard(conditions):
     for field in (3.0, 8.0, 20.0, 45.0, 80.0):
         for seed in (100, 101):
             c = seen(field, seed, **HARD[conditions])
-            reason = plausibility.find_reason(sc.Observations(**c.columns), sheet(c), Status.MAX_ITERATIONS) or ""
+            reason = (
+                plausibility.find_reason(
+                    sc.Observations(**c.columns), sheet(c), Status.MAX_ITERATIONS
+                )
+                or ""
+            )
             assert not [words for words in BLAMES if words in reason], reason
 
 
@@ -231,7 +290,9 @@ def test_control_a_field_near_the_pole_and_one_near_the_equinox():
         columns["dec_deg"] = np.degrees(np.arcsin(r[mine, 2]))
         frames.append(columns)
     for columns in frames:
-        assert plausibility.find_reason(sc.Observations(**columns), sheet(c), Status.STALLED) is None
+        assert (
+            plausibility.find_reason(sc.Observations(**columns), sheet(c), Status.STALLED) is None
+        )
 
 
 def _turning_to(axis):

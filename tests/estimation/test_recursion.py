@@ -1,4 +1,6 @@
-"""The recursion: innovations against explicit pairs, recursive against batch, order, noise, files."""
+"""The recursion: innovations against explicit pairs, recursive against batch, order, noise,
+files.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,16 @@ from starcal_uq.observations.frames import StarFrames
 from tests.helpers.same import assert_same
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
-SCALES = {"f": 1.0, "k1": 1e-9, "k2": 1e-14, "k3": 1e-20, "p1": 1e-6, "p2": 1e-6, "x0": 1.0, "y0": 1.0}
+SCALES = {
+    "f": 1.0,
+    "k1": 1e-9,
+    "k2": 1e-14,
+    "k3": 1e-20,
+    "p1": 1e-6,
+    "p2": 1e-6,
+    "x0": 1.0,
+    "y0": 1.0,
+}
 
 
 def scale_of(model):
@@ -55,7 +66,11 @@ def relative(a, b):
 @pytest.mark.parametrize("stated", [False, True])
 def test_innovations_are_generalised_least_squares_over_explicit_pairs(model, stated):
     obs = with_sigmas(observations(model)) if stated else observations(model)
-    frames, theta, scale = StarFrames.from_observations(obs), camera(model).theta.copy(), scale_of(model)
+    frames, theta, scale = (
+        StarFrames.from_observations(obs),
+        camera(model).theta.copy(),
+        scale_of(model),
+    )
     theta[:3] += [0.4, -0.3, 0.8]
     full = frame_normals(frames, model, theta, scale)
     diagonal = frame_normals(frames, model, theta, scale, "diagonal")
@@ -91,7 +106,9 @@ def test_numbers_of_a_frame_do_not_depend_on_its_company(covariance):
 
 
 def test_innovations_say_what_the_likelihood_of_positions_says():
-    """To first order the pairs with their full covariance are the positions with the attitudes eliminated."""
+    """To first order the pairs with their full covariance are the positions with the attitudes
+    eliminated.
+    """
     obs = observations()
     frames, theta, scale = StarFrames.from_observations(obs), camera().theta, scale_of("brown")
     normals = frame_normals(frames, "brown", theta, scale)
@@ -103,21 +120,34 @@ def test_innovations_say_what_the_likelihood_of_positions_says():
     error = (total[1:, 0] + exact.gradient * scale) / np.sqrt(np.diag(total[1:, 1:]) * 0.05**2)
     assert np.max(np.abs(error)) < 0.02
     state, _ = likelihood.profile(theta)
-    response = -np.mean(likelihood.attitude_response(state, likelihood.derivatives(theta, state)), axis=2).T * scale
-    assert np.max(np.abs(np.mean(normals.response, axis=0) - response)) < 2e-3 * np.max(np.abs(response))
-    assert np.allclose(np.mean(normals.noise, axis=0), np.mean(state.inverse, axis=2), rtol=0, atol=1e-3 * 3e-6)
+    response = (
+        -np.mean(
+            likelihood.attitude_response(state, likelihood.derivatives(theta, state)), axis=2
+        ).T
+        * scale
+    )
+    assert np.max(np.abs(np.mean(normals.response, axis=0) - response)) < 2e-3 * np.max(
+        np.abs(response)
+    )
+    assert np.allclose(
+        np.mean(normals.noise, axis=0), np.mean(state.inverse, axis=2), rtol=0, atol=1e-3 * 3e-6
+    )
 
 
 def test_three_stars_in_line_do_no_harm():
     obs = observations()
     line = dataclasses.replace(
-        obs.select(np.arange(obs.n_stars) < 3), x_px=[100.0, 400.0, 900.0], y_px=[110.0, 408.0, 905.0 + 1.0 / 3.0]
+        obs.select(np.arange(obs.n_stars) < 3),
+        x_px=[100.0, 400.0, 900.0],
+        y_px=[110.0, 408.0, 905.0 + 1.0 / 3.0],
     )
     frames = StarFrames.from_observations(line)
     normals = frame_normals(frames, "none", camera("none").theta, np.ones(3))
     assert np.isfinite(normals.grams).all()
     # Such a frame must not claim what it cannot know.
-    usual = frame_normals(StarFrames.from_observations(obs), "none", camera("none").theta, np.ones(3))
+    usual = frame_normals(
+        StarFrames.from_observations(obs), "none", camera("none").theta, np.ones(3)
+    )
     assert (np.diag(normals.grams[0])[1:] < 0.5 * np.diag(np.median(usual.grams, axis=0))[1:]).all()
     assert np.linalg.eigvalsh(normals.grams[0, 1:, 1:])[0] > -1e-12
 
@@ -153,7 +183,9 @@ def linear_frames(n_frames, m, p, seed=0):
     u = rng.normal(0.0, 10.0, p)
     slopes = rng.normal(size=(n_frames, m, p)) * np.logspace(0, -2, p)
     d = slopes @ u + 0.3 * rng.normal(size=(n_frames, m))
-    frames = StarFrames(np.zeros((2, n_frames * 5)), np.zeros((3, n_frames * 5)), None, np.arange(n_frames + 1) * 5)
+    frames = StarFrames(
+        np.zeros((2, n_frames * 5)), np.zeros((3, n_frames * 5)), None, np.arange(n_frames + 1) * 5
+    )
     frames.pixel[0] = np.repeat(np.arange(n_frames), 5)
     return slopes, d, frames
 
@@ -168,7 +200,9 @@ def use_linear(monkeypatch, slopes, d):
         shifted[:, :, 0] -= columns[k, :, 1:] @ theta
         grams = shifted.transpose(0, 2, 1) @ shifted
         n, p = len(k), len(theta)
-        return PairNormals(grams, grams, np.full(n, float(d.shape[1])), np.zeros((n, 3, p)), np.zeros((n, 3, 3)))
+        return PairNormals(
+            grams, grams, np.full(n, float(d.shape[1])), np.zeros((n, 3, p)), np.zeros((n, 3, 3))
+        )
 
     monkeypatch.setattr(recursion_module, "frame_normals", normals)
 
@@ -182,7 +216,10 @@ def test_recursive_equals_batch_in_the_linear_case(monkeypatch, forgetting):
         filtered.advance(frames)
         weights = forgetting ** (199.0 - np.arange(200))
         rows = np.concatenate(
-            [(slopes * np.sqrt(weights)[:, None, None]).reshape(-1, 5), np.eye(5) / 50.0 * forgetting**100]
+            [
+                (slopes * np.sqrt(weights)[:, None, None]).reshape(-1, 5),
+                np.eye(5) / 50.0 * forgetting**100,
+            ]
         )
         right = np.concatenate([(d * np.sqrt(weights)[:, None]).ravel(), np.zeros(5)])
         batch, misfit = np.linalg.lstsq(rows, right, rcond=None)[:2]
@@ -232,7 +269,9 @@ def plain_start():
 
 
 def batch_optimum(obs, model, start):
-    """Maximum of the likelihood with its sigmas: what a filter with the full covariance should find."""
+    """Maximum of the likelihood with its sigmas: what a filter with the full covariance should
+    find.
+    """
     likelihood = MarginalLikelihood(obs, model)
     best = levenberg_marquardt(likelihood.evaluate, start, tolerance=1e-18)
     unit = np.sqrt(np.diag(best.normal.matrix))
@@ -247,7 +286,9 @@ def filtered_theta(obs, start, **options):
 
 
 def test_frozen_frames_give_the_batch_step():
-    """Linearised at one point for good, the frames are a linear problem, and the filter its solution."""
+    """Linearised at one point for good, the frames are a linear problem, and the filter its
+    solution.
+    """
     obs = observations("none")
     frames = StarFrames.from_observations(obs)
     theta = camera("none").theta
@@ -268,7 +309,8 @@ def test_from_72_mm_it_lands_on_the_batch_answer(seed):
     assert np.max(np.abs(theta - best) / sigmas) < 0.04
     assert np.allclose(step.sigmas, sigmas, rtol=3e-3)
     assert step.sigma == pytest.approx(0.05, rel=0.03)
-    # Control: the plain filter, which linearises each frame once, keeps the error of the first ones.
+    # Control: the plain filter, which linearises each frame once, keeps the error of the first
+    # ones.
     plain, _ = filtered_theta(obs, plain_start(), iterations=1)
     assert np.max(np.abs(plain - best) / sigmas) > 0.1
 
@@ -282,7 +324,9 @@ def test_all_parameters_land_on_the_batch_answer():
 
 
 def test_the_order_of_frames_does_not_matter():
-    """Beyond linearisation: less than 0.04 sigma, although every permutation starts on other frames."""
+    """Beyond linearisation: less than 0.04 sigma, although every permutation starts on other
+    frames.
+    """
     obs = observations("none", 200)
     ids, rng = obs.frame_ids, np.random.default_rng(1)
     spread, control = [], []
@@ -330,7 +374,9 @@ CASES = [
 @pytest.mark.parametrize(("method", "options"), CASES)
 @pytest.mark.parametrize("cut", [0, 3, 40])
 def test_saved_and_resumed_equals_uninterrupted(tmp_path, method, options, cut):
-    """Bit for bit, wherever it is cut: before the first frame, while the start still waits, and in full swing."""
+    """Bit for bit, wherever it is cut: before the first frame, while the start still waits, and in
+    full swing.
+    """
     obs = observations(n_frames=60)
     frames = [obs.select_frames([k]) for k in obs.frame_ids]
     whole = RecursiveCalibration(sc.paper.paper_start(), method, RecursionOptions(**options))
@@ -345,12 +391,19 @@ def test_saved_and_resumed_equals_uninterrupted(tmp_path, method, options, cut):
         again = second.update(frame)
     assert np.array_equal(again.theta, last.theta)
     assert np.array_equal(again.covariance, last.covariance)
-    assert (again.sigma, again.chi2, again.n_frames, again.n_stars) == (last.sigma, last.chi2, 60, obs.n_stars)
+    assert (again.sigma, again.chi2, again.n_frames, again.n_stars) == (
+        last.sigma,
+        last.chi2,
+        60,
+        obs.n_stars,
+    )
     assert_same(second._recursion, whole._recursion)
     ours, theirs = second.result(throw=False), whole.result(throw=False)
     for field in dataclasses.fields(ours):
         if isinstance(getattr(ours, field.name), np.ndarray):
-            assert np.array_equal(getattr(ours, field.name), getattr(theirs, field.name)), field.name
+            assert np.array_equal(getattr(ours, field.name), getattr(theirs, field.name)), (
+                field.name
+            )
     for a, b in zip(ours.stages, theirs.stages, strict=True):
         assert np.array_equal(a.trajectory, b.trajectory)
     assert ours.provenance["data_sha256"] == theirs.provenance["data_sha256"]
@@ -384,7 +437,10 @@ def test_a_broken_or_foreign_file_is_named(tmp_path):
     data = path.read_bytes()
     for length in (0, 10, 1000, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:length])
-        with pytest.raises(RunFolderError, match=r"state\.npz: is not a saved recursive calibration, or is incomplete"):
+        with pytest.raises(
+            RunFolderError,
+            match=r"state\.npz: is not a saved recursive calibration, or is incomplete",
+        ):
             RecursiveCalibration.load(path)
     np.savez(path, a=np.zeros(3))
     with pytest.raises(RunFolderError, match=r"give a file written by RecursiveCalibration\.save"):
@@ -396,7 +452,8 @@ def test_a_broken_or_foreign_file_is_named(tmp_path):
     with pytest.raises(RunFolderError, match=r"note\.npz"):
         RecursiveCalibration.load(tmp_path / "note.npz")
     with pytest.raises(
-        RunFolderError, match=r"nowhere\.npz: cannot be read \(No such file or directory\); give a file"
+        RunFolderError,
+        match=r"nowhere\.npz: cannot be read \(No such file or directory\); give a file",
     ):
         RecursiveCalibration.load(tmp_path / "nowhere.npz")
     with pytest.raises(RunFolderError, match="does not exist"):
@@ -416,7 +473,8 @@ def test_steps_tell_estimate_and_covariance_after_every_frame():
         step = steps.update(obs.select_frames([k]))
         widths.append(step.sigmas)
         told.append(step.theta)
-    # Information only grows; the noise is estimated anew after each frame, which moves all sigmas together.
+    # Information only grows; the noise is estimated anew after each frame, which moves all sigmas
+    # together.
     covariances = np.array(widths)[5:]
     assert (covariances[-1] < 0.4 * covariances[0]).all()
     cal = steps.result()
@@ -439,7 +497,9 @@ def test_history_of_a_long_stream_is_thinned(monkeypatch):
 
 def test_data_without_noise_give_the_truth():
     obs = observations("brown", sigma_px=0.0)
-    step = RecursiveCalibration(sc.paper.paper_start(), options=RecursionOptions(parameters="all")).update(obs)
+    step = RecursiveCalibration(
+        sc.paper.paper_start(), options=RecursionOptions(parameters="all")
+    ).update(obs)
     # The start is believed a little: one part in a million of its error stays.
     assert np.allclose(step.theta[:3], camera().theta[:3], rtol=0, atol=5e-5)
     assert np.allclose(step.theta[3:], camera().theta[3:], rtol=1e-4)
@@ -497,10 +557,14 @@ def test_options_that_make_no_sense(method, options, words):
 def test_noise_must_be_stated_for_process_noise_and_the_same_way_throughout():
     obs = observations()
     with pytest.raises(CalibrationError, match="process noise needs a stated noise"):
-        RecursiveCalibration(sc.paper.paper_start(), "samaan", RecursionOptions(process_noise=0.1)).update(obs)
+        RecursiveCalibration(
+            sc.paper.paper_start(), "samaan", RecursionOptions(process_noise=0.1)
+        ).update(obs)
     stated = with_sigmas(obs)
     with pytest.raises(CalibrationError, match="leave sigma_px out"):
-        RecursiveCalibration(sc.paper.paper_start(), "griffith", RecursionOptions(sigma_px=0.1)).update(stated)
+        RecursiveCalibration(
+            sc.paper.paper_start(), "griffith", RecursionOptions(sigma_px=0.1)
+        ).update(stated)
     steps = RecursiveCalibration(sc.paper.paper_start())
     steps.update(obs)
     with pytest.raises(CalibrationError, match="some frames state the noise"):

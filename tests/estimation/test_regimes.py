@@ -1,4 +1,6 @@
-"""From narrow to wide fields, from 64 to 20,000 px: a right answer with an honest sigma, or what is left open."""
+"""From narrow to wide fields, from 64 to 20,000 px: a right answer with an honest sigma, or what is
+left open.
+"""
 
 import numpy as np
 import pytest
@@ -13,8 +15,9 @@ from starcal_uq.estimation.robust import star_scores
 from starcal_uq.observations.frames import StarFrames
 from tests.helpers.outside import Campaign, campaign
 
-# Field (deg), side (px), focal length (mm), stars a frame, frames, noise (px), focal length of the data sheet (relative
-# error), displacements at the corner over the half diagonal. In the first six the paper's stages alone go astray.
+# Field (deg), side (px), focal length (mm), stars a frame, frames, noise (px), focal length of the
+# data sheet (relative error), displacements at the corner over the half diagonal. In the first six
+# the paper's stages alone go astray.
 SENSORS = {
     "half a degree, 64 px": (0.5, 64, 150.0, 60, 40, 0.002, 0.03, (-3e-4, 2e-4)),
     "half a degree, 200 px": (0.54, 199, 159.0, 400, 8, 0.0027, -0.038, (-3e-4, -1e-3)),
@@ -49,7 +52,11 @@ def observed(name: str, seed: int, **options) -> Campaign:
     """A campaign of one of the sensors."""
     field, size, _, stars, frames, noise, _, (first, second) = SENSORS[name]
     half = size / np.sqrt(2.0)
-    own = {"corner_px": (first * half, second * half), "sigma_px": noise, "offset_px": (0.04 * size, -0.03 * size)}
+    own = {
+        "corner_px": (first * half, second * half),
+        "sigma_px": noise,
+        "offset_px": (0.04 * size, -0.03 * size),
+    }
     rng = np.random.default_rng([seed, *name.encode()])
     own |= {"n_frames": frames, "stars_per_frame": stars, "field_deg": field, "size_px": size}
     return campaign(rng, **own | options)
@@ -63,7 +70,9 @@ def sheet(c: Campaign, name: str) -> sc.Camera:
 
 
 def squared_error(cal: sc.Calibration, theta: np.ndarray, claim: float = 1.0) -> float:
-    """Squared error in units of `claim` times the stated covariance, chi-square with as many degrees as parameters."""
+    """Squared error in units of `claim` times the stated covariance, chi-square with as many
+    degrees as parameters.
+    """
     z = (cal.theta - theta) / (claim * cal.sigmas)
     return float(z @ np.linalg.solve(cal.correlation, z))
 
@@ -81,11 +90,16 @@ def test_every_sensor_is_calibrated_with_an_honest_sigma(name):
     assert cal.sigma == pytest.approx(SENSORS[name][5], rel=0.2)
 
 
-@pytest.mark.parametrize("name", ["half a degree, 20,000 px", pytest.param("sensor 14", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["half a degree, 20,000 px", pytest.param("sensor 14", marks=pytest.mark.slow)]
+)
 def test_student_t_leaves_the_minimum_that_interstar_angles_stray_into(name):
-    # Angles alone end hundreds of pixels away, in "sensor 14" at a noise six times the true one, without a word.
+    # Angles alone end hundreds of pixels away, in "sensor 14" at a noise six times the true one,
+    # without a word.
     c = observed(name, 1)
-    cal = sc.calibrate(sc.Observations(**c.columns), sheet(c, name), likelihood="student_t", model="brown")
+    cal = sc.calibrate(
+        sc.Observations(**c.columns), sheet(c, name), likelihood="student_t", model="brown"
+    )
     assert squared_error(cal, c.theta) < UNLIKELY
     assert cal.sigma < SENSORS[name][5]
 
@@ -97,7 +111,9 @@ def filtered(c, sheet):
 
 def merged(c, sheet):
     obs = sc.Observations(**c.columns)
-    return sc.estimation.merge([sc.calibrate(obs.select_frames(obs.frame_ids[i::2]), sheet) for i in range(2)])
+    return sc.estimation.merge(
+        [sc.calibrate(obs.select_frames(obs.frame_ids[i::2]), sheet) for i in range(2)]
+    )
 
 
 def with_errors_of_stars(c, sheet):
@@ -107,14 +123,27 @@ def with_errors_of_stars(c, sheet):
 @pytest.mark.parametrize(
     ("way", "name"),
     [
-        *((filtered, name) for name in ("half a degree, 200 px", "two degrees, one frame", "ninety degrees, 5 mm")),
-        *((merged, name) for name in ("half a degree, 64 px", "one degree, two frames", "ninety degrees, 10 m")),
-        *((with_errors_of_stars, name) for name in ("half a degree, 64 px", "ten degrees", "ninety degrees, 10 m")),
+        *(
+            (filtered, name)
+            for name in ("half a degree, 200 px", "two degrees, one frame", "ninety degrees, 5 mm")
+        ),
+        *(
+            (merged, name)
+            for name in ("half a degree, 64 px", "one degree, two frames", "ninety degrees, 10 m")
+        ),
+        *(
+            (with_errors_of_stars, name)
+            for name in ("half a degree, 64 px", "ten degrees", "ninety degrees, 10 m")
+        ),
     ],
 )
 def test_every_way_to_an_estimate_has_an_honest_sigma(way, name):
     _, _, _, stars, _, noise, _, _ = SENSORS[name]
-    patch = {"patch_stars": max(3 * stars, 40), "star_sigma_px": 2.0 * noise} if way is with_errors_of_stars else {}
+    patch = (
+        {"patch_stars": max(3 * stars, 40), "star_sigma_px": 2.0 * noise}
+        if way is with_errors_of_stars
+        else {}
+    )
     c = observed(name, 1, **patch)
     cal = way(c, sheet(c, name))
     assert squared_error(cal, c.theta) < UNLIKELY
@@ -132,7 +161,9 @@ def test_every_way_to_an_estimate_has_an_honest_sigma(way, name):
 )
 def test_a_filter_that_went_astray_is_sent_to_what_it_has(method, name, status):
     c = observed(name, 1)
-    with pytest.raises(CalibrationError, match="use method='efficient', which weighs all frames together") as caught:
+    with pytest.raises(
+        CalibrationError, match="use method='efficient', which weighs all frames together"
+    ) as caught:
         sc.calibrate(sc.Observations(**c.columns), sheet(c, name), method=method)
     assert caught.value.status is status
 
@@ -145,7 +176,9 @@ def test_stars_whose_noises_differ_by_a_million(name):
         return 1e-7 * size * 10.0 ** (1.5 * (magnitude - 2.0))
 
     c = observed(name, 0, sigma_px=lambda radius, magnitude, frame: noise(magnitude))
-    cal = sc.calibrate(sc.Observations(**c.columns, sigma_px=noise(c.columns["mag"])), sheet(c, name))
+    cal = sc.calibrate(
+        sc.Observations(**c.columns, sigma_px=noise(c.columns["mag"])), sheet(c, name)
+    )
     assert squared_error(cal, c.theta) < UNLIKELY
     assert cal.sigma == pytest.approx(1.0, rel=0.2)
 
@@ -177,22 +210,40 @@ def test_four_hundred_partners_find_the_wrong_stars_of_a_frame_of_thousands():
     c = campaign(np.random.default_rng(1), n_frames=1, stars_per_frame=1500, field_deg=20.0)
     wrong = np.arange(0, 1500, 3)
     c.columns["x_px"][wrong] = np.roll(c.columns["x_px"][wrong], 1)
-    scores = star_scores(StarFrames.from_observations(sc.Observations(**c.columns)), "brown", c.theta)
+    scores = star_scores(
+        StarFrames.from_observations(sc.Observations(**c.columns)), "brown", c.theta
+    )
     right = np.setdiff1d(np.arange(1500), wrong)
     assert np.max(scores[right]) < 0.2
     assert np.mean(scores[wrong] > 0.2) > 0.98
 
 
-def drawn(place, *, n_frames=40, sigma_px=0.05, size_px=1024, field_deg=15.0, corner_px=(3.0, -1.5), seed=3):
+def drawn(
+    place,
+    *,
+    n_frames=40,
+    sigma_px=0.05,
+    size_px=1024,
+    field_deg=15.0,
+    corner_px=(3.0, -1.5),
+    seed=3,
+):
     """Stars at places (2, m) px off the principal point, where an ideal camera would see them."""
     rng = np.random.default_rng(seed)
-    focal, centre = 0.5 * size_px / np.tan(np.radians(0.5 * field_deg)), np.array([[0.52 * size_px], [0.47 * size_px]])
+    focal, centre = (
+        0.5 * size_px / np.tan(np.radians(0.5 * field_deg)),
+        np.array([[0.52 * size_px], [0.47 * size_px]]),
+    )
     k = np.array(corner_px) / (size_px / np.sqrt(2.0)) ** np.array([3, 5])
     columns = {name: [] for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg")}
     for frame in range(n_frames):
         ideal = place(rng)
         r2 = np.sum(ideal**2, axis=0)
-        xy = centre + ideal * (1.0 + k[0] * r2 + k[1] * r2**2) + sigma_px * rng.standard_normal(ideal.shape)
+        xy = (
+            centre
+            + ideal * (1.0 + k[0] * r2 + k[1] * r2**2)
+            + sigma_px * rng.standard_normal(ideal.shape)
+        )
         b = np.vstack([ideal, np.full(ideal.shape[1], focal)])
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         r = np.linalg.det(turn) * turn @ b
@@ -200,9 +251,15 @@ def drawn(place, *, n_frames=40, sigma_px=0.05, size_px=1024, field_deg=15.0, co
         found += (np.degrees(np.arctan2(r[2], np.hypot(r[0], r[1]))),)
         for column, values in zip(columns.values(), found, strict=True):
             column.append(values)
-    sheet = sc.Camera(size_px, size_px, 10.0, 0.0101 * focal, 0.5 * size_px - 0.5, 0.5 * size_px - 0.5)
+    sheet = sc.Camera(
+        size_px, size_px, 10.0, 0.0101 * focal, 0.5 * size_px - 0.5, 0.5 * size_px - 0.5
+    )
     theta = np.array([*centre[:, 0], focal, *k])
-    return sc.Observations(**{name: np.concatenate(values) for name, values in columns.items()}), sheet, theta
+    return (
+        sc.Observations(**{name: np.concatenate(values) for name, values in columns.items()}),
+        sheet,
+        theta,
+    )
 
 
 def on_a_ring(rng, radius=0.4, m=12):
@@ -227,9 +284,24 @@ def in_a_corner(rng):
 
 
 LEFT_OPEN = {
-    "one radius": (on_a_ring, {}, "brown", "do not tell k1 and k2 apart: stars at more radii are needed"),
-    "one radius, without noise": (on_a_ring, {"sigma_px": 1e-7}, "brown", "stars at more radii are needed"),
-    "the middle of the field": (in_the_middle, {}, "k1", "k1.* are needed, or a distortion model with fewer"),
+    "one radius": (
+        on_a_ring,
+        {},
+        "brown",
+        "do not tell k1 and k2 apart: stars at more radii are needed",
+    ),
+    "one radius, without noise": (
+        on_a_ring,
+        {"sigma_px": 1e-7},
+        "brown",
+        "stars at more radii are needed",
+    ),
+    "the middle of the field": (
+        in_the_middle,
+        {},
+        "k1",
+        "k1.* are needed, or a distortion model with fewer",
+    ),
     "a field of half a degree, 64 px": (
         lambda rng: rng.uniform(-28.0, 28.0, (2, 10)),
         {"n_frames": 20, "size_px": 64, "field_deg": 0.5, "corner_px": (0.0, 0.0)},
@@ -239,7 +311,9 @@ LEFT_OPEN = {
 }
 
 
-@pytest.mark.parametrize("likelihood", ["marginal", pytest.param("student_t", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "likelihood", ["marginal", pytest.param("student_t", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("name", LEFT_OPEN)
 def test_what_the_data_leave_open_is_named_and_what_would_determine_it(name, likelihood):
     place, options, model, words = LEFT_OPEN[name]
@@ -252,7 +326,9 @@ def test_what_the_data_leave_open_is_named_and_what_would_determine_it(name, lik
 
 
 @pytest.mark.parametrize("place", [anywhere, on_a_line, in_a_corner])
-@pytest.mark.parametrize("likelihood", ["marginal", pytest.param("student_t", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "likelihood", ["marginal", pytest.param("student_t", marks=pytest.mark.slow)]
+)
 def test_stars_in_odd_places_that_determine_everything(place, likelihood):
     obs, sheet, theta = drawn(place)
     cal = sc.calibrate(obs, sheet, likelihood=likelihood)

@@ -1,4 +1,6 @@
-"""Two exposures of one field are no repeated measurement, however poor the fit of the campaign that they are in."""
+"""Two exposures of one field are no repeated measurement, however poor the fit of the campaign that
+they are in.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,11 @@ SIZE, FOCAL_PX, STARS = 1024, 4000.0, 25
 
 
 def folder(seed, factor, *, copied=False):
-    """Eight frames of one camera, of which frame 7 sees the field of frame 6, and two of a longer lens.
+    """Eight frames of one camera, of which frame 7 sees the field of frame 6, and two of a longer
+    lens.
 
-    Frame 7 is another exposure, or with `copied` the same one, measured again to within a tenth of the noise.
+    Frame 7 is another exposure, or with `copied` the same one, measured again to within a tenth of
+    the noise.
     """
     rng = np.random.default_rng(seed)
     sigma = np.exp(rng.uniform(np.log(0.02), np.log(0.1), (10, STARS, 1)))

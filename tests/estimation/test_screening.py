@@ -1,4 +1,6 @@
-"""Screening: wrong identifications are found, right stars survive, every rejected row is accounted for."""
+"""Screening: wrong identifications are found, right stars survive, every rejected row is accounted
+for.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,11 @@ from scipy import stats
 import starcal_uq as sc
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.screening.consensus import focal_ratio, pre_screen
-from starcal_uq.estimation.screening.outliers import star_residuals, star_threshold, truncated_variance
+from starcal_uq.estimation.screening.outliers import (
+    star_residuals,
+    star_threshold,
+    truncated_variance,
+)
 from starcal_uq.estimation.screening.result import COLUMNS, REASONS
 from starcal_uq.estimation.screening.screening import screen
 from starcal_uq.estimation.screening.tails import allowed_near, fit_tails
@@ -58,11 +64,14 @@ def with_noise(obs: sc.Observations, seed: int, sigma: object = 0.05) -> sc.Obse
     return replace(obs, x_px=obs.x_px + noise[0], y_px=obs.y_px + noise[1])
 
 
-# --- the statistics ---------------------------------------------------------------------------------------------------
+# --- the statistics
+# --------------------------------------------------------------------------------------------------
 
 
 def test_statistic_is_the_change_of_the_sum_of_squares() -> None:
-    """Against refits of attitude and camera without the star: the closed form is exact up to curvature."""
+    """Against refits of attitude and camera without the star: the closed form is exact up to
+    curvature.
+    """
     obs = scenes.observations(n_frames=12, seed=3)
     frames = StarFrames.from_observations(obs)
     theta = sc.calibrate(obs, scenes.nominal(TRUTH)).theta
@@ -74,7 +83,9 @@ def test_statistic_is_the_change_of_the_sum_of_squares() -> None:
         for _ in range(3):
             normal = likelihood.evaluate(at)
             scale = 1.0 / np.sqrt(np.diag(normal.matrix))
-            at = at - scale * np.linalg.solve(normal.matrix * np.outer(scale, scale), scale * normal.gradient)
+            at = at - scale * np.linalg.solve(
+                normal.matrix * np.outer(scale, scale), scale * normal.gradient
+            )
         return likelihood.evaluate(at).cost, at
 
     whole = best(everything)[0]
@@ -96,7 +107,9 @@ def test_statistic_follows_its_distribution_and_raw_residuals_do_not() -> None:
     for seed in range(60):
         obs = with_noise(base, seed)
         cal = sc.calibrate(obs, scenes.nominal(TRUTH))
-        found = star_residuals(StarFrames.from_observations(obs), "brown", cal.theta, np.ones(len(obs), dtype=bool))
+        found = star_residuals(
+            StarFrames.from_observations(obs), "brown", cal.theta, np.ones(len(obs), dtype=bool)
+        )
         statistic, dof = found.studentised()
         # One star per frame: those of a frame are not independent.
         one = obs.frame_starts[:-1]
@@ -113,20 +126,25 @@ def test_taste_follows_its_distribution() -> None:
     for seed in range(20):
         obs = with_noise(base, seed)
         cal = sc.calibrate(obs, scenes.nominal(TRUTH))
-        found = star_residuals(StarFrames.from_observations(obs), "brown", cal.theta, np.ones(len(obs), dtype=bool))
+        found = star_residuals(
+            StarFrames.from_observations(obs), "brown", cal.theta, np.ones(len(obs), dtype=bool)
+        )
         p_values.append(found.taste()[1])
     assert stats.kstest(np.concatenate(p_values), "uniform").pvalue > 0.01
 
 
 def test_thresholds_are_those_of_scipy() -> None:
     for p_value, dof in ((0.01, 20.0), (1e-5, 800.0), (1e-6, 3e4)):
-        assert star_threshold(p_value, dof) == pytest.approx(2.0 * stats.f.isf(p_value, 2, dof), rel=1e-8)
+        assert star_threshold(p_value, dof) == pytest.approx(
+            2.0 * stats.f.isf(p_value, 2, dof), rel=1e-8
+        )
     cut = stats.chi2.isf(0.05, 2)
     mean = stats.chi2(2).expect(lambda x: x, lb=0.0, ub=cut, conditional=True)
     assert truncated_variance(0.05) == pytest.approx(mean / 2.0, rel=1e-6)
 
 
-# --- before any calibration -------------------------------------------------------------------------------------------
+# --- before any calibration
+# -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("focal", [0.9, 0.97, 1.03, 1.1])
@@ -140,7 +158,10 @@ def test_pre_screen_with_an_uncalibrated_camera(focal: float) -> None:
         agree, _ = pre_screen(nominal, frames)
         assert not np.any(~agree & ~dirty.wrong)
         missed = dirty.wrong & agree
-        distance = np.linalg.norm(dirty.observations.directions_icrs - obs.directions_icrs, axis=1) * TRUTH.focal_px
+        distance = (
+            np.linalg.norm(dirty.observations.directions_icrs - obs.directions_icrs, axis=1)
+            * TRUTH.focal_px
+        )
         # Only neighbours nearer than what an uncalibrated camera can tell.
         assert np.all(distance[missed] < 4.0)
 
@@ -169,11 +190,17 @@ def test_half_of_a_frame_wrong_and_a_frame_beyond_help() -> None:
     found = screen(replace(obs, ra_deg=ra), uncalibrated())
     assert np.array_equal(~found.kept, wrong)
     assert found.dropped_frames.tolist() == [obs.frame_ids[5]]
-    assert set(found.rejected["reason"][found.rejected["frame"] == obs.frame_ids[5]]) == {"frame_dropped"}
-    assert set(found.rejected["reason"][found.rejected["frame"] == obs.frame_ids[2]]) <= {"elsewhere", "displaced"}
+    assert set(found.rejected["reason"][found.rejected["frame"] == obs.frame_ids[5]]) == {
+        "frame_dropped"
+    }
+    assert set(found.rejected["reason"][found.rejected["frame"] == obs.frame_ids[2]]) <= {
+        "elsewhere",
+        "displaced",
+    }
 
 
-# --- what is reported -------------------------------------------------------------------------------------------------
+# --- what is reported
+# -------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +224,9 @@ def test_every_rejected_row_is_listed_with_its_reason(dirty, found) -> None:
     assert np.all(table["statistic"] > table["threshold"])
     # The residual is the distance between the right star and the one it was taken for.
     truth = scenes.observations().directions_icrs[rows]
-    distance = np.linalg.norm(truth - dirty.observations.directions_icrs[rows], axis=1) * TRUTH.focal_px
+    distance = (
+        np.linalg.norm(truth - dirty.observations.directions_icrs[rows], axis=1) * TRUTH.focal_px
+    )
     assert np.allclose(table["residual_px"], distance, rtol=0.02, atol=0.3)
     assert sum(found.counts.values()) == found.n_rejected == len(rows)
     assert len(found.observations) + found.n_rejected == len(dirty.observations)
@@ -271,7 +300,9 @@ def test_a_single_frame() -> None:
     obs = scenes.observations("none").select_frames([5])
     nominal = uncalibrated(scenes.camera("none"))
     assert screen(obs, nominal).kept.all()
-    found = screen(replace(obs, ra_deg=np.where(np.arange(len(obs)) == 3, 10.0, obs.ra_deg)), nominal)
+    found = screen(
+        replace(obs, ra_deg=np.where(np.arange(len(obs)) == 3, 10.0, obs.ra_deg)), nominal
+    )
     assert found.rejected["row"].tolist() == [3]
 
 
@@ -283,10 +314,18 @@ def test_nothing_right_is_said() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"significance": 0.0}, {"significance": 0.1, "control": "star"}, {"control": "row"}, {"max_rounds": 0}]
+    "options",
+    [
+        {"significance": 0.0},
+        {"significance": 0.1, "control": "star"},
+        {"control": "row"},
+        {"max_rounds": 0},
+    ],
 )
 def test_options_that_make_no_sense(options) -> None:
-    with pytest.raises(ValueError, match=next(iter(options)) if len(options) == 1 else "significance"):
+    with pytest.raises(
+        ValueError, match=next(iter(options)) if len(options) == 1 else "significance"
+    ):
         screen(scenes.observations(), TRUTH, **options)
 
 
@@ -306,7 +345,9 @@ def test_heavy_tails_are_not_called_wrong_stars() -> None:
 
 
 def poor_camera(seed: int, *, share_wrong: float = 0.0, tails: bool = True, bend_px: float = 2.0):
-    """Ten frames whose centroids are of very unequal noise, through a lens with a bend that no model here has."""
+    """Ten frames whose centroids are of very unequal noise, through a lens with a bend that no
+    model here has.
+    """
     rng = np.random.default_rng(seed)
     by_frame = np.exp(0.4 * rng.standard_normal(10)) if tails else np.ones(10)
 
@@ -316,11 +357,18 @@ def poor_camera(seed: int, *, share_wrong: float = 0.0, tails: bool = True, bend
         sigma = 0.1 * by_frame[frame] * np.exp(tails * rng.standard_normal(d.shape[1]))
         return bend + sigma * rng.standard_normal(d.shape)
 
-    c = campaign(rng, n_frames=10, stars_per_frame=40, field_deg=20.0, sigma_px=0.0, displaced=displaced)
+    c = campaign(
+        rng, n_frames=10, stars_per_frame=40, field_deg=20.0, sigma_px=0.0, displaced=displaced
+    )
     wrong = rng.random(len(c.columns["frame"])) < share_wrong
     for name in ("x_px", "y_px"):
         c.columns[name] = np.where(wrong, rng.uniform(0.0, 1023.0, len(wrong)), c.columns[name])
-    return c, sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), wrong
+    return (
+        c,
+        sc.Observations(**c.columns),
+        sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)),
+        wrong,
+    )
 
 
 def test_screening_does_not_hurt_where_the_model_is_wrong() -> None:
@@ -335,7 +383,9 @@ def test_screening_does_not_hurt_where_the_model_is_wrong() -> None:
 
 
 def test_a_lens_without_its_model_is_no_tail() -> None:
-    """Student's tails put f 6.6 and 4.4 sigma off here; the control has the tails without the bend."""
+    """Student's tails put f 6.6 and 4.4 sigma off here; the control has the tails without the
+    bend.
+    """
     for seed in (0, 1):
         c, obs, camera, _ = poor_camera(seed, bend_px=5.0)
         found = screen(obs, camera)
@@ -373,7 +423,8 @@ def test_a_t_is_fitted_to_what_hangs_together() -> None:
 
 def test_how_many_stars_may_be_just_beyond_the_limit() -> None:
     rng = np.random.default_rng(1)
-    # Wrong stars anywhere within 60 px, at a noise of 0.3 px: 14 of 4000 are near, and are allowed for.
+    # Wrong stars anywhere within 60 px, at a noise of 0.3 px: 14 of 4000 are near, and are allowed
+    # for.
     wrong = rng.uniform(20.0, 40_000.0, 4000)
     near, allowed = allowed_near(wrong, np.full(4000, 20.0), 0.05)
     assert 0 < near <= allowed < 30
@@ -384,18 +435,25 @@ def test_how_many_stars_may_be_just_beyond_the_limit() -> None:
 
 
 def test_a_poor_model_is_not_hidden_by_screening() -> None:
-    """Right stars at the edge, rejected for a distortion that the model lacks, raise a warning; inner ones do not."""
+    """Right stars at the edge, rejected for a distortion that the model lacks, raise a warning;
+    inner ones do not.
+    """
     from starcal_uq.estimation.screening.result import warnings_about
 
     obs = scenes.observations()
     radius = np.hypot(obs.x_px - TRUTH.x0_px, obs.y_px - TRUTH.y0_px)
-    for rows, expected in ((np.argsort(radius)[-12:], True), (np.arange(0, len(obs), len(obs) // 12), False)):
+    for rows, expected in (
+        (np.argsort(radius)[-12:], True),
+        (np.arange(0, len(obs), len(obs) // 12), False),
+    ):
         kept = np.ones(len(obs), dtype=bool)
         kept[rows] = False
         base = screen(obs, uncalibrated())
         import pandas as pd
 
-        table = pd.DataFrame({"row": rows, "reason": "displaced", "statistic": 1e4, "threshold": 20.0})
+        table = pd.DataFrame(
+            {"row": rows, "reason": "displaced", "statistic": 1e4, "threshold": 20.0}
+        )
         texts = warnings_about(obs, base.calibration.camera, kept, table)
         assert any("distortion model" in text for text in texts) == expected
 
@@ -412,22 +470,28 @@ def test_per_star_noise_is_respected() -> None:
     assert found.rejected["row"].tolist() == [moved]
     assert found.calibration.sigma_name == "sigma_scale"
     assert found.calibration.sigma == pytest.approx(1.0, abs=0.05)
-    # The control: without the stated noise, the noisy stars are tails that one noise does not explain.
+    # The control: without the stated noise, the noisy stars are tails that one noise does not
+    # explain.
     assert screen(replace(obs, x_px=x, sigma_px=None), uncalibrated()).model_is_wrong
 
 
 def test_a_thousand_frames_are_fast() -> None:
-    """Some ten calibrations of clean stars: three, the search for frames that agree, and every star left out once."""
+    """Some ten calibrations of clean stars: three, the search for frames that agree, and every star
+    left out once.
+    """
     obs = scenes.observations(n_frames=1000, seed=1)
     dirty = contaminate(obs, deep_catalogue(), TRUTH, 0.1, "neighbour", seed=1)
     screen(dirty.observations.select_frames(np.arange(20)), uncalibrated())
     ratio = times_as_long(
-        lambda: screen(dirty.observations, uncalibrated()), lambda: sc.calibrate(obs, uncalibrated()), repeats=2
+        lambda: screen(dirty.observations, uncalibrated()),
+        lambda: sc.calibrate(obs, uncalibrated()),
+        repeats=2,
     )
     assert ratio < 16.0
 
 
-# --- contamination ----------------------------------------------------------------------------------------------------
+# --- contamination
+# --------------------------------------------------------------------------------------------------
 
 
 def test_contamination_is_what_it_says() -> None:
@@ -452,17 +516,21 @@ def test_contamination_is_what_it_says() -> None:
         contaminate(obs, deep_catalogue(), TRUTH, 0.1, "other")
 
 
-# --- real stars -------------------------------------------------------------------------------------------------------
+# --- real stars
+# --------------------------------------------------------------------------------------------------
 
 
 def test_real_stars(real_data) -> None:
     camera = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
     path = real_data / "esa_tetra3_observations.csv"
-    obs = sc.load_observations(path, camera, columns={"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"})
+    obs = sc.load_observations(
+        path, camera, columns={"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
+    )
     with path.open() as stream:
         snr = np.array([float(row["snr"]) for row in csv.DictReader(stream)])
     everything = screen(obs, camera)
-    # A hundredth is just beyond the limit, faint stars: their noise differs, they are not other stars.
+    # A hundredth is just beyond the limit, faint stars: their noise differs, they are not other
+    # stars.
     assert everything.model_is_wrong and everything.n_rejected == 0
     # With noise that grows as 1 / SNR stated, hardly any.
     assert screen(replace(obs, sigma_px=np.hypot(0.06, 0.6 / snr)), camera).n_rejected <= 2
@@ -480,34 +548,49 @@ def test_real_stars(real_data) -> None:
     )
 
 
-# --- long runs --------------------------------------------------------------------------------------------------------
+# --- long runs
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("control", "significance"), [("table", 0.2), ("star", 0.01), ("star", 0.001)])
+@pytest.mark.parametrize(
+    ("control", "significance"), [("table", 0.2), ("star", 0.01), ("star", 0.001)]
+)
 @pytest.mark.parametrize("stated", [False, True])
 def test_false_rejections_on_clean_data(control: str, significance: float, stated: bool) -> None:
     base = noise_free()
-    sigma = np.random.default_rng(9).uniform(0.02, 0.3, len(base)) if stated else np.full(len(base), 0.05)
+    sigma = (
+        np.random.default_rng(9).uniform(0.02, 0.3, len(base))
+        if stated
+        else np.full(len(base), 0.05)
+    )
     if stated:
         base = replace(base, sigma_px=sigma)
     replicates = 150 if control == "table" else 40
     rejected = np.array(
         [
             screen(
-                with_noise(base, 100 + seed, sigma), uncalibrated(), significance=significance, control=control
+                with_noise(base, 100 + seed, sigma),
+                uncalibrated(),
+                significance=significance,
+                control=control,
             ).n_rejected
             for seed in range(replicates)
         ]
     )
-    # Independent tests would give the stated rate; stars and frames that overlap give less, but not half.
+    # Independent tests would give the stated rate; stars and frames that overlap give less, but not
+    # half.
     if control == "table":
         expected = significance * replicates
         assert stats.binom.cdf(np.count_nonzero(rejected), replicates, 0.4 * significance) > 1e-3
         assert stats.binom.sf(np.count_nonzero(rejected) - 1, replicates, significance) > 1e-3
     else:
         expected = significance * replicates * len(base)
-        assert 0.6 * expected - 4 * np.sqrt(expected) < rejected.sum() < expected + 4 * np.sqrt(expected)
+        assert (
+            0.6 * expected - 4 * np.sqrt(expected)
+            < rejected.sum()
+            < expected + 4 * np.sqrt(expected)
+        )
 
 
 @pytest.mark.slow
@@ -546,6 +629,7 @@ def test_estimate_and_coverage_with_wrong_identifications(kind: str, fraction: f
             except sc.errors.CalibrationError:
                 z_control.append(np.full(5, np.inf))
     assert np.all(np.mean(shift, axis=0) < 0.5)
-    # 300 intervals, five of a replicate being dependent: 92 % less two standard errors of 120 independent ones.
+    # 300 intervals, five of a replicate being dependent: 92 % less two standard errors of 120
+    # independent ones.
     assert np.mean(np.abs(z) < 1.96) > 0.92 - 2 * np.sqrt(0.95 * 0.05 / 120)
     assert np.median(np.mean(z_control, axis=1)) > 3.0

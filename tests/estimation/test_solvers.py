@@ -1,4 +1,6 @@
-"""Solvers against NIST's Statistical Reference Datasets for nonlinear regression, and on the edges of their status."""
+"""Solvers against NIST's Statistical Reference Datasets for nonlinear regression, and on the edges
+of their status.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +11,41 @@ from starcal_uq.core.status import Status
 from starcal_uq.estimation.ipopt import ipopt
 from starcal_uq.estimation.solvers import Constraints, Last, Normal, levenberg_marquardt, minpack
 
-# Data, starts and certified values: NIST StRD, https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml
+# Data, starts and certified values: NIST StRD,
+# https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml
 MISRA1A = (
-    [77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8, 593.1, 689.1, 760.0],
-    [10.07, 14.73, 17.94, 23.93, 29.61, 35.18, 40.02, 44.82, 50.76, 55.05, 61.01, 66.40, 75.47, 81.78],
+    [
+        77.6,
+        114.9,
+        141.1,
+        190.8,
+        239.9,
+        289.0,
+        332.8,
+        378.4,
+        434.8,
+        477.3,
+        536.8,
+        593.1,
+        689.1,
+        760.0,
+    ],
+    [
+        10.07,
+        14.73,
+        17.94,
+        23.93,
+        29.61,
+        35.18,
+        40.02,
+        44.82,
+        50.76,
+        55.05,
+        61.01,
+        66.40,
+        75.47,
+        81.78,
+    ],
 )
 BOXBOD = ([1.0, 2.0, 3.0, 5.0, 7.0, 10.0], [109.0, 149.0, 149.0, 191.0, 213.0, 224.0])
 MGH09 = (
@@ -118,16 +151,26 @@ def test_start_that_is_not_finite_is_named():
 
 def test_iteration_limit_is_named():
     evaluate = _normal(_saturation(MISRA1A))
-    assert levenberg_marquardt(evaluate, np.array([500.0, 1e-4]), max_iterations=2).status is Status.MAX_ITERATIONS
+    assert (
+        levenberg_marquardt(evaluate, np.array([500.0, 1e-4]), max_iterations=2).status
+        is Status.MAX_ITERATIONS
+    )
 
 
 def test_last_step_is_taken_unseen_or_left():
     evaluate, start = _normal(_saturation(MISRA1A)), np.array([250.0, 5e-4])
-    seen, unseen, left = (levenberg_marquardt(evaluate, start, tolerance=1e-8, last=x) for x in Last.__args__)
+    seen, unseen, left = (
+        levenberg_marquardt(evaluate, start, tolerance=1e-8, last=x) for x in Last.__args__
+    )
     assert (unseen.status, left.status) == (Status.CONVERGED, Status.CONVERGED)
     assert unseen.evaluations == left.evaluations == seen.evaluations - 1
-    assert np.array_equal(unseen.theta, seen.theta) and np.array_equal(left.theta, seen.trajectory[-2])
-    assert unseen.costs[-1] == pytest.approx(seen.costs[-1], rel=1e-10) and unseen.normal.cost == left.normal.cost
+    assert np.array_equal(unseen.theta, seen.theta) and np.array_equal(
+        left.theta, seen.trajectory[-2]
+    )
+    assert (
+        unseen.costs[-1] == pytest.approx(seen.costs[-1], rel=1e-10)
+        and unseen.normal.cost == left.normal.cost
+    )
 
 
 def test_exact_fit_converges():

@@ -1,4 +1,6 @@
-"""Errors of the stars in the covariance: the algebra against dense matrices, the estimate against its truth."""
+"""Errors of the stars in the covariance: the algebra against dense matrices, the estimate against
+its truth.
+"""
 
 from __future__ import annotations
 
@@ -29,19 +31,25 @@ def made():
 
 
 def dense(obs, cal, model, ratio):
-    """Residuals (2 N,) and their weight W (2 N, 2 N) in units of sigma^-2, attitudes integrated out, as written."""
+    """Residuals (2 N,) and their weight W (2 N, 2 N) in units of sigma^-2, attitudes integrated
+    out, as written.
+    """
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
     state, _ = likelihood.profile(cal.theta, quaternion_to_rotation(cal.quaternions))
     n, s = obs.n_stars, len(model.images)
     z, a = np.zeros((2, n, 2 * s)), np.zeros((2, n, 3 * obs.n_frames))
     frame = np.searchsorted(obs.frame_ids, obs.frame)
-    # Derivatives by finite turns of the directions and of the camera, without the columns under test.
+    # Derivatives by finite turns of the directions and of the camera, without the columns under
+    # test.
     axes = model.sums().axes
     for i in range(2):
         step = 1e-7
         turned = np.einsum("nij,jn->in", state.rotations[frame], axes[i])
         z[:, np.arange(n), 2 * model.numbers + i] = (
-            (sc.camera.project(cal.camera, (state.b + step * turned).T).T - sc.camera.project(cal.camera, state.b.T).T)
+            (
+                sc.camera.project(cal.camera, (state.b + step * turned).T).T
+                - sc.camera.project(cal.camera, state.b.T).T
+            )
             / step
             / model.focal_px
         )
@@ -110,14 +118,27 @@ def test_without_errors_nothing_changes():
 
 def test_compressed_and_exact_agree_and_the_record_is_kept(made, tmp_path):
     _, obs, _, _, cal = made
-    exact = StarLikelihood(obs, "brown", cal.theta, quaternion_to_rotation(cal.quaternions), cal.star_errors, cal.sigma)
+    exact = StarLikelihood(
+        obs, "brown", cal.theta, quaternion_to_rotation(cal.quaternions), cal.star_errors, cal.sigma
+    )
     rng = np.random.default_rng(0)
-    theta = cal.theta + rng.standard_normal((12, 5)) @ np.linalg.cholesky(cal.correlation).T * cal.sigmas
-    difference = [exact.log_likelihood(t, 0.05) for t in theta] - cal.compressed.log_likelihood(theta, 0.05)
+    theta = (
+        cal.theta
+        + rng.standard_normal((12, 5)) @ np.linalg.cholesky(cal.correlation).T * cal.sigmas
+    )
+    difference = [exact.log_likelihood(t, 0.05) for t in theta] - cal.compressed.log_likelihood(
+        theta, 0.05
+    )
     assert np.ptp(difference) < 0.02
     # The control: the likelihood that knows of no stars.
     plain = MarginalLikelihood(obs, "brown")
-    assert np.ptp([plain.log_likelihood(t, 0.05) for t in theta] - cal.compressed.log_likelihood(theta, 0.05)) > 1.0
+    assert (
+        np.ptp(
+            [plain.log_likelihood(t, 0.05) for t in theta]
+            - cal.compressed.log_likelihood(theta, 0.05)
+        )
+        > 1.0
+    )
     cal.save(tmp_path / "calibration.json")
     assert sc.Calibration.load(tmp_path / "calibration.json").star_errors == cal.star_errors
 
@@ -148,7 +169,10 @@ def test_what_cannot_be_is_refused(made):
 
 def test_other_models_are_compared_on_equal_terms(made):
     _, obs, _, plain, cal = made
-    moves = [sc.diagnostics.compare_models(obs, one, ("brown3",)).of("brown3").common_arcsec for one in (plain, cal)]
+    moves = [
+        sc.diagnostics.compare_models(obs, one, ("brown3",)).of("brown3").common_arcsec
+        for one in (plain, cal)
+    ]
     assert moves[1] == pytest.approx(moves[0], abs=0.05)
 
 

@@ -1,4 +1,6 @@
-"""Heavy tails: the likelihood itself, the start that wrong stars do not spoil, the estimate and its posterior."""
+"""Heavy tails: the likelihood itself, the start that wrong stars do not spoil, the estimate and its
+posterior.
+"""
 
 from __future__ import annotations
 
@@ -34,8 +36,12 @@ from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 60, "n_burn": 10, "seed": 3}
 
 
-def spoil(obs: Observations, share: float, kind: str = "random", seed: int = 0) -> tuple[Observations, np.ndarray]:
-    """Give some stars the direction of any star of the catalogue, or one within 60 px; also which."""
+def spoil(
+    obs: Observations, share: float, kind: str = "random", seed: int = 0
+) -> tuple[Observations, np.ndarray]:
+    """Give some stars the direction of any star of the catalogue, or one within 60 px; also
+    which.
+    """
     rng = np.random.default_rng(seed)
     wrong = np.sort(rng.choice(obs.n_stars, round(share * obs.n_stars), replace=False))
     ra, dec = obs.ra_deg.copy(), obs.dec_deg.copy()
@@ -54,7 +60,9 @@ def spoil(obs: Observations, share: float, kind: str = "random", seed: int = 0) 
 def student(obs: Observations, model: str = "brown") -> StudentLikelihood:
     frames = StarFrames.from_observations(obs)
     theta = camera(model).theta
-    return StudentLikelihood(frames, model, theta, MarginalLikelihood(frames, model).start_rotations(theta))
+    return StudentLikelihood(
+        frames, model, theta, MarginalLikelihood(frames, model).start_rotations(theta)
+    )
 
 
 @pytest.mark.parametrize("stated", [False, True])
@@ -65,7 +73,9 @@ def test_many_degrees_of_freedom_are_the_gaussian(stated: bool) -> None:
     theta, sigma = camera().theta, 1.1 if stated else 0.055
     for shift in (0.0, 0.5):
         at = theta + np.array([shift, -shift, 0.1 * shift, 0.0, 0.0])
-        assert heavy.log_likelihood(at, sigma, 1e9) == pytest.approx(exact.log_likelihood(at, sigma), abs=1e-3)
+        assert heavy.log_likelihood(at, sigma, 1e9) == pytest.approx(
+            exact.log_likelihood(at, sigma), abs=1e-3
+        )
     # The control: at four degrees of freedom it is another likelihood.
     assert abs(heavy.log_likelihood(theta, sigma, 4.0) - exact.log_likelihood(theta, sigma)) > 5.0
 
@@ -82,16 +92,24 @@ def test_attitudes_are_integrated_out() -> None:
         state = heavy.state(cam.theta, sigma, nu)
         # Standard deviations along the principal axes of the attitude's covariance.
         axes = np.linalg.cholesky(state.inverse[..., 0] * sigma**2)
-        phi = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1).reshape(-1, 3) @ axes.T
+        phi = (
+            np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1).reshape(-1, 3) @ axes.T
+        )
         total = 0.0
         for part in np.array_split(phi, 40):
-            b = np.einsum("gij,nj->gni", exp_rotation(part) @ state.rotations[0], obs.directions_icrs)
+            b = np.einsum(
+                "gij,nj->gni", exp_rotation(part) @ state.rotations[0], obs.directions_icrs
+            )
             xy = project(cam, b.reshape(-1, 3)).reshape(len(part), -1, 2)
             square = np.sum((obs.xy - xy) ** 2, axis=2) / sigma**2
-            total += float(np.sum(np.exp(-0.5 * (nu + 2.0) * np.sum(np.log1p(square / nu), axis=1))))
+            total += float(
+                np.sum(np.exp(-0.5 * (nu + 2.0) * np.sum(np.log1p(square / nu), axis=1)))
+            )
         volume = np.linalg.det(axes) * (grid[1] - grid[0]) ** 3 / (2.0 * np.pi) ** 1.5
         values.append(
-            np.log(total * volume) - 2.0 * obs.n_stars * np.log(sigma) - heavy.log_likelihood(cam.theta, sigma, nu)
+            np.log(total * volume)
+            - 2.0 * obs.n_stars * np.log(sigma)
+            - heavy.log_likelihood(cam.theta, sigma, nu)
         )
     assert np.max(np.abs(values)) < 0.1
 
@@ -108,7 +126,10 @@ def test_score_and_information_are_the_derivatives(model: str) -> None:
     state = heavy.state(at, sigma, nu)
     score = heavy.information(at, state, sigma).score * sd
     mixed = np.array(
-        [heavy.information(at + 0.01 * e, heavy.state(at + 0.01 * e, sigma, nu), sigma).score for e in np.diag(sd)]
+        [
+            heavy.information(at + 0.01 * e, heavy.state(at + 0.01 * e, sigma, nu), sigma).score
+            for e in np.diag(sd)
+        ]
     )
 
     def without_volume(point: np.ndarray) -> float:
@@ -118,8 +139,12 @@ def test_score_and_information_are_the_derivatives(model: str) -> None:
 
     noise = heavy.information(at, state, sigma).attitude_noise
     assert np.allclose(noise, np.mean(state.inverse, axis=2) * sigma**2, rtol=1e-12, atol=0.0)
-    assert state.log_volume == pytest.approx(0.5 * np.sum(np.linalg.slogdet(np.moveaxis(state.inverse, 2, 0))[1]))
-    slope = [(without_volume(at + 0.05 * e) - without_volume(at - 0.05 * e)) / 0.1 for e in np.diag(sd)]
+    assert state.log_volume == pytest.approx(
+        0.5 * np.sum(np.linalg.slogdet(np.moveaxis(state.inverse, 2, 0))[1])
+    )
+    slope = [
+        (without_volume(at + 0.05 * e) - without_volume(at - 0.05 * e)) / 0.1 for e in np.diag(sd)
+    ]
     assert np.max(np.abs(score - slope)) < 0.01
     assert np.max(np.abs(score)) > 0.3
     information = heavy.information(at, state, sigma).matrix * np.outer(sd, sd)
@@ -164,7 +189,9 @@ def test_subset_keeps_whole_frames() -> None:
     assert used.n_frames == 19
     assert used.n_stars == frames.n_stars - frames.sizes[0] - 1
     assert used.weight is not None
-    assert np.array_equal(used.pixel[:, : used.starts[1]], frames.pixel[:, frames.starts[1] : frames.starts[2]])
+    assert np.array_equal(
+        used.pixel[:, : used.starts[1]], frames.pixel[:, frames.starts[1] : frames.starts[2]]
+    )
 
 
 @pytest.mark.parametrize("model", ["brown", "none", "brown_tangential", "inverse"])
@@ -176,7 +203,8 @@ def test_robust_estimate_of_every_model(model: str) -> None:
     cal = calibrate(obs, nominal(truth), likelihood="student_t")
     assert cal.status.ok
     assert [stage.name for stage in cal.stages][-1] == "refinement"
-    # Of right stars the two make different use, so that they differ by less than a sigma or two of either.
+    # Of right stars the two make different use, so that they differ by less than a sigma or two of
+    # either.
     assert np.max(np.abs(cal.theta - reference.theta) / reference.sigmas) < 2.0
     assert np.all((cal.sigmas / reference.sigmas > 0.9) & (cal.sigmas / reference.sigmas < 1.6))
     assert cal.provenance["settings"]["likelihood"] == "student_t"
@@ -190,7 +218,9 @@ def test_robust_estimate_of_every_model(model: str) -> None:
 def test_free_degrees_of_freedom_tell_clean_data_from_spoilt() -> None:
     clean = observations(n_frames=60)
     dofs = [
-        calibrate(o, nominal(camera()), likelihood="student_t", dof="free").provenance["student_t"]["dof"]
+        calibrate(o, nominal(camera()), likelihood="student_t", dof="free").provenance["student_t"][
+            "dof"
+        ]
         for o in (clean, spoil(clean, 0.05, "neighbour")[0])
     ]
     assert dofs[0] > 20.0
@@ -218,7 +248,10 @@ def test_robust_estimate_saves_itself(tmp_path: Path) -> None:
         ({"likelihood": "student_t", "dof": 0.1}, "from 2 to 200"),
         ({"likelihood": "student_t", "dof": "many"}, "'free'"),
         ({"dof": 4.0}, "dof=4.0 needs likelihood='student_t', and likelihood is 'marginal'"),
-        ({"likelihood": "student_t", "method": "three_stage"}, "likelihood='student_t' needs method='efficient'"),
+        (
+            {"likelihood": "student_t", "method": "three_stage"},
+            "likelihood='student_t' needs method='efficient'",
+        ),
     ],
 )
 def test_settings_without_meaning_are_refused(options: dict[str, Any], match: str) -> None:
@@ -253,7 +286,10 @@ def test_sampling_with_given_degrees_of_freedom(spoilt: tuple[Any, Any]) -> None
     assert np.max(np.abs(post.mean - cal.theta) / cal.sigmas) < 0.2
     assert post.sigma_draws.mean() == pytest.approx(cal.sigma, rel=0.02)
     short = {**QUICK, "n_walkers": 12, "n_steps": 8, "n_burn": 2}
-    both = [sample(obs, cal, **short, likelihood="student_t", evaluation=name) for name in ("compressed", "exact")]
+    both = [
+        sample(obs, cal, **short, likelihood="student_t", evaluation=name)
+        for name in ("compressed", "exact")
+    ]
     assert both[1].diagnostics.likelihood_used == "exact"
     assert np.max(np.abs(both[0].mean - both[1].mean) / cal.sigmas) < 0.1
 
@@ -293,9 +329,13 @@ def test_student_t_from_a_gaussian_calibration() -> None:
 
 @pytest.fixture(scope="module")
 def esa() -> tuple[Any, Any]:
-    """Real frames of 24 to 92 stars, some with wrong ones and with more than one attitude that is a maximum."""
+    """Real frames of 24 to 92 stars, some with wrong ones and with more than one attitude that is a
+    maximum.
+    """
     example = example_data("esa")
-    return example.observations, calibrate(example.observations, example.camera, likelihood="student_t")
+    return example.observations, calibrate(
+        example.observations, example.camera, likelihood="student_t"
+    )
 
 
 def test_the_exact_likelihood_does_not_jump_between_attitudes(esa: tuple[Any, Any]) -> None:
@@ -314,7 +354,8 @@ def test_points_together_are_as_alone(esa: tuple[Any, Any]) -> None:
     obs, cal = esa
     start, rng = quaternion_to_rotation(cal.quaternions), np.random.default_rng(4)
     heavy = StudentLikelihood(StarFrames.from_observations(obs), "brown", cal.theta, start)
-    # Far and near, so that searches end after different numbers of steps; and more stars than go together.
+    # Far and near, so that searches end after different numbers of steps; and more stars than go
+    # together.
     theta = cal.theta + rng.choice([0.01, 3.0], (30, 1)) * cal.sigmas * rng.standard_normal((30, 5))
     sigma, nu = cal.sigma * rng.uniform(0.7, 1.5, 30), rng.uniform(2.5, 20.0, 30)
     alone = [heavy.log_likelihood(*at) for at in zip(theta, sigma, nu, strict=True)]
@@ -323,7 +364,9 @@ def test_points_together_are_as_alone(esa: tuple[Any, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_a_polynomial_for_few_stars_gives_the_draws_of_the_exact_likelihood(esa: tuple[Any, Any]) -> None:
+def test_a_polynomial_for_few_stars_gives_the_draws_of_the_exact_likelihood(
+    esa: tuple[Any, Any],
+) -> None:
     obs, cal = esa
     long: dict[str, Any] = {"n_walkers": 32, "n_steps": 100, "seed": 3, "likelihood": "student_t"}
     fast, exact = (sample(obs, cal, **long, evaluation=e) for e in ("auto", "exact"))
@@ -331,7 +374,9 @@ def test_a_polynomial_for_few_stars_gives_the_draws_of_the_exact_likelihood(esa:
     assert exact.diagnostics.likelihood_used == "exact" and exact.diagnostics.ok
 
     def apart(post: Any) -> float:
-        return float(np.max(np.abs(np.quantile(post.draws, [0.05, 0.5, 0.95], axis=0) - middle) / exact.sd))
+        return float(
+            np.max(np.abs(np.quantile(post.draws, [0.05, 0.5, 0.95], axis=0) - middle) / exact.sd)
+        )
 
     middle = np.quantile(exact.draws, [0.05, 0.5, 0.95], axis=0)
     # Quantiles of 10,000 effective draws differ by 0.03 sigma at the outer ones.
@@ -354,7 +399,8 @@ def test_wrong_identifications_do_not_move_the_estimate(kind: str) -> None:
         likelihood = MarginalLikelihood(obs, "brown")
         normal = likelihood.evaluate(truth.theta)
         step = np.linalg.solve(
-            normal.matrix * np.outer(reference.sigmas, reference.sigmas), normal.gradient * reference.sigmas
+            normal.matrix * np.outer(reference.sigmas, reference.sigmas),
+            normal.gradient * reference.sigmas,
         )
         # One Gauss-Newton step of least squares from the truth: where wrong stars pull it.
         gaussian.append(-step if np.isfinite(normal.cost) else np.full(5, np.inf))
@@ -371,7 +417,12 @@ def test_polynomial_stands_for_a_likelihood_and_stays_tame() -> None:
 
     def likelihood(at: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         u = (at - theta) / sd
-        return 1e6 - 0.5 * np.sum(u * u, axis=1) + 0.1 * u[:, 0] ** 2 * u[:, 1] - 200.0 * (np.log(sigma) + 3.0) ** 2
+        return (
+            1e6
+            - 0.5 * np.sum(u * u, axis=1)
+            + 0.1 * u[:, 0] ** 2 * u[:, 1]
+            - 200.0 * (np.log(sigma) + 3.0) ** 2
+        )
 
     target = Target(likelihood, priors, np.append(theta, -3.0), np.diag(np.append(sd, 0.05)), None)
     fitted = [fit_polynomial(target, degree, np.random.default_rng(1)) for degree in (3, 2)]
@@ -381,7 +432,8 @@ def test_polynomial_stands_for_a_likelihood_and_stays_tame() -> None:
     u = 0.8 * np.random.default_rng(2).standard_normal((500, 6))
     exact = target.likelihood_at(u)
     assert np.max(np.abs(cubic(*target.arguments(target.natural(u))) - exact)) < 1e-6
-    # The control: without the third order it misses by more than the bound on compressed likelihoods.
+    # The control: without the third order it misses by more than the bound on compressed
+    # likelihoods.
     assert np.max(np.abs(flat(*target.arguments(target.natural(u))) - exact)) > 0.5
     far = target.natural(30.0 * u)
     assert np.all(cubic(*target.arguments(far)) < 1e6 - 100.0)
@@ -390,7 +442,12 @@ def test_polynomial_stands_for_a_likelihood_and_stays_tame() -> None:
         u = (at - theta) / sd
         return likelihood(at, sigma) + 0.5 * u[:, 4] ** 2 - 2.0 * np.abs(np.abs(u[:, 4]) - 1.5)
 
-    assert fit_polynomial(dataclasses.replace(target, log_likelihood=two_peaks), 2, np.random.default_rng(1)) is None
+    assert (
+        fit_polynomial(
+            dataclasses.replace(target, log_likelihood=two_peaks), 2, np.random.default_rng(1)
+        )
+        is None
+    )
 
 
 def test_a_noise_beyond_all_numbers_is_impossible_and_no_error() -> None:
@@ -398,7 +455,9 @@ def test_a_noise_beyond_all_numbers_is_impossible_and_no_error() -> None:
     cal = calibrate(obs, nominal(camera()))
     rotations = quaternion_to_rotation(cal.quaternions)
     student = StudentLikelihood(StarFrames.from_observations(obs), "brown", cal.theta, rotations)
-    values = student.many(np.stack([cal.theta] * 3), np.array([0.05, 1e200, np.inf]), np.full(3, 4.0))
+    values = student.many(
+        np.stack([cal.theta] * 3), np.array([0.05, 1e200, np.inf]), np.full(3, 4.0)
+    )
     assert np.isfinite(values[0])
     assert values[1] < values[0] - 1e4
     assert values[2] == -np.inf
@@ -414,7 +473,9 @@ def test_prior_of_the_tails_is_a_gamma_density():
 
 
 def _curvature(state: Any, frame_stars: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Curvatures (3, 3) of one frame: as observed, with what is negative counted as none, and reweighted."""
+    """Curvatures (3, 3) of one frame: as observed, with what is negative counted as none, and
+    reweighted.
+    """
     curvatures = np.zeros((3, 3, 3))
     for i in range(*frame_stars.indices(state.e.shape[1])):
         e, a, w = state.e[:, i], state.attitude[:, :, i], state.weight[i]
@@ -430,7 +491,10 @@ def test_a_frame_of_doubtful_stars_is_curved_by_the_first_way_that_curves_it() -
     heavy, theta = student(obs), camera().theta
     starts, sigma, ways = heavy.frames.starts, 1.2, []
     turn = np.radians(np.linspace(0.0, 90.0, len(starts) - 1) / 3600.0)
-    at = exp_rotation(turn[:, None] * np.random.default_rng(3).standard_normal((len(turn), 3))) @ heavy._rotations
+    at = (
+        exp_rotation(turn[:, None] * np.random.default_rng(3).standard_normal((len(turn), 3)))
+        @ heavy._rotations
+    )
     _, state, step, gain = heavy._step(theta[None], np.array([sigma]), np.array([4.0]), at)
     volume = 0.0
     for k, (first, last) in enumerate(pairwise(starts)):
@@ -442,8 +506,12 @@ def test_a_frame_of_doubtful_stars_is_curved_by_the_first_way_that_curves_it() -
         assert np.allclose(state.inverse[..., k] @ curvatures[way], np.eye(3), atol=1e-6)
         volume -= 0.5 * np.linalg.slogdet(curvatures[way])[1]
         # The step never overshoots: where it is long it is the reweighted one.
-        slope = np.einsum("iun,un,n->i", *(x[..., first:last] for x in (state.attitude, state.e, state.weight)))
-        assert gain[k] == pytest.approx(0.5 * slope @ np.linalg.solve(curvatures[way], slope) / sigma**2, rel=1e-5)
+        slope = np.einsum(
+            "iun,un,n->i", *(x[..., first:last] for x in (state.attitude, state.e, state.weight))
+        )
+        assert gain[k] == pytest.approx(
+            0.5 * slope @ np.linalg.solve(curvatures[way], slope) / sigma**2, rel=1e-5
+        )
         chosen = curvatures[way] if gain[k] < 1.0 else curvatures[2]
         assert np.allclose(step[:, k], np.linalg.solve(chosen, slope), rtol=1e-5, atol=1e-15)
     assert state.log_volume == pytest.approx(volume, abs=1e-6)

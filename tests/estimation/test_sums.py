@@ -22,7 +22,9 @@ from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import camera, observations, with_sigmas
 
-needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="Numba is not installed")
+needs_numba = pytest.mark.skipif(
+    importlib.util.find_spec("numba") is None, reason="Numba is not installed"
+)
 
 
 def _scaled(matrix, reference):
@@ -37,16 +39,25 @@ def test_parts_add_up_wherever_they_are_cut():
     whitening = np.diag(1.0 / np.sqrt(np.diag(whole.matrix)))
     gram = gram_sums(frames, "brown", theta, whitening, attitudes.rotations)
     cuts = [(0, 1), (1, 27), (27, 60)]
-    parts = [frame_sums(frames.part(a, b), "brown", theta, attitudes.rotations[a:b])[0] for a, b in cuts]
-    grams = [gram_sums(frames.part(a, b), "brown", theta, whitening, attitudes.rotations[a:b]) for a, b in cuts]
+    parts = [
+        frame_sums(frames.part(a, b), "brown", theta, attitudes.rotations[a:b])[0] for a, b in cuts
+    ]
+    grams = [
+        gram_sums(frames.part(a, b), "brown", theta, whitening, attitudes.rotations[a:b])
+        for a, b in cuts
+    ]
     total = sum_of(parts)
     assert total.cost == pytest.approx(whole.cost, rel=1e-12)
     assert total.turn == max(part.turn for part in parts) > min(part.turn for part in parts)
-    assert np.allclose(_scaled(total.matrix, whole.matrix), _scaled(whole.matrix, whole.matrix), rtol=0, atol=1e-12)
+    assert np.allclose(
+        _scaled(total.matrix, whole.matrix), _scaled(whole.matrix, whole.matrix), rtol=0, atol=1e-12
+    )
     assert (total.n_stars, total.n_frames) == (frames.n_stars, 60)
     added = grams[0] + grams[1] + grams[2]
     assert (added.n_stars, added.n_frames) == (frames.n_stars, 60)
-    assert np.allclose(_scaled(added.gram, gram.gram), _scaled(gram.gram, gram.gram), rtol=0, atol=1e-9)
+    assert np.allclose(
+        _scaled(added.gram, gram.gram), _scaled(gram.gram, gram.gram), rtol=0, atol=1e-9
+    )
     size = np.abs(gram.gram).max()
     assert np.allclose(added.gram, gram.gram, rtol=0, atol=1e-14 * size)
     assert added.log_determinant == pytest.approx(gram.log_determinant, rel=1e-12)
@@ -64,7 +75,9 @@ def test_blocks_of_any_size_give_the_same_sums_and_residuals(monkeypatch):
     assert len(frames.parts(40)) > 2
     (whole, attitudes, left), (cut, others, same) = both
     assert cut.cost == pytest.approx(whole.cost, rel=1e-12)
-    assert np.allclose(_scaled(cut.matrix, whole.matrix), _scaled(whole.matrix, whole.matrix), rtol=0, atol=1e-12)
+    assert np.allclose(
+        _scaled(cut.matrix, whole.matrix), _scaled(whole.matrix, whole.matrix), rtol=0, atol=1e-12
+    )
     assert np.allclose(others.shift, attitudes.shift, rtol=0, atol=1e-15)
     assert np.array_equal(same, left)
     b = frames.rotated(rotations)
@@ -84,12 +97,17 @@ def test_sums_of_single_frames_keep_their_digits_in_a_narrow_field(field_deg):
     e = (frames.pixel - xy)[None]
     own = np.empty_like(gram)
     for k, (first, last) in enumerate(zip(frames.starts[:-1], frames.starts[1:], strict=True)):
-        rows = [(array[..., first:last] * frames.weight[first:last]).reshape(len(array), -1).T for array in (a, e, h)]
+        rows = [
+            (array[..., first:last] * frames.weight[first:last]).reshape(len(array), -1).T
+            for array in (a, e, h)
+        ]
         # Without differences of large numbers: what the orthogonal columns of the attitude leave.
         q, r = np.linalg.qr(rows[0])
         left = np.hstack(rows[1:]) - q @ (q.T @ np.hstack(rows[1:]))
         own[k] = left.T @ left
-        assert log_determinant[k] == pytest.approx(2.0 * np.sum(np.log(np.abs(np.diag(r)))), rel=1e-9)
+        assert log_determinant[k] == pytest.approx(
+            2.0 * np.sum(np.log(np.abs(np.diag(r)))), rel=1e-9
+        )
     size = np.sqrt(np.einsum("kii->ki", own))
     assert np.max(np.abs(gram - own) / (size[:, :, None] * size[:, None])) < 1e-7
     assert np.max(np.abs(shift)) < 1e-9
@@ -108,7 +126,11 @@ def test_attitudes_follow_the_parameters_in_one_pass():
     frames, theta = likelihood.frames, np.array(camera().theta)
     descent = Descent(frames, "brown", likelihood.start_rotations(theta))
     first = descent.evaluate(theta)
-    sigma = np.sqrt(np.diag(np.linalg.inv(_scaled(first.matrix, first.matrix)))) / np.sqrt(np.diag(first.matrix)) * 0.05
+    sigma = (
+        np.sqrt(np.diag(np.linalg.inv(_scaled(first.matrix, first.matrix))))
+        / np.sqrt(np.diag(first.matrix))
+        * 0.05
+    )
     moved = theta + 3.0 * sigma
     followed, exact = descent.evaluate(moved), likelihood.evaluate(moved)
     # The best point is the best, whichever came first.
@@ -117,16 +139,21 @@ def test_attitudes_follow_the_parameters_in_one_pass():
     for found in (back, descent):
         assert np.array_equal(found.best[1].theta, costs[min(costs)])
     assert followed.cost == pytest.approx(exact.cost, rel=1e-9)
-    # Attitudes that stay where they were are far from the best: what the sums say is then no evaluation of the model.
+    # Attitudes that stay where they were are far from the best: what the sums say is then no
+    # evaluation of the model.
     stayed = likelihood.frames.pixel - _predicted(frames, moved, descent.best[1].rotations)
-    left = likelihood.frames.pixel - _predicted(frames, moved, likelihood.profile(moved)[0].rotations)
+    left = likelihood.frames.pixel - _predicted(
+        frames, moved, likelihood.profile(moved)[0].rotations
+    )
     assert np.sum(stayed**2) > 1.01 * np.sum(left**2)
 
 
 def _predicted(frames, theta, rotations):
     from starcal_uq.camera.projection import forward_kernel
 
-    return forward_kernel("brown", "value")(frames.n_stars, theta, frames.rotated(rotations), np.zeros(2))[0]
+    return forward_kernel("brown", "value")(
+        frames.n_stars, theta, frames.rotated(rotations), np.zeros(2)
+    )[0]
 
 
 def test_switch_of_the_kernels(monkeypatch):
@@ -145,7 +172,9 @@ def test_switch_of_the_kernels(monkeypatch):
 
 @needs_numba
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "stated"), [("brown", False), ("brown", True), ("inverse", False), ("none", True)])
+@pytest.mark.parametrize(
+    ("model", "stated"), [("brown", False), ("brown", True), ("inverse", False), ("none", True)]
+)
 def test_compiled_loops_equal_numpy(model, stated, monkeypatch):
     obs = observations(model, n_frames=60)
     likelihood = MarginalLikelihood(with_sigmas(obs) if stated else obs, model)
@@ -163,8 +192,11 @@ def test_compiled_loops_equal_numpy(model, stated, monkeypatch):
     assert np.max(np.abs(slope)) < 1e-12
     assert np.allclose(there.shift, where.shift, rtol=0, atol=1e-15)
     # Rounding of positions of a thousand px, in units of a noise of down to 0.02 px.
-    assert np.allclose(residuals, _residuals(likelihood, model, theta, rotations), rtol=0, atol=1e-10)
-    # The compiled loops turn to the best attitudes first: 0.2 nrad that are left change a derivative by 5e-12.
+    assert np.allclose(
+        residuals, _residuals(likelihood, model, theta, rotations), rtol=0, atol=1e-10
+    )
+    # The compiled loops turn to the best attitudes first: 0.2 nrad that are left change a
+    # derivative by 5e-12.
     best = settled_sums(likelihood.frames, model, theta, rotations)[1].at(theta)
     _compare_gram(likelihood, model, theta, best, plain.matrix, monkeypatch)
     _compare_pairs(likelihood.frames, model, theta, monkeypatch)
@@ -184,7 +216,8 @@ def _compare_gram(likelihood, model, theta, rotations, matrix, monkeypatch):
     p = len(theta)
     difference = np.abs(_scaled(fused.gram - plain.gram, plain.gram))
     assert np.max(difference[: p + 1, : p + 1]) < 1e-12
-    # What the attitudes take off the second derivatives is ten digits of them, and nothing of the likelihood.
+    # What the attitudes take off the second derivatives is ten digits of them, and nothing of the
+    # likelihood.
     assert np.max(difference) < 1e-8
     assert np.max(np.abs(fused.gram - plain.gram)) < 1e-12 * np.max(plain.gram)
     assert np.allclose(fused.log_determinant_slope, plain.log_determinant_slope, rtol=0, atol=1e-12)
@@ -199,10 +232,13 @@ def _compare_pairs(frames, model, theta, monkeypatch):
         both.append((objective.evaluate(theta), objective.godambe(theta), objective.rotations))
         # Pixels beyond the fold of a strong distortion have no direction.
         folded = np.concatenate([theta[:3], np.full(len(theta) - 3, -4e-6)])
-        assert np.isfinite(objective.evaluate(folded).cost) == (len(theta) == 3 or model == "inverse")
+        assert np.isfinite(objective.evaluate(folded).cost) == (
+            len(theta) == 3 or model == "inverse"
+        )
     (fused, fused_covariance, turned), (plain, covariance, rotations) = both
     assert np.allclose(turned, rotations, rtol=0, atol=1e-13)
-    # The matrix is what a common turn leaves of ten thousand times as much: neither path knows its twelfth digit.
+    # The matrix is what a common turn leaves of ten thousand times as much: neither path knows its
+    # twelfth digit.
     assert fused.cost == pytest.approx(plain.cost, rel=1e-11)
     assert np.max(np.abs(_scaled(fused.matrix - plain.matrix, plain.matrix))) < 1e-10
     assert np.max(np.abs(_scaled(fused_covariance - covariance, covariance))) < 1e-7
@@ -232,8 +268,15 @@ def test_machine_code_is_kept_for_other_processes_and_not_needed(tmp_path, monke
     )
 
     def run(folder):
-        environment = {"XDG_CACHE_HOME": str(folder), "PATH": "", "HOME": str(tmp_path), "PYTHONPATH": sys.path[0]}
-        done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+        environment = {
+            "XDG_CACHE_HOME": str(folder),
+            "PATH": "",
+            "HOME": str(tmp_path),
+            "PYTHONPATH": sys.path[0],
+        }
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=environment, capture_output=True, text=True
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout.split()
 

@@ -1,12 +1,14 @@
-"""Many calibration campaigns of one sensor with known true attitudes, and what attitude errors they make.
+"""Many calibration campaigns of one sensor with known true attitudes, and what attitude errors they
+make.
 
 Run as ``python -m tests.helpers.attitude_campaigns`` for the table of the documentation.
 
-Every campaign has its own noise on the same stars. The camera that it would estimate is the linear, efficient one,
-theta = truth + G e with G = (M^T M)^-1 M^T and M the derivatives of the pixels after each frame's attitude has been
-projected out; derivatives are central differences of `project`, so that nothing of the likelihood or of the propagation
-is used. The full calibration of a few campaigns shows how near that is. Attitudes are exact: noise and cameras go
-through QUEST as they are.
+Every campaign has its own noise on the same stars. The camera that it would estimate is the linear,
+efficient one, theta = truth + G e with G = (M^T M)^-1 M^T and M the derivatives of the pixels after
+each frame's attitude has been projected out; derivatives are central differences of `project`, so
+that nothing of the likelihood or of the propagation is used. The full calibration of a few
+campaigns shows how near that is. Attitudes are exact: noise and cameras go through QUEST as they
+are.
 """
 
 from __future__ import annotations
@@ -37,9 +39,11 @@ _BATCH = 25
 
 @dataclass(frozen=True)
 class Campaigns:
-    """Root mean squares (3,) over campaigns and frames, and coverage (4,) of stated half-widths, by part.
+    """Root mean squares (3,) over campaigns and frames, and coverage (4,) of stated half-widths, by
+    part.
 
-    `together` is the root mean square of the whole error; `correlation` (3,) that of noise and calibration.
+    `together` is the root mean square of the whole error; `correlation` (3,) that of noise and
+    calibration.
     """
 
     rms: dict[str, np.ndarray]
@@ -69,11 +73,17 @@ def linear_estimator(clean: Observations, truth: Camera) -> np.ndarray:
         return (plus - minus) / (2.0 * h)
 
     columns = [
-        derivative(*(project(truth.with_theta(truth.theta + sign * h * unit), b) for sign in (1.0, -1.0)), h=h)
+        derivative(
+            *(project(truth.with_theta(truth.theta + sign * h * unit), b) for sign in (1.0, -1.0)),
+            h=h,
+        )
         for h, unit in zip(step, np.eye(5), strict=True)
     ]
     turns = [
-        derivative(*(project(truth, b @ exp_rotation(sign * 1e-6 * axis).T) for sign in (1.0, -1.0)), h=1e-6)
+        derivative(
+            *(project(truth, b @ exp_rotation(sign * 1e-6 * axis).T) for sign in (1.0, -1.0)),
+            h=1e-6,
+        )
         for axis in np.eye(3)
     ]
     H, A = np.stack(columns, axis=-1), np.stack(turns, axis=-1)
@@ -102,7 +112,8 @@ def fly(
     sigma_px: float = 0.05,
     seed: int = 1,
 ) -> list[Campaigns]:
-    """Attitude errors of n campaigns on these frames against the truth, and how often stated half-widths hold.
+    """Attitude errors of n campaigns on these frames against the truth, and how often stated
+    half-widths hold.
 
     All frames make the estimate; attitudes, and the alignment, are those of `some_frames`.
     """
@@ -110,7 +121,8 @@ def fly(
     flown = some_frames(clean, every)
     model, r, starts, xy = truth.distortion, flown.directions_icrs, flown.frame_starts, flown.xy
     seen = np.isin(
-        np.repeat(np.arange(clean.n_frames), np.diff(clean.frame_starts)), np.arange(clean.n_frames)[::every]
+        np.repeat(np.arange(clean.n_frames), np.diff(clean.frame_starts)),
+        np.arange(clean.n_frames)[::every],
     )
     G = linear_estimator(clean, truth)
 
@@ -172,8 +184,14 @@ def sigmas_of(error: AttitudeError) -> dict[str, np.ndarray]:
 
 
 def failures(flown: Campaigns, error: AttitudeError, slack: float = 0.03) -> set[str]:
-    """Parts whose stated sigma is off by more than `slack`, or whose 95 % half-widths do not hold 93 to 97 %."""
-    wrong = {part for part in PARTS if np.abs(sigmas_of(error)[part] / flown.rms[part] - 1.0).max() > slack}
+    """Parts whose stated sigma is off by more than `slack`, or whose 95 % half-widths do not hold
+    93 to 97 %.
+    """
+    wrong = {
+        part
+        for part in PARTS
+        if np.abs(sigmas_of(error)[part] / flown.rms[part] - 1.0).max() > slack
+    }
     return wrong | {part for part in PARTS if np.abs(flown.coverage[part] - 0.95).max() > 0.02}
 
 
@@ -193,9 +211,14 @@ def main() -> None:
     print(error.to_dataframe()[columns].to_string(index=False))
     print(error.text)
     (flown,) = fly(clean, [error], n=options.campaigns)
-    print(f"\n{flown.n} campaigns of {clean.n_frames} frames: pitch, yaw, roll (and across the boresight)")
+    print(
+        f"\n{flown.n} campaigns of {clean.n_frames} frames: pitch, yaw, roll (and across the "
+        "boresight)"
+    )
     for part, sigma in sigmas_of(error).items():
-        print(f"{part:7s} sigma {flown.rms[part]} arcsec, stated over found {sigma / flown.rms[part]}")
+        print(
+            f"{part:7s} sigma {flown.rms[part]} arcsec, stated over found {sigma / flown.rms[part]}"
+        )
         print(f"{'':7s} 95 % half-widths hold {100.0 * flown.coverage[part]} %")
     print(f"interaction {flown.interaction}, stated {error.interaction_arcsec}")
     print(f"together {flown.together}; correlation of noise and calibration {flown.correlation}")

@@ -18,12 +18,17 @@ _CALLS = ("replace", "rename", "unlink", "remove", "rmdir", "mkdir", "symlink", 
 
 @contextmanager
 def snapshots(folder: Path, kept: Path) -> Iterator[list[Path]]:
-    """Copy a folder before each change of a name anywhere, as a kill then would leave it; those that differ."""
+    """Copy a folder before each change of a name anywhere, as a kill then would leave it; those
+    that differ.
+    """
     found: list[Path] = []
     seen: set[int] = set()
 
     def keep() -> None:
-        state = {p.relative_to(folder): p.read_bytes() if p.is_file() else b"" for p in sorted(folder.rglob("*"))}
+        state = {
+            p.relative_to(folder): p.read_bytes() if p.is_file() else b""
+            for p in sorted(folder.rglob("*"))
+        }
         mark = hash(tuple(state.items()))
         if mark not in seen:
             seen.add(mark)
@@ -49,7 +54,9 @@ def snapshots(folder: Path, kept: Path) -> Iterator[list[Path]]:
 
 @contextmanager
 def small_files(largest: int) -> Iterator[None]:
-    """No file grows beyond a number of bytes: the system refuses to write on, as it does on a full disk."""
+    """No file grows beyond a number of bytes: the system refuses to write on, as it does on a full
+    disk.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (largest, hard))
     try:
@@ -61,9 +68,9 @@ def small_files(largest: int) -> Iterator[None]:
 class Disk:
     """What of a folder a loss of power leaves, at its worst and at its best.
 
-    A file has the content that it had when it was last flushed, and is empty before; a folder has the names that it had
-    when it was last flushed, or those that it has now, each folder on its own. A file that was moved from one folder to
-    another is in one of them at least.
+    A file has the content that it had when it was last flushed, and is empty before; a folder has
+    the names that it had when it was last flushed, or those that it has now, each folder on its
+    own. A file that was moved from one folder to another is in one of them at least.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -91,23 +98,36 @@ class Disk:
             os.close(handle)
 
     def left(self) -> list[dict[str, bytes]]:
-        """All that may be left now: files by their names, for every choice of folders that are as they were flushed."""
-        now = {os.stat(path).st_ino: _numbers(path) for path in (self.folder, *self.folder.rglob("*")) if path.is_dir()}
+        """All that may be left now: files by their names, for every choice of folders that are as
+        they were flushed.
+        """
+        now = {
+            os.stat(path).st_ino: _numbers(path)
+            for path in (self.folder, *self.folder.rglob("*"))
+            if path.is_dir()
+        }
         changed = [number for number, names in now.items() if names != self._names.get(number, {})]
         found = []
         for bits in range(2 ** len(changed)):
             lost = {number for place, number in enumerate(changed) if bits >> place & 1}
-            names = {number: self._names.get(number, {}) if number in lost else now[number] for number in now}
+            names = {
+                number: self._names.get(number, {}) if number in lost else now[number]
+                for number in now
+            }
             names = self._names | names
             there = {inside for number in now for inside in names[number].values()}
             moved = {inside for held in now.values() for inside in held.values()} - there
             for number in now.keys() & self._names.keys():
-                back = {name: inside for name, inside in self._names[number].items() if inside in moved}
+                back = {
+                    name: inside for name, inside in self._names[number].items() if inside in moved
+                }
                 names[number] = names[number] | back
             found.append(dict(self._files(os.stat(self.folder).st_ino, names, "")))
         return found
 
-    def _files(self, number: int, names: dict[int, dict[str, int]], start: str) -> Iterator[tuple[str, bytes]]:
+    def _files(
+        self, number: int, names: dict[int, dict[str, int]], start: str
+    ) -> Iterator[tuple[str, bytes]]:
         for name, inside in names[number].items():
             if inside in names:
                 yield from self._files(inside, names, f"{start}{name}/")
@@ -121,7 +141,9 @@ def _numbers(folder: Path | str) -> dict[str, int]:
 
 @contextmanager
 def losses_of_power(folder: Path) -> Iterator[list[dict[str, bytes]]]:
-    """All different states that a loss of power may leave of a folder before each change of a name within the block."""
+    """All different states that a loss of power may leave of a folder before each change of a name
+    within the block.
+    """
     disk, found, seen = Disk(folder), list[dict[str, bytes]](), set[int]()
     originals = {name: getattr(os, name) for name in _CALLS}
 

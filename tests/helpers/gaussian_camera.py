@@ -1,4 +1,6 @@
-"""A calibration whose posterior is known in closed form, with the scales and couplings of a real star sensor."""
+"""A calibration whose posterior is known in closed form, with the scales and couplings of a real
+star sensor.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ COVARIANCE = CORRELATION * np.outer(SD, SD)
 
 @dataclass(frozen=True)
 class GaussianLikelihood:
-    """Gaussian in theta at every sigma: ``-1/2 (dof sigma0^2 + q(theta)) / sigma^2 - dof log sigma``."""
+    """Gaussian in theta at every sigma: ``-1/2 (dof sigma0^2 + q(theta)) / sigma^2 - dof log
+    sigma``.
+    """
 
     theta: np.ndarray
     information: np.ndarray
@@ -67,8 +71,12 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
     return SimpleNamespace(**values, remedy=values["status"].value)
 
 
-def gaussian_posterior(cal: Calibration, n: int = 4000, scale: float = 1.0, seed: int = 0) -> SimpleNamespace:
-    """What `propagate` reads of a posterior, with Gaussian draws; sigmas `scale` times those of the calibration."""
+def gaussian_posterior(
+    cal: Calibration, n: int = 4000, scale: float = 1.0, seed: int = 0
+) -> SimpleNamespace:
+    """What `propagate` reads of a posterior, with Gaussian draws; sigmas `scale` times those of the
+    calibration.
+    """
     rng = np.random.default_rng(seed)
     sd = np.sqrt(np.diag(cal.covariance))
     root = np.linalg.cholesky(cal.covariance / np.outer(sd, sd))

@@ -13,7 +13,9 @@ from starcal_uq.sky.positions import ra_dec_deg
 from starcal_uq.sky.refraction import site_among_stars
 from starcal_uq.sky.site import Site
 
-SITE = Site(latitude_deg=-24.6, longitude_deg=-70.4, height_m=2635.0, pressure_hpa=743.0, temperature_c=12.0)
+SITE = Site(
+    latitude_deg=-24.6, longitude_deg=-70.4, height_m=2635.0, pressure_hpa=743.0, temperature_c=12.0
+)
 CAMERA = sc.Camera(1024, 768, 6.9, 35.3, 517.0, 390.0, "brown", (3e-9, 1e-15))
 NOMINAL = sc.Camera(1024, 768, 6.9, 35.0, 511.5, 383.5, "brown", (0.0, 0.0))
 
@@ -34,10 +36,14 @@ def ground_frames(
     camera: sc.Camera = CAMERA,
     times: list[str] | None = None,
 ) -> Observations:
-    """Frames at given altitudes and random azimuths: directions of the catalogue, pixels as seen from the site."""
+    """Frames at given altitudes and random azimuths: directions of the catalogue, pixels as seen
+    from the site.
+    """
     rng = np.random.default_rng(seed)
     columns: dict[str, list] = {name: [] for name in ("frame", "xy", "star", "time")}
-    for number, (altitude, time) in enumerate(zip(altitudes_deg, times or night(len(altitudes_deg)), strict=True)):
+    for number, (altitude, time) in enumerate(
+        zip(altitudes_deg, times or night(len(altitudes_deg)), strict=True)
+    ):
         zenith, _ = site_among_stars(site, time)
         level = np.linalg.svd(zenith[None])[2][1:]
         angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -47,7 +53,9 @@ def ground_frames(
         x = np.cross(boresight, zenith)
         x /= np.linalg.norm(x)
         y = np.cross(boresight, x)
-        rotation = np.stack([np.cos(roll) * x + np.sin(roll) * y, np.cos(roll) * y - np.sin(roll) * x, boresight])
+        rotation = np.stack(
+            [np.cos(roll) * x + np.sin(roll) * y, np.cos(roll) * y - np.sin(roll) * x, boresight]
+        )
         near = np.flatnonzero(stars.directions_icrs @ boresight > np.cos(np.radians(9.0)))
         seen = apparent_directions(stars.directions_icrs[near], time, site=site) @ rotation.T
         xy = project(camera, seen) + rng.normal(0.0, sigma_px, (len(near), 2))

@@ -1,8 +1,9 @@
 """Damaged files of every kind that the package reads, and what its loaders say of them.
 
-`SAMPLES` is the table of readers: a small valid file each, with the public names that read it. `mutant` damages it: as
-bytes, as text, or inside its format, so that the damage passes the checksums of archives and meets the code behind
-them. `judge` loads it and says what came out. All chance is in a `random.Random`, which hypothesis can play as well.
+`SAMPLES` is the table of readers: a small valid file each, with the public names that read it.
+`mutant` damages it: as bytes, as text, or inside its format, so that the damage passes the
+checksums of archives and meets the code behind them. `judge` loads it and says what came out. All
+chance is in a `random.Random`, which hypothesis can play as well.
 """
 
 from __future__ import annotations
@@ -48,7 +49,18 @@ class Sample:
 
     @property
     def binary(self) -> bool:
-        return self.ending in ("npz", "nc", "parquet", "fits", "bin", "gz", "tiff", "png", "jpg", "bmp")
+        return self.ending in (
+            "npz",
+            "nc",
+            "parquet",
+            "fits",
+            "bin",
+            "gz",
+            "tiff",
+            "png",
+            "jpg",
+            "bmp",
+        )
 
 
 @cache
@@ -145,7 +157,12 @@ IMAGES = (
     "image.bmp",
 )
 # Format of another program, by the file.
-CAMERAS = {"opencv.yaml": "opencv", "ros.yml": "ros", "kalibr.yaml": "kalibr", "mrcal.cameramodel": "mrcal"}
+CAMERAS = {
+    "opencv.yaml": "opencv",
+    "ros.yml": "ros",
+    "kalibr.yaml": "kalibr",
+    "mrcal.cameramodel": "mrcal",
+}
 SAMPLES = (
     *(Sample(name, _image, ("images.read_image", "images.read_images")) for name in IMAGES),
     *(Sample(name, sc.Camera.load, ("Camera.load",)) for name in ("camera.toml", *CAMERAS)),
@@ -162,8 +179,16 @@ SAMPLES = (
     Sample("observations.csv", sc.load_observations, ("load_observations",)),
     Sample("observations.ecsv", sc.load_observations, ("load_observations",)),
     Sample("observations.parquet", sc.load_observations, ("load_observations",)),
-    Sample("stream.csv", lambda path: _all(sc.observations.stream_frames(path)), ("observations.stream_frames",)),
-    Sample("stream.parquet", lambda path: _all(sc.observations.stream_frames(path)), ("observations.stream_frames",)),
+    Sample(
+        "stream.csv",
+        lambda path: _all(sc.observations.stream_frames(path)),
+        ("observations.stream_frames",),
+    ),
+    Sample(
+        "stream.parquet",
+        lambda path: _all(sc.observations.stream_frames(path)),
+        ("observations.stream_frames",),
+    ),
     Sample("part.parquet", _partitions, ("observations.open_partitions",)),
     Sample("frames.parquet", _frames, ("Run",)),
     Sample("centroids.csv", sc.images.Centroids.load, ("images.Centroids.load",)),
@@ -171,7 +196,9 @@ SAMPLES = (
     Sample("centroids.parquet", sc.images.Centroids.load, ("images.Centroids.load",)),
     Sample("profile.csv", sc.attitude.load_attitude_profile, ("attitude.load_attitude_profile",)),
     Sample("profile.ecsv", sc.attitude.load_attitude_profile, ("attitude.load_attitude_profile",)),
-    Sample("profile.parquet", sc.attitude.load_attitude_profile, ("attitude.load_attitude_profile",)),
+    Sample(
+        "profile.parquet", sc.attitude.load_attitude_profile, ("attitude.load_attitude_profile",)
+    ),
     Sample("catalogue.csv", sc.sky.read_catalogue, ("sky.read_catalogue",)),
     Sample("catalogue.ecsv", sc.sky.read_catalogue, ("sky.read_catalogue",)),
     Sample("catalogue.fits", sc.sky.read_catalogue, ("sky.read_catalogue",)),
@@ -187,18 +214,28 @@ SAMPLES = (
     ),
     Sample("posterior.nc", sc.Posterior.load, ("Posterior.load",)),
     Sample("checkpoint.npz", _checkpoint, ("sample",)),
-    Sample("state.npz", sc.estimation.RecursiveCalibration.load, ("estimation.RecursiveCalibration.load",)),
+    Sample(
+        "state.npz",
+        sc.estimation.RecursiveCalibration.load,
+        ("estimation.RecursiveCalibration.load",),
+    ),
     Sample("attitude.csv", sc.propagation.AttitudeError.load, ("propagation.AttitudeError.load",)),
     Sample("field_map.npz", sc.propagation.FieldMap.load, ("propagation.FieldMap.load",)),
     Sample("spectrum.npz", sc.propagation.ErrorSpectrum.load, ("propagation.ErrorSpectrum.load",)),
     Sample("budget.csv", sc.budgeting.Budget.load, ("budgeting.Budget.load",)),
-    Sample("comparison.json", sc.comparison.CameraComparison.load, ("comparison.CameraComparison.load",)),
+    Sample(
+        "comparison.json",
+        sc.comparison.CameraComparison.load,
+        ("comparison.CameraComparison.load",),
+    ),
     Sample("diagnosis.json", sc.diagnostics.Diagnosis.load, ("diagnostics.Diagnosis.load",)),
     Sample("validation.npz", sc.diagnostics.Validation.load, ("diagnostics.Validation.load",)),
     Sample("images.json", _image_record, ("Run",)),
     Sample("run.json", _manifest, ("Run",)),
     Sample("replicates.npz", sc.paper.Replicates.load, ("paper.Replicates.load",)),
-    Sample("interaction.csv", sc.paper.InteractionStudy.load_csv, ("paper.InteractionStudy.load_csv",)),
+    Sample(
+        "interaction.csv", sc.paper.InteractionStudy.load_csv, ("paper.InteractionStudy.load_csv",)
+    ),
     Sample("study.nc", sc.studies.Study.load, ("studies.Study.load",)),
     Sample("cells.parquet", _store, ("study",)),
     Sample("pairs.npz", _pairs, ("identification.identify",)),
@@ -234,11 +271,17 @@ def _write_images(folder: Path) -> None:
     rng = np.random.default_rng(2)
     pixels = rng.normal(90.0, 3.0, (40, 48))
     pixels[20, 20:22] += 120.0
-    header = fits.Header({"DATE-OBS": "2026-11-21T01:02:03", "EXPTIME": 1.0, "EGAIN": 2.0, "SATURATE": 4000.0})
+    header = fits.Header(
+        {"DATE-OBS": "2026-11-21T01:02:03", "EXPTIME": 1.0, "EGAIN": 2.0, "SATURATE": 4000.0}
+    )
     whole = fits.PrimaryHDU(pixels.astype(np.uint16), header)
     whole.writeto(folder / "image.fits")
-    (folder / "image.fits.gz").write_bytes(gzip.compress((folder / "image.fits").read_bytes(), mtime=0))
-    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(whole.data, header)]).writeto(folder / "tiles.fits")
+    (folder / "image.fits.gz").write_bytes(
+        gzip.compress((folder / "image.fits").read_bytes(), mtime=0)
+    )
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(whole.data, header)]).writeto(
+        folder / "tiles.fits"
+    )
     PIL.Image.fromarray(whole.data).save(folder / "image.tiff", compression="tiff_deflate")
     PIL.Image.fromarray(whole.data).save(folder / "image.png")
     grey = PIL.Image.fromarray(pixels.astype(np.uint8))
@@ -256,27 +299,47 @@ def _write_tables(folder: Path) -> None:
     rng = np.random.default_rng(1)
     n = 12
     columns = {
-        **{"frame": np.repeat([1, 2, 4], 4), "x_px": rng.uniform(0, 900, n), "y_px": rng.uniform(0, 900, n)},
+        **{
+            "frame": np.repeat([1, 2, 4], 4),
+            "x_px": rng.uniform(0, 900, n),
+            "y_px": rng.uniform(0, 900, n),
+        },
         **dict.fromkeys(("var_x_px2", "var_y_px2"), np.full(n, 0.01)),
         **{"cov_xy_px2": np.zeros(n), "flux": rng.uniform(1e3, 1e4, n), "snr": np.full(n, 30.0)},
-        **{"peak": np.full(n, 900.0), **dict.fromkeys(("saturated", "blended", "edge"), np.arange(n) % 5 == 0)},
+        **{
+            "peak": np.full(n, 900.0),
+            **dict.fromkeys(("saturated", "blended", "edge"), np.arange(n) % 5 == 0),
+        },
     }
     frames = {
-        **{"frame_ids": [1, 2, 3, 4], "image": list("abcd"), "time_utc": [""] * 4, "background": [100.0] * 4},
+        **{
+            "frame_ids": [1, 2, 3, 4],
+            "image": list("abcd"),
+            "time_utc": [""] * 4,
+            "background": [100.0] * 4,
+        },
         **{"noise": [5.0] * 4, "psf_sigma_px": [1.0] * 4, "problem": ["", "", "no star", ""]},
     }
-    centroids = sc.images.Centroids(**columns, **frames, messages=("one",), meta={"flux_unit": "adu"})
+    centroids = sc.images.Centroids(
+        **columns, **frames, messages=("one",), meta={"flux_unit": "adu"}
+    )
     for ending in ("csv", "ecsv", "parquet"):
         centroids.save(folder / f"centroids.{ending}")
     q = rng.standard_normal((8, 4)) * 0.01 + [0.0, 0.0, 0.0, 1.0]
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    profile = Table(dict(zip(("time_s", "qx", "qy", "qz", "qw"), (np.arange(8.0), *q.T), strict=True)))
+    profile = Table(
+        dict(zip(("time_s", "qx", "qy", "qz", "qw"), (np.arange(8.0), *q.T), strict=True))
+    )
     profile.write(folder / "profile.csv", format="ascii.csv")
     profile.write(folder / "profile.ecsv", format="ascii.ecsv", delimiter=",")
     profile.to_pandas().to_parquet(folder / "profile.parquet")
     stars = Table(
         {
-            **{"star_id": [f"S {i}" for i in range(9)], "ra": rng.uniform(0, 360, 9), "dec": rng.uniform(-80, 80, 9)},
+            **{
+                "star_id": [f"S {i}" for i in range(9)],
+                "ra": rng.uniform(0, 360, 9),
+                "dec": rng.uniform(-80, 80, 9),
+            },
             **{"mag": rng.uniform(2, 6, 9), "pmra": np.full(9, 5.0), "pmdec": np.full(9, -5.0)},
             "epoch": np.full(9, 2016.0),
         }
@@ -286,9 +349,13 @@ def _write_tables(folder: Path) -> None:
     stars.write(folder / "catalogue.fits", format="fits")
     import gzip
 
-    (folder / "catalogue.csv.gz").write_bytes(gzip.compress((folder / "catalogue.csv").read_bytes(), mtime=0))
+    (folder / "catalogue.csv.gz").write_bytes(
+        gzip.compress((folder / "catalogue.csv").read_bytes(), mtime=0)
+    )
     (folder / "hip_main.dat").write_text("\n".join(HIPPARCOS) + "\n")
-    write_gaia_records(folder / "gaia.bin", rng.uniform(0, 360, 9), rng.uniform(-80, 80, 9), rng.uniform(2, 6, 9))
+    write_gaia_records(
+        folder / "gaia.bin", rng.uniform(0, 360, 9), rng.uniform(-80, 80, 9), rng.uniform(2, 6, 9)
+    )
 
 
 PRIORS = """[priors]
@@ -343,12 +410,17 @@ def _write_results(folder: Path) -> None:
     (folder / "chain.toml").write_text('[priors]\nprior_from = "earlier"\ninflation = 2.0\n')
     (folder / "budget.toml").write_text(BUDGET)
     sc.studies.write_study_template("magnitude-noise", folder / "study.toml", force=True)
-    posterior = sc.sample(_observations(), _calibration(), n_walkers=16, n_steps=8, n_ensembles=2, seed=1)
+    posterior = sc.sample(
+        _observations(), _calibration(), n_walkers=16, n_steps=8, n_ensembles=2, seed=1
+    )
     posterior.save(folder / "posterior.nc", force=True)
     study = made_study({"max_mag": (5.0, 6.0)}, lambda cell: {}, seeds=2)
     study.data.attrs["definition"] = json.dumps(study.definition.to_dict())
     study.save(folder)
-    write_manifest(folder, Manifest({"camera.toml": Entry(680, "0" * 64, "calibrate")}, {"calibrate": {"seed": 1}}))
+    write_manifest(
+        folder,
+        Manifest({"camera.toml": Entry(680, "0" * 64, "calibrate")}, {"calibrate": {"seed": 1}}),
+    )
     cells = Store(None)
     cells.append([row("a", "brown", {"status": "ok", "truth": np.arange(5.0)})])
     write_part(cells.table(), folder / "cells.parquet")
@@ -361,7 +433,15 @@ def _write_results(folder: Path) -> None:
     store._write(folder / "checkpoint.npz")
     table = {name: ["distortion"] for name in ("axis", "method", "handling", "parameter", "unit")}
     table |= {name: [3] for name in ("n_frames", "min_stars", "seed", "n", "failed")}
-    numbers = ("value", "corner_px", "corner_size_px", "field_deg", "stars_per_frame", "max_mag", "sigma_px")
+    numbers = (
+        "value",
+        "corner_px",
+        "corner_size_px",
+        "field_deg",
+        "stars_per_frame",
+        "max_mag",
+        "sigma_px",
+    )
     table |= {name: [0.123456789012345678] for name in (*numbers, "bias", "spread", "rmse", "crlb")}
     pd.DataFrame(table).to_csv(folder / "interaction.csv", index=False)
     n, p = 3, 2
@@ -371,21 +451,88 @@ def _write_results(folder: Path) -> None:
         **{"neighbour": np.arange(2 * p), "neighbour_angle": np.arange(2.0 * p)},
     }
     known = {f.name for f in dataclasses.fields(StarPairs)}
-    np.savez(folder / "pairs.npz", **{name: value for name, value in arrays.items() if name in known})
+    np.savez(
+        folder / "pairs.npz", **{name: value for name, value in arrays.items() if name in known}
+    )
 
 
 # What stands where a number or a text should.
 ODD = (
-    *("nan", "inf", "-inf", "1e999", "1e300", "-1e300", "1e-320", "-1", "0", "", "text", "é", "\x00", "\x07"),
-    *("1" * 30, "1" * 5000, '"', "'", "=1+1", "true", "None", "null", "-0.0", "2024-01-01T00:00:00", "\u2028", "0x10"),
+    *(
+        "nan",
+        "inf",
+        "-inf",
+        "1e999",
+        "1e300",
+        "-1e300",
+        "1e-320",
+        "-1",
+        "0",
+        "",
+        "text",
+        "é",
+        "\x00",
+        "\x07",
+    ),
+    *(
+        "1" * 30,
+        "1" * 5000,
+        '"',
+        "'",
+        "=1+1",
+        "true",
+        "None",
+        "null",
+        "-0.0",
+        "2024-01-01T00:00:00",
+        "\u2028",
+        "0x10",
+    ),
 )
 LITERALS = (
-    *("nan", "-inf", "1e300", "-1", "0", '""', '"text"', "[]", "{}", "true", "1979-05-27", "1" * 30, "1" * 5000),
-    *("[" * 3000 + "]" * 3000, "{a=" * 1500 + "1" + "}" * 1500, '"\\u0001"', "[1, 'a']", "1e-320", "07:32:00"),
+    *(
+        "nan",
+        "-inf",
+        "1e300",
+        "-1",
+        "0",
+        '""',
+        '"text"',
+        "[]",
+        "{}",
+        "true",
+        "1979-05-27",
+        "1" * 30,
+        "1" * 5000,
+    ),
+    *(
+        "[" * 3000 + "]" * 3000,
+        "{a=" * 1500 + "1" + "}" * 1500,
+        '"\\u0001"',
+        "[1, 'a']",
+        "1e-320",
+        "07:32:00",
+    ),
 )
 _NESTED = "@nested@"
 NODES: tuple[Any, ...] = (
-    *(None, True, "", "text", "\ud800", -1, 0, 1e300, float("nan"), float("inf"), 10**30, 10**400, [], {}, [[]]),
+    *(
+        None,
+        True,
+        "",
+        "text",
+        "\ud800",
+        -1,
+        0,
+        1e300,
+        float("nan"),
+        float("inf"),
+        10**30,
+        10**400,
+        [],
+        {},
+        [[]],
+    ),
     *([1, 2], {"a": 1}, ["a"], [None], _NESTED, -0.5, "\x00", "9" * 5000),
 )
 
@@ -398,9 +545,14 @@ def mutant(sample: Sample, data: bytes, rng: random.Random, other: bytes = b"") 
         ways.append(_text)
     if ending in ("toml",):
         ways.append(_toml)
-    structural = {"json": _json, "npz": _npz, "parquet": _parquet, "nc": _netcdf, "fits": _fits, "png": _png}.get(
-        ending
-    )
+    structural = {
+        "json": _json,
+        "npz": _npz,
+        "parquet": _parquet,
+        "nc": _netcdf,
+        "fits": _fits,
+        "png": _png,
+    }.get(ending)
     if ending == "gz":
         structural = _packed
     if structural is not None:
@@ -441,7 +593,9 @@ def _bytes(data: bytes, rng: random.Random, other: bytes) -> bytes:
     if way == 6:
         return data[:low] + bytes(min(high - low, 512)) + data[low + min(high - low, 512) :]
     if way == 7:
-        return data[:i] + bytes(rng.randrange(256) for _ in range(rng.choice((1, 4, 16)))) + data[i:]
+        return (
+            data[:i] + bytes(rng.randrange(256) for _ in range(rng.choice((1, 4, 16)))) + data[i:]
+        )
     return data[:high] + data[low:]
 
 
@@ -465,7 +619,11 @@ def _text(data: bytes, rng: random.Random) -> bytes:
     elif way == 7:
         lines = lines[: i + 1]
     else:
-        lines[i] = lines[i].rstrip("\n") + rng.choice((",", '"', "\t", " x", "," * 200, "9" * 200_000)) + "\n"
+        lines[i] = (
+            lines[i].rstrip("\n")
+            + rng.choice((",", '"', "\t", " x", "," * 200, "9" * 200_000))
+            + "\n"
+        )
     return "".join(lines).encode("utf-8", "surrogateescape")
 
 
@@ -530,7 +688,9 @@ def _node(document: Any, rng: random.Random) -> Any:
         if way == 0:
             return {name: value for name, value in document.items() if name != key}
         if way == 1:
-            return {(f"{name}_" if name == key else name): value for name, value in document.items()}
+            return {
+                (f"{name}_" if name == key else name): value for name, value in document.items()
+            }
         if way == 2:
             return rng.choice(NODES)
         return {**document, key: _node(document[key], rng)}
@@ -562,13 +722,25 @@ CARDS = (
         b"1E300",
         b"NaN",
     ),
-    *(b"''", b"'text'", b"'2026-11-21T25:00:00'", b"(1.0, 2.0)", b"", b"\xff", b"'open", b"-1E400", b"40000"),
+    *(
+        b"''",
+        b"'text'",
+        b"'2026-11-21T25:00:00'",
+        b"(1.0, 2.0)",
+        b"",
+        b"\xff",
+        b"'open",
+        b"-1E400",
+        b"40000",
+    ),
 )
 
 
 def _fits(data: bytes, rng: random.Random) -> bytes:
     """A card of a header changed, left out, repeated, or in the place of another."""
-    cards = [i for i in range(0, len(data), 80) if re.match(rb"[A-Z0-9_-]{1,8} *=", data[i : i + 10])]
+    cards = [
+        i for i in range(0, len(data), 80) if re.match(rb"[A-Z0-9_-]{1,8} *=", data[i : i + 10])
+    ]
     i, j, way = rng.choice(cards), rng.choice(cards), rng.randrange(6)
     card = data[i : i + 80]
     if way == 0:
@@ -576,7 +748,17 @@ def _fits(data: bytes, rng: random.Random) -> bytes:
     if way == 1:
         return data[:j] + card + data[j + 80 :]
     if way == 2:
-        names = (b"BSCALE", b"BZERO", b"BLANK", b"PCOUNT", b"GCOUNT", b"GROUPS", b"NAXIS3", b"EXTEND", b"BAYERPAT")
+        names = (
+            b"BSCALE",
+            b"BZERO",
+            b"BLANK",
+            b"PCOUNT",
+            b"GCOUNT",
+            b"GROUPS",
+            b"NAXIS3",
+            b"EXTEND",
+            b"BAYERPAT",
+        )
         card = rng.choice(names).ljust(8) + card[8:]
     return data[:i] + (card[:10] + rng.choice(CARDS).rjust(20)).ljust(80) + data[i + 80 :]
 
@@ -597,11 +779,15 @@ def _png(data: bytes, rng: random.Random) -> bytes:
     elif way == 1:
         parts.insert(i, parts[i])
     elif way == 2 and name == b"IHDR":
-        sizes = struct.pack(">II", *(rng.choice((0, 1, 7, 40, 70_000, 2**31 - 1, 2**32 - 1)) for _ in range(2)))
+        sizes = struct.pack(
+            ">II", *(rng.choice((0, 1, 7, 40, 70_000, 2**31 - 1, 2**32 - 1)) for _ in range(2))
+        )
         parts[i] = name, sizes + bytes(rng.choice((0, 1, 2, 3, 4, 6, 8, 16, 255)) for _ in range(5))
     else:
         parts[i] = name, _bytes(content, rng, data)
-    made = (struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in parts)
+    made = (
+        struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in parts
+    )
     return data[:8] + b"".join(made)
 
 
@@ -611,7 +797,9 @@ def _packed(data: bytes, rng: random.Random) -> bytes:
 
     content = gzip.decompress(data)
     if content.startswith(b"SIMPLE"):
-        content = rng.choice((_fits, lambda d, r: _bytes(d, r, data), lambda d, r: d + bytes(10**6)))(content, rng)
+        content = rng.choice(
+            (_fits, lambda d, r: _bytes(d, r, data), lambda d, r: d + bytes(10**6))
+        )(content, rng)
     else:
         content = _text(content, rng)
     return gzip.compress(content, mtime=0)
@@ -634,7 +822,9 @@ def _npz(data: bytes, rng: random.Random) -> bytes:
     elif way == 4:
         members[name] = _header(members[name], rng)
     elif way == 5:
-        members[name] = rng.choice((b"", b"\x93NUMPY", b"text", members[name][:-4], members[name][:20]))
+        members[name] = rng.choice(
+            (b"", b"\x93NUMPY", b"text", members[name][:-4], members[name][:20])
+        )
     else:
         document = next((m for m in ("document.npy", "header.npy") if m in members), None)
         if document is None:
@@ -657,7 +847,9 @@ def _npy(array: Any) -> bytes:
 
 
 def _numeric(array: Any) -> Any:
-    return np.asarray(array, dtype=float) if array.dtype.kind in "fiub" else np.zeros(np.shape(array))
+    return (
+        np.asarray(array, dtype=float) if array.dtype.kind in "fiub" else np.zeros(np.shape(array))
+    )
 
 
 _ARRAYS: tuple[Callable[[Any], Any], ...] = (
@@ -683,8 +875,12 @@ _ARRAYS: tuple[Callable[[Any], Any], ...] = (
 def _header(member: bytes, rng: random.Random) -> bytes:
     """An array's file whose header declares something else."""
     array = np.load(io.BytesIO(member))
-    descr = rng.choice((array.dtype.str, "|O", "<f4", "<c16", "<U1000000", "<M8[s]", "|V8", "not a type"))
-    shape = rng.choice((array.shape, (10**12,), (10**6, 10**6), (-1,), (2**62, 4), "shape", (0,), (1.5,), (10**9,)))
+    descr = rng.choice(
+        (array.dtype.str, "|O", "<f4", "<c16", "<U1000000", "<M8[s]", "|V8", "not a type")
+    )
+    shape = rng.choice(
+        (array.shape, (10**12,), (10**6, 10**6), (-1,), (2**62, 4), "shape", (0,), (1.5,), (10**9,))
+    )
     text = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape!r}, }}"
     if rng.random() < 0.1:
         text = "(" * 5000
@@ -710,8 +906,25 @@ def _parquet(data: bytes, rng: random.Random) -> bytes:
     elif way in (3, 4):
         n = len(column)
         odd: list[Any] = [
-            *(["text"] * n, [[1.0]] * n, [True] * n, [None] * n, [float("nan")] * n, [float("inf")] * n, [b"\xff"] * n),
-            *([2**62] * n, [-1] * n, [1e300] * n, [{"a": 1}] * n, [0.5] * n, [0] * n, ["\x00"] * n, ["1"] * n),
+            *(
+                ["text"] * n,
+                [[1.0]] * n,
+                [True] * n,
+                [None] * n,
+                [float("nan")] * n,
+                [float("inf")] * n,
+                [b"\xff"] * n,
+            ),
+            *(
+                [2**62] * n,
+                [-1] * n,
+                [1e300] * n,
+                [{"a": 1}] * n,
+                [0.5] * n,
+                [0] * n,
+                ["\x00"] * n,
+                ["1"] * n,
+            ),
         ]
         table = table.set_column(i, name, pa.array(rng.choice(odd)))
     elif way == 5:
@@ -723,7 +936,9 @@ def _parquet(data: bytes, rng: random.Random) -> bytes:
         key = rng.choice(sorted(meta)) if meta else b"starcal_uq"
         document = meta.get(key, b"{}")
         if rng.random() < 0.4:
-            meta[key] = rng.choice((b"", b"{", b"[]", b"null", b"1", b"\xff", b"[" * 100_000, b'{"directions": 3}'))
+            meta[key] = rng.choice(
+                (b"", b"{", b"[]", b"null", b"1", b"\xff", b"[" * 100_000, b'{"directions": 3}')
+            )
         elif rng.random() < 0.2:
             meta.pop(key, None)
         else:
@@ -751,7 +966,9 @@ def _netcdf(data: bytes, rng: random.Random) -> bytes:
         elif way == 1 and len(file.attrs):
             del file.attrs[rng.choice(sorted(file.attrs))]
         elif way in (2, 3):
-            numeric = values if np.asarray(values).dtype.kind in "fiu" else np.zeros(np.shape(values))
+            numeric = (
+                values if np.asarray(values).dtype.kind in "fiu" else np.zeros(np.shape(values))
+            )
             made = rng.choice(_ARRAYS[:10])(np.asarray(numeric))
             del file[name]
             file[name] = made if made.dtype.kind not in "UO" else np.array([b"text"])
@@ -774,13 +991,15 @@ def _netcdf(data: bytes, rng: random.Random) -> bytes:
 class Outcome:
     """What became of a file."""
 
-    # ``same`` (the numbers of the valid file), ``other`` (a result with others), ``refused``, ``words`` (refused with
-    # a bad sentence), or ``escaped``.
+    # ``same`` (the numbers of the valid file), ``other`` (a result with others), ``refused``,
+    # ``words`` (refused with a bad sentence), or ``escaped``.
     kind: str
     detail: str = ""  # The sentence, or what escaped and where
 
 
-_CLASS_NAMES = re.compile(r"\b[A-Z]\w*(Error|Exception)\b|NoneType|Traceback|object is not| at 0x[0-9a-f]{6}|<class ")
+_CLASS_NAMES = re.compile(
+    r"\b[A-Z]\w*(Error|Exception)\b|NoneType|Traceback|object is not| at 0x[0-9a-f]{6}|<class "
+)
 
 
 def faults(message: str, path: Path) -> Iterator[str]:
@@ -810,7 +1029,11 @@ def judge(sample: Sample, path: Path, valid: str = "") -> Outcome:
             use(result)
     except StarcalError as error:
         wrong = list(faults(str(error), path))
-        return Outcome("words", f"{'; '.join(wrong)}: {error}"[:1000]) if wrong else Outcome("refused", str(error))
+        return (
+            Outcome("words", f"{'; '.join(wrong)}: {error}"[:1000])
+            if wrong
+            else Outcome("refused", str(error))
+        )
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
         own = [f for f in frames if "starcal_uq" in f.filename]
@@ -842,7 +1065,10 @@ def digest(value: Any) -> str:
 def _feed(value: Any, put: Callable[[bytes], None], seen: set[int]) -> None:
     if isinstance(value, np.ndarray | np.generic):
         array = np.asarray(value)
-        put(f"{array.dtype.str}{array.shape}".encode() + (repr(array.tolist()).encode() if array.size else b""))
+        put(
+            f"{array.dtype.str}{array.shape}".encode()
+            + (repr(array.tolist()).encode() if array.size else b"")
+        )
     elif isinstance(value, Mapping):
         for key in sorted(value, key=str):
             put(str(key).encode())
@@ -857,7 +1083,11 @@ def _feed(value: Any, put: Callable[[bytes], None], seen: set[int]) -> None:
         if id(value) in seen:
             return
         seen.add(id(value))
-        own = {f.name for f in dataclasses.fields(value)} if dataclasses.is_dataclass(value) else set(vars(value))
+        own = (
+            {f.name for f in dataclasses.fields(value)}
+            if dataclasses.is_dataclass(value)
+            else set(vars(value))
+        )
         for name in sorted(own):
             if name not in ("path", "source", "name", "seconds"):
                 put(name.encode())
@@ -895,7 +1125,9 @@ class Bench:
         made = mutant(sample, data, rng, other)
         return made, self.judged(sample, made, expected, path)
 
-    def judged(self, sample: Sample, made: bytes, expected: str = "", path: Path | None = None) -> Outcome:
+    def judged(
+        self, sample: Sample, made: bytes, expected: str = "", path: Path | None = None
+    ) -> Outcome:
         """What becomes of the sample with this content."""
         if path is None:
             _, expected, path = self.valid(sample)

@@ -1,7 +1,9 @@
-"""A star sensor of a second make: NumPy alone, no code of the package, for tests that attack from outside.
+"""A star sensor of a second make: NumPy alone, no code of the package, for tests that attack from
+outside.
 
-Distortion is Brown's (ideal to distorted). Every departure from the package's assumptions is a switch: directions that
-err with their star, noise that varies with radius, magnitude or frame, frames that see one patch of sky.
+Distortion is Brown's (ideal to distorted). Every departure from the package's assumptions is a
+switch: directions that err with their star, noise that varies with radius, magnitude or frame,
+frames that see one patch of sky.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 Noise = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-# Shifts (2, n) in px of stars at (2, n) px from the principal point, at (2, n) px, with their magnitudes, of a frame.
+# Shifts (2, n) in px of stars at (2, n) px from the principal point, at (2, n) px, with their
+# magnitudes, of a frame.
 Displacement = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 
 
@@ -20,8 +23,9 @@ Displacement = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 class Campaign:
     """Columns of an observations table, and what is true.
 
-    `columns` has frame, x_px, y_px, ra_deg, dec_deg, star_id and mag; `theta` is x0, y0, f, k1, k2 in px units;
-    `attitudes` (K, 3, 3) turn ICRS into the camera; `size_px` is the side of the square detector.
+    `columns` has frame, x_px, y_px, ra_deg, dec_deg, star_id and mag; `theta` is x0, y0, f, k1, k2
+    in px units; `attitudes` (K, 3, 3) turn ICRS into the camera; `size_px` is the side of the
+    square detector.
     """
 
     columns: dict[str, np.ndarray]
@@ -30,11 +34,22 @@ class Campaign:
     size_px: int
 
     def camera_toml(self, focal_error: float = 0.01) -> dict[str, float | str | int]:
-        """A data sheet: centred, the focal length wrong by a fraction, no distortion; 10 um pixels."""
+        """A data sheet: centred, the focal length wrong by a fraction, no distortion; 10 um
+        pixels.
+        """
         centre = 0.5 * (self.size_px - 1)
         focal_mm = self.theta[2] * 0.01 * (1.0 + focal_error)
-        sheet: dict[str, float | str | int] = {"width_px": self.size_px, "height_px": self.size_px, "pixel_um": 10.0}
-        return sheet | {"focal_mm": focal_mm, "x0_px": centre, "y0_px": centre, "distortion": "brown"}
+        sheet: dict[str, float | str | int] = {
+            "width_px": self.size_px,
+            "height_px": self.size_px,
+            "pixel_um": 10.0,
+        }
+        return sheet | {
+            "focal_mm": focal_mm,
+            "x0_px": centre,
+            "y0_px": centre,
+            "distortion": "brown",
+        }
 
 
 def campaign(
@@ -57,29 +72,41 @@ def campaign(
 ) -> Campaign:
     """Observe.
 
-    `field_deg` is the width of the field; `corner_px` are the displacements by k1 and k2 at the corner; `sigma_px` is a
-    number or a function of (radius over the half diagonal, magnitude, frame number). With `patch_stars` all frames see
-    the same stars, that many over a patch that random rolls and pointings of up to a fifth of the field stay within;
-    otherwise every frame has stars of its own. `star_sigma_px` is the error per axis of each star's own direction, the
-    same whenever it is seen; `frame_focal` the relative spread of the focal length from frame to frame. With
-    `pointings` the camera stares: frames take turns at so many attitudes, each with the same stars whenever it comes
-    round, and `drift_px` further along the rows from one turn to the next. `displaced` moves what is seen, after the
-    distortion. Along a `path` (n_frames, 3, 3) of attitudes all frames see one sky, whose stars stay while they are in
-    the field. The principal point is `offset_px` off the centre.
+    `field_deg` is the width of the field; `corner_px` are the displacements by k1 and k2 at the
+    corner; `sigma_px` is a number or a function of (radius over the half diagonal, magnitude, frame
+    number). With `patch_stars` all frames see the same stars, that many over a patch that random
+    rolls and pointings of up to a fifth of the field stay within; otherwise every frame has stars
+    of its own. `star_sigma_px` is the error per axis of each star's own direction, the same
+    whenever it is seen; `frame_focal` the relative spread of the focal length from frame to frame.
+    With `pointings` the camera stares: frames take turns at so many attitudes, each with the same
+    stars whenever it comes round, and `drift_px` further along the rows from one turn to the next.
+    `displaced` moves what is seen, after the distortion. Along a `path` (n_frames, 3, 3) of
+    attitudes all frames see one sky, whose stars stay while they are in the field. The principal
+    point is `offset_px` off the centre.
     """
     focal = 0.5 * size_px / np.tan(np.radians(0.5 * field_deg))
     x0, y0 = 0.5 * size_px + offset_px[0], 0.5 * size_px + offset_px[1]
     corner = 0.5 * size_px * np.sqrt(2.0)
     k1, k2 = corner_px[0] / corner**3, corner_px[1] / corner**5
-    patch = None if patch_stars is None else cap(rng, np.array([0.3, -0.5, 0.8]), 0.85 * field_deg, patch_stars)
+    patch = (
+        None
+        if patch_stars is None
+        else cap(rng, np.array([0.3, -0.5, 0.8]), 0.85 * field_deg, patch_stars)
+    )
     magnitudes = None if patch_stars is None else rng.uniform(2.0, 6.0, patch_stars)
-    offsets = None if patch_stars is None else star_sigma_px / focal * rng.standard_normal((patch_stars, 2))
+    offsets = (
+        None
+        if patch_stars is None
+        else star_sigma_px / focal * rng.standard_normal((patch_stars, 2))
+    )
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("frame", "x", "y", "r", "id", "mag")}
     attitudes: list[np.ndarray] = []
     views: list[tuple[np.ndarray, ...]] = []
     if path is not None:
         # As many to the sky as give a frame its stars.
-        number = round(1.3 * stars_per_frame * 4.0 * np.pi / (2.0 * np.tan(np.radians(0.5 * field_deg))) ** 2)
+        number = round(
+            1.3 * stars_per_frame * 4.0 * np.pi / (2.0 * np.tan(np.radians(0.5 * field_deg))) ** 2
+        )
         sky = np.array([random_unit(rng) for _ in range(number)])
         patch, magnitudes, offsets = sky, rng.uniform(2.0, 6.0, number), np.zeros((number, 2))
     for frame in range(n_frames):
@@ -90,7 +117,11 @@ def campaign(
             attitude, stars, mag, number, own = views[frame % pointings]
             angle = drift_px / focal * (frame // pointings)
             turn = np.array(
-                [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
+                [
+                    [np.cos(angle), 0.0, np.sin(angle)],
+                    [0.0, 1.0, 0.0],
+                    [-np.sin(angle), 0.0, np.cos(angle)],
+                ]
             )
             attitude = turn @ attitude
         elif patch is None:
@@ -112,21 +143,33 @@ def campaign(
         x, y = x0 + (x - x0) * stretch, y0 + (y - y0) * stretch
         # Far outside the field the polynomial folds back onto the detector.
         near = 0.3 if path is None else np.cos(np.radians(0.75 * field_deg))
-        seen = np.flatnonzero((b[:, 2] > near) & (x > 0) & (x < size_px - 1) & (y > 0) & (y < size_px - 1))
+        seen = np.flatnonzero(
+            (b[:, 2] > near) & (x > 0) & (x < size_px - 1) & (y > 0) & (y < size_px - 1)
+        )
         if path is not None:
             chosen = np.argsort(mag[seen], kind="stable")
         else:
             chosen = np.arange(len(seen)) if pointings is not None else rng.permutation(len(seen))
         seen = seen[chosen[:stars_per_frame]]
         radius = np.sqrt(r2[seen]) / corner
-        sigma = sigma_px(radius, mag[seen], np.full(len(seen), frame)) if callable(sigma_px) else sigma_px
+        sigma = (
+            sigma_px(radius, mag[seen], np.full(len(seen), frame))
+            if callable(sigma_px)
+            else sigma_px
+        )
         noise = sigma * rng.standard_normal((2, len(seen)))
         attitudes.append(attitude)
         xy = np.array([x[seen], y[seen]])
         if displaced is not None:
             xy = xy + displaced(xy - np.array([[x0], [y0]]), xy, mag[seen], frame)
         xy = xy + noise
-        values = (np.full(len(seen), frame), *xy, moved(stars[seen], own[seen]), number[seen], mag[seen])
+        values = (
+            np.full(len(seen), frame),
+            *xy,
+            moved(stars[seen], own[seen]),
+            number[seen],
+            mag[seen],
+        )
         for name, column in zip(rows, values, strict=True):
             rows[name].append(column)
     r = np.concatenate(rows["r"])
@@ -143,17 +186,28 @@ def campaign(
 
 
 def zeniths_of_frames(
-    rng: np.random.Generator, c: Campaign, high_deg: tuple[float, float] = (20.0, 60.0), turned: bool = True
+    rng: np.random.Generator,
+    c: Campaign,
+    high_deg: tuple[float, float] = (20.0, 60.0),
+    turned: bool = True,
 ) -> np.ndarray:
-    """Zeniths (K, 3) at some distances from the boresights, in any direction or, not `turned`, at one in the camera."""
+    """Zeniths (K, 3) at some distances from the boresights, in any direction or, not `turned`, at
+    one in the camera.
+    """
     distance = np.radians(rng.uniform(*high_deg, len(c.attitudes)))
-    angle = rng.uniform(0.0, 2.0 * np.pi, len(c.attitudes)) if turned else np.full(len(c.attitudes), 0.7)
+    angle = (
+        rng.uniform(0.0, 2.0 * np.pi, len(c.attitudes))
+        if turned
+        else np.full(len(c.attitudes), 0.7)
+    )
     up = [np.sin(distance) * np.cos(angle), np.sin(distance) * np.sin(angle), np.cos(distance)]
     return np.einsum("ik,kij->kj", np.array(up), c.attitudes)
 
 
 def through_air(c: Campaign, zeniths: np.ndarray, arcsec: float = 58.0) -> Campaign:
-    """The same images with directions that lack `arcsec` tan z of refraction towards zeniths (K, 3)."""
+    """The same images with directions that lack `arcsec` tan z of refraction towards zeniths (K,
+    3).
+    """
     zenith, r = zeniths[c.columns["frame"]], _directions(c)
     sine = np.sum(r * zenith, axis=1, keepdims=True)
     # The way to the zenith is as long as the cosine of the altitude.
@@ -161,7 +215,9 @@ def through_air(c: Campaign, zeniths: np.ndarray, arcsec: float = 58.0) -> Campa
 
 
 def aberrated(c: Campaign, velocity_km_s: np.ndarray) -> Campaign:
-    """The same images with directions that are aberrated by this velocity, ICRS axes; a negative one takes it off."""
+    """The same images with directions that are aberrated by this velocity, ICRS axes; a negative
+    one takes it off.
+    """
     return _redirected(c, _directions(c) + velocity_km_s / 299792.458)
 
 
@@ -184,7 +240,8 @@ def measured_again(
     origin_px: float = 0.0,
     lost: float = 0.07,
 ) -> dict[str, np.ndarray]:
-    """The same images by another program: its own errors and origin, some stars lost, other numbers and order.
+    """The same images by another program: its own errors and origin, some stars lost, other numbers
+    and order.
 
     Frame numbers run backwards from 1000 on; names and magnitudes are not known.
     """
@@ -198,18 +255,26 @@ def measured_again(
 
 
 def slew(n_frames: int, step_deg: float) -> np.ndarray:
-    """Attitudes (n, 3, 3) of a camera that turns about its y axis by a step a frame, and slowly about the others."""
+    """Attitudes (n, 3, 3) of a camera that turns about its y axis by a step a frame, and slowly
+    about the others.
+    """
     found = []
     for a in np.radians(step_deg) * np.arange(n_frames):
-        turn_y = np.array([[np.cos(a), 0.0, -np.sin(a)], [0.0, 1.0, 0.0], [np.sin(a), 0.0, np.cos(a)]])
+        turn_y = np.array(
+            [[np.cos(a), 0.0, -np.sin(a)], [0.0, 1.0, 0.0], [np.sin(a), 0.0, np.cos(a)]]
+        )
         roll = 0.3 * a
-        turn_z = np.array([[np.cos(roll), np.sin(roll), 0.0], [-np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]])
+        turn_z = np.array(
+            [[np.cos(roll), np.sin(roll), 0.0], [-np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]]
+        )
         found.append(turn_z @ turn_y)
     return np.array(found)
 
 
 def attitude_errors(c: Campaign, theta: np.ndarray) -> np.ndarray:
-    """Rotation vectors (K, 3), arcsec, by which attitudes err that a camera `theta` finds: Wahba's problem by SVD."""
+    """Rotation vectors (K, 3), arcsec, by which attitudes err that a camera `theta` finds: Wahba's
+    problem by SVD.
+    """
     x0, y0, f, k1, k2 = theta
     d = np.array([c.columns["x_px"] - x0, c.columns["y_px"] - y0])
     ideal = d.copy()
@@ -225,7 +290,10 @@ def attitude_errors(c: Campaign, theta: np.ndarray) -> np.ndarray:
         u, _, vt = np.linalg.svd(b[mine].T @ r[mine])
         found = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         turn = found @ truth.T
-        errors.append(0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]))
+        errors.append(
+            0.5
+            * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        )
     return np.array(errors) * 648000.0 / np.pi
 
 

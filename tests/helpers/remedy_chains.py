@@ -40,14 +40,26 @@ DISPLACED: dict[str, Callable[[Any, Any, Any, int], Any]] = {
         0.5 * np.stack([_rho(uv) ** 2 + 2 * (uv[0] / CORNER) ** 2, 2 * uv[0] * uv[1] / CORNER**2])
     ),
     "radial wave, 0.3 px": lambda uv, xy, mag, frame: 0.3 * np.sin(2 * np.pi * _rho(uv)) * _out(uv),
-    "fast radial wave, 0.2 px": lambda uv, xy, mag, frame: 0.2 * np.sin(6 * np.pi * _rho(uv)) * _out(uv),
-    "twist, 0.3 px": lambda uv, xy, mag, frame: 0.3 * _rho(uv) ** 3 * np.stack([-_out(uv)[1], _out(uv)[0]]),
-    "scale of x against y, 0.3 px": lambda uv, xy, mag, frame: 0.3 / CORNER * np.stack([uv[0], -uv[1]]),
+    "fast radial wave, 0.2 px": lambda uv, xy, mag, frame: (
+        0.2 * np.sin(6 * np.pi * _rho(uv)) * _out(uv)
+    ),
+    "twist, 0.3 px": lambda uv, xy, mag, frame: (
+        0.3 * _rho(uv) ** 3 * np.stack([-_out(uv)[1], _out(uv)[0]])
+    ),
+    "scale of x against y, 0.3 px": lambda uv, xy, mag, frame: (
+        0.3 / CORNER * np.stack([uv[0], -uv[1]])
+    ),
     "skew of the axes, 0.3 px": lambda uv, xy, mag, frame: 0.3 / CORNER * np.stack([uv[1], uv[0]]),
     "waves over the field, 0.2 px": lambda uv, xy, mag, frame: 0.2 * np.sin(uv / 90.0),
-    "one corner bent, 1 px": lambda uv, xy, mag, frame: np.where((uv[0] > 250) & (uv[1] > 250), 1.0, 0.0) * _out(uv),
-    "pixel phase in x, 0.08 px": lambda uv, xy, mag, frame: np.stack([0.08 * np.sin(2 * np.pi * xy[0]), 0 * xy[1]]),
-    "pixel phase in y, 0.08 px": lambda uv, xy, mag, frame: np.stack([0 * xy[0], 0.08 * np.sin(2 * np.pi * xy[1])]),
+    "one corner bent, 1 px": lambda uv, xy, mag, frame: (
+        np.where((uv[0] > 250) & (uv[1] > 250), 1.0, 0.0) * _out(uv)
+    ),
+    "pixel phase in x, 0.08 px": lambda uv, xy, mag, frame: np.stack(
+        [0.08 * np.sin(2 * np.pi * xy[0]), 0 * xy[1]]
+    ),
+    "pixel phase in y, 0.08 px": lambda uv, xy, mag, frame: np.stack(
+        [0 * xy[0], 0.08 * np.sin(2 * np.pi * xy[1])]
+    ),
     "shift with magnitude, 0.1 px": lambda uv, xy, mag, frame: np.outer([0.1, -0.05], mag - 4.0),
     "scale with magnitude, 0.2 px": lambda uv, xy, mag, frame: 0.2 * uv / CORNER * (mag - 4.0),
     "drift of f, 0.5 px": lambda uv, xy, mag, frame: 0.5 * uv / CORNER * (frame - 12.0) / 12.0,
@@ -60,7 +72,9 @@ DISPLACED: dict[str, Callable[[Any, Any, Any, int], Any]] = {
 NOISY: dict[str, dict[str, Any]] = {
     "none": {},
     "noise grows with radius": {"sigma_px": lambda radius, mag, frame: 0.03 * (1.0 + 3.0 * radius)},
-    "noise grows with magnitude": {"sigma_px": lambda radius, mag, frame: 0.02 * 1.6 ** (mag - 2.0)},
+    "noise grows with magnitude": {
+        "sigma_px": lambda radius, mag, frame: 0.02 * 1.6 ** (mag - 2.0)
+    },
     "noise of each frame": {"sigma_px": lambda radius, mag, frame: 0.05 * (1.0 + (frame % 3))},
     "noise of 3 px": {"sigma_px": 3.0},
     "strong distortion": {"corner_px": (40.0, -10.0)},
@@ -88,7 +102,9 @@ def plant(name: str, folder: Path, seed: int = 7) -> tuple[str, ...]:
         stars = sc.load_catalogue(max_mag=6.5, epoch=2026.9)
         obs = ground_frames(stars, np.linspace(25.0, 80.0, 16), seed=seed)
         if "without" in name:
-            obs = sc.Observations(**{key: value for key, value in obs.columns.items() if key != "time_utc"})
+            obs = sc.Observations(
+                **{key: value for key, value in obs.columns.items() if key != "time_utc"}
+            )
         NOMINAL.save(sheet)
         obs.save(table)
         declared = ("--directions", "apparent" if "without" in name else "catalogue")
@@ -102,7 +118,9 @@ def plant(name: str, folder: Path, seed: int = 7) -> tuple[str, ...]:
         wrong = rng.random(n) < float(name.split(" %")[0]) / 100.0
         columns["x_px"] = columns["x_px"] + wrong * rng.uniform(3.0, 30.0, n)
     if name == "heavy tails":
-        columns |= {axis: columns[axis] + 0.04 * rng.standard_t(2.0, n) for axis in ("x_px", "y_px")}
+        columns |= {
+            axis: columns[axis] + 0.04 * rng.standard_t(2.0, n) for axis in ("x_px", "y_px")
+        }
     if name.startswith("noise of x"):
         columns["x_px"] = columns["x_px"] + 0.19 * rng.standard_normal(n)
     on = [(columns[axis] > 0.0) & (columns[axis] < 1023.0) for axis in ("x_px", "y_px")]
@@ -113,7 +131,9 @@ def plant(name: str, folder: Path, seed: int = 7) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Step:
-    """One command and how it ended: options, exit status, checks that failed or warned, commands that are printed."""
+    """One command and how it ended: options, exit status, checks that failed or warned, commands
+    that are printed.
+    """
 
     options: dict[str, tuple[str | None, ...]]
     status: int
@@ -125,13 +145,19 @@ class Step:
 def printed(out: str) -> tuple[str, ...]:
     """The commands that are to be tried."""
     whole = re.sub(r"\s*\\\n\s*", " ", out)
-    return tuple(line.strip().removeprefix("try: ") for line in whole.splitlines() if line.strip().startswith("try: "))
+    return tuple(
+        line.strip().removeprefix("try: ")
+        for line in whole.splitlines()
+        if line.strip().startswith("try: ")
+    )
 
 
 def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
-    """Follow the first command that is printed, literally, until there is none; all are checked on the way.
+    """Follow the first command that is printed, literally, until there is none; all are checked on
+    the way.
 
-    AssertionError where a command does not run, changes nothing, repeats an option, or was there before.
+    AssertionError where a command does not run, changes nothing, repeats an option, or was there
+    before.
     """
     steps: list[Step] = []
     lines = [[*words, "-o", str(folder / "run"), "--force"]]
@@ -141,13 +167,22 @@ def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
             assert status in (0, 1), (line, status, err[-400:])
         options = parsed(lines[-1])[1]
         assert options not in [step.options for step in steps], (lines[-1], "was there before")
-        assert all(len(values) == 1 for name, values in options.items() if name != "--column"), lines[-1]
+        assert all(len(values) == 1 for name, values in options.items() if name != "--column"), (
+            lines[-1]
+        )
         found = re.search(r"Checks: (.*) of \d+", out)
         assert found is not None, (lines, out[-600:])
-        counts = {word: int(number) for number, word in re.findall(r"(\d+) (passed|gave|failed)", found[1])}
+        counts = {
+            word: int(number)
+            for number, word in re.findall(r"(\d+) (passed|gave|failed)", found[1])
+        }
         commands = printed(out)
         assert len(commands) <= 3
-        runs = [command for command in commands if command.split(" && ")[-1].startswith("starcal-uq run ")]
+        runs = [
+            command
+            for command in commands
+            if command.split(" && ")[-1].startswith("starcal-uq run ")
+        ]
         for command in runs:
             _, asked = parsed(shlex.split(command.split(" && ")[-1]))
             assert conflict(named(asked)) is None, command
@@ -156,9 +191,12 @@ def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
         end = re.search(r"No model here explains this[\s\S]*?(?=^Report:)", out, re.M)
         said = " ".join(end[0].split()) if end else ""
         doubts = counts.get("failed", 0), counts.get("gave", 0)
-        # A failure that nothing is left to try against is said to be one, with the data that would tell.
+        # A failure that nothing is left to try against is said to be one, with the data that would
+        # tell.
         assert bool(said) == (bool(doubts[0]) and not commands), (options, out[-1500:])
-        assert not said or ("usable: " in said and "not: " in said and "What would tell" in said), said
+        assert not said or ("usable: " in said and "not: " in said and "What would tell" in said), (
+            said
+        )
         steps.append(Step(options, status, doubts, commands, said))
         for command in set(commands) - set(runs):
             status, _, err = call(shlex.split(command)[1:])
@@ -174,10 +212,23 @@ def row(name: str, steps: Sequence[Step]) -> tuple[str, str, str, str]:
     start = steps[0].options
     tried = []
     for step in steps[1:]:
-        words = [word for name, values in step.options.items() if start.get(name) != values for word in (name, *values)]
-        shown = " ".join("SITE" if str(word).endswith(".toml") else str(word) for word in words if word)
+        words = [
+            word
+            for name, values in step.options.items()
+            if start.get(name) != values
+            for word in (name, *values)
+        ]
+        shown = " ".join(
+            "SITE" if str(word).endswith(".toml") else str(word) for word in words if word
+        )
         tried.append(f"`{shown}` {step.doubts[0]}, {step.doubts[1]}")
     last = steps[-1]
-    end = "passes" if last.doubts == (0, 0) else "warnings, no command left" if last.doubts[0] == 0 else "no model here"
+    end = (
+        "passes"
+        if last.doubts == (0, 0)
+        else "warnings, no command left"
+        if last.doubts[0] == 0
+        else "no model here"
+    )
     end = "more frames (`plan`)" if last.commands else end
     return name, f"{steps[0].doubts[0]}, {steps[0].doubts[1]}", " → ".join(tried) or "–", end

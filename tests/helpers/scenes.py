@@ -1,4 +1,6 @@
-"""Small scenes shared by the tests: cameras of every distortion model, and simulated observations of them."""
+"""Small scenes shared by the tests: cameras of every distortion model, and simulated observations
+of them.
+"""
 
 from __future__ import annotations
 
@@ -36,13 +38,19 @@ def nominal(truth: Camera) -> Camera:
 
 @lru_cache(maxsize=8)
 def catalogue(max_mag: float = 6.0, epoch: float = 2026.9) -> StarCatalogue:
-    """Stars of the embedded catalogue, whose file takes longer to read than a campaign to simulate."""
+    """Stars of the embedded catalogue, whose file takes longer to read than a campaign to
+    simulate.
+    """
     return load_catalogue(max_mag=max_mag, epoch=epoch)
 
 
 @lru_cache(maxsize=64)
 def observations(
-    model: str = "brown", n_frames: int = 60, seed: int = 3, sigma_px: float = 0.05, max_mag: float = 6.0
+    model: str = "brown",
+    n_frames: int = 60,
+    seed: int = 3,
+    sigma_px: float = 0.05,
+    max_mag: float = 6.0,
 ) -> Observations:
     """Simulated observations; cached, since many tests look at the same ones."""
     return simulate(

@@ -36,7 +36,16 @@ def star_field(rotation, focal_px, size=SIZE, max_mag=7.0):
 
 
 def picture(
-    path: Path, rotation, focal_px, *, size=SIZE, jitter_px=0.0, noise=10.0, max_mag=7.0, seed=0, shift=(0.0, 0.0)
+    path: Path,
+    rotation,
+    focal_px,
+    *,
+    size=SIZE,
+    jitter_px=0.0,
+    noise=10.0,
+    max_mag=7.0,
+    seed=0,
+    shift=(0.0, 0.0),
 ):
     """Write a picture of 16 bits: Gaussian stars of one pixel's width, a background and noise."""
     rng = np.random.default_rng(seed)

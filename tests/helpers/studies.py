@@ -1,4 +1,6 @@
-"""Studies whose answer is known: correlations, sigmas and errors are given by formulas, not computed from frames."""
+"""Studies whose answer is known: correlations, sigmas and errors are given by formulas, not
+computed from frames.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +34,13 @@ def made_study(
     target_arcsec: float | None = 0.5,
     bias_arcsec: Callable[[Mapping[str, Any]], float] = lambda cell: 0.1,
 ) -> Study:
-    """A study in which a cell's correlations, the size of its errors (arcsec) and its failures are given.
+    """A study in which a cell's correlations, the size of its errors (arcsec) and its failures are
+    given.
 
-    `correlations`: from a cell's values to the correlations of pairs; all others are zero.
-    `size`: factor on all sigmas and errors of a cell; the frame-dependent error is this many arcsec.
-    `jitter`: standard deviation that other seeds give the correlations.
-    `covered`: probability that an interval holds the truth; makes the study a simulated one.
+    `correlations`: from a cell's values to the correlations of pairs; all others are zero. `size`:
+    factor on all sigmas and errors of a cell; the frame-dependent error is this many arcsec.
+    `jitter`: standard deviation that other seeds give the correlations. `covered`: probability that
+    an interval holds the truth; makes the study a simulated one.
     """
     rng = np.random.default_rng(1)
     definition = StudyDefinition(
@@ -49,7 +52,11 @@ def made_study(
         target_arcsec=target_arcsec,
         target_sigma={"f": 0.05},
     )
-    cells = [dict(zip(sweep, values, strict=True)) for values in product(*sweep.values()) for _ in range(seeds)]
+    cells = [
+        dict(zip(sweep, values, strict=True))
+        for values in product(*sweep.values())
+        for _ in range(seeds)
+    ]
     n, p = len(cells), len(NAMES)
     status = np.array([failing(cell) for cell in cells])
     good = status == "ok"
@@ -89,9 +96,15 @@ def made_study(
         "nea_arcsec": (("cell", "axis"), scale[:, None] * ones),
         "error_curve_arcsec": (("cell", "frames_factor"), scale[:, None] / np.sqrt(factor)),
         # Sigmas fall as the root of the number of frames.
-        "frames_needed_sigma": (("cell", "parameter"), np.ceil(frames[:, None] * (sigma / 0.05) ** 2)),
+        "frames_needed_sigma": (
+            ("cell", "parameter"),
+            np.ceil(frames[:, None] * (sigma / 0.05) ** 2),
+        ),
         "model_bias_arcsec": (("cell", "simpler"), bias[:, None]),
-        "model_bias_attitude_arcsec": (("cell", "simpler", "axis"), bias[:, None, None] * ones[:, None, :]),
+        "model_bias_attitude_arcsec": (
+            ("cell", "simpler", "axis"),
+            bias[:, None, None] * ones[:, None, :],
+        ),
     }
     if covered is not None:
         held = np.where(good[:, None], rng.random((n, p)) < covered, np.nan)

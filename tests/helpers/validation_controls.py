@@ -1,4 +1,6 @@
-"""Ways to get the uncertainty wrong, for validations that must notice. Worker processes import this module."""
+"""Ways to get the uncertainty wrong, for validations that must notice. Worker processes import this
+module.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,9 @@ from typing import Any
 
 
 def forgets_attitudes(obs: Any, cal: Any) -> Any:
-    """Counts 2 N residuals, as if no attitude had been fitted to them: sigma comes out too small."""
+    """Counts 2 N residuals, as if no attitude had been fitted to them: sigma comes out too
+    small.
+    """
     return dataclasses.replace(cal.compressed, dof=2 * obs.n_stars)
 
 

@@ -24,7 +24,9 @@ def stars() -> StarCatalogue:
 
 @pytest.fixture
 def work(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """Triangles that are looked up, pairs that are tried as their bases, and fits of matched stars."""
+    """Triangles that are looked up, pairs that are tried as their bases, and fits of matched
+    stars.
+    """
     counts: Counter[str] = Counter()
     look_up, fit = pyramid._look_up, match._fit
 
@@ -45,7 +47,9 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 
 def test_few_stars_of_a_lens_that_bends(stars: StarCatalogue, work: Counter[str]) -> None:
-    """Three frames of 30 stars and as many false ones take fewer triangles than one frame that fails by itself."""
+    """Three frames of 30 stars and as many false ones take fewer triangles than one frame that
+    fails by itself.
+    """
     lens = Lens(1600, 1200, 60.0, 0.05)
     table, truth = measured(stars, lens, [30, 30, 30], 30, 0.2, 3)
     found = identify(table, None, stars, cache=False)
@@ -55,14 +59,20 @@ def test_few_stars_of_a_lens_that_bends(stars: StarCatalogue, work: Counter[str]
     assert work["fits"] <= 3 * 60
 
 
-def test_random_detections_of_a_narrow_field_are_given_up(monkeypatch: pytest.MonkeyPatch, work: Counter[str]) -> None:
-    """Where each triangle has thousands of pairs for its base, the search of a frame ends after so many pairs."""
+def test_random_detections_of_a_narrow_field_are_given_up(
+    monkeypatch: pytest.MonkeyPatch, work: Counter[str]
+) -> None:
+    """Where each triangle has thousands of pairs for its base, the search of a frame ends after so
+    many pairs.
+    """
     lens = Lens(1024, 1024, 3.0)
     sheet = sc.Camera(lens.width, lens.height, 5.0, 5e-3 * lens.focal, 511.5, 511.5)
     table = noise_frames(lens, [40], 2)
     deep = sc.load_catalogue(8.0, epoch=2016.0)
     monkeypatch.setattr("starcal_uq.identification.engine.find_optics", lambda *_: None)
-    searches = 3 * 2  # Two numbers of centroids: the camera as it is, and with a worse lens; and once more.
+    searches = (
+        3 * 2
+    )  # Two numbers of centroids: the camera as it is, and with a worse lens; and once more.
     most = 20_000
     monkeypatch.setattr(pyramid, "_MOST_PAIRS", most)
     largest = 0
@@ -82,7 +92,9 @@ def test_random_detections_of_a_narrow_field_are_given_up(monkeypatch: pytest.Mo
 
 
 def test_pairs_of_a_narrow_field_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With many stars the pairs at larger angles are left out, and every question below them has the same answer."""
+    """With many stars the pairs at larger angles are left out, and every question below them has
+    the same answer.
+    """
     rng = np.random.default_rng(1)
     directions = rng.standard_normal((4000, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -101,7 +113,9 @@ def test_pairs_of_a_narrow_field_are_bounded(monkeypatch: pytest.MonkeyPatch) ->
     asked, tolerance = np.full(500, 0.8 * reach), 0.1 * reach
     star = np.arange(500)
     for one, other in zip(
-        every.near_angle(star, asked, tolerance), fewer.near_angle(star, asked, tolerance), strict=True
+        every.near_angle(star, asked, tolerance),
+        fewer.near_angle(star, asked, tolerance),
+        strict=True,
     ):
         np.testing.assert_array_equal(one, other)
     question, hit = fewer.near_angle(star, asked, tolerance)
@@ -110,14 +124,20 @@ def test_pairs_of_a_narrow_field_are_bounded(monkeypatch: pytest.MonkeyPatch) ->
     # A smaller table of steps says the same.
     monkeypatch.setattr("starcal_uq.identification.pairs._ALL_STEPS", 20_000)
     for one, other in zip(
-        fewer.near_angle(star, asked, tolerance), pairs().near_angle(star, asked, tolerance), strict=True
+        fewer.near_angle(star, asked, tolerance),
+        pairs().near_angle(star, asked, tolerance),
+        strict=True,
     ):
         np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow
-def test_a_field_of_one_degree_that_fails(monkeypatch: pytest.MonkeyPatch, work: Counter[str]) -> None:
-    """With half a million stars: as many listed pairs, and tried ones, as a field of some degrees takes."""
+def test_a_field_of_one_degree_that_fails(
+    monkeypatch: pytest.MonkeyPatch, work: Counter[str]
+) -> None:
+    """With half a million stars: as many listed pairs, and tried ones, as a field of some degrees
+    takes.
+    """
     lens = Lens(1024, 1024, 1.0)
     sheet = sc.Camera(lens.width, lens.height, 5.0, 5e-3 * lens.focal, 511.5, 511.5)
     deep = sc.load_catalogue(10.0, epoch=2016.0)

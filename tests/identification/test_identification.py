@@ -22,9 +22,19 @@ from starcal_uq.identification import match as matching
 from starcal_uq.identification import search
 from starcal_uq.identification.brightness import instrumental_mag, unlike_brightness
 from starcal_uq.identification.engine import calibrated_tolerance, identify
-from starcal_uq.identification.pairs import angle_between, cached_star_pairs, default_cache_dir, find_star_pairs
+from starcal_uq.identification.pairs import (
+    angle_between,
+    cached_star_pairs,
+    default_cache_dir,
+    find_star_pairs,
+)
 from starcal_uq.identification.proposers import ENGINES
-from starcal_uq.identification.pyramid import CameraTolerance, first_order, mortari_order, remaining_order
+from starcal_uq.identification.pyramid import (
+    CameraTolerance,
+    first_order,
+    mortari_order,
+    remaining_order,
+)
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
@@ -33,9 +43,13 @@ SIGMA = 0.3
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
-def square_camera(fov_deg: float, focal: float = 1.0, shift_px: float = 0.0, **changes: Any) -> sc.Camera:
+def square_camera(
+    fov_deg: float, focal: float = 1.0, shift_px: float = 0.0, **changes: Any
+) -> sc.Camera:
     focal_px = focal * 512.0 / np.tan(np.radians(fov_deg / 2.0))
-    return sc.Camera(1024, 1024, 10.0, focal_px / 100.0, 511.5 + shift_px, 511.5 + shift_px, **changes)
+    return sc.Camera(
+        1024, 1024, 10.0, focal_px / 100.0, 511.5 + shift_px, 511.5 + shift_px, **changes
+    )
 
 
 def centroid_table(frames: list[tuple[Any, Any]], sigma_px: float = SIGMA) -> Any:
@@ -64,7 +78,9 @@ def random_frames(
     for star, xy in Sky(stars, camera, 2.0).views(rotations):
         seen = rng.random(len(star)) >= missing
         star, xy = star[seen], xy[seen]
-        xy = np.vstack([xy + SIGMA * rng.standard_normal(xy.shape), rng.random((false, 2)) * 1023.0])
+        xy = np.vstack(
+            [xy + SIGMA * rng.standard_normal(xy.shape), rng.random((false, 2)) * 1023.0]
+        )
         mag = stars.mag[star] + 0.2 * rng.standard_normal(len(star))
         frames.append((xy, 10.0 ** (-0.4 * np.concatenate([mag, rng.choice(stars.mag, false)]))))
         names += [*stars.star_id[star], *[""] * false]
@@ -92,7 +108,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("fov_deg", [12.0, 20.0])
 @pytest.mark.parametrize(("focal", "shift_px"), [(1.0, 0.0), (0.97, 20.0)])
-def test_random_frames_are_identified(stars: Any, folder: Path, fov_deg: float, focal: float, shift_px: float) -> None:
+def test_random_frames_are_identified(
+    stars: Any, folder: Path, fov_deg: float, focal: float, shift_px: float
+) -> None:
     table, names, rotations = random_frames(stars, square_camera(fov_deg, focal, shift_px), 60, 1)
     found = identify(table, square_camera(fov_deg), stars, share_camera=False, cache_dir=folder)
     assert found.n_identified == 60, found.text
@@ -100,12 +118,15 @@ def test_random_frames_are_identified(stars: Any, folder: Path, fov_deg: float, 
     assert len(found.observations) > 0.95 * len(names)
     # The largest accepted expectation of a wrong attitude is far below one.
     assert all(frame.log10_expected_false < -4.0 for frame in found.frames)
-    # Where the middle of the detector points; the attitude by itself is only known together with the principal point.
+    # Where the middle of the detector points; the attitude by itself is only known together with
+    # the principal point.
     middle = np.array([[511.5, 511.5]])
     seen = unproject(found.camera, middle)[0]
     true = unproject(square_camera(fov_deg, focal, shift_px), middle)[0]
     for frame, rotation in zip(found.frames, rotations, strict=True):
-        assert angle_between(seen @ quaternion_to_rotation(frame.quaternion), true @ rotation) < 2e-4
+        assert (
+            angle_between(seen @ quaternion_to_rotation(frame.quaternion), true @ rotation) < 2e-4
+        )
     assert abs(found.camera.focal_px / square_camera(fov_deg, focal).focal_px - 1.0) < 2e-4
 
 
@@ -136,12 +157,22 @@ def test_stops_at_the_first_good_match_and_looks_before_it_matches(
     # Half of the centroids are too faint for the catalogue, which is no reason to look on.
     bright = stars.select(stars.mag < 5.2)
     table, _, _ = random_frames(stars, square_camera(20.0, 0.98, 10.0), 10, 6)
-    assert identify(table, square_camera(20.0), bright, share_camera=False, cache_dir=folder).n_identified == 10
+    assert (
+        identify(
+            table, square_camera(20.0), bright, share_camera=False, cache_dir=folder
+        ).n_identified
+        == 10
+    )
     assert calls["match_frame"] < 3 * 10
     calls.clear()
     table, _, _ = random_frames(stars, square_camera(12.0), 2, 7)
     table.x_px = np.random.default_rng(8).random(len(table.x_px)) * 1023.0
-    assert identify(table, square_camera(12.0), stars, share_camera=False, cache_dir=folder).n_identified == 0
+    assert (
+        identify(
+            table, square_camera(12.0), stars, share_camera=False, cache_dir=folder
+        ).n_identified
+        == 0
+    )
     # Four fits each where every one is matched; most are seen to be wrong before the first.
     assert calls["match_frame"] > 100 and calls["_fit"] < calls["match_frame"]
 
@@ -152,7 +183,9 @@ def test_no_stars_at_all(stars: Any, folder: Path) -> None:
     assert [frame.status for frame in found.frames] == ["too few stars"] * 2
     for name in ("frame_ids", "image", "time_utc"):
         setattr(table, name, getattr(table, name)[:0])
-    assert identify(table, square_camera(12.0), stars, cache_dir=folder).text == "There are no frames."
+    assert (
+        identify(table, square_camera(12.0), stars, cache_dir=folder).text == "There are no frames."
+    )
 
 
 def test_false_and_missing_stars(stars: Any, folder: Path) -> None:
@@ -164,7 +197,9 @@ def test_false_and_missing_stars(stars: Any, folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def disturbed(stars: Any) -> tuple[Any, Any]:
-    """Frames in which a false star lies beside the place of a missing one, at 2.5 sigma, and the rows of these."""
+    """Frames in which a false star lies beside the place of a missing one, at 2.5 sigma, and the
+    rows of these.
+    """
     table, *_ = random_frames(stars, square_camera(12.0), 40, 14)
     rows = np.array([np.flatnonzero(table.frame == k)[7] for k in range(40)])
     angle = np.random.default_rng(15).random(40) * 2.0 * np.pi
@@ -177,7 +212,10 @@ def refused_stars(table: Any, rows: Any, found: Any) -> tuple[int, int]:
     """Planted rows that are identified, and how many matches were given up for their brightness."""
     o = found.observations
     used = set(zip(o.frame.tolist(), o.x_px.tolist(), strict=True))
-    kept = sum((f, x) in used for f, x in zip(table.frame[rows].tolist(), table.x_px[rows].tolist(), strict=True))
+    kept = sum(
+        (f, x) in used
+        for f, x in zip(table.frame[rows].tolist(), table.x_px[rows].tolist(), strict=True)
+    )
     return kept, sum(frame.n_unlike_brightness for frame in found.frames)
 
 
@@ -185,10 +223,14 @@ def refused_stars(table: Any, rows: Any, found: Any) -> tuple[int, int]:
 def test_false_stars_are_known_by_their_brightness(
     stars: Any, folder: Path, disturbed: tuple[Any, Any], gain: float
 ) -> None:
-    """Faint false stars beside the places of brighter ones are refused; those of the right brightness cannot be."""
+    """Faint false stars beside the places of brighter ones are refused; those of the right
+    brightness cannot be.
+    """
     table, rows = disturbed
     like = SimpleNamespace(**vars(table) | {"flux": gain * table.flux})
-    kept, unlike = refused_stars(like, rows, identify(like, square_camera(12.0), stars, cache_dir=folder))
+    kept, unlike = refused_stars(
+        like, rows, identify(like, square_camera(12.0), stars, cache_dir=folder)
+    )
     assert kept >= 20
     assert unlike <= 4
     flux = gain * table.flux
@@ -201,11 +243,16 @@ def test_false_stars_are_known_by_their_brightness(
     assert "brightness is unlike" in found.text
     # Where all fluxes are equal they say nothing.
     flat = SimpleNamespace(**vars(table) | {"flux": np.ones(len(flux))})
-    assert refused_stars(flat, rows, identify(flat, square_camera(12.0), stars, cache_dir=folder))[1] == 0
+    assert (
+        refused_stars(flat, rows, identify(flat, square_camera(12.0), stars, cache_dir=folder))[1]
+        == 0
+    )
 
 
 def test_brightness_is_only_a_second_opinion() -> None:
-    """Variable, saturated and few stars stay; what is far from its place or much too bright does not."""
+    """Variable, saturated and few stars stay; what is far from its place or much too bright does
+    not.
+    """
     rng = np.random.default_rng(16)
     difference, misfit = 7.0 + 0.2 * rng.standard_normal(30), np.full(30, 1.0)
     difference[0], difference[1], misfit[1], difference[2], misfit[2] = 8.5, 8.5, 10.0, 3.5, 0.0
@@ -213,7 +260,9 @@ def test_brightness_is_only_a_second_opinion() -> None:
     saturated = np.where(difference > 8.0, np.nan, difference)
     assert np.flatnonzero(unlike_brightness(saturated, misfit)).tolist() == [2]
     # A gain, and a frame whose brightness is only known to half a magnitude.
-    assert np.array_equal(unlike_brightness(difference + 4.0, misfit), unlike_brightness(difference, misfit))
+    assert np.array_equal(
+        unlike_brightness(difference + 4.0, misfit), unlike_brightness(difference, misfit)
+    )
     assert not unlike_brightness(7.0 + 0.6 * rng.standard_normal(30), np.full(30, 3.0)).any()
     assert not unlike_brightness(difference[:5], misfit[:5]).any()
     assert instrumental_mag(np.full(9, 3.0)) is None
@@ -226,16 +275,24 @@ def test_brightness_is_only_a_second_opinion() -> None:
 def test_taste_follows_chi_square(stars: Any, folder: Path) -> None:
     """With the stated noise the p-values are uniform; with half of it they are not."""
     table, *_ = random_frames(stars, square_camera(12.0, 1.01), 80, 3)
-    p = [f.taste_p_value for f in identify(table, square_camera(12.0), stars, cache_dir=folder).frames]
+    p = [
+        f.taste_p_value
+        for f in identify(table, square_camera(12.0), stars, cache_dir=folder).frames
+    ]
     assert 0.35 < np.mean(p) < 0.7
     assert np.mean(np.array(p) < 0.01) < 0.06
     table.sigma_px = table.sigma_px / 2.0
-    low = [f.taste_p_value for f in identify(table, square_camera(12.0), stars, cache_dir=folder).frames]
+    low = [
+        f.taste_p_value
+        for f in identify(table, square_camera(12.0), stars, cache_dir=folder).frames
+    ]
     assert np.nanmedian(low) < 1e-3
 
 
 def test_frames_without_a_solution(stars: Any, folder: Path) -> None:
-    """Random points, empty frames and frames of three stars get a word, and nothing is identified."""
+    """Random points, empty frames and frames of three stars get a word, and nothing is
+    identified.
+    """
     rng = np.random.default_rng(4)
     frames = [(rng.random((n, 2)) * 1023.0, rng.random(n)) for n in (0, 3, 4, 6, 9, 14, 25)]
     found = identify(centroid_table(frames), square_camera(12.0), stars, cache_dir=folder)
@@ -248,7 +305,9 @@ def test_frames_without_a_solution(stars: Any, folder: Path) -> None:
 
 
 def test_another_sky_is_not_identified(stars: Any, folder: Path) -> None:
-    """With the stars of the catalogue shuffled nothing fits; a turned catalogue gives a turned attitude."""
+    """With the stars of the catalogue shuffled nothing fits; a turned catalogue gives a turned
+    attitude.
+    """
     table, *_ = random_frames(stars, square_camera(12.0), 3, 5)
     rng = np.random.default_rng(6)
     directions = rng.standard_normal((len(stars), 3))
@@ -257,7 +316,10 @@ def test_another_sky_is_not_identified(stars: Any, folder: Path) -> None:
     assert identify(table, square_camera(12.0), shuffled, cache_dir=folder).n_identified == 0
     straight = identify(table, square_camera(12.0), stars, cache_dir=folder)
     turned = identify(
-        table, square_camera(12.0), replace(stars, ra_deg=(stars.ra_deg + 90.0) % 360.0), cache_dir=folder
+        table,
+        square_camera(12.0),
+        replace(stars, ra_deg=(stars.ra_deg + 90.0) % 360.0),
+        cache_dir=folder,
     )
     assert straight.n_identified == turned.n_identified == 3
     assert np.array_equal(straight.observations.star_id, turned.observations.star_id)
@@ -359,7 +421,9 @@ def test_pairs_are_complete_and_cached(tmp_path: Path) -> None:
     hits = np.abs(angles[stars_asked] - asked[:, None]) <= 1e-3
     hits[np.arange(len(stars_asked)), stars_asked] = False
     hits &= angles[stars_asked] < 0.2
-    assert sorted(zip(question.tolist(), partner.tolist(), strict=True)) == [tuple(x) for x in np.argwhere(hits)]
+    assert sorted(zip(question.tolist(), partner.tolist(), strict=True)) == [
+        tuple(x) for x in np.argwhere(hits)
+    ]
 
     folder = tmp_path / "new" / "cache"
     first = cached_star_pairs(directions, mag, 0.04, 0.2, folder)
@@ -388,13 +452,19 @@ def test_triangles_do_not_stay_with_one_star() -> None:
     order = mortari_order(8)
     assert len({tuple(t) for t in order.tolist()}) == 56
     assert np.all(np.diff(order, axis=1) > 0)
-    # Six triangles in, no star has been in all of them, so that one false star cannot stall the search.
+    # Six triangles in, no star has been in all of them, so that one false star cannot stall the
+    # search.
     assert np.bincount(order[:6].ravel()).max() <= 3
 
 
 def test_triangles_left_after_a_first_search() -> None:
-    """Every five stars hold a triangle of the first or of the second search, and none is in both."""
-    first, left = ({tuple(t) for t in order.tolist()} for order in (first_order(10, True), remaining_order(16, 10)))
+    """Every five stars hold a triangle of the first or of the second search, and none is in
+    both.
+    """
+    first, left = (
+        {tuple(t) for t in order.tolist()}
+        for order in (first_order(10, True), remaining_order(16, 10))
+    )
     assert len(first) + len(left) < 170
     assert not first & left
     for five in combinations(range(16), 5):
@@ -402,13 +472,18 @@ def test_triangles_left_after_a_first_search() -> None:
     assert len(first_order(10, False)) == 120
 
 
-@pytest.mark.parametrize(("fov_deg", "focal", "shift_px"), [(12.0, 1.02, 10.0), (20.0, 0.97, -20.0)])
-def test_engines_agree(stars: Any, folder: Path, fov_deg: float, focal: float, shift_px: float) -> None:
+@pytest.mark.parametrize(
+    ("fov_deg", "focal", "shift_px"), [(12.0, 1.02, 10.0), (20.0, 0.97, -20.0)]
+)
+def test_engines_agree(
+    stars: Any, folder: Path, fov_deg: float, focal: float, shift_px: float
+) -> None:
     """tetra3rs finds other patterns, and the same stars come out."""
     pytest.importorskip("tetra3rs", reason="the extra `tetra3rs` is not installed")
     table, names, _ = random_frames(stars, square_camera(fov_deg, focal, shift_px), 30, 17)
     ours, theirs = (
-        identify(table, square_camera(fov_deg), stars, engine=engine, cache_dir=folder) for engine in ENGINES
+        identify(table, square_camera(fov_deg), stars, engine=engine, cache_dir=folder)
+        for engine in ENGINES
     )
     assert ours.n_identified == theirs.n_identified == 30
     assert np.array_equal(ours.observations.frame, theirs.observations.frame)
@@ -437,7 +512,9 @@ def test_engine_that_is_not_there(stars: Any, monkeypatch: pytest.MonkeyPatch) -
 
 def test_bad_input(stars: Any, folder: Path) -> None:
     table, *_ = random_frames(stars, square_camera(12.0), 1, 12)
-    with pytest.raises(SettingError, match=r"focal_tolerance is .*: give a number from 1e-09 to 0.3"):
+    with pytest.raises(
+        SettingError, match=r"focal_tolerance is .*: give a number from 1e-09 to 0.3"
+    ):
         identify(table, square_camera(12.0), stars, focal_tolerance=0.0)
     with pytest.raises(IdentificationError, match="too few"):
         identify(table, square_camera(12.0), stars.select(np.arange(10)))
@@ -450,16 +527,22 @@ def test_bad_input(stars: Any, folder: Path) -> None:
 
 
 def test_real_frames(folder: Path) -> None:
-    """All eight, from the data sheet's camera, and no star elsewhere than an independent match put it."""
+    """All eight, from the data sheet's camera, and no star elsewhere than an independent match put
+    it.
+    """
     source = DATA / "esa_tetra3_observations.csv"
     if not source.is_file():
         pytest.skip("the real frames' table is not there (../shared/data)")
     with source.open() as file:
         rows = list(csv.DictReader(file))
-    values = {c: np.array([float(row[c]) for row in rows]) for c in ("x_px", "y_px", "mag", "ra_deg", "dec_deg")}
+    values = {
+        c: np.array([float(row[c]) for row in rows])
+        for c in ("x_px", "y_px", "mag", "ra_deg", "dec_deg")
+    }
     frame = np.array([int(row["frame"]) for row in rows])
     groups = [
-        (np.column_stack([values["x_px"], values["y_px"]])[frame == k], values["mag"][frame == k]) for k in range(8)
+        (np.column_stack([values["x_px"], values["y_px"]])[frame == k], values["mag"][frame == k])
+        for k in range(8)
     ]
     table = centroid_table([(xy, 10.0 ** (-0.4 * mag)) for xy, mag in groups], 0.1)
     nominal = sc.Camera.load(DATA / "esa_tetra3_camera.toml")
@@ -467,9 +550,14 @@ def test_real_frames(folder: Path) -> None:
     o = found.observations
     assert found.n_identified == 8
     assert len(o) >= 8 * 30
-    truth = {key: i for i, key in enumerate(zip(frame.tolist(), values["x_px"], values["y_px"], strict=True))}
+    truth = {
+        key: i
+        for i, key in enumerate(zip(frame.tolist(), values["x_px"], values["y_px"], strict=True))
+    }
     at = [truth[key] for key in zip(o.frame.tolist(), o.x_px, o.y_px, strict=True)]
-    apart = angle_between(o.directions_icrs, unit_vectors(values["ra_deg"][at], values["dec_deg"][at]))
+    apart = angle_between(
+        o.directions_icrs, unit_vectors(values["ra_deg"][at], values["dec_deg"][at])
+    )
     assert np.degrees(apart.max()) * 3600.0 < 10.0
     # Refraction is in the focal length here, and an independent fit without it has 5114.3 px.
     assert abs(found.camera.focal_px - 5114.3) < 2.0
@@ -477,7 +565,9 @@ def test_real_frames(folder: Path) -> None:
 
 
 def test_brightness_of_real_frames(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another band, saturated and variable stars: no star of the table is refused, and two of a thousand at most."""
+    """Another band, saturated and variable stars: no star of the table is refused, and two of a
+    thousand at most.
+    """
     images = sorted((DATA / "esa-tetra3").glob("*.tiff"))
     if not images:
         pytest.skip("the real frames are not there (../shared/data)")
@@ -487,15 +577,22 @@ def test_brightness_of_real_frames(folder: Path, monkeypatch: pytest.MonkeyPatch
     found = identify(table, nominal, stars, cache_dir=folder)
     assert found.n_identified == 8
     assert sum(f.n_unlike_brightness for f in found.frames) <= 0.002 * len(found.observations)
-    monkeypatch.setattr(matching, "unlike_brightness", lambda difference, misfit: np.zeros(len(misfit), dtype=bool))
+    monkeypatch.setattr(
+        matching, "unlike_brightness", lambda difference, misfit: np.zeros(len(misfit), dtype=bool)
+    )
     every = identify(table, nominal, stars, cache_dir=folder).observations
     o = found.observations
     kept = set(zip(o.frame.tolist(), o.star_id.tolist(), strict=True))
     refused = [
-        i for i, key in enumerate(zip(every.frame.tolist(), every.star_id.tolist(), strict=True)) if key not in kept
+        i
+        for i, key in enumerate(zip(every.frame.tolist(), every.star_id.tolist(), strict=True))
+        if key not in kept
     ]
     with (DATA / "esa_tetra3_observations.csv").open() as file:
-        rows = [(int(row["frame"]), float(row["x_px"]), float(row["y_px"])) for row in csv.DictReader(file)]
+        rows = [
+            (int(row["frame"]), float(row["x_px"]), float(row["y_px"]))
+            for row in csv.DictReader(file)
+        ]
     frame, x, y = np.array(rows).T
     for i in refused:
         assert np.hypot(x - every.x_px[i], y - every.y_px[i])[frame == every.frame[i]].min() > 3.0

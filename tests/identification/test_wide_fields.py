@@ -18,8 +18,28 @@ from tests.identification.wide import Lens, attitude, picture, view
 
 # Field of view in degrees, and by how much of its distance the corner is drawn in.
 FIELDS = [
-    *((30, 0.0), (30, 0.045), (30, 0.08), (40, 0.02), (40, 0.05), (40, 0.08), (50, 0.03), (50, 0.06), (60, 0.0)),
-    *((60, 0.04), (60, 0.06), (60, 0.08), (70, 0.04), (70, 0.08), (80, 0.03), (80, 0.06), (90, 0.04), (90, 0.08)),
+    *(
+        (30, 0.0),
+        (30, 0.045),
+        (30, 0.08),
+        (40, 0.02),
+        (40, 0.05),
+        (40, 0.08),
+        (50, 0.03),
+        (50, 0.06),
+        (60, 0.0),
+    ),
+    *(
+        (60, 0.04),
+        (60, 0.06),
+        (60, 0.08),
+        (70, 0.04),
+        (70, 0.08),
+        (80, 0.03),
+        (80, 0.06),
+        (90, 0.04),
+        (90, 0.08),
+    ),
     *((100, 0.03), (100, 0.06)),
 ]
 STARS = (60, 120, 200, 400)
@@ -35,7 +55,9 @@ def lens_of(number: int, rng: np.random.Generator) -> Lens:
     field, barrel = FIELDS[number]
     width = (1200, 1600, 3000)[number % 3]
     off = 0.004 * width * rng.standard_normal(2)
-    return Lens(width, 3 * width // 4, field, barrel, (0.0, 0.2 * barrel)[number % 2], (off[0], off[1]))
+    return Lens(
+        width, 3 * width // 4, field, barrel, (0.0, 0.2 * barrel)[number % 2], (off[0], off[1])
+    )
 
 
 def rendered(stars: StarCatalogue, number: int, seed: int) -> tuple[Any, Lens, Any, Any]:
@@ -47,7 +69,9 @@ def rendered(stars: StarCatalogue, number: int, seed: int) -> tuple[Any, Lens, A
     return extract_centroids(image), lens, rows, places
 
 
-def wrong_and_right(found: Identification, names: Any, places: Any, frame: int = 0) -> tuple[int, int]:
+def wrong_and_right(
+    found: Identification, names: Any, places: Any, frame: int = 0
+) -> tuple[int, int]:
     """Identified stars of a frame that are not those at their places, and those that are."""
     o = found.observations
     mine = np.flatnonzero(o.frame == frame)
@@ -58,7 +82,9 @@ def wrong_and_right(found: Identification, names: Any, places: Any, frame: int =
     return int((~right).sum()), int(right.sum())
 
 
-@pytest.mark.parametrize("number", [1, 11, 19], ids=lambda number: "{} degrees, {:.1%}".format(*FIELDS[number]))
+@pytest.mark.parametrize(
+    "number", [1, 11, 19], ids=lambda number: "{} degrees, {:.1%}".format(*FIELDS[number])
+)
 def test_a_lens_that_bends_needs_no_sheet(stars: StarCatalogue, number: int) -> None:
     """The whole field is identified, and the focal length is that of the middle."""
     table, lens, rows, places = rendered(stars, number, 3)
@@ -77,7 +103,9 @@ def test_a_lens_that_bends_needs_no_sheet(stars: StarCatalogue, number: int) -> 
 
 @pytest.mark.slow
 def test_twenty_wide_fields(stars: StarCatalogue) -> None:
-    """30 to 100 degrees, 0 to 8 % of barrel at the corner: none wrong, one missed at most, and each almost filled."""
+    """30 to 100 degrees, 0 to 8 % of barrel at the corner: none wrong, one missed at most, and each
+    almost filled.
+    """
     shares = []
     for number in range(len(FIELDS)):
         table, _, rows, places = rendered(stars, number, 7)
@@ -90,7 +118,9 @@ def test_twenty_wide_fields(stars: StarCatalogue) -> None:
 
 
 def table_of(frames: list[tuple[Any, Any]], lens: Lens, sigma: float) -> Any:
-    """Frames of places and magnitudes as what `identify` reads, without a word of the camera but its size."""
+    """Frames of places and magnitudes as what `identify` reads, without a word of the camera but
+    its size.
+    """
     n = [len(xy) for xy, _ in frames]
     xy = np.concatenate([xy for xy, _ in frames])
     return SimpleNamespace(
@@ -106,14 +136,20 @@ def table_of(frames: list[tuple[Any, Any]], lens: Lens, sigma: float) -> Any:
     )
 
 
-def measured(stars: StarCatalogue, lens: Lens, n: list[int], false: int, sigma: float, seed: int) -> tuple[Any, Any]:
-    """A table of frames with so many stars, and false ones among them, and each frame's names and places."""
+def measured(
+    stars: StarCatalogue, lens: Lens, n: list[int], false: int, sigma: float, seed: int
+) -> tuple[Any, Any]:
+    """A table of frames with so many stars, and false ones among them, and each frame's names and
+    places.
+    """
     rng = np.random.default_rng(seed)
     size = np.array([lens.width - 1.0, lens.height - 1.0])
     frames, truth = [], []
     for count in n:
         rows, places = view(stars, lens, attitude(rng), count)
-        xy = np.vstack([places + sigma * rng.standard_normal(places.shape), rng.random((false, 2)) * size])
+        xy = np.vstack(
+            [places + sigma * rng.standard_normal(places.shape), rng.random((false, 2)) * size]
+        )
         mag = np.concatenate([stars.mag[rows], rng.choice(stars.mag[rows], false)])
         frames.append((xy, mag + 0.2 * rng.standard_normal(len(mag))))
         truth.append((np.append(stars.star_id[rows], [""] * false), xy))
@@ -121,11 +157,15 @@ def measured(stars: StarCatalogue, lens: Lens, n: list[int], false: int, sigma: 
 
 
 @pytest.mark.parametrize("told", [False, True], ids=["no sheet", "a pinhole's sheet"])
-def test_what_one_frame_shows_of_the_lens_serves_the_others(stars: StarCatalogue, told: bool) -> None:
+def test_what_one_frame_shows_of_the_lens_serves_the_others(
+    stars: StarCatalogue, told: bool
+) -> None:
     """Nine frames of a webcam of 70 degrees with few stars, and five false ones in each."""
     lens = Lens(1280, 720, 70.0, 0.03, 0.01, (8.0, -5.0))
     table, truth = measured(stars, lens, [11, 24, 9, 13, 14, 21, 22, 8, 15], 5, 0.3, 3)
-    sheet = sc.Camera(lens.width, lens.height, 5.0, 5e-3 * lens.focal, 639.5, 359.5) if told else None
+    sheet = (
+        sc.Camera(lens.width, lens.height, 5.0, 5e-3 * lens.focal, 639.5, 359.5) if told else None
+    )
     found = identify(table, sheet, stars, cache=False)
     assert found.n_identified >= 8
     counts = [wrong_and_right(found, *frame, k) for k, frame in enumerate(truth)]
@@ -147,7 +187,9 @@ def test_thousands_of_detections(stars: StarCatalogue, barrel: float) -> None:
 
 @pytest.mark.parametrize("n", [1, 4])
 def test_hot_pixels_hide_no_lens_that_was_found(stars: StarCatalogue, n: int) -> None:
-    """They are the brightest detections of every frame, so that no triangle of the brightest is one of stars."""
+    """They are the brightest detections of every frame, so that no triangle of the brightest is one
+    of stars.
+    """
     lens = Lens(1600, 1200, 60.0, 0.05)
     table, truth = measured(stars, lens, [80] * n, 14, 0.2, 8)
     table.flux[np.concatenate([names for names, _ in truth]) == ""] = table.flux.max()
@@ -161,7 +203,9 @@ def test_hot_pixels_hide_no_lens_that_was_found(stars: StarCatalogue, n: int) ->
 def noise_frames(lens: Lens, n: list[int], seed: int) -> Any:
     rng = np.random.default_rng(seed)
     size = np.array([lens.width - 1.0, lens.height - 1.0])
-    return table_of([(rng.random((count, 2)) * size, rng.random(count) * 5.0) for count in n], lens, 0.2)
+    return table_of(
+        [(rng.random((count, 2)) * size, rng.random(count) * 5.0) for count in n], lens, 0.2
+    )
 
 
 def test_detections_at_random_are_no_wide_field(stars: StarCatalogue) -> None:

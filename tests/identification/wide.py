@@ -1,4 +1,6 @@
-"""Pictures of the sky by NumPy alone: wide fields, lenses that bend, and detections that are no stars."""
+"""Pictures of the sky by NumPy alone: wide fields, lenses that bend, and detections that are no
+stars.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens of a field so many degrees wide, whose corner is drawn in by `barrel`, a part of its distance.
+    """A lens of a field so many degrees wide, whose corner is drawn in by `barrel`, a part of its
+    distance.
 
     A point that a pinhole would show at the radius r, in units of the corner's distance, is seen at
-    ``r (1 - (barrel + wave) r^2 + wave r^4)``. The axis is off the detector's middle by `off` pixels.
+    ``r (1 - (barrel + wave) r^2 + wave r^4)``. The axis is off the detector's middle by `off`
+    pixels.
     """
 
     width: int
@@ -62,16 +66,21 @@ def view(stars: Any, lens: Lens, rotation: Any, n: int) -> tuple[Any, Any]:
 
 
 def picture(lens: Lens, places: Any, mag: Any, rng: np.random.Generator, psf: float = 1.1) -> Any:
-    """Counts (height, width) of Gaussian spots, the faintest with about eight times the noise, 12 bit in 16."""
+    """Counts (height, width) of Gaussian spots, the faintest with about eight times the noise, 12
+    bit in 16.
+    """
     expected = np.full((lens.height, lens.width), 200.0)
     parts = (np.arange(5) - 2.0) / 5.0
     reach = 6
     for (x, y), flux in zip(places, 500.0 * 10.0 ** (-0.4 * (mag - mag.max())), strict=True):
-        columns, rows = (np.arange(round(v) - reach, round(v) + reach + 1) for v in (float(x), float(y)))
+        columns, rows = (
+            np.arange(round(v) - reach, round(v) + reach + 1) for v in (float(x), float(y))
+        )
         columns = columns[(columns >= 0) & (columns < lens.width)]
         rows = rows[(rows >= 0) & (rows < lens.height)]
         along, down = (
-            np.exp(-0.5 * ((at[:, None] + parts - v) / psf) ** 2).mean(axis=1) for at, v in ((columns, x), (rows, y))
+            np.exp(-0.5 * ((at[:, None] + parts - v) / psf) ** 2).mean(axis=1)
+            for at, v in ((columns, x), (rows, y))
         )
         expected[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] += (
             flux / (2.0 * np.pi * psf**2) * np.outer(down, along)

@@ -24,7 +24,8 @@ from starcal_uq.images.image import Image, read_image
 from tests.helpers.speed import sort_a_million, times_as_long
 
 sep, fits = (
-    pytest.importorskip(name, reason="the extra images is not installed") for name in ("sep", "astropy.io.fits")
+    pytest.importorskip(name, reason="the extra images is not installed")
+    for name in ("sep", "astropy.io.fits")
 )
 
 BACKGROUND_E, READ_NOISE_E = 50.0, 5.0
@@ -37,7 +38,9 @@ def line(centre, sigma, first, n):
 
 
 def sky(xy, flux, sigma, shape=(512, 512)):
-    """Expected electrons of stars on the background; stars near the border lose what lies outside."""
+    """Expected electrons of stars on the background; stars near the border lose what lies
+    outside.
+    """
     h = int(np.ceil(6.0 * sigma)) + 2
     image = np.zeros((shape[0] + 2 * h, shape[1] + 2 * h))
     for (x, y), f in zip(xy, np.broadcast_to(flux, len(xy)), strict=True):
@@ -48,11 +51,15 @@ def sky(xy, flux, sigma, shape=(512, 512)):
 
 
 def noisy(expected, rng, gain=1.0):
-    return ((rng.poisson(expected) + rng.normal(0.0, READ_NOISE_E, expected.shape)) / gain).astype(np.float32)
+    return ((rng.poisson(expected) + rng.normal(0.0, READ_NOISE_E, expected.shape)) / gain).astype(
+        np.float32
+    )
 
 
 def bound(flux, sigma):
-    """Cramer-Rao bound of x (standard deviation, mean over pixel phases), and the SNR of the flux."""
+    """Cramer-Rao bound of x (standard deviation, mean over pixel phases), and the SNR of the
+    flux.
+    """
     h, d = int(np.ceil(6.0 * sigma)) + 1, 1e-4
     covariances = []
     for u in np.linspace(-0.4, 0.4, 5):
@@ -60,7 +67,9 @@ def bound(flux, sigma):
             px, py = line(u, sigma, -h, 2 * h + 1), line(v, sigma, -h, 2 * h + 1)
             dx = (line(u + d, sigma, -h, 2 * h + 1) - line(u - d, sigma, -h, 2 * h + 1)) / (2 * d)
             dy = (line(v + d, sigma, -h, 2 * h + 1) - line(v - d, sigma, -h, 2 * h + 1)) / (2 * d)
-            design = np.stack([flux * np.outer(py, dx), flux * np.outer(dy, px), np.outer(py, px)]).reshape(3, -1)
+            design = np.stack(
+                [flux * np.outer(py, dx), flux * np.outer(dy, px), np.outer(py, px)]
+            ).reshape(3, -1)
             variance = flux * design[2] + BACKGROUND_E + READ_NOISE_E**2
             covariances.append(np.diag(np.linalg.inv((design / variance) @ design.T)))
     x, _, f = np.mean(covariances, axis=0)
@@ -78,7 +87,9 @@ def flux_for(snr, sigma):
 def grid(rng, n=21, pitch=24.0):
     """Places of n x n stars at random pixel phases."""
     at = 16.0 + pitch * np.arange(n)
-    return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2) + rng.uniform(-0.5, 0.5, (n * n, 2))
+    return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2) + rng.uniform(
+        -0.5, 0.5, (n * n, 2)
+    )
 
 
 def matched(centroids, xy, reach=2.0):
@@ -108,7 +119,8 @@ def trial(snr, sigma):
     return xy, image, extract_centroids(Image(image, "trial"), gain_e_per_count=1.0)
 
 
-# ---- accuracy ------------------------------------------------------------------------------------------------------
+# ---- accuracy
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sigma", [0.8, 1.2, 2.0])
@@ -160,7 +172,9 @@ def test_without_gain_counts_are_reported_and_a_message_says_what_is_missing():
     _, image, known = trial(300, 1.2)
     unknown = extract_centroids(Image(image, "trial"))
     assert unknown.meta["flux_unit"] == "counts" and known.meta["flux_unit"] == "electrons"
-    assert "gain is unknown" in unknown.messages[-1] and not any("gain" in text for text in known.messages)
+    assert "gain is unknown" in unknown.messages[-1] and not any(
+        "gain" in text for text in known.messages
+    )
     assert np.median(unknown.sigma_px) < 0.8 * np.median(known.sigma_px)
 
 
@@ -178,7 +192,11 @@ def test_the_gain_scales_fluxes_and_not_positions():
 def test_a_large_frame_takes_a_moment():
     rng = np.random.default_rng(2)
     xy = rng.uniform(20, 1000, (15, 2))
-    counts = noisy(sky(xy, rng.uniform(2000, 30000, 15), 1.0, (1024, 1024)), rng).clip(0).astype(np.uint16)
+    counts = (
+        noisy(sky(xy, rng.uniform(2000, 30000, 15), 1.0, (1024, 1024)), rng)
+        .clip(0)
+        .astype(np.uint16)
+    )
     image = Image(counts, "large", gain_e_per_count=1.0)
     assert len(matched(extract_centroids(image), xy)[0]) == 15
     # A third of it.
@@ -201,7 +219,11 @@ def test_an_image_is_passed_over_once_and_stars_are_fitted_together(monkeypatch)
     for module, name in ((sep, "Background"), (sep, "extract"), (detection, "_filtered")):
         monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     solve = star_fits._solve
-    monkeypatch.setattr(star_fits, "_solve", lambda normal, right: (fits.append(len(normal)), solve(normal, right))[1])
+    monkeypatch.setattr(
+        star_fits,
+        "_solve",
+        lambda normal, right: (fits.append(len(normal)), solve(normal, right))[1],
+    )
     assert len(matched(extract_centroids(image, gain_e_per_count=1.0), xy)[0]) == len(xy)
     assert passes == {"Background": 1, "extract": 1, "_filtered": 1}
     # Width, shape and places: some ten steps for each star, all stars in one call.
@@ -209,7 +231,9 @@ def test_an_image_is_passed_over_once_and_stars_are_fitted_together(monkeypatch)
 
 
 def test_detections_are_those_of_sextractor():
-    """Filter and taking apart are done in fewer steps than SExtractor's, and find what it finds, in a crowd too."""
+    """Filter and taking apart are done in fewer steps than SExtractor's, and find what it finds, in
+    a crowd too.
+    """
     rng = np.random.default_rng(22)
     xy = rng.uniform(3, 252, (300, 2))
     image = Image(noisy(sky(xy, 10.0 ** rng.uniform(3.0, 5.0, 300), 1.2, (256, 256)), rng), "crowd")
@@ -218,12 +242,20 @@ def test_detections_are_those_of_sextractor():
     line_ = np.exp(-0.5 * (np.arange(-3, 4) / 1.2) ** 2)
     kernel = np.outer(line_, line_).astype(np.float32)
     threshold = 5.0 * np.sqrt(np.sum(kernel**2)) / kernel.sum()
-    theirs = sep.extract(frame.counts, threshold, err=frame.noise, minarea=1, filter_kernel=kernel, filter_type="conv")
+    theirs = sep.extract(
+        frame.counts,
+        threshold,
+        err=frame.noise,
+        minarea=1,
+        filter_kernel=kernel,
+        filter_type="conv",
+    )
     distance, index = cKDTree(np.column_stack([ours["x"], ours["y"]])).query(
         np.column_stack([theirs["x"], theirs["y"]])
     )
     same = distance < 1e-3
-    # Cleaning weighs areas of the filtered image here: a detection at the foot of a bright one may differ.
+    # Cleaning weighs areas of the filtered image here: a detection at the foot of a bright one may
+    # differ.
     assert len(ours) == pytest.approx(len(theirs), abs=3) and np.count_nonzero(~same) <= 3
     assert np.count_nonzero(theirs["flag"] & 1) > 50
     np.testing.assert_array_equal(ours["flag"][index[same]], theirs["flag"][same])
@@ -236,13 +268,17 @@ def test_windows_settle_where_sextractors_do():
     xy, image, found = trial(100, 2.0)
     frame, _, _ = prepare_image(Image(image, "window"), 1.0, None, None)
     start, width = found.xy[:, 0] + 0.2, np.full(len(found), 2.0)
-    stamps = star_fits.cut_stamps(frame.counts, None, start, found.xy[:, 1] - 0.2, 9, frame.noise, 1.0)
+    stamps = star_fits.cut_stamps(
+        frame.counts, None, start, found.xy[:, 1] - 0.2, 9, frame.noise, 1.0
+    )
     x, y, good = star_fits.window_positions(
         stamps, image.shape, start, found.xy[:, 1] - 0.2, np.hypot(width, 0.3), width, 2e-4
     )
     theirs = sep.winpos(frame.counts, start, found.xy[:, 1] - 0.2, np.hypot(width, 0.3))
     assert good.all() and len(good) == len(xy)
-    np.testing.assert_allclose(np.hypot(x - theirs[0], y - theirs[1]), 0.0, atol=0.02 * found.sigma_px.max())
+    np.testing.assert_allclose(
+        np.hypot(x - theirs[0], y - theirs[1]), 0.0, atol=0.02 * found.sigma_px.max()
+    )
 
 
 def test_pairs_of_near_positions_are_all_found():
@@ -253,7 +289,8 @@ def test_pairs_of_near_positions_are_all_found():
     assert len(pairs) == 2 * len(expected) and not len(star_fits.near_pairs(x[:1], y[:1], 5.0))
 
 
-# ---- flags and rejections ------------------------------------------------------------------------------------------
+# ---- flags and rejections
+# ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -293,7 +330,9 @@ def test_saturated_stars_are_flagged_and_measured_from_their_wings(stars):
     assert len(rows) == len(xy) and found.saturated.all() and found.peak.max() == 600.0
     z = error / found.sigma_px[rows, None]
     assert np.sqrt(np.mean(z**2)) < 1.4
-    free = extract_centroids(Image(noisy(expected, rng), "free", saturation=60000.0), gain_e_per_count=1.0)
+    free = extract_centroids(
+        Image(noisy(expected, rng), "free", saturation=60000.0), gain_e_per_count=1.0
+    )
     assert not free.saturated.any() and found.sigma_px.mean() > 1.2 * free.sigma_px.mean()
 
 
@@ -301,7 +340,9 @@ def test_neighbours_are_flagged_and_do_not_pull(stars):
     rng = np.random.default_rng(4)
     lone = grid(rng, 8, 60.0)
     xy = np.concatenate([lone, lone[::2] + np.array([4.5, 0.0])])
-    found = extract_centroids(Image(noisy(sky(xy, 8000.0, 1.0), rng), "pairs"), gain_e_per_count=1.0)
+    found = extract_centroids(
+        Image(noisy(sky(xy, 8000.0, 1.0), rng), "pairs"), gain_e_per_count=1.0
+    )
     rows, error = matched(found, xy)
     assert len(rows) == len(xy)
     index = cKDTree(xy).query(found.xy)[1]
@@ -312,7 +353,9 @@ def test_neighbours_are_flagged_and_do_not_pull(stars):
 
 def test_stars_at_the_border_are_flagged():
     rng = np.random.default_rng(6)
-    xy = np.array([[0.7, 100.0], [510.5, 300.0], [250.0, 1.0], [250.0, 250.0], [100.0, 400.0], [400.0, 100.0]])
+    xy = np.array(
+        [[0.7, 100.0], [510.5, 300.0], [250.0, 1.0], [250.0, 250.0], [100.0, 400.0], [400.0, 100.0]]
+    )
     found = extract_centroids(Image(noisy(sky(xy, 9000.0, 1.0), rng), "edge"), gain_e_per_count=1.0)
     rows, error = matched(found, xy)
     assert len(rows) == 6 and np.abs(error).max() < 0.2
@@ -334,24 +377,32 @@ def test_a_steep_background_is_no_noise(stars):
     found = extract_centroids(Image(image, "slope"), gain_e_per_count=1.0)
     rows, error = matched(found, xy)
     assert len(rows) == len(found) == len(xy)
-    assert np.sqrt(np.mean((error / found.sigma_px[rows, None]) ** 2)) == pytest.approx(1.0, abs=0.2)
+    assert np.sqrt(np.mean((error / found.sigma_px[rows, None]) ** 2)) == pytest.approx(
+        1.0, abs=0.2
+    )
 
 
 @pytest.mark.parametrize("offset", [2.5, 0.0])
 def test_eight_bits_with_less_noise_than_a_count_or_cut_off_at_black(stars, offset):
     xy, expected, rng = stars
-    counts = (noisy(expected - BACKGROUND_E, rng) / 20.0 + offset).round().clip(0, 255).astype(np.uint8)
+    counts = (
+        (noisy(expected - BACKGROUND_E, rng) / 20.0 + offset).round().clip(0, 255).astype(np.uint8)
+    )
     found = extract_centroids(Image(counts, "coarse"), gain_e_per_count=20.0)
     rows, error = matched(found, xy)
     assert len(rows) == len(xy) and len(found) <= len(xy) + 1 and found.messages == ()
-    assert np.sqrt(np.mean((error / found.sigma_px[rows, None]) ** 2)) == pytest.approx(1.0, abs=0.3)
+    assert np.sqrt(np.mean((error / found.sigma_px[rows, None]) ** 2)) == pytest.approx(
+        1.0, abs=0.3
+    )
 
 
 def test_undersampled_stars_with_halos_get_windowed_centroids():
     rng = np.random.default_rng(9)
     xy = grid(rng, 8, 60.0)
     halo = sky(xy, 12000.0, 1.8) - BACKGROUND_E
-    found = extract_centroids(Image(noisy(sky(xy, 30000.0, 0.55) + halo, rng), "halo"), gain_e_per_count=1.0)
+    found = extract_centroids(
+        Image(noisy(sky(xy, 30000.0, 0.55) + halo, rng), "halo"), gain_e_per_count=1.0
+    )
     assert "windowed" in found.messages[0]
     rows, error = matched(found, xy)
     assert len(rows) == len(xy) and np.abs(error).max() < 0.05
@@ -372,10 +423,14 @@ def test_frames_that_cannot_be_used_are_left_out_and_the_others_go_on(stars, tmp
     fits.writeto(tmp_path / "g.fits", good[:256])
     fits.writeto(tmp_path / "h.fits", noisy(sky(xy[:0], 1.0, 1.0), rng))
     eight = np.clip(good / 4, 0, 255).astype(np.uint8)
-    PIL.Image.fromarray(np.stack([eight, eight // 2, eight], axis=-1)).save(tmp_path / "i.jpg", quality=95)
+    PIL.Image.fromarray(np.stack([eight, eight // 2, eight], axis=-1)).save(
+        tmp_path / "i.jpg", quality=95
+    )
     (tmp_path / "notes.txt").write_text("not an image, and not looked at")
     steps = []
-    found = extract_centroids(tmp_path, camera=camera, progress=lambda done, total: steps.append((done, total)))
+    found = extract_centroids(
+        tmp_path, camera=camera, progress=lambda done, total: steps.append((done, total))
+    )
     assert steps == [(i + 1, 9) for i in range(9)]
     assert found.image.tolist() == [
         "a.fits",
@@ -390,14 +445,26 @@ def test_frames_that_cannot_be_used_are_left_out_and_the_others_go_on(stars, tmp
     ]
     problem = dict(zip(found.image.tolist(), found.problem.tolist(), strict=True))
     assert problem["a.fits"] == problem["h.fits"] == problem["i.jpg"] == ""
-    assert "truncated" in problem["b.fits"] and "empty" in problem["c.fits"] and "not an image" in problem["d.png"]
+    assert (
+        "truncated" in problem["b.fits"]
+        and "empty" in problem["c.fits"]
+        and "not an image" in problem["d.png"]
+    )
     assert problem["e.fits"] == "every pixel has the value 0"
-    assert "100 % of the pixels are saturated" in problem["f.fits"] and "512 x 256 px" in problem["g.fits"]
+    assert (
+        "100 % of the pixels are saturated" in problem["f.fits"]
+        and "512 x 256 px" in problem["g.fits"]
+    )
     assert found.n_frames == 9 and found.n_left_out == 6
     counts = dict(zip(found.image.tolist(), found.stars_per_frame.tolist(), strict=True))
     assert counts["a.fits"] == 64 and counts["h.fits"] <= 1 and counts["i.jpg"] >= 60
-    assert "6 frames were left out: " in found.text and "1 because every pixel has the value 0" in found.text
-    assert any("luminance" in text for text in found.messages) and any("JPEG" in text for text in found.messages)
+    assert (
+        "6 frames were left out: " in found.text
+        and "1 because every pixel has the value 0" in found.text
+    )
+    assert any("luminance" in text for text in found.messages) and any(
+        "JPEG" in text for text in found.messages
+    )
     assert sum("was left out" in text for text in found.messages) == 6
     alone = extract_centroids(tmp_path / "a.fits", camera=camera)
     np.testing.assert_array_equal(alone.xy, found.select_frames([0]).xy)
@@ -405,18 +472,26 @@ def test_frames_that_cannot_be_used_are_left_out_and_the_others_go_on(stars, tmp
 
 def test_options_out_of_range_are_named():
     image = Image(np.zeros((8, 8)), "a")
-    for name, value in (("threshold_sigma", 0.5), ("gain_e_per_count", 0.0), ("max_stars", 0), ("psf_sigma_px", 99.0)):
+    for name, value in (
+        ("threshold_sigma", 0.5),
+        ("gain_e_per_count", 0.0),
+        ("max_stars", 0),
+        ("psf_sigma_px", 99.0),
+    ):
         with pytest.raises(SettingError, match=f"{name} is {value}: give a"):
             extract_centroids(image, **{name: value})
     with pytest.raises(ImageError, match="there is none"):
         extract_centroids([])
 
 
-# ---- reading images ------------------------------------------------------------------------------------------------
+# ---- reading images
+# ------------------------------------------------------------------------------------------------
 
 
 def test_fits_with_time_exposure_gain_and_saturation(tmp_path):
-    header = fits.Header({"DATE-OBS": "2026-11-21T01:02:03.5", "EXPTIME": 1.0, "SATURATE": 4000.0, "OBJECT": "sky"})
+    header = fits.Header(
+        {"DATE-OBS": "2026-11-21T01:02:03.5", "EXPTIME": 1.0, "SATURATE": 4000.0, "OBJECT": "sky"}
+    )
     header["GAIN"] = 2.5, "[e-/ADU]"
     data = np.arange(12, dtype=np.float32).reshape(3, 4)
     for name in ("a.fits", "a.fit", "a.fits.gz"):
@@ -451,7 +526,9 @@ def test_pictures_keep_their_bits(tmp_path):
 
 def test_errors_of_reading_are_sentences_with_a_remedy(tmp_path):
     (tmp_path / "a.xyz").write_text("a")
-    PIL.Image.fromarray(np.random.default_rng(0).integers(0, 255, (99, 99)).astype(np.uint8)).save(tmp_path / "cut.png")
+    PIL.Image.fromarray(np.random.default_rng(0).integers(0, 255, (99, 99)).astype(np.uint8)).save(
+        tmp_path / "cut.png"
+    )
     (tmp_path / "cut.png").write_bytes((tmp_path / "cut.png").read_bytes()[:4000])
     (tmp_path / "fake.fits").write_text("no FITS")
     fits.writeto(tmp_path / "cut.fits.gz", np.arange(9999.0).reshape(99, 101))
@@ -474,7 +551,8 @@ def test_errors_of_reading_are_sentences_with_a_remedy(tmp_path):
         read_image(tmp_path)
 
 
-# ---- the table -----------------------------------------------------------------------------------------------------
+# ---- the table
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -516,13 +594,21 @@ def test_files_that_are_no_centroids(tmp_path):
 
 
 def test_the_table_and_its_frames(table):
-    assert table.n_frames == 3 and table.n_left_out == 1 and table.stars_per_frame.tolist() == [64, 0, 64]
+    assert (
+        table.n_frames == 3
+        and table.n_left_out == 1
+        and table.stars_per_frame.tolist() == [64, 0, 64]
+    )
     assert table.frame_starts.tolist() == [0, 64, 64, 128]
-    assert table.text.startswith("128 stars in 2 frames; 1 frame was left out: 1 because every pixel")
+    assert table.text.startswith(
+        "128 stars in 2 frames; 1 frame was left out: 1 because every pixel"
+    )
     assert np.isnan(table.noise[1]) and table.time_utc.tolist() == ["2026-11-21T01:02:03", "", ""]
     assert np.all(np.diff(table.flux[:64]) <= 0)
     assert table.select_frames([1, 2]).stars_per_frame.tolist() == [0, 64]
-    assert list(table.to_dataframe().columns) == list(COLUMNS) and len(table.frames_dataframe()) == 3
+    assert (
+        list(table.to_dataframe().columns) == list(COLUMNS) and len(table.frames_dataframe()) == 3
+    )
     assert "first, or so" in table._repr_html_() and "128 stars" in repr(table)
     np.testing.assert_allclose(table.var_x_px2 + table.var_y_px2, 2 * table.sigma_px**2)
     assert not table.x_px.flags.writeable
@@ -532,7 +618,8 @@ def test_the_table_and_its_frames(table):
         table.select_frames([7])
 
 
-# ---- the real sky --------------------------------------------------------------------------------------------------
+# ---- the real sky
+# --------------------------------------------------------------------------------------------------
 
 
 def test_real_frames_agree_with_the_independent_centroids(real_data):
@@ -555,32 +642,52 @@ def test_real_frames_agree_with_the_independent_centroids(real_data):
 
 
 def test_coarse_counts_give_no_false_stars():
-    # A background of a few electrons behind a gain of 4: the median of the counts is off by a quarter of a count.
+    # A background of a few electrons behind a gain of 4: the median of the counts is off by a
+    # quarter of a count.
     rng = np.random.default_rng(1)
     n = 0
     for _ in range(4):
-        data = np.round(60.0 + rng.poisson(25.0, (1024, 1024)) / 4.0 + rng.normal(0.0, 0.9, (1024, 1024)))
+        data = np.round(
+            60.0 + rng.poisson(25.0, (1024, 1024)) / 4.0 + rng.normal(0.0, 0.9, (1024, 1024))
+        )
         n += extract_centroids(Image(data=data.astype(np.uint16), name="dark")).n_stars
     assert n <= 6
 
 
-# ---- what headers and folders may do -------------------------------------------------------------------------------
+# ---- what headers and folders may do
+# -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("header", "time", "words"),
     [
         ({"DATE-OBS": "2019-07-29T22:47:26+02:00"}, "2019-07-29T20:47:26.000000", None),
-        ({"DATE-OBS": "2019-07-29T22:47:26+02:00", "EXPTIME": 3.0}, "2019-07-29T20:47:27.500000", None),
+        (
+            {"DATE-OBS": "2019-07-29T22:47:26+02:00", "EXPTIME": 3.0},
+            "2019-07-29T20:47:27.500000",
+            None,
+        ),
         ({"DATE-OBS": "2019-07-29", "TIME-OBS": "20:47:26"}, "2019-07-29T20:47:26.000000", None),
         ({"DATE-OBS": "2019-07-29T20:47:26", "TIMESYS": "UTC"}, "2019-07-29T20:47:26.000000", None),
         # 37 leap seconds since 2017, 10 before 1972-07-01.
         ({"DATE-OBS": "2019-07-29T20:48:03", "TIMESYS": "TAI"}, "2019-07-29T20:47:26.000000", None),
         ({"DATE-OBS": "1972-01-02T00:00:10", "TIMESYS": "tai"}, "1972-01-02T00:00:00.000000", None),
         ({"DATE-OBS": "2019-07-29T20:47:44", "TIMESYS": "GPS"}, "2019-07-29T20:47:26.000000", None),
-        ({"DATE-AVG": "2019-07-29T20:48:35.184", "TIMESYS": "TT(BIPM)"}, "2019-07-29T20:47:26.000000", None),
-        ({"DATE-OBS": "2019-07-29T20:47:26", "TIMESYS": "LOCAL"}, None, "a.fits: DATE-OBS is in LOCAL by TIMESYS"),
-        ({"DATE-OBS": "1858-11-17T00:00:00"}, None, "a.fits: DATE-OBS is of the year 1858, not of 1960 to 2100"),
+        (
+            {"DATE-AVG": "2019-07-29T20:48:35.184", "TIMESYS": "TT(BIPM)"},
+            "2019-07-29T20:47:26.000000",
+            None,
+        ),
+        (
+            {"DATE-OBS": "2019-07-29T20:47:26", "TIMESYS": "LOCAL"},
+            None,
+            "a.fits: DATE-OBS is in LOCAL by TIMESYS",
+        ),
+        (
+            {"DATE-OBS": "1858-11-17T00:00:00"},
+            None,
+            "a.fits: DATE-OBS is of the year 1858, not of 1960 to 2100",
+        ),
         ({"DATE-OBS": "0001-01-01T00:00:00+02:00"}, None, "a.fits: DATE-OBS is of the year 1,"),
         ({"DATE-OBS": "2019-07-29T20:47:26", "EXPTIME": 1e300}, None, None),
         ({"DATE-OBS": "29/07/19"}, None, None),
@@ -602,14 +709,20 @@ def test_the_time_in_a_name_replaces_an_impossible_one(tmp_path):
 
 def test_the_science_image_is_taken_rather_than_its_preview(tmp_path):
     science = np.arange(48 * 64, dtype=np.int16).reshape(48, 64)
-    preview, first, big = fits.ImageHDU(science[::8, ::8]), fits.PrimaryHDU(), fits.ImageHDU(np.ones((99, 99)))
+    preview, first, big = (
+        fits.ImageHDU(science[::8, ::8]),
+        fits.PrimaryHDU(),
+        fits.ImageHDU(np.ones((99, 99))),
+    )
     first.header["DATE-OBS"] = "2019-07-29T20:47:26"
     path = tmp_path / "a.fits"
     fits.HDUList([first, preview, fits.ImageHDU(science), fits.ImageHDU(science + 1)]).writeto(path)
     camera = Camera(64, 48, 10.0, 50.0, 31.5, 23.5)
     for image in (read_image(path), read_image(path, camera)):
         np.testing.assert_array_equal(image.data, science)
-        assert image.messages == ("a.fits: of 3 images in the file, the one of 64 x 48 px in HDU 2 was taken.",)
+        assert image.messages == (
+            "a.fits: of 3 images in the file, the one of 64 x 48 px in HDU 2 was taken.",
+        )
         # The first header holds for all images.
         assert image.time_utc == "2019-07-29T20:47:26.000000" and image.header["NAXIS1"] == 64
     fits.HDUList([first, preview, fits.ImageHDU(science), big]).writeto(path, overwrite=True)
@@ -637,8 +750,16 @@ def test_a_folder_of_subfolders_says_that_they_are_not_searched(tmp_path):
     ("statuses", "n_left_out", "words"),
     [
         (["identified"], 0, "1 of 1 frame is identified, with 5.0 stars on average."),
-        (["identified", "too few stars"], 1, "1 of 1 frame is identified, with 5.0 stars on average."),
-        (["identified"] * 2 + ["too few stars"] * 3, 1, "Left out: 2 with fewer than four centroids."),
+        (
+            ["identified", "too few stars"],
+            1,
+            "1 of 1 frame is identified, with 5.0 stars on average.",
+        ),
+        (
+            ["identified"] * 2 + ["too few stars"] * 3,
+            1,
+            "Left out: 2 with fewer than four centroids.",
+        ),
         (["identified"] * 2 + ["ambiguous"], 0, "2 of 3 frames are identified"),
         (["not identified"], 0, "0 of 1 frame is identified. Left out: 1 in which"),
         (["not identified"] * 2, 0, "0 of 2 frames are identified. Left out: 2 in which"),
@@ -646,7 +767,9 @@ def test_a_folder_of_subfolders_says_that_they_are_not_searched(tmp_path):
 )
 def test_frames_left_out_before_are_not_counted_again(statuses, n_left_out, words):
     frames = tuple(
-        FrameIdentification(k, "", status, 5, 5 * (status == "identified"), 0, 0, np.nan, None, 1.0, 1.0, 1.0, 1.0)
+        FrameIdentification(
+            k, "", status, 5, 5 * (status == "identified"), 0, 0, np.nan, None, 1.0, 1.0, 1.0, 1.0
+        )
         for k, status in enumerate(statuses)
     )
     camera = Camera(64, 48, 10.0, 50.0, 31.5, 23.5)

@@ -1,4 +1,6 @@
-"""Files of images that are damaged, too large or of another kind: read right, or refused by name in one sentence."""
+"""Files of images that are damaged, too large or of another kind: read right, or refused by name in
+one sentence.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,13 @@ def card(key, value, comment=""):
 
 def fits(shape, data=b"", *extra, bitpix=16, naxis=None):
     sizes = [card(f"NAXIS{k + 1}", size) for k, size in enumerate(reversed(shape))]
-    cards = [card("SIMPLE", "T"), card("BITPIX", bitpix), card("NAXIS", naxis or len(shape)), *sizes, *extra]
+    cards = [
+        card("SIMPLE", "T"),
+        card("BITPIX", bitpix),
+        card("NAXIS", naxis or len(shape)),
+        *sizes,
+        *extra,
+    ]
     header = b"".join(cards) + b"END".ljust(80)
     return header + b" " * (-len(header) % 2880) + data + bytes(-len(data) % 2880)
 
@@ -41,7 +49,9 @@ def fits(shape, data=b"", *extra, bitpix=16, naxis=None):
 def png(width, height, depth, colour, rows=b""):
     header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
     chunks = (b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")
-    made = (struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in chunks)
+    made = (
+        struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in chunks
+    )
     return b"\x89PNG\r\n\x1a\n" + b"".join(made)
 
 
@@ -67,7 +77,9 @@ def dng(counts):
             head += struct.pack("<HHI", tag, kind, len(values)) + packed.ljust(4, b"\0")
     content = bytearray((head + bytes(4)).ljust(4096, b"\0"))
     content[exposure : exposure + 8] = struct.pack("<II", 1, 2)
-    content[2000:2072] = b"".join(struct.pack("<ii", int(j == k), 1) for j in range(3) for k in range(3))
+    content[2000:2072] = b"".join(
+        struct.pack("<ii", int(j == k), 1) for j in range(3) for k in range(3)
+    )
     return bytes(content) + counts.tobytes()
 
 
@@ -104,9 +116,14 @@ def test_what_cannot_be_read_right_is_refused_by_name(tmp_path, monkeypatch, nam
 
 
 def test_a_small_packed_file_takes_no_memory(tmp_path, monkeypatch):
-    """Refused by what the first header declares, and by what comes out where the header is silent."""
+    """Refused by what the first header declares, and by what comes out where the header is
+    silent.
+    """
     zeros = bytes(5_000_000)
-    packed = gzip.compress(fits((40_000, 40_000), zeros)), gzip.compress(fits((), zeros + zeros, naxis="0"))
+    packed = (
+        gzip.compress(fits((40_000, 40_000), zeros)),
+        gzip.compress(fits((), zeros + zeros, naxis="0")),
+    )
     monkeypatch.setattr(files, "_MODEST_BYTES", 2**20)
     for content in packed:
         (tmp_path / "packed.fits.gz").write_bytes(content)
@@ -139,7 +156,11 @@ def test_a_pipe_is_not_waited_for(tmp_path):
 
 def test_wide_images_and_cards_that_cannot_be_read_do_no_harm(tmp_path):
     wide = np.arange(4 * 1500, dtype=">i2").reshape(4, 1500)
-    image = read(tmp_path, "wide.fits", fits(wide.shape, wide.tobytes(), card("SATURATE", "NaN"), card("EXPTIME", 2.0)))
+    image = read(
+        tmp_path,
+        "wide.fits",
+        fits(wide.shape, wide.tobytes(), card("SATURATE", "NaN"), card("EXPTIME", 2.0)),
+    )
     np.testing.assert_array_equal(image.data, wide)
     assert image.exposure_s == 2.0
 
@@ -147,7 +168,9 @@ def test_wide_images_and_cards_that_cannot_be_read_do_no_harm(tmp_path):
 def test_numbers_beyond_all_counts_have_no_value(tmp_path):
     counts = np.full((4, 6), 7.0)
     counts[1, 2:5] = 1e300, -np.inf, 3e38
-    image = read(tmp_path, "odd.fits", fits(counts.shape, counts.astype(">f8").tobytes(), bitpix=-64))
+    image = read(
+        tmp_path, "odd.fits", fits(counts.shape, counts.astype(">f8").tobytes(), bitpix=-64)
+    )
     assert np.isnan(image.data[1, 2:5]).all() and np.count_nonzero(np.isnan(image.data)) == 3
     assert "3 pixels without a value" in image.messages[0]
     with warnings.catch_warnings():
@@ -167,7 +190,9 @@ def test_colours_of_16_bits_keep_their_depth(tmp_path, ending):
     cv2 = pytest.importorskip("cv2")
     colours = np.random.default_rng(2).integers(0, 60_000, (5, 7, 3)).astype(np.uint16)
     colours[1, 2] = 65_535, 7, 7
-    (tmp_path / f"deep.{ending}").write_bytes(cv2.imencode(f".{ending}", colours[..., ::-1])[1].tobytes())
+    (tmp_path / f"deep.{ending}").write_bytes(
+        cv2.imencode(f".{ending}", colours[..., ::-1])[1].tobytes()
+    )
     image = read_image(tmp_path / f"deep.{ending}")
     expected = colours @ [0.299, 0.587, 0.114]
     expected[1, 2] = 65_535.0
@@ -178,7 +203,9 @@ def test_colours_of_16_bits_keep_their_depth(tmp_path, ending):
 
 
 def test_planes_pages_and_extensions_are_frames(tmp_path):
-    """Each with its own name and time; noise maps, previews and pages of another size are named, not read."""
+    """Each with its own name and time; noise maps, previews and pages of another size are named,
+    not read.
+    """
     data = np.arange(24, dtype=np.int16).reshape(4, 6)
     header = {"DATE-OBS": "2026-11-21T01:00:00", "EXPTIME": 2.0}
     path = tmp_path / "cube.fits"
@@ -190,7 +217,9 @@ def test_planes_pages_and_extensions_are_frames(tmp_path):
         # All planes together were exposed for so long.
         ({"DATE-END": "2026-11-21T01:00:03"}, (0.5, 1.5, 2.5)),
     ):
-        astropy_fits.writeto(path, np.stack([data + k for k in range(3)]), astropy_fits.Header(header | extra))
+        astropy_fits.writeto(
+            path, np.stack([data + k for k in range(3)]), astropy_fits.Header(header | extra)
+        )
         images = read_images(path)
         path.unlink()
         assert [image.name for image in images] == ["cube.fits[0]", "cube.fits[1]", "cube.fits[2]"]
@@ -198,11 +227,17 @@ def test_planes_pages_and_extensions_are_frames(tmp_path):
         assert [int(image.data[0, 0]) for image in images] == [0, 1, 2]
         assert "3 planes were read as frames" in images[0].messages[0] and not images[1].messages
     hdus = [astropy_fits.PrimaryHDU(), astropy_fits.ImageHDU(data), astropy_fits.ImageHDU(data[:2])]
-    hdus += [astropy_fits.ImageHDU(data, name="ERR"), astropy_fits.ImageHDU(np.stack([data + 1, data + 2]))]
+    hdus += [
+        astropy_fits.ImageHDU(data, name="ERR"),
+        astropy_fits.ImageHDU(np.stack([data + 1, data + 2])),
+    ]
     astropy_fits.HDUList(hdus).writeto(path)
     images = read_images(path)
     assert [image.name for image in images] == ["cube.fits[1]", "cube.fits[4,0]", "cube.fits[4,1]"]
-    assert "of 4 images in the file, 2 of 6 x 4 px" in images[0].messages[0] and "ERR" in images[0].messages[1]
+    assert (
+        "of 4 images in the file, 2 of 6 x 4 px" in images[0].messages[0]
+        and "ERR" in images[0].messages[1]
+    )
     np.testing.assert_array_equal(read_image(tmp_path / "cube.fits[4,1]").data, data + 2)
     with pytest.raises(ImageError, match=r"no such frame; the file has cube.fits\[1\], .*\[4,1\]"):
         read_image(tmp_path / "cube.fits[9]")
@@ -231,17 +266,24 @@ def test_what_a_folder_holds_beside_images_is_named_once(tmp_path):
     messages = extract_centroids(tmp_path).messages
     assert [text for text in messages if "not read" in text] == [
         f"{tmp_path}: not read, because subfolders are not searched: inner.",
-        f"{tmp_path}: not read, because the ending is of no image that is read: camera.toml, notes.txt.",
+        (
+            f"{tmp_path}: not read, because the ending is of no image that is read: camera.toml, "
+            "notes.txt."
+        ),
     ]
 
 
 def mosaic_scene(pattern, seed=5, shape=(512, 640), sigma=0.8):
-    """Places of stars, and counts that a sensor of one colour and one with a mosaic of colours give for them."""
+    """Places of stars, and counts that a sensor of one colour and one with a mosaic of colours give
+    for them.
+    """
     rng = np.random.default_rng(seed)
     # One star in each of 120 cells, so that none is near another.
     y, x = (np.indices((10, 12)).reshape(2, -1) + rng.uniform(0.3, 0.7, (2, 120))) * 50.0
     edges = [(np.arange(size + 1) - 0.5)[:, None] for size in shape]
-    parts = [np.diff(ndtr((edge - at) / sigma), axis=0) for edge, at in zip(edges, (y, x), strict=True)]
+    parts = [
+        np.diff(ndtr((edge - at) / sigma), axis=0) for edge, at in zip(edges, (y, x), strict=True)
+    ]
     light = (parts[0] * rng.uniform(300, 2500, 120)) @ parts[1].T
     # Red and blue see other parts of the light of stars, and of that of the sky.
     seen, sky = np.ones(shape), np.ones(shape)
@@ -249,14 +291,17 @@ def mosaic_scene(pattern, seed=5, shape=(512, 640), sigma=0.8):
         place = slice(k // 2, None, 2), slice(k % 2, None, 2)
         seen[place], sky[place] = {"R": (0.6, 1.6), "G": (1.0, 1.0), "B": (0.4, 0.7)}[colour]
     counts = [
-        rng.poisson(light * part + 200.0 * glow) + rng.normal(100.0, 3.0, shape) for part, glow in ((1, 1), (seen, sky))
+        rng.poisson(light * part + 200.0 * glow) + rng.normal(100.0, 3.0, shape)
+        for part, glow in ((1, 1), (seen, sky))
     ]
     return np.column_stack([x, y]), [np.rint(values).astype(np.uint16) for values in counts]
 
 
 @pytest.mark.parametrize("pattern", ["RGGB", "GBRG"])
 def test_green_pixels_of_a_mosaic_are_measured_at_their_places(tmp_path, pattern):
-    """Most stars come, without bias by half a pixel, where a mosaic that is read as grey loses most."""
+    """Most stars come, without bias by half a pixel, where a mosaic that is read as grey loses
+    most.
+    """
     true, (grey, counts) = mosaic_scene(pattern)
 
     def measured(data, **options):
@@ -280,28 +325,48 @@ def test_green_pixels_of_a_mosaic_are_measured_at_their_places(tmp_path, pattern
 def test_the_mosaic_of_a_header_counts_from_the_row_that_is_stored_first(tmp_path):
     def pattern(*cards, rows=4):
         return read(
-            tmp_path, "a.fits", fits((rows, 6), bytes(2 * rows * 6), card("BAYERPAT", "'RGGB    '"), *cards)
+            tmp_path,
+            "a.fits",
+            fits((rows, 6), bytes(2 * rows * 6), card("BAYERPAT", "'RGGB    '"), *cards),
         ).mosaic
 
     order = card("ROWORDER", "'BOTTOM-UP'")
-    assert pattern() == "RGGB" and pattern(card("XBAYROFF", 1)) == "GRBG" and pattern(card("YBAYROFF", 1)) == "GBRG"
+    assert (
+        pattern() == "RGGB"
+        and pattern(card("XBAYROFF", 1)) == "GRBG"
+        and pattern(card("YBAYROFF", 1)) == "GBRG"
+    )
     assert pattern(order) == "GBRG" and pattern(order, rows=5) == "RGGB"
 
 
 def test_what_rawpy_says_is_taken_over(tmp_path, monkeypatch):
-    """By a stand-in for the library, which is an extra: the test after this one has the library itself."""
+    """By a stand-in for the library, which is an extra: the test after this one has the library
+    itself.
+    """
     counts = np.arange(24, dtype=np.uint16).reshape(4, 6)
 
     class StandInForRawpy:
-        raw_image_visible, raw_pattern, color_desc, white_level = counts, np.array([[2, 3], [1, 0]]), b"RGBG", 4095
+        raw_image_visible, raw_pattern, color_desc, white_level = (
+            counts,
+            np.array([[2, 3], [1, 0]]),
+            b"RGBG",
+            4095,
+        )
         raw_colors_visible = np.tile(raw_pattern, (2, 3))
         other = SimpleNamespace(shutter_speed=0.5, focal_length=0.0)
 
-    monkeypatch.setitem(sys.modules, "rawpy", SimpleNamespace(imread=lambda file: nullcontext(StandInForRawpy)))
+    monkeypatch.setitem(
+        sys.modules, "rawpy", SimpleNamespace(imread=lambda file: nullcontext(StandInForRawpy))
+    )
     (tmp_path / "a.NEF").write_bytes(b"any")
     image = read_image(tmp_path / "a.NEF")
     np.testing.assert_array_equal(image.data, counts)
-    assert (image.mosaic, image.saturation, image.exposure_s, image.header) == ("BGGR", 4095.0, 0.5, {"EXPTIME": 0.5})
+    assert (image.mosaic, image.saturation, image.exposure_s, image.header) == (
+        "BGGR",
+        4095.0,
+        0.5,
+        {"EXPTIME": 0.5},
+    )
     StandInForRawpy.raw_pattern = np.zeros((6, 6), dtype=int)
     with pytest.raises(ImageError, match="is not red, green, green and blue"):
         read_image(tmp_path / "a.NEF")
@@ -349,7 +414,9 @@ def test_interrupted_centroids_go_on_bit_for_bit(tmp_path, monkeypatch):
     monkeypatch.setattr("starcal_uq.images.extract._WORTH_PROCESSES", 18)
     measured = []
     measure = _Measure.__call__
-    monkeypatch.setattr(_Measure, "__call__", lambda task, number: measured.append(number) or measure(task, number))
+    monkeypatch.setattr(
+        _Measure, "__call__", lambda task, number: measured.append(number) or measure(task, number)
+    )
     whole = extract_centroids(tmp_path / "img", workers=0)
     measured.clear()
 
@@ -376,9 +443,14 @@ def test_centroids_do_not_depend_on_the_number_of_processes(tmp_path):
     eighteen(tmp_path)
     done = []
     one, two = (
-        extract_centroids(tmp_path, workers=workers, progress=lambda n, of: done.append((n, of))) for workers in (0, 2)
+        extract_centroids(tmp_path, workers=workers, progress=lambda n, of: done.append((n, of)))
+        for workers in (0, 2)
     )
     for name in ("frame", "x_px", "y_px", "flux", "image", "problem"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
-    assert (one.messages, one.meta) == (two.messages, two.meta) and len(one) > 5 and one.n_left_out == 1
+    assert (
+        (one.messages, one.meta) == (two.messages, two.meta)
+        and len(one) > 5
+        and one.n_left_out == 1
+    )
     assert done[-1] == (18, 18)

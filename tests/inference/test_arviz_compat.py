@@ -43,7 +43,9 @@ def test_equal_weights_are_no_failure(shift: float) -> None:
 
 
 def test_rows_are_smoothed_one_by_one() -> None:
-    rows = np.random.default_rng(9).exponential(size=(4, 2000)) * np.array([[0.1], [0.4], [0.8], [0.0]])
+    rows = np.random.default_rng(9).exponential(size=(4, 2000)) * np.array(
+        [[0.1], [0.4], [0.8], [0.0]]
+    )
     together, khats = arviz_compat.psis(rows)
     apart = [arviz_compat.psis(row) for row in rows]
     assert np.array_equal(together, [weights for weights, _ in apart])
@@ -81,17 +83,23 @@ def test_correlated_draws_are_counted_as_fewer() -> None:
 
 
 def test_chains_that_disagree_are_caught() -> None:
-    draws = np.random.default_rng(7).standard_normal((4, 1000)) + np.array([[0.0], [0.0], [0.0], [0.5]])
+    draws = np.random.default_rng(7).standard_normal((4, 1000)) + np.array(
+        [[0.0], [0.0], [0.0], [0.5]]
+    )
     assert arviz_compat.rhat(draws) > 1.01
 
 
 def test_container_holds_the_groups() -> None:
-    dataset = xr.Dataset({"f": (("chain", "draw"), np.zeros((2, 3)), {"units": "px"})}, attrs={"made_by": "test"})
+    dataset = xr.Dataset(
+        {"f": (("chain", "draw"), np.zeros((2, 3)), {"units": "px"})}, attrs={"made_by": "test"}
+    )
     data = arviz_compat.to_arviz({"posterior": dataset})
     import arviz
 
     # By its own version, not by what the module under test says.
-    assert type(data) is (arviz.InferenceData if arviz.__version__.startswith("0.") else xr.DataTree)
+    assert type(data) is (
+        arviz.InferenceData if arviz.__version__.startswith("0.") else xr.DataTree
+    )
     assert data.posterior["f"].shape == (2, 3)
     assert data.posterior["f"].attrs["units"] == "px"
     assert data.posterior.attrs["made_by"] == "test"
@@ -106,7 +114,9 @@ def test_tails_are_those_of_five_per_cent() -> None:
 
     def ess(share: float) -> float:
         """Of the indicator of a quantile, by its own words (Vehtari et al. 2021)."""
-        return arviz_compat._diagnostic("ess", (draws <= np.quantile(draws, share)).astype(float), method="mean")
+        return arviz_compat._diagnostic(
+            "ess", (draws <= np.quantile(draws, share)).astype(float), method="mean"
+        )
 
     assert found == pytest.approx(min(ess(0.05), ess(0.95)), rel=0.05)
     assert found < 0.8 * min(ess(0.1), ess(0.9))

@@ -1,4 +1,6 @@
-"""A posterior as the next prior: two runs in a row give what both give at once, and a moved camera is noticed."""
+"""A posterior as the next prior: two runs in a row give what both give at once, and a moved camera
+is noticed.
+"""
 
 from __future__ import annotations
 
@@ -57,8 +59,13 @@ def test_density_and_draws_are_scipys() -> None:
     reference = stats.multivariate_normal(np.zeros(5), priors.theta_covariance / np.outer(sd, sd))
     expected = reference.logpdf((draws[:50, :5] - priors.theta_mean) / sd) - np.sum(np.log(sd))
     assert np.allclose(priors.log_density_theta(draws[:50, :5]), expected, rtol=1e-9)
-    assert np.allclose(np.corrcoef(draws[:, :5].T), priors.theta_covariance / np.outer(sd, sd), atol=0.02)
-    assert np.allclose(priors.precision(priors.names[:-1]) @ priors.theta_covariance * np.outer(sd, 1 / sd), np.eye(5))
+    assert np.allclose(
+        np.corrcoef(draws[:, :5].T), priors.theta_covariance / np.outer(sd, sd), atol=0.02
+    )
+    assert np.allclose(
+        priors.precision(priors.names[:-1]) @ priors.theta_covariance * np.outer(sd, 1 / sd),
+        np.eye(5),
+    )
     # Without the others, a parameter's precision is that of its marginal.
     assert priors.precision(["f"])[0, 0] == pytest.approx(sd[2] ** -2)
     assert np.allclose(priors.sd(["x0", "k2"]), sd[[0, 4]])
@@ -110,12 +117,20 @@ def test_prior_widens_by_inflation_and_allowed_shift() -> None:
     plain = prior_from(ground())
     assert np.allclose(plain.theta_covariance, ground().covariance)
     assert plain.sigma_median == Priors.default(NOMINAL).sigma_median
-    assert np.allclose(prior_from(ground(), inflation=2.0).sd(("x0", "k1")), 2.0 * plain.sd(("x0", "k1")))
+    assert np.allclose(
+        prior_from(ground(), inflation=2.0).sd(("x0", "k1")), 2.0 * plain.sd(("x0", "k1"))
+    )
     shift = AllowedShift(principal_point_px=5.0, focal_fraction=1e-3, distortion_corner_px=0.5)
     wide = prior_from(ground(), shift=shift)
     extra = np.sqrt(wide.sd(wide.names[:-1]) ** 2 - plain.sd(plain.names[:-1]) ** 2)
     camera = ground().camera
-    expected = [5.0, 5.0, 1e-3 * camera.focal_px, 0.5 / camera.corner_radius_px**3, 0.5 / camera.corner_radius_px**5]
+    expected = [
+        5.0,
+        5.0,
+        1e-3 * camera.focal_px,
+        0.5 / camera.corner_radius_px**3,
+        0.5 / camera.corner_radius_px**5,
+    ]
     assert np.allclose(extra, expected, rtol=1e-6)
     noise = prior_from(ground(), noise="posterior")
     assert noise.sigma_median == pytest.approx(np.median(ground().sigma_draws), rel=0.01)
@@ -210,7 +225,9 @@ def test_shift_test_sees_what_moved() -> None:
     assert "widen the prior" in moved._repr_html_()
     assert list(moved.to_dataframe()["parameter"]) == list(NOMINAL.parameter_names)
     # With that much allowed, it is no surprise.
-    assert not shift_test(calibrated(1), calibrated(3, 40, 1.0), AllowedShift(focal_fraction=3e-4)).significant
+    assert not shift_test(
+        calibrated(1), calibrated(3, 40, 1.0), AllowedShift(focal_fraction=3e-4)
+    ).significant
     # Posteriors with wide priors say the same as calibrations.
     posterior = shift_test(ground(), calibrated(2))
     assert posterior.p_value == pytest.approx(still.p_value, abs=0.1)
@@ -223,4 +240,6 @@ def test_shift_test_refuses_what_is_not_independent() -> None:
     with pytest.raises(PriorError, match="test its calibration"):
         shift_test(calibrated(3), chained)
     with pytest.raises(PriorError, match="do not compare"):
-        shift_test(calibrated(1), calibrate(scenes.observations("k1"), scenes.nominal(scenes.camera("k1"))))
+        shift_test(
+            calibrated(1), calibrate(scenes.observations("k1"), scenes.nominal(scenes.camera("k1")))
+        )

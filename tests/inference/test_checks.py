@@ -20,7 +20,9 @@ N_STEPS = 60
 
 @pytest.fixture(scope="module")
 def post() -> Posterior:
-    return sample(None, gaussian_calibration(), n_walkers=16, n_steps=N_STEPS, seed=3, evaluation="compressed")
+    return sample(
+        None, gaussian_calibration(), n_walkers=16, n_steps=N_STEPS, seed=3, evaluation="compressed"
+    )
 
 
 def changed(post: Posterior, **changes: object) -> Posterior:
@@ -61,12 +63,20 @@ def test_too_few_effective_draws_take_as_many_more_steps(post: Posterior) -> Non
 def test_what_follows_from_the_parameters_converges_too(post, late) -> None:
     good = Derived("focal length", "mm", 1.0, 1.0, 0.01, 1.001, 9000.0, 9000.0)
     numbers = {"rhat": 1.2, "ess_bulk": 200.0, "ess_tail": 200.0}
-    other = dataclasses.replace(good, name="common rotation", **({} if late is None else {late: numbers[late]}))
+    other = dataclasses.replace(
+        good, name="common rotation", **({} if late is None else {late: numbers[late]})
+    )
     check = checks._derived(post, [good, other])
     if late is None:
-        assert check.level is Level.PASS and "have converged too" in check.sentence and check.remedy == ""
+        assert (
+            check.level is Level.PASS
+            and "have converged too" in check.sentence
+            and check.remedy == ""
+        )
         return
-    assert check.level is Level.FAIL and check.sentence.startswith("Common rotation has not converged")
+    assert check.level is Level.FAIL and check.sentence.startswith(
+        "Common rotation has not converged"
+    )
     asked = 2.0 if late == "rhat" else np.ceil(1.2 * checks.ESS_BOUND / 200.0)
     assert times_longer(check) == max(asked, 2.0)
 
@@ -95,24 +105,44 @@ def test_importance_sampling_agrees_or_not(post: Posterior) -> None:
     assert good.level is Level.PASS and good.remedy == "" and "gives the same" in good.sentence
     for name in ("agreement_mean", "agreement_sd"):
         bad = checks._independent(changed(post, **(alike | {name: 1.0})))
-        assert bad.level is Level.FAIL and "gives other" in bad.sentence and times_longer(bad) == 2.0
+        assert (
+            bad.level is Level.FAIL and "gives other" in bad.sentence and times_longer(bad) == 2.0
+        )
     heavy = checks._independent(changed(post, **(alike | {"psis_khat": 0.9, "agreement_sd": 1.0})))
-    assert heavy.level is Level.FAIL and "says nothing" in heavy.sentence and "--model k1" in heavy.remedy
+    assert (
+        heavy.level is Level.FAIL
+        and "says nothing" in heavy.sentence
+        and "--model k1" in heavy.remedy
+    )
 
 
 def test_how_the_likelihood_was_evaluated(post: Posterior) -> None:
-    def said(used: str, difference: float, khat: float = 0.0, frames: tuple[int, int] = (0, 0)) -> checks.Check | None:
+    def said(
+        used: str, difference: float, khat: float = 0.0, frames: tuple[int, int] = (0, 0)
+    ) -> checks.Check | None:
         words = {"compressed_khat": khat, "compressed_frames": frames}
-        return checks._evaluation(changed(post, likelihood_used=used, compressed_max_difference=difference, **words))
+        return checks._evaluation(
+            changed(post, likelihood_used=used, compressed_max_difference=difference, **words)
+        )
 
     assert said("exact", np.nan) is None
     tried = said("exact", 3.0)
-    assert tried.level is Level.PASS and tried.value == "exact" and "departs from it by 3.0 nat" in tried.sentence
+    assert (
+        tried.level is Level.PASS
+        and tried.value == "exact"
+        and "departs from it by 3.0 nat" in tried.sentence
+    )
     unchecked = said("compressed", np.nan)
     assert unchecked.level is Level.WARN and unchecked.remedy == "sc.sample(obs, cal)"
     good = said("compressed", 0.01)
-    assert good.level is Level.PASS and good.remedy == "" and good.sentence.endswith("wherever the posterior is.")
-    assert "as 1000 of 5000 frames tell" in said("compressed", 0.01, frames=(1000, 5000)).sentence.replace("\u202f", "")
+    assert (
+        good.level is Level.PASS
+        and good.remedy == ""
+        and good.sentence.endswith("wherever the posterior is.")
+    )
+    assert "as 1000 of 5000 frames tell" in said(
+        "compressed", 0.01, frames=(1000, 5000)
+    ).sentence.replace("\u202f", "")
     for bad in (said("compressed", 5.0), said("compressed", 0.01, khat=0.9)):
         assert bad.level is Level.FAIL and "--evaluation exact" in bad.remedy
     whole = checks.CompressionCheck(0.1, 0.2)
@@ -135,13 +165,19 @@ def test_a_likelihood_that_is_known_to_be_wrong(post: Posterior) -> None:
     assert pairs.level is Level.PASS and pairs.remedy == ""
     assert pairs.sentence == "The posterior is that of the likelihood 'pairs'. Godambe."
     naive = checks._likelihood(changed(post, likelihood="pairs_naive"), ())
-    assert naive.level is Level.FAIL and "which they are not" in naive.sentence and "likelihood='pairs'" in naive.remedy
+    assert (
+        naive.level is Level.FAIL
+        and "which they are not" in naive.sentence
+        and "likelihood='pairs'" in naive.remedy
+    )
 
 
 def test_sampling_again_keeps_the_settings(post: Posterior) -> None:
     default = checks.resample(post, n_steps=900)
-    assert default == "starcal-uq sample RUN --force --walkers 16 --steps 900 --evaluation compressed or " + (
-        "sc.sample(obs, cal, n_walkers=16, n_steps=900, evaluation='compressed')"
+    assert (
+        default
+        == "starcal-uq sample RUN --force --walkers 16 --steps 900 --evaluation compressed or "
+        + ("sc.sample(obs, cal, n_walkers=16, n_steps=900, evaluation='compressed')")
     )
     # An object of one's own is evaluated as it is, and no command takes it.
     assert (
@@ -152,7 +188,9 @@ def test_sampling_again_keeps_the_settings(post: Posterior) -> None:
 
 def moved(post: Posterior, column: int, draws: np.ndarray) -> Posterior:
     """With other draws of one parameter."""
-    return dataclasses.replace(post, draws=np.insert(np.delete(post.draws, column, axis=1), column, draws, axis=1))
+    return dataclasses.replace(
+        post, draws=np.insert(np.delete(post.draws, column, axis=1), column, draws, axis=1)
+    )
 
 
 def test_a_sampler_that_hardly_moves(post: Posterior) -> None:
@@ -167,7 +205,9 @@ def test_a_sampler_that_hardly_moves(post: Posterior) -> None:
 
 
 @pytest.mark.parametrize("sd", [0.7, 5.3])
-def test_monte_carlo_error_is_held_against_the_last_printed_digit(post: Posterior, sd: float) -> None:
+def test_monte_carlo_error_is_held_against_the_last_printed_digit(
+    post: Posterior, sd: float
+) -> None:
     """Means are printed to the second digit of sigma: to 0.01 px of 0.7, to 0.1 px of 5.3."""
     unit = 10.0 ** (np.floor(np.log10(sd)) - 1.0)
     z = post.draws[:, 2] - post.draws[:, 2].mean()
@@ -184,7 +224,8 @@ def test_draws_beyond_what_a_camera_can_be(post: Posterior) -> None:
     camera, n = post.camera, len(post.draws)
     spread = np.linspace(-1.0, 1.0, n)
     sd = spread.std(ddof=1)
-    # Ten standard deviations from each edge of the detector in turn; pixels reach half a pixel beyond their centres.
+    # Ten standard deviations from each edge of the detector in turn; pixels reach half a pixel
+    # beyond their centres.
     for column, edge, inside in ((0, -0.5, 1.0), (1, -0.5, 1.0), (0, camera.width_px - 0.5, -1.0)):
         near = checks._bounds(moved(post, column, edge + inside * 10.0 * sd + spread))
         assert near.level is Level.PASS and near.value == "nearest bound 10 sigma away"
@@ -193,7 +234,9 @@ def test_draws_beyond_what_a_camera_can_be(post: Posterior) -> None:
         x0[: round(share * n)] = -1.0
         check = checks._bounds(moved(post, 0, x0))
         assert check.level is level
-    assert check.sentence.startswith("2.0\N{NO-BREAK SPACE}% of the draws have their principal point off")
+    assert check.sentence.startswith(
+        "2.0\N{NO-BREAK SPACE}% of the draws have their principal point off"
+    )
     k1 = post.draws[:, 3].copy()
     k1[0] = -1e-5
     folds = checks._bounds(moved(post, 3, k1))

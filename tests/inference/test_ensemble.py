@@ -8,11 +8,18 @@ import numpy as np
 
 from starcal_uq.inference import arviz as arviz_compat
 from starcal_uq.inference.checks import chain_order, step_order
-from starcal_uq.inference.ensemble import EnsembleSettings, make_moves, run_ensembles, student_t_proposal
+from starcal_uq.inference.ensemble import (
+    EnsembleSettings,
+    make_moves,
+    run_ensembles,
+    student_t_proposal,
+)
 
 
 def _variance_z(moves: list[tuple[Any, float]] | None) -> float:
-    """Largest deviation of a variance from one in Monte Carlo errors, on a standard normal target."""
+    """Largest deviation of a variance from one in Monte Carlo errors, on a standard normal
+    target.
+    """
     seeds = np.random.SeedSequence(11).spawn(4)
     settings = EnsembleSettings(40, 300, 50, "mixture")
     chains = run_ensembles(lambda u: -0.5 * np.sum(u * u, axis=1), 5, seeds, settings, moves=moves)

@@ -1,4 +1,6 @@
-"""ArviZ's groups against integration over the attitude, a second exposure, and the product's own comparison."""
+"""ArviZ's groups against integration over the attitude, a second exposure, and the product's own
+comparison.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ SIGMA = 0.05
 @pytest.fixture(scope="module")
 def night() -> outside.Campaign:
     """Few stars a frame, where the attitude takes up much."""
-    return outside.campaign(np.random.default_rng(4), n_frames=150, stars_per_frame=5, sigma_px=SIGMA)
+    return outside.campaign(
+        np.random.default_rng(4), n_frames=150, stars_per_frame=5, sigma_px=SIGMA
+    )
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +62,9 @@ def directions(obs: sc.Observations) -> np.ndarray:
     return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
 
 
-def test_groups_have_names_units_and_the_same_draws(data: Any, post: Posterior, obs: sc.Observations) -> None:
+def test_groups_have_names_units_and_the_same_draws(
+    data: Any, post: Posterior, obs: sc.Observations
+) -> None:
     for group in ("posterior", "sample_stats", *GROUPS):
         dataset = data[group]
         assert all(dataset[name].attrs["units"] for name in dataset.data_vars), group
@@ -79,7 +85,9 @@ def test_arviz_writes_all_of_it(data: Any, tmp_path: Path) -> None:
 
     data.to_netcdf(tmp_path / "all.nc", engine="h5netcdf")
     again = xr.open_dataset(tmp_path / "all.nc", group="log_likelihood", engine="h5netcdf")
-    assert np.array_equal(again[LOG_LIKELIHOOD].values, data["log_likelihood"][LOG_LIKELIHOOD].values)
+    assert np.array_equal(
+        again[LOG_LIKELIHOOD].values, data["log_likelihood"][LOG_LIKELIHOOD].values
+    )
 
 
 def test_sampled_degrees_of_freedom_are_a_variable(post: Posterior, tmp_path: Path) -> None:
@@ -94,7 +102,8 @@ def test_sampled_degrees_of_freedom_are_a_variable(post: Posterior, tmp_path: Pa
 
 def test_the_same_seed_gives_the_same_images(post: Posterior, obs: sc.Observations) -> None:
     one, same, other = (
-        arviz_data(post, obs, groups=["posterior_predictive"], n_draws=8, n_frames=3, seed=seed) for seed in (5, 5, 6)
+        arviz_data(post, obs, groups=["posterior_predictive"], n_draws=8, n_frames=3, seed=seed)
+        for seed in (5, 5, 6)
     )
     images = [d["posterior_predictive"]["x_px"].values for d in (one, same, other)]
     assert np.array_equal(images[0], images[1])
@@ -122,15 +131,26 @@ def test_log_likelihood_is_the_integral_over_the_attitude(
     for i, j, k in np.ndindex(7, 7, 7):
         u = nodes[[i, j, k]]
         e = residuals(best.x + root @ u)
-        total += weights[i] * weights[j] * weights[k] * np.exp(-0.5 * e @ e + best.cost + 0.5 * u @ u)
+        total += (
+            weights[i] * weights[j] * weights[k] * np.exp(-0.5 * e @ e + best.cost + 0.5 * u @ u)
+        )
     n = 2 * len(r)
-    expected = np.log(total * np.linalg.det(root)) - best.cost - n * np.log(sigma) - 0.5 * n * np.log(2.0 * np.pi)
+    expected = (
+        np.log(total * np.linalg.det(root))
+        - best.cost
+        - n * np.log(sigma)
+        - 0.5 * n * np.log(2.0 * np.pi)
+    )
     found = float(data["log_likelihood"][LOG_LIKELIHOOD].values[1, 7, frame])
     assert found == pytest.approx(expected, abs=1e-3)
 
 
 def test_drawn_images_are_those_of_a_second_exposure(
-    data: Any, post: Posterior, night: outside.Campaign, obs: sc.Observations, monkeypatch: pytest.MonkeyPatch
+    data: Any,
+    post: Posterior,
+    night: outside.Campaign,
+    obs: sc.Observations,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rng = np.random.default_rng(8)
     b = np.einsum("nij,nj->ni", np.repeat(night.attitudes, 5, axis=0), directions(obs))
@@ -140,7 +160,9 @@ def test_drawn_images_are_those_of_a_second_exposure(
         images = made["posterior_predictive"]
         hits = []
         for axis, name in enumerate(("x_px", "y_px")):
-            low, high = np.quantile(images[name].values, [0.5 - share / 2, 0.5 + share / 2], axis=(0, 1))
+            low, high = np.quantile(
+                images[name].values, [0.5 - share / 2, 0.5 + share / 2], axis=(0, 1)
+            )
             hits.append((low < again[:, axis]) & (again[:, axis] < high))
         return float(np.mean(hits))
 
@@ -149,11 +171,18 @@ def test_drawn_images_are_those_of_a_second_exposure(
     assert abs(inside(data, 0.5) - 0.5) < 0.039
     # The control does not draw the attitude, which takes up 3 of the 10 numbers of a frame.
     monkeypatch.setattr(groups, "_roots", np.zeros_like)
-    assert inside(arviz_data(post, obs, groups=["posterior_predictive"], n_draws=400, n_frames=150), 0.95) < 0.93
+    assert (
+        inside(
+            arviz_data(post, obs, groups=["posterior_predictive"], n_draws=400, n_frames=150), 0.95
+        )
+        < 0.93
+    )
 
 
 def test_residuals_of_data_and_drawn_images_are_alike(data: Any) -> None:
-    observed, drawn = (data[g]["residual_x_px"].values for g in ("observed_data", "posterior_predictive"))
+    observed, drawn = (
+        data[g]["residual_x_px"].values for g in ("observed_data", "posterior_predictive")
+    )
     spread = drawn.std(axis=-1)
     assert np.mean(spread < observed.std()) == pytest.approx(0.5, abs=0.49)
     # What an attitude takes up is no residual: 0.7 of the variance is left.
@@ -169,7 +198,9 @@ def test_loo_is_the_comparison_of_the_product() -> None:
     elpd, pointwise = {}, {}
     for name in ("brown", "k1"):
         fitted = sc.calibrate(obs, scenes.nominal(scenes.camera(name)))
-        made = arviz_data(sc.sample(obs, fitted, seed=3, n_steps=100), obs, groups=["log_likelihood"], n_draws=600)
+        made = arviz_data(
+            sc.sample(obs, fitted, seed=3, n_steps=100), obs, groups=["log_likelihood"], n_draws=600
+        )
         found = az.loo(made, pointwise=True)
         elpd[name] = float(found["elpd_loo"] if hasattr(found, "elpd_loo") else found.elpd)
         pointwise[name] = np.asarray(found.loo_i if hasattr(found, "loo_i") else found.elpd_i)
@@ -180,7 +211,9 @@ def test_loo_is_the_comparison_of_the_product() -> None:
         assert elpd[name] == pytest.approx(score.closed_form, abs=0.4)
     worse = own.of("k1")
     assert worse is not None
-    assert elpd["k1"] - elpd["brown"] == pytest.approx(worse.difference, abs=0.1 * worse.difference_se)
+    assert elpd["k1"] - elpd["brown"] == pytest.approx(
+        worse.difference, abs=0.1 * worse.difference_se
+    )
     spread = float(np.sqrt(40) * np.std(pointwise["k1"] - pointwise["brown"], ddof=1))
     assert spread == pytest.approx(worse.difference_se, rel=0.05)
 
@@ -195,14 +228,18 @@ def test_frames_of_a_student_likelihood_add_up() -> None:
     assert likelihood.by_frame(*at).sum() == pytest.approx(likelihood.log_likelihood(*at), abs=1e-5)
 
 
-def test_student_draws_have_tails_and_stated_noise_its_density(post: Posterior, obs: sc.Observations) -> None:
+def test_student_draws_have_tails_and_stated_noise_its_density(
+    post: Posterior, obs: sc.Observations
+) -> None:
     settings = {"settings": {**post.provenance["settings"], "dof": 3.0}}
     heavy = replace(
         post,
         diagnostics=replace(post.diagnostics, likelihood="student_t"),
         provenance=post.provenance | settings,
     )
-    made = arviz_data(heavy, obs, groups=["log_likelihood", "posterior_predictive"], n_draws=40, n_frames=150)
+    made = arviz_data(
+        heavy, obs, groups=["log_likelihood", "posterior_predictive"], n_draws=40, n_frames=150
+    )
     drawn = made["posterior_predictive"]["residual_x_px"].values.ravel()
     assert np.mean((drawn / drawn.std()) ** 4) > 5.0
     assert np.isfinite(made["log_likelihood"][LOG_LIKELIHOOD].values).all()

@@ -20,16 +20,28 @@ from tests.helpers.same import assert_same
 
 @pytest.fixture(scope="module")
 def post() -> Posterior:
-    return sample(None, gaussian_calibration(), n_walkers=16, n_steps=100, seed=7, evaluation="compressed")
+    return sample(
+        None, gaussian_calibration(), n_walkers=16, n_steps=100, seed=7, evaluation="compressed"
+    )
 
 
 @pytest.fixture(scope="module")
 def given() -> Posterior:
-    return sample(None, gaussian_calibration(), sigma=0.05, n_walkers=16, n_steps=20, seed=7, evaluation="compressed")
+    return sample(
+        None,
+        gaussian_calibration(),
+        sigma=0.05,
+        n_walkers=16,
+        n_steps=20,
+        seed=7,
+        evaluation="compressed",
+    )
 
 
 @pytest.mark.parametrize("which", ["post", "given"])
-def test_file_round_trip_is_lossless(which: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_file_round_trip_is_lossless(
+    which: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     original = request.getfixturevalue(which)
     path = tmp_path / "posterior.nc"
     original.save(path)
@@ -46,7 +58,8 @@ def test_opening_a_file_needs_no_heavy_library(post: Posterior, tmp_path: Path) 
     code = (
         "import sys; from starcal_uq.inference.posterior import Posterior; "
         f"p = Posterior.load({str(path)!r}); p.mean, p.covariance, p.sd, p.thin(5, 1); "
-        "heavy = {'casadi', 'emcee', 'matplotlib', 'arviz', 'arviz_stats', 'scipy', 'pandas'} & set(sys.modules); "
+        "heavy = {'casadi', 'emcee', 'matplotlib', 'arviz', 'arviz_stats', 'scipy', 'pandas'} & "
+        "set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -64,20 +77,25 @@ def test_other_tools_can_read_the_file(post: Posterior, tmp_path: Path) -> None:
 
 
 def test_every_place_of_the_draws_states_its_unit(post: Posterior, tmp_path: Path) -> None:
-    """The same draws stand plain at the top of the file and in the data frame, and scaled in ArviZ's group."""
+    """The same draws stand plain at the top of the file and in the data frame, and scaled in
+    ArviZ's group.
+    """
     import xarray as xr
 
     post.save(tmp_path / "posterior.nc")
     units = {"x0": "px", "y0": "px", "f": "px", "k1": "px^-2", "k2": "px^-4", "sigma": "px"}
     with xr.open_dataset(tmp_path / "posterior.nc", engine="h5netcdf") as file:
-        stated = dict(zip(file["draws"].columns.split(", "), file["draws"].units.split(", "), strict=True))
+        stated = dict(
+            zip(file["draws"].columns.split(", "), file["draws"].units.split(", "), strict=True)
+        )
         plain = file["draws"].values
     table = post.to_dataframe()
     assert stated == units == table.attrs["units"]
     assert np.array_equal(plain, table[list(units)].to_numpy())
     with xr.open_dataset(tmp_path / "posterior.nc", group="posterior", engine="h5netcdf") as file:
         assert all("units" in file[name].attrs for name in units)
-        # Control: by their units the two are the same number, and by their values alone they are not.
+        # Control: by their units the two are the same number, and by their values alone they are
+        # not.
         scale = float(file["k1"].units.split()[0])
         assert np.allclose(file["k1"].values.ravel() * scale, plain[:, 3], rtol=1e-12, atol=0.0)
         assert not np.allclose(file["k1"].values.ravel(), plain[:, 3])

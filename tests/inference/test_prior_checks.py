@@ -1,4 +1,6 @@
-"""The prior predictive check flags a prior that the data contradict; power scaling finds what the prior decides."""
+"""The prior predictive check flags a prior that the data contradict; power scaling finds what the
+prior decides.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ NOMINAL = scenes.nominal(scenes.camera())
 DEFAULT = Priors.default(NOMINAL)
 
 
-# --- prior predictive ------------------------------------------------------------------------------------------------
+# --- prior predictive
+# ------------------------------------------------------------------------------------------------
 
 
 def test_default_priors_expect_the_paper_s_camera() -> None:
@@ -45,12 +48,19 @@ def test_default_priors_expect_the_paper_s_camera() -> None:
         ({"focal_fraction": 1e-3, "distortion_corner_px": 0.5}, "scale_percent"),
         ({"focal_px": 7000.0, "focal_fraction": 0.01}, "scale_percent"),
         (
-            {"sigma_median": 1e-4, "sigma_log_sd": 0.1, "distortion_corner_px": 1e-3, "principal_point_px": 1e-2},
+            {
+                "sigma_median": 1e-4,
+                "sigma_log_sd": 0.1,
+                "distortion_corner_px": 1e-3,
+                "principal_point_px": 1e-2,
+            },
             "residual",
         ),
     ],
 )
-def test_priors_that_the_data_contradict_are_flagged(change: dict[str, float], quantity: str) -> None:
+def test_priors_that_the_data_contradict_are_flagged(
+    change: dict[str, float], quantity: str
+) -> None:
     found = prior_predictive(DEFAULT.replace(**change), NOMINAL, scenes.observations())
     assert not found.ok
     assert any(name.startswith(quantity) for name in found.surprising)
@@ -60,7 +70,9 @@ def test_priors_that_the_data_contradict_are_flagged(change: dict[str, float], q
 def test_focal_prior_is_the_scale_s_prior() -> None:
     """Without distortion, the predicted scale is the relative focal length, as drawn."""
     camera = scenes.nominal(scenes.camera("none"))
-    priors = Priors.default(camera).replace(focal_fraction=0.01, principal_point_px=1e-3, sigma_median=0.01)
+    priors = Priors.default(camera).replace(
+        focal_fraction=0.01, principal_point_px=1e-3, sigma_median=0.01
+    )
     found = prior_predictive(priors, camera, scenes.observations("none"), n_draws=400)
     scale = found.draws[:, found.names.index("scale_percent")]
     assert np.mean(scale) == pytest.approx(0.0, abs=0.2)
@@ -69,8 +81,12 @@ def test_focal_prior_is_the_scale_s_prior() -> None:
 
 @pytest.mark.slow
 def test_a_prior_is_calibrated_when_cameras_are_drawn_from_it() -> None:
-    """Tail probabilities of data from the prior itself are uniform; of data from a wider one they are not."""
-    priors = DEFAULT.replace(focal_fraction=0.005, distortion_corner_px=1.0, sigma_log_sd=0.2, principal_point_px=5.0)
+    """Tail probabilities of data from the prior itself are uniform; of data from a wider one they
+    are not.
+    """
+    priors = DEFAULT.replace(
+        focal_fraction=0.005, distortion_corner_px=1.0, sigma_log_sd=0.2, principal_point_px=5.0
+    )
     sky = load_catalogue(max_mag=6.0, epoch=2026.9)
     rng = np.random.default_rng(7)
 
@@ -106,14 +122,19 @@ def test_predictive_check_repeats_and_refuses() -> None:
         prior_predictive(DEFAULT, scenes.camera("k1"))
     with pytest.raises(PriorError, match="per_star_sigma"):
         prior_predictive(DEFAULT, NOMINAL, scenes.with_sigmas(obs))
-    assert prior_predictive(Priors.default(NOMINAL, True), NOMINAL, scenes.with_sigmas(obs), n_draws=100).ok
+    assert prior_predictive(
+        Priors.default(NOMINAL, True), NOMINAL, scenes.with_sigmas(obs), n_draws=100
+    ).ok
 
 
-# --- power scaling ---------------------------------------------------------------------------------------------------
+# --- power scaling
+# --------------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=8)
-def posterior(principal_point_px: float = 100.0, centre: tuple[float, float] = (500.0, 530.0)) -> Posterior:
+def posterior(
+    principal_point_px: float = 100.0, centre: tuple[float, float] = (500.0, 530.0)
+) -> Posterior:
     """Known sigmas: 0.15 px of x0 and y0 from the data."""
     cal = gaussian_calibration()
     priors = Priors.default(cal.nominal).replace(
@@ -151,7 +172,9 @@ def test_a_conflict_is_found_and_its_direction() -> None:
 
 
 def test_mean_shift_is_the_derivative_in_closed_form() -> None:
-    """Normal prior and normal likelihood: the mean's derivative with respect to the power is known."""
+    """Normal prior and normal likelihood: the mean's derivative with respect to the power is
+    known.
+    """
     tau, s, distance = 0.15, 0.15, 0.9
     found = prior_sensitivity(posterior(tau, (500.0, 530.0 + distance)))
     a, b = tau**-2, s**-2
@@ -163,7 +186,9 @@ def test_mean_shift_is_the_derivative_in_closed_form() -> None:
 
 def test_further_quantities_are_scaled_too() -> None:
     post = posterior(0.15, (500.0, 530.9))
-    found = prior_sensitivity(post, {"radius": np.hypot(*post.draws[:, :2].T), "f_mm": post.draws[:, 2] * 0.012})
+    found = prior_sensitivity(
+        post, {"radius": np.hypot(*post.draws[:, :2].T), "f_mm": post.draws[:, 2] * 0.012}
+    )
     assert found.names[-2:] == ("radius", "f_mm")
     assert found.diagnosis[-2:] == (CONFLICT, FINE)
     # Units do not matter.
@@ -194,5 +219,7 @@ def test_sensitivity_is_arvizs() -> None:
         values = post.draws[:, i][None]
         weights = [np.exp((alpha - 1.0) * (log_prior - log_prior.mean())) for alpha in (0.99, 1.01)]
         lower, upper = ((w / w.sum())[None] for w in weights)
-        theirs = array_stats.power_scale_sense(values, lower, upper, lower_alpha=0.99, upper_alpha=1.01)
+        theirs = array_stats.power_scale_sense(
+            values, lower, upper, lower_alpha=0.99, upper_alpha=1.01
+        )
         assert found.prior[i] == pytest.approx(float(theirs), rel=0.03)

@@ -40,7 +40,9 @@ def test_marginal_densities_integrate_to_one(name: str) -> None:
     mean, sd = priors.mean([name])[0], priors.sd([name])[0]
     low, high = (1e-12, 200.0) if name == "sigma" else (mean - 9 * sd, mean + 9 * sd)
     grid = np.geomspace(low, high, 20_001) if name == "sigma" else np.linspace(low, high, 20_001)
-    assert integrate.trapezoid(priors.marginal_density(name, grid), grid) == pytest.approx(1.0, abs=1e-4)
+    assert integrate.trapezoid(priors.marginal_density(name, grid), grid) == pytest.approx(
+        1.0, abs=1e-4
+    )
 
 
 def test_draws_have_the_stated_moments() -> None:
@@ -73,7 +75,9 @@ def test_defaults_are_wide_and_centred_on_the_nominal_camera() -> None:
 def test_noise_must_be_positive_to_have_a_density() -> None:
     priors = Priors.default(CAMERA)
     theta = np.tile(CAMERA.theta, (3, 1))
-    assert np.array_equal(np.isfinite(priors.log_density(theta, np.array([0.1, 0.0, -1.0]))), [True, False, False])
+    assert np.array_equal(
+        np.isfinite(priors.log_density(theta, np.array([0.1, 0.0, -1.0]))), [True, False, False]
+    )
     assert np.array_equal(priors.marginal_density("sigma", np.array([-1.0, 0.0])), [0.0, 0.0])
 
 
@@ -106,7 +110,10 @@ def test_priors_of_another_model_are_refused() -> None:
 
 def test_toml_overrides_defaults(tmp_path: Path) -> None:
     path = tmp_path / "priors.toml"
-    path.write_text("[priors]\nfocal_fraction = 0.001\nprincipal_point_centre_px = [500, 530.5]\n", encoding="utf-8")
+    path.write_text(
+        "[priors]\nfocal_fraction = 0.001\nprincipal_point_centre_px = [500, 530.5]\n",
+        encoding="utf-8",
+    )
     priors = Priors.from_toml(path, CAMERA)
     assert priors.focal_fraction == 0.001
     assert priors.principal_point_centre_px == (500.0, 530.5)
@@ -118,9 +125,15 @@ def test_toml_overrides_defaults(tmp_path: Path) -> None:
     [
         ("[priors]\nfocal_frac = 0.1\n", "key focal_frac is unknown; did you mean focal_fraction"),
         ("[prior]\nfocal_fraction = 0.1\n", r"section \[priors\] is missing"),
-        ("[priors]\nfocal_fraction = 'wide'\n", "focal_fraction is 'wide'; write a number above zero"),
+        (
+            "[priors]\nfocal_fraction = 'wide'\n",
+            "focal_fraction is 'wide'; write a number above zero",
+        ),
         ("[priors]\nfocal_fraction = true\n", "focal_fraction is True; write a number above zero"),
-        ("[priors]\nprincipal_point_centre_px = 500\n", "principal_point_centre_px is 500; write two numbers"),
+        (
+            "[priors]\nprincipal_point_centre_px = 500\n",
+            "principal_point_centre_px is 500; write two numbers",
+        ),
         ("[priors]\nfocal_fraction = -0.1\n", "above zero"),
         ("[priors]\ndistortion_corner_px = 1e-300\n", "leave no number"),
         ("[priors\n", "not valid TOML"),

@@ -1,4 +1,6 @@
-"""The sampler draws from the posterior it was given, again and again the same, and says when it did not."""
+"""The sampler draws from the posterior it was given, again and again the same, and says when it did
+not.
+"""
 
 from __future__ import annotations
 
@@ -78,8 +80,11 @@ def test_known_posterior_is_recovered_at_extreme_scales() -> None:
 
 def test_informative_prior_shifts_the_posterior_as_it_must() -> None:
     cal = gaussian_calibration()
-    # A focal length known to 0.02 px, 0.05 px away from the estimate, also moves k1 and k2 through their couplings.
-    priors = Priors.default(cal.nominal).replace(focal_px=cal.theta[2] + 0.05, focal_fraction=0.02 / cal.theta[2])
+    # A focal length known to 0.02 px, 0.05 px away from the estimate, also moves k1 and k2 through
+    # their couplings.
+    priors = Priors.default(cal.nominal).replace(
+        focal_px=cal.theta[2] + 0.05, focal_fraction=0.02 / cal.theta[2]
+    )
     post = sample(None, cal, priors, sigma=0.05, seed=1, evaluation="compressed")
     mean, covariance = conjugate(priors, cal)
     assert abs(mean[3] - cal.theta[3]) > 0.5 * SD[3]
@@ -89,7 +94,8 @@ def test_informative_prior_shifts_the_posterior_as_it_must() -> None:
 
 
 def test_noise_has_the_posterior_found_by_quadrature() -> None:
-    # So few degrees of freedom that a forgotten Jacobian (a factor sigma) would move the mean by about 0.2 sd.
+    # So few degrees of freedom that a forgotten Jacobian (a factor sigma) would move the mean by
+    # about 0.2 sd.
     cal = gaussian_calibration(dof=12)
     post = sample(None, cal, seed=1, evaluation="compressed")
     s = np.geomspace(0.005, 2.0, 20_001)
@@ -116,7 +122,9 @@ def test_defaults_give_ten_thousand_effective_draws() -> None:
 
 def test_stretch_move_agrees() -> None:
     cal = gaussian_calibration()
-    post = sample(None, cal, sigma=0.05, moves="stretch", n_steps=400, seed=1, evaluation="compressed")
+    post = sample(
+        None, cal, sigma=0.05, moves="stretch", n_steps=400, seed=1, evaluation="compressed"
+    )
     mean, covariance = conjugate(post.priors, cal)
     z = whitened(post.theta_draws, mean, covariance)
     assert np.max(np.abs(np.cov(z.T) - np.eye(5))) < 0.2
@@ -125,7 +133,9 @@ def test_stretch_move_agrees() -> None:
 
 def test_same_seed_same_bits_and_ensembles_differ() -> None:
     cal = gaussian_calibration()
-    first, second, other = (sample(None, cal, **{**QUICK, "seed": seed}, evaluation="compressed") for seed in (3, 3, 4))
+    first, second, other = (
+        sample(None, cal, **{**QUICK, "seed": seed}, evaluation="compressed") for seed in (3, 3, 4)
+    )
     assert np.array_equal(first.draws, second.draws)
     assert np.array_equal(first.log_posterior, second.log_posterior)
     assert first.diagnostics.psis_khat == second.diagnostics.psis_khat
@@ -138,7 +148,9 @@ def test_a_seed_is_taken_and_recorded() -> None:
     cal = gaussian_calibration()
     options = {**QUICK, "seed": None}
     post = sample(None, cal, **options, evaluation="compressed")
-    again = sample(None, cal, **{**options, "seed": post.provenance["seed"]}, evaluation="compressed")
+    again = sample(
+        None, cal, **{**options, "seed": post.provenance["seed"]}, evaluation="compressed"
+    )
     assert np.array_equal(post.draws, again.draws)
 
 
@@ -153,10 +165,17 @@ def test_resumed_run_is_the_uninterrupted_run(tmp_path: Path, stop: int) -> None
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt)
+        sample(
+            None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt
+        )
     seen: list[int] = []
     resumed = sample(
-        None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=lambda done, _: seen.append(done)
+        None,
+        cal,
+        **QUICK,
+        evaluation="compressed",
+        checkpoint=checkpoint,
+        progress=lambda done, _: seen.append(done),
     )
     assert np.array_equal(resumed.draws, whole.draws)
     assert np.array_equal(resumed.log_posterior, whole.log_posterior)
@@ -175,15 +194,26 @@ def test_a_checkpoint_that_is_stale_or_damaged_is_passed_over(tmp_path: Path) ->
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt)
+        sample(
+            None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt
+        )
     content = checkpoint.read_bytes()
     other = {**QUICK, "seed": 4}
     wider = SimpleNamespace(**{**vars(cal), "inflation": np.full(5, 1.7)})
-    cases = ((content, cal, other), (content, wider, QUICK), (content[:-100], cal, QUICK), (b"nothing", cal, QUICK))
+    cases = (
+        (content, cal, other),
+        (content, wider, QUICK),
+        (content[:-100], cal, QUICK),
+        (b"nothing", cal, QUICK),
+    )
     for stale, calibration, settings in cases:
         checkpoint.write_bytes(stale)
-        found = sample(None, calibration, **settings, evaluation="compressed", checkpoint=checkpoint)
-        assert np.array_equal(found.draws, sample(None, calibration, **settings, evaluation="compressed").draws)
+        found = sample(
+            None, calibration, **settings, evaluation="compressed", checkpoint=checkpoint
+        )
+        assert np.array_equal(
+            found.draws, sample(None, calibration, **settings, evaluation="compressed").draws
+        )
 
 
 def test_given_noise_fills_the_last_column() -> None:
@@ -245,7 +275,9 @@ def test_starts_without_density_are_refused() -> None:
     class Cut:
         def log_likelihood(self, theta: np.ndarray, sigma: np.ndarray) -> np.ndarray:
             # A wall one standard deviation from the mode.
-            return np.where(theta[:, 0] > cal.theta[0] + SD[0], -np.inf, inner.log_likelihood(theta, sigma))
+            return np.where(
+                theta[:, 0] > cal.theta[0] + SD[0], -np.inf, inner.log_likelihood(theta, sigma)
+            )
 
     class Nowhere:
         def log_likelihood(self, theta: np.ndarray, sigma: np.ndarray) -> np.ndarray:
@@ -261,7 +293,9 @@ def test_newton_finds_a_mode_away_from_its_start() -> None:
     cal = gaussian_calibration()
     priors = Priors.default(cal.nominal)
     away = cal.theta + 20.0 * SD * np.array([1, -1, 1, 0, 0])
-    start = start_target(cal.compressed.log_likelihood, priors, away, 3.0 * cal.information, 0.08, cal.dof, False)
+    start = start_target(
+        cal.compressed.log_likelihood, priors, away, 3.0 * cal.information, 0.08, cal.dof, False
+    )
     _, laplace = laplace_approximation(start)
     assert laplace.converged
     assert np.max(np.abs(laplace.mode[:5] - cal.theta) / SD) < 0.02
@@ -273,7 +307,13 @@ def test_newton_finds_a_mode_away_from_its_start() -> None:
 def test_importance_sampling_knows_the_moments_and_its_own_limits() -> None:
     cal = gaussian_calibration()
     start = start_target(
-        cal.compressed.log_likelihood, Priors.default(cal.nominal), cal.theta, cal.information, 0.05, cal.dof, False
+        cal.compressed.log_likelihood,
+        Priors.default(cal.nominal),
+        cal.theta,
+        cal.information,
+        0.05,
+        cal.dof,
+        False,
     )
     target, laplace = laplace_approximation(start)
     check = importance_check(target, 20_000, 8.0, np.random.default_rng(1))
@@ -288,12 +328,15 @@ def test_importance_sampling_knows_the_moments_and_its_own_limits() -> None:
 def test_compression_check_measures_the_difference() -> None:
     cal = gaussian_calibration()
     exact = cal.compressed.log_likelihood
-    start = start_target(exact, Priors.default(cal.nominal), cal.theta, cal.information, 0.05, cal.dof, False)
+    start = start_target(
+        exact, Priors.default(cal.nominal), cal.theta, cal.information, 0.05, cal.dof, False
+    )
     target, laplace = laplace_approximation(start)
     draws = target.natural(np.random.default_rng(1).standard_normal((300, 6)))
 
     def off_by(nat: float) -> Any:
-        # The difference is nat times the square of the first parameter's deviation, plus a constant that cannot matter.
+        # The difference is nat times the square of the first parameter's deviation, plus a constant
+        # that cannot matter.
         return lambda t, s: exact(t, s) + nat * ((t[:, 0] - cal.theta[0]) / SD[0]) ** 2 + 7.0
 
     fine = check_compression(off_by(0.001), exact, target, draws, laplace)
@@ -331,7 +374,8 @@ def test_a_sample_of_frames_bounds_the_error_of_the_expansion(
     assert some.diagnostics.compressed_frames == (40, 100)
     # One px of noise: more than 0.005 nat are left out, and the sample's own uncertainty counts.
     assert 0.01 < every.compressed_max_difference < some.diagnostics.compressed_max_difference < 2.0
-    # Controls: half of the frames counted twice, which no sample sees by itself, and second derivatives left out.
+    # Controls: half of the frames counted twice, which no sample sees by itself, and second
+    # derivatives left out.
     twice = sample(obs, spoilt(cal), **QUICKER, evaluation="compressed").diagnostics
     assert twice.compressed_max_difference > 1.5
     gram = cal.compressed.gram.copy()
@@ -341,7 +385,9 @@ def test_a_sample_of_frames_bounds_the_error_of_the_expansion(
     assert linear.compressed_max_difference > 2.0 * every.compressed_max_difference
 
 
-def test_a_check_by_a_sample_costs_the_same_at_any_number_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_check_by_a_sample_costs_the_same_at_any_number_of_frames(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     from starcal_uq.estimation.marginal import MarginalLikelihood
 
     monkeypatch.setattr("starcal_uq.inference.exact.SAMPLED_FRAMES", 20)
@@ -362,7 +408,8 @@ def test_a_check_by_a_sample_costs_the_same_at_any_number_of_frames(monkeypatch:
         visited.clear()
         sample(obs, cal, **QUICKER, evaluation="compressed")
         monkeypatch.setattr(MarginalLikelihood, "sums", sums)
-        # All frames are visited at the estimate, the mode and two points, the sample at 24 and the mode.
+        # All frames are visited at the estimate, the mode and two points, the sample at 24 and the
+        # mode.
         assert visited.count(n_frames) == 4
         of_sample.append(sum(visited) - 4 * n_frames)
     assert of_sample[0] == of_sample[1]
@@ -378,7 +425,9 @@ def test_surprising_results_are_said() -> None:
     cal = gaussian_calibration()
     priors = Priors.default(cal.nominal).replace(focal_fraction=0.001)
     post = sample(None, cal, priors, **QUICK, evaluation="compressed")
-    assert "prior standard deviations away" in sentence_of(post, "Influence of the priors", Level.WARN)
+    assert "prior standard deviations away" in sentence_of(
+        post, "Influence of the priors", Level.WARN
+    )
     off = cal.camera.replace(x0_px=-3.0).theta
     likelihood = GaussianLikelihood(off, cal.information, cal.sigma, cal.dof)
     away = gaussian_calibration(theta=off, compressed=likelihood)
@@ -408,7 +457,9 @@ def test_compressed_and_exact_posteriors_are_the_same(few_frames: tuple[Any, Any
 
 def spoilt(cal: Any) -> Any:
     """A calibration whose compressed likelihood has half of the data counted twice."""
-    return dataclasses.replace(cal, compressed=dataclasses.replace(cal.compressed, gram=1.5 * cal.compressed.gram))
+    return dataclasses.replace(
+        cal, compressed=dataclasses.replace(cal.compressed, gram=1.5 * cal.compressed.gram)
+    )
 
 
 @pytest.fixture
@@ -425,7 +476,9 @@ def replaced(few_frames: tuple[Any, Any], no_polynomial: Any) -> Any:
     return sample(obs, spoilt(cal), **QUICKER)
 
 
-def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], replaced: Any) -> None:
+def test_a_wrong_compressed_likelihood_is_replaced(
+    few_frames: tuple[Any, Any], replaced: Any
+) -> None:
     obs, cal = few_frames
     assert replaced.diagnostics.likelihood_used == "exact"
     assert replaced.diagnostics.compressed_max_difference > 0.5
@@ -470,8 +523,13 @@ def test_every_distortion_model_and_stated_noise(model: str) -> None:
 
 
 def test_stars_of_another_table_are_no_check_that_passes(tmp_path: Path) -> None:
-    """Where the exact likelihood is not even finite, the compressed one is not taken for unchecked."""
-    cal, others = calibrate(observations(n_frames=20), nominal(camera())), observations(n_frames=20, seed=4)
+    """Where the exact likelihood is not even finite, the compressed one is not taken for
+    unchecked.
+    """
+    cal, others = (
+        calibrate(observations(n_frames=20), nominal(camera())),
+        observations(n_frames=20, seed=4),
+    )
     with pytest.raises(SamplingError, match="that the observations are its own"):
         sample(others, cal, **QUICK)
     post = sample(others, cal, evaluation="compressed", **QUICK)
@@ -487,7 +545,9 @@ def test_points_together_and_one_by_one() -> None:
     theta = cal.theta + 3.0 * cal.sigmas * np.random.default_rng(1).standard_normal((50, 5))
     sigma = np.linspace(0.9, 1.1, 50) * cal.sigma
     likelihood = MarginalLikelihood(obs, "brown")
-    one_by_one = np.array([likelihood.log_likelihood(t, s) for t, s in zip(theta, sigma, strict=True)])
+    one_by_one = np.array(
+        [likelihood.log_likelihood(t, s) for t, s in zip(theta, sigma, strict=True)]
+    )
     exact = ExactMarginal(obs, cal)
     np.testing.assert_allclose(exact.log_likelihood(theta, sigma), one_by_one, rtol=0.0, atol=1e-5)
     # A point that no camera can have is nothing, and spoils no other.
@@ -499,7 +559,9 @@ def test_points_together_and_one_by_one() -> None:
 
 
 def test_noisy_stars_do_not_take_chains_of_the_exact_likelihood(monkeypatch) -> None:
-    """Where the expansion misses a little, a polynomial holds it: thousands of exact evaluations, not tens of them."""
+    """Where the expansion misses a little, a polynomial holds it: thousands of exact evaluations,
+    not tens of them.
+    """
     c = campaign(np.random.default_rng(1), n_frames=20, stars_per_frame=32, sigma_px=5.0)
     obs, sheet = Observations(**c.columns), Camera(**c.camera_toml())
     cal = calibrate(obs, sheet)
@@ -530,9 +592,13 @@ def test_frames_in_batches_say_what_the_expansion_leaves_out() -> None:
     compressed = cal.compressed.log_likelihood(theta, sigma)
     assert np.abs(np.diff(exact - compressed)).max() > 0.01
     left = batches.log_likelihood(theta, sigma) - exact
-    assert np.abs(left - left[0]).max() < 0.02 * np.abs(exact - compressed - (exact - compressed)[0]).max() + 1e-3
+    assert (
+        np.abs(left - left[0]).max()
+        < 0.02 * np.abs(exact - compressed - (exact - compressed)[0]).max() + 1e-3
+    )
     assert batches.left_out(theta, sigma).shape == (10, 4)
-    # Of frames that stand for more, the expansion is that of all, and what is left out grows with them.
+    # Of frames that stand for more, the expansion is that of all, and what is left out grows with
+    # them.
     more = FrameSample(obs, cal, of_frames=40)
     np.testing.assert_allclose(more.left_out(theta, sigma), 2.0 * batches.left_out(theta, sigma))
 
@@ -554,7 +620,9 @@ def accepted() -> Any:
     ("likelihood", "evaluation"),
     [("marginal", "compressed"), ("marginal", "exact"), ("student_t", "auto"), ("pairs", "auto")],
 )
-def test_draws_are_as_wide_as_an_accepted_inflation(accepted: Any, likelihood: Any, evaluation: Any) -> None:
+def test_draws_are_as_wide_as_an_accepted_inflation(
+    accepted: Any, likelihood: Any, evaluation: Any
+) -> None:
     obs, (cal, before) = observations(n_frames=20), accepted
     how = {**QUICK, "likelihood": likelihood, "evaluation": evaluation}
     post, formal = sample(obs, cal, **how), sample(obs, before, **how)
@@ -566,7 +634,8 @@ def test_draws_are_as_wide_as_an_accepted_inflation(accepted: Any, likelihood: A
     assert post.diagnostics.psis_khat < 0.7
     if likelihood == "marginal":
         assert post.sd[:-1] / cal.sigmas == pytest.approx(1.0, rel=0.1)
-        # The control: draws of the formal errors are as much narrower than the calibration as was accepted.
+        # The control: draws of the formal errors are as much narrower than the calibration as was
+        # accepted.
         assert cal.sigmas / formal.sd[:-1] == pytest.approx(FACTORS, rel=0.1)
 
 
@@ -574,7 +643,9 @@ def test_an_accepted_inflation_widens_no_prior_and_nothing_twice(accepted: Any) 
     obs, (cal, before) = observations(n_frames=20), accepted
     # A prior that knows f as well as the formal errors do is as narrow beside the wider ones.
     tight = dataclasses.replace(
-        Priors.default(cal.nominal), focal_px=cal.theta[2], focal_fraction=before.sigmas[2] / cal.theta[2]
+        Priors.default(cal.nominal),
+        focal_px=cal.theta[2],
+        focal_fraction=before.sigmas[2] / cal.theta[2],
     )
     post = sample(obs, cal, tight, **QUICK)
     information = before.information / np.outer(FACTORS, FACTORS)
@@ -589,13 +660,23 @@ def test_an_accepted_inflation_widens_no_prior_and_nothing_twice(accepted: Any) 
 
 def test_a_sample_of_frames_checks_the_wider_likelihood(accepted: Any) -> None:
     obs, (cal, _) = observations(n_frames=20), accepted
-    plain = dataclasses.replace(named.find_source("marginal", obs, accepted[1], None), sample=FrameSample(obs, cal))
+    plain = dataclasses.replace(
+        named.find_source("marginal", obs, accepted[1], None), sample=FrameSample(obs, cal)
+    )
     source = named._inflated(plain, FACTORS)
     steps = np.random.default_rng(1).standard_normal((4, 5)) * cal.sigmas
     sigma = np.full(4, cal.sigma)
-    assert source.sample is not None and plain.sample is not None and source.fast is not None and plain.fast is not None
+    assert (
+        source.sample is not None
+        and plain.sample is not None
+        and source.fast is not None
+        and plain.fast is not None
+    )
     far, near = cal.theta + steps * FACTORS, cal.theta + steps
-    for wide, narrow in ((source.sample.left_out, plain.sample.left_out), (source.fast, plain.fast)):
+    for wide, narrow in (
+        (source.sample.left_out, plain.sample.left_out),
+        (source.fast, plain.fast),
+    ):
         np.testing.assert_allclose(wide(far, sigma), narrow(near, sigma), rtol=1e-6, atol=1e-6)
     assert np.abs(plain.fast(far, sigma) - plain.fast(near, sigma)).max() > 1.0
 
@@ -609,7 +690,9 @@ def test_degrees_of_freedom_are_the_callers_or_the_calibrations() -> None:
 
 
 def test_a_stream_of_samaans_has_no_likelihood_to_sample() -> None:
-    cal = SimpleNamespace(provenance={"settings": {"stream": True, "method": "samaan"}}, star_errors=1)
+    cal = SimpleNamespace(
+        provenance={"settings": {"stream": True, "method": "samaan"}}, star_errors=1
+    )
     with pytest.raises(SamplingError, match="a stream leaves only the quadratic likelihood"):
         named._named_source("pairs", None, cal, None)
     with pytest.raises(SamplingError, match="holds errors of the stars"):

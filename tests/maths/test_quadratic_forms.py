@@ -13,7 +13,9 @@ from starcal_uq.maths.quadratic_forms import weighted_chi_square_tail
 @pytest.mark.parametrize("x", [1e-6, 0.1, 1.0, 2.0, 5.0, 20.0, 100.0, 300.0])
 def test_equal_weights_give_chi_square(count: int, x: float) -> None:
     """To relative accuracy, down to 1e-67."""
-    assert weighted_chi_square_tail(np.full(count, 2.5), 2.5 * x) == pytest.approx(chi2.sf(x, count), rel=1e-8)
+    assert weighted_chi_square_tail(np.full(count, 2.5), 2.5 * x) == pytest.approx(
+        chi2.sf(x, count), rel=1e-8
+    )
 
 
 @pytest.mark.parametrize(("a", "b"), [(1.0, 0.5), (1.0, 0.01), (1.0, 1e-4), (3.0, 2.9)])
@@ -30,7 +32,9 @@ def test_an_estimated_noise_gives_f(count: int, dof: int) -> None:
         tail = weighted_chi_square_tail(np.ones(count), x, dof)
         assert tail == pytest.approx(f.sf(x / count, count, dof), rel=1e-5)
     # Control: taking the noise as known is wrong where it rests on few numbers.
-    assert weighted_chi_square_tail(np.ones(5), 20.0) < 0.7 * weighted_chi_square_tail(np.ones(5), 20.0, 20)
+    assert weighted_chi_square_tail(np.ones(5), 20.0) < 0.7 * weighted_chi_square_tail(
+        np.ones(5), 20.0, 20
+    )
 
 
 def test_unequal_weights_agree_with_draws() -> None:
@@ -38,7 +42,9 @@ def test_unequal_weights_agree_with_draws() -> None:
     sums = np.random.default_rng(0).standard_normal((400_000, 4)) ** 2 @ weights
     for x in (0.3, 1.0, 3.0, 6.0):
         share = float(np.mean(sums > x))
-        assert weighted_chi_square_tail(weights, x) == pytest.approx(share, abs=4 * np.sqrt(share / 400_000))
+        assert weighted_chi_square_tail(weights, x) == pytest.approx(
+            share, abs=4 * np.sqrt(share / 400_000)
+        )
 
 
 def test_what_is_no_quadratic_form_is_refused() -> None:

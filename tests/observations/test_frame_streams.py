@@ -1,4 +1,6 @@
-"""Frames from files larger than memory: the same stars, the same complaints, and no more memory than a batch."""
+"""Frames from files larger than memory: the same stars, the same complaints, and no more memory
+than a batch.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def test_frames_come_one_by_one_and_whole(tmp_path, ending, batch_rows, stated):
         if getattr(obs, name) is None:
             assert all(getattr(f, name) is None for f in frames)
         else:
-            assert np.array_equal(np.concatenate([getattr(f, name) for f in frames]), getattr(obs, name))
+            assert np.array_equal(
+                np.concatenate([getattr(f, name) for f in frames]), getattr(obs, name)
+            )
     assert frames[0].meta["directions"] == ("apparent" if ending == ".parquet" else "undeclared")
     # Reads again from the start.
     assert len(list(stream)) == obs.n_frames
@@ -57,7 +61,9 @@ def test_columns_in_other_units_are_those_of_a_whole_table(tmp_path, ending):
     table["X"], table["RA [h]"] = table.pop("x_px") + 1.0, table.pop("ra_deg") / 15.0
     path = tmp_path / f"table{ending}"
     columns = {"x_px": "X - 1", "ra_deg": "RA [h] * 15"}
-    table.to_parquet(path) if ending == ".parquet" else table.to_csv(path, index=False, sep=";", decimal=",")
+    table.to_parquet(path) if ending == ".parquet" else table.to_csv(
+        path, index=False, sep=";", decimal=","
+    )
     whole = sc.load_observations(path, columns=columns)
     found = [stream_frames(path, camera(), columns, batch_rows=7)]
     if ending == ".parquet":
@@ -67,7 +73,9 @@ def test_columns_in_other_units_are_those_of_a_whole_table(tmp_path, ending):
     for frames in found:
         frames = list(frames)
         for name in COLUMNS[:5]:
-            np.testing.assert_array_equal(np.concatenate([getattr(f, name) for f in frames]), getattr(whole, name))
+            np.testing.assert_array_equal(
+                np.concatenate([getattr(f, name) for f in frames]), getattr(whole, name)
+            )
     np.testing.assert_allclose(whole.ra_deg, obs.ra_deg, rtol=1e-14)
 
 
@@ -75,7 +83,9 @@ def test_columns_in_other_units_are_those_of_a_whole_table(tmp_path, ending):
 def test_a_file_is_calibrated_without_being_loaded(tmp_path, method):
     obs = observations(n_frames=100)
     obs.save(tmp_path / "table.parquet")
-    cal = sc.calibrate(stream_frames(tmp_path / "table.parquet"), sc.paper.paper_start(), method=method)
+    cal = sc.calibrate(
+        stream_frames(tmp_path / "table.parquet"), sc.paper.paper_start(), method=method
+    )
     table = sc.calibrate(obs, sc.paper.paper_start(), method=method)
     assert np.allclose(cal.theta, table.theta, rtol=1e-9)
     assert cal.n_stars == obs.n_stars
@@ -90,7 +100,9 @@ def test_a_folder_of_files_is_one_stream(tmp_path):
     frames = list(stream_frames(tmp_path, batch_rows=50))
     assert [int(f.frame[0]) for f in frames] == obs.frame_ids.tolist()
     write(parts[1].select_frames([30]), tmp_path / "c.csv")
-    with pytest.raises(ObservationError, match=r"c\.csv, line 2: frame 30 comes back after other frames; sort"):
+    with pytest.raises(
+        ObservationError, match=r"c\.csv, line 2: frame 30 comes back after other frames; sort"
+    ):
         list(stream_frames(tmp_path))
 
 
@@ -137,7 +149,9 @@ def test_frames_before_a_bad_row_are_given_out(tmp_path):
     obs = observations()
     values = obs.x_px.copy()
     values[-1] = 5000.0
-    stream = iter(stream_frames(write(obs, tmp_path / "bad.parquet", x_px=values), camera(), batch_rows=100))
+    stream = iter(
+        stream_frames(write(obs, tmp_path / "bad.parquet", x_px=values), camera(), batch_rows=100)
+    )
     given = 0
     with pytest.raises(ObservationError):
         for _ in stream:
@@ -147,9 +161,13 @@ def test_frames_before_a_bad_row_are_given_out(tmp_path):
 
 def test_other_complaints_are_those_of_the_loader(tmp_path):
     obs = observations()
-    two = obs.select(np.arange(obs.n_stars) != 0).select(np.arange(obs.n_stars - 1) >= obs.stars_per_frame[0] - 3)
+    two = obs.select(np.arange(obs.n_stars) != 0).select(
+        np.arange(obs.n_stars - 1) >= obs.stars_per_frame[0] - 3
+    )
     path = write(two, tmp_path / "two.parquet")
-    with pytest.raises(ObservationError, match=r"row 1, column frame: frame 0 has 2 stars, and 3 are needed"):
+    with pytest.raises(
+        ObservationError, match=r"row 1, column frame: frame 0 has 2 stars, and 3 are needed"
+    ):
         list(stream_frames(path, batch_rows=9))
     twice = obs.ra_deg.copy(), obs.dec_deg.copy()
     for values in twice:
@@ -162,7 +180,9 @@ def test_other_complaints_are_those_of_the_loader(tmp_path):
     with pytest.raises(ObservationError, match="column dec_deg is missing"):
         list(stream_frames(path))
     path.write_text("frame,x_px,y_px,ra_deg,dec_deg\n0,1,2,3\n")
-    with pytest.raises(ObservationError, match=r"short\.csv, line 2: 4 values under a header of 5 columns"):
+    with pytest.raises(
+        ObservationError, match=r"short\.csv, line 2: 4 values under a header of 5 columns"
+    ):
         list(stream_frames(path))
     path.write_text("frame,x_px,y_px,ra_deg,dec_deg\n")
     with pytest.raises(ObservationError, match="has no rows"):
@@ -194,7 +214,9 @@ def test_what_cannot_be_streamed_is_refused_at_once(tmp_path):
     with pytest.raises(ObservationError, match=r"holds no \.parquet or \.csv file"):
         stream_frames(tmp_path)
     observations().save(tmp_path / "table.ecsv")
-    with pytest.raises(ObservationError, match=r"\.ecsv cannot be streamed; save the table as \.parquet or \.csv"):
+    with pytest.raises(
+        ObservationError, match=r"\.ecsv cannot be streamed; save the table as \.parquet or \.csv"
+    ):
         stream_frames(tmp_path / "table.ecsv")
     path = write(observations(), tmp_path / "table.parquet")
     with pytest.raises(ObservationError, match="'x' is no column of observations"):
@@ -222,14 +244,18 @@ def test_frame_numbers_need_not_be_in_order(tmp_path):
 
 
 def test_memory_is_that_of_a_batch(tmp_path):
-    """300,000 rows in row groups of 4096, read 2048 at a time; the whole table would be 12 MB and more."""
+    """300,000 rows in row groups of 4096, read 2048 at a time; the whole table would be 12 MB and
+    more.
+    """
     import pyarrow as pa
     from pyarrow import parquet
 
     obs = observations()
     copies = 300_000 // obs.n_stars
     frame = np.concatenate([obs.frame + k * 1000 for k in range(copies)])
-    columns = {name: np.tile(getattr(obs, name), copies) for name in ("x_px", "y_px", "ra_deg", "dec_deg")}
+    columns = {
+        name: np.tile(getattr(obs, name), copies) for name in ("x_px", "y_px", "ra_deg", "dec_deg")
+    }
     table = pa.table({"frame": frame} | columns)
     path = tmp_path / "large.parquet"
     parquet.write_table(table, path, row_group_size=4096)

@@ -1,4 +1,6 @@
-"""Matched stars out and in: FITS tables, astrometry.net's files, matches of tetra3 and tetra3rs; judged by astropy."""
+"""Matched stars out and in: FITS tables, astrometry.net's files, matches of tetra3 and tetra3rs;
+judged by astropy.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ ASTROPY = [
 SkyCoord, fits, Table, WCS = ASTROPY[0].SkyCoord, ASTROPY[1], ASTROPY[2].Table, ASTROPY[3].WCS
 
 CAMERA = sc.Camera(1000, 800, 10.0, 50.0, 499.5, 399.5, "none")
-# The same camera and its attitude as astropy has them: y down and x to the west, as in a picture of the sky.
+# The same camera and its attitude as astropy has them: y down and x to the west, as in a picture of
+# the sky.
 SKY = WCS(naxis=2)
 SKY.wcs.ctype, SKY.wcs.crval = ["RA---TAN", "DEC--TAN"], [83.0, -5.0]
 SKY.wcs.crpix, SKY.wcs.cdelt = [500.5, 400.5], [-np.degrees(1.0 / 5000.0)] * 2
@@ -105,18 +108,26 @@ def test_units_are_converted_or_refused_by_one_rule_in_all_formats(tmp_path, obs
         hdu.writeto(path)
     else:
         table.write(path, format="ascii.ecsv", delimiter=",")
-        path.write_text(path.read_text().replace(f"name: {name},", f"name: {name}, unit: {unit},", 1))
+        path.write_text(
+            path.read_text().replace(f"name: {name},", f"name: {name}, unit: {unit},", 1)
+        )
         assert f"unit: {unit}" in path.read_text()
     if one is None:
-        with pytest.raises(ObservationError, match=rf"column {name} has the unit '{unit}'; give it in "):
+        with pytest.raises(
+            ObservationError, match=rf"column {name} has the unit '{unit}'; give it in "
+        ):
             load_observations(path)
         return
-    np.testing.assert_allclose(load_observations(path).columns[name], wanted, rtol=1e-12, atol=1e-11)
+    np.testing.assert_allclose(
+        load_observations(path).columns[name], wanted, rtol=1e-12, atol=1e-11
+    )
     # Control: as plain numbers, without a unit, the values are others.
     if one != 1.0 or shift:
         table.write(tmp_path / "plain.fits", format="fits")
         with pytest.raises((AssertionError, ObservationError)):
-            np.testing.assert_allclose(load_observations(tmp_path / "plain.fits").columns[name], wanted, rtol=1e-9)
+            np.testing.assert_allclose(
+                load_observations(tmp_path / "plain.fits").columns[name], wanted, rtol=1e-9
+            )
 
 
 def test_a_stated_factor_goes_before_the_unit_of_the_file(tmp_path, obs):
@@ -132,8 +143,12 @@ def test_a_stated_factor_goes_before_the_unit_of_the_file(tmp_path, obs):
 
 
 def test_a_fits_table_of_another_program_is_no_image(tmp_path, obs):
-    """By what the headers say: tables of any name, with long headers; images, plain or compressed in a table."""
-    table = Table({name: values for name, values in obs.columns.items() if values.dtype.kind != "U"})
+    """By what the headers say: tables of any name, with long headers; images, plain or compressed
+    in a table.
+    """
+    table = Table(
+        {name: values for name, values in obs.columns.items() if values.dtype.kind != "U"}
+    )
     table.write(tmp_path / "table.fits")
     hdu = fits.BinTableHDU(table, name="STARS")
     for number in range(500):
@@ -155,22 +170,36 @@ def test_a_fits_table_of_another_program_is_no_image(tmp_path, obs):
 
 
 def test_corr_files_are_as_astrometry_net_writes_them(tmp_path, obs):
-    """By astropy's world coordinates with pixels counted from one: field and index differ where a star was moved."""
+    """By astropy's world coordinates with pixels counted from one: field and index differ where a
+    star was moved.
+    """
     moved = obs.x_px.copy()
     moved[[2, 14]] += 0.5
-    Observations(**{**obs.columns, "x_px": moved}, meta=obs.meta).save(tmp_path / "night.corr", camera=CAMERA)
+    Observations(**{**obs.columns, "x_px": moved}, meta=obs.meta).save(
+        tmp_path / "night.corr", camera=CAMERA
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["night_3.corr", "night_7.corr"]
     for frame, part in ((3, slice(0, 12)), (7, slice(12, 24))):
         with fits.open(tmp_path / f"night_{frame}.corr") as hdus:
             table, header = hdus[1].data, hdus[1].header
-        names = "field_x field_y field_ra field_dec index_x index_y index_ra index_dec index_id field_id match_weight"
-        assert table.names[:11] == names.split() and header["FRAME"] == frame and "(1, 1)" in str(header["COMMENT"])
+        names = (
+            "field_x field_y field_ra field_dec index_x index_y index_ra index_dec index_id "
+            "field_id match_weight"
+        )
+        assert (
+            table.names[:11] == names.split()
+            and header["FRAME"] == frame
+            and "(1, 1)" in str(header["COMMENT"])
+        )
         np.testing.assert_allclose(table["field_x"], moved[part] + 1.0, rtol=0, atol=1e-12)
         index = SkyCoord(table["index_ra"], table["index_dec"], unit="deg")
         # The shift of one star turns the frame by a twelfth of it.
         expected = np.column_stack(SKY.wcs_world2pix(index.ra.deg, index.dec.deg, 1))
         assert np.abs(np.column_stack([table["index_x"], table["index_y"]]) - expected).max() < 0.15
-        apart = index.separation(SkyCoord(table["field_ra"], table["field_dec"], unit="deg")).rad * 5000.0
+        apart = (
+            index.separation(SkyCoord(table["field_ra"], table["field_dec"], unit="deg")).rad
+            * 5000.0
+        )
         missed = np.hypot(table["index_x"] - table["field_x"], table["index_y"] - table["field_y"])
         np.testing.assert_allclose(apart, missed, atol=0.02)
         assert missed.argmax() == 2 and 0.35 < missed[2] < 0.5 and np.delete(missed, 2).max() < 0.15
@@ -182,10 +211,18 @@ def test_corr_files_come_back(tmp_path, obs):
     back = load_observations(paths, CAMERA)
     assert back.frame_ids.tolist() == [0, 1] and back.meta["directions"] == "apparent"
     same(Observations(**{**obs.columns, "frame": np.repeat([0, 1], 12)}), back, 1e-12)
-    assert load_observations(paths[1]).frame_ids.tolist() == [7] and back.meta["ignored_columns"] == []
+    assert (
+        load_observations(paths[1]).frame_ids.tolist() == [7] and back.meta["ignored_columns"] == []
+    )
     # One of another program: its own columns alone, in capital letters or not.
-    columns = {"FIELD_X": [1.0, 2.5, 3.0], "FIELD_Y": [1.0, 4.0, 9.0], "index_ra": [10.0, 10.1, 10.2]}
-    Table(columns | {"index_dec": [1.0, 1.1, 1.0], "index_id": [5, 6, 7]}).write(tmp_path / "a.corr", format="fits")
+    columns = {
+        "FIELD_X": [1.0, 2.5, 3.0],
+        "FIELD_Y": [1.0, 4.0, 9.0],
+        "index_ra": [10.0, 10.1, 10.2],
+    }
+    Table(columns | {"index_dec": [1.0, 1.1, 1.0], "index_id": [5, 6, 7]}).write(
+        tmp_path / "a.corr", format="fits"
+    )
     other = load_observations(tmp_path / "a.corr")
     assert (other.x_px.tolist(), other.y_px.tolist()) == ([0.0, 1.5, 2.0], [0.0, 3.0, 8.0])
     assert other.star_id is None and other.meta["directions"] == "undeclared"
@@ -211,8 +248,13 @@ def test_matches_of_tetra3_come_in(tmp_path, obs):
     plain = [{key: np.asarray(value).tolist() for key, value in item.items()} for item in solutions]
     (tmp_path / "tetra3.json").write_text(json.dumps({"frames": plain}))
     (tmp_path / "one.json").write_text(json.dumps(plain[0]))
-    for found in (Observations.from_matches(solutions, camera=CAMERA), load_observations(tmp_path / "tetra3.json")):
-        assert found.frame.tolist() == [0] * 12 + [2] * 12 and found.meta["frames_without_matches"] == [1]
+    for found in (
+        Observations.from_matches(solutions, camera=CAMERA),
+        load_observations(tmp_path / "tetra3.json"),
+    ):
+        assert found.frame.tolist() == [0] * 12 + [2] * 12 and found.meta[
+            "frames_without_matches"
+        ] == [1]
         for name in ("x_px", "y_px", "ra_deg", "dec_deg", "mag"):
             np.testing.assert_allclose(getattr(found, name), getattr(obs, name), rtol=0, atol=1e-12)
         assert found.star_id[1] == "3-4-5"
@@ -245,17 +287,31 @@ def test_what_are_no_matches_is_refused_with_the_way_to_get_them(tmp_path, obs, 
 
 
 def test_matches_of_tetra3rs_come_in(tmp_path):
-    """Of its own centroids, of stars painted where they are known, which says from where it counts."""
+    """Of its own centroids, of stars painted where they are known, which says from where it
+    counts.
+    """
     solver = pytest.importorskip("tetra3rs")
     y, x = np.mgrid[:200, :301]
     places = np.array([[40.3, 50.7], [200.0, 120.0], [260.5, 30.25], [100.1, 170.9]])
     light = sum(3000.0 * np.exp(-0.5 * ((x - a) ** 2 + (y - b) ** 2) / 1.5**2) for a, b in places)
     painted = np.random.default_rng(0).normal(100.0, 2.0, light.shape) + light
     centroids = [(c.x, c.y) for c in solver.extract_centroids(painted.astype(np.float32)).centroids]
-    document = {"centroids": centroids, "matched_centroids": [2, 0, 3], "matched_catalog_ids": [11, 12, 13]}
-    document |= {"matched_stars": [[1.0, 2.0], [1.5, 2.5], [2.0, 2.0]], "image_width": 301, "image_height": 200}
+    document = {
+        "centroids": centroids,
+        "matched_centroids": [2, 0, 3],
+        "matched_catalog_ids": [11, 12, 13],
+    }
+    document |= {
+        "matched_stars": [[1.0, 2.0], [1.5, 2.5], [2.0, 2.0]],
+        "image_width": 301,
+        "image_height": 200,
+    }
     (tmp_path / "tetra3rs.json").write_text(json.dumps(document))
     found = load_observations(tmp_path / "tetra3rs.json")
     apart = np.linalg.norm(found.xy[:, None] - places, axis=2)
-    assert len(found) == 3 and apart.min(axis=1).max() < 0.01 and found.star_id.tolist() == ["11", "12", "13"]
+    assert (
+        len(found) == 3
+        and apart.min(axis=1).max() < 0.01
+        and found.star_id.tolist() == ["11", "12", "13"]
+    )
     assert found.mag is None

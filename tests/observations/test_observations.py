@@ -33,7 +33,9 @@ ROWS = [
 ]
 
 
-def write_csv(path: Path, rows: list[list[str]] = ROWS, header: list[str] = HEADER, comment: str = "") -> Path:
+def write_csv(
+    path: Path, rows: list[list[str]] = ROWS, header: list[str] = HEADER, comment: str = ""
+) -> Path:
     with path.open("w", newline="", encoding="utf-8") as file:
         file.write(comment)
         csv.writer(file).writerows([header, *rows])
@@ -58,7 +60,10 @@ def random_table(n_frames: int = 4, m: int = 5, seed: int = 0, **changes: object
     """A table with every column, and no number that has a short decimal form."""
     rng = np.random.default_rng(seed)
     n = n_frames * m
-    times = [f"2026-11-21T{k // 3600:02d}:{k // 60 % 60:02d}:{k % 60:02d}.123456789" for k in range(n_frames)]
+    times = [
+        f"2026-11-21T{k // 3600:02d}:{k // 60 % 60:02d}:{k % 60:02d}.123456789"
+        for k in range(n_frames)
+    ]
     columns: dict[str, object] = {
         "frame": np.repeat(np.arange(n_frames) * 3 - 1, m),
         "x_px": rng.uniform(-0.5, 1023.5, n),
@@ -98,7 +103,8 @@ def caught(path: Path, **options: object) -> ObservationError:
     return info.value
 
 
-# ---- the table ---------------------------------------------------------------------------------------------------
+# ---- the table
+# --------------------------------------------------------------------------------------------------
 
 
 def test_rows_are_sorted_by_frame_and_keep_their_order_within():
@@ -111,7 +117,11 @@ def test_rows_are_sorted_by_frame_and_keep_their_order_within():
     np.testing.assert_array_equal(obs.frame_starts, [0, 3, 5])
     np.testing.assert_array_equal(obs.stars_per_frame, [3, 2])
     assert (obs.n_stars, obs.n_frames, len(obs)) == (5, 2, 5)
-    assert (obs.frame.dtype, obs.frame_starts.dtype, obs.mag.dtype) == (np.int64, np.int64, np.float64)
+    assert (obs.frame.dtype, obs.frame_starts.dtype, obs.mag.dtype) == (
+        np.int64,
+        np.int64,
+        np.float64,
+    )
 
 
 def test_arrays_are_copies_that_cannot_be_changed():
@@ -119,13 +129,21 @@ def test_arrays_are_copies_that_cannot_be_changed():
     obs = random_table(x_px=x)
     x[0] = 99.0
     assert obs.x_px[0] == 0.0
-    for values in (*obs.columns.values(), obs.xy, obs.directions_icrs, obs.frame_ids, obs.frame_starts):
+    for values in (
+        *obs.columns.values(),
+        obs.xy,
+        obs.directions_icrs,
+        obs.frame_ids,
+        obs.frame_starts,
+    ):
         with pytest.raises(ValueError, match="read-only"):
             values[0] = values[1]
 
 
 def test_directions_are_unit_vectors():
-    obs = Observations([0] * 4, np.zeros(4), np.arange(4), [0.0, 90.0, 45.0, 10.0], [0.0, 0.0, 45.0, -90.0])
+    obs = Observations(
+        [0] * 4, np.zeros(4), np.arange(4), [0.0, 90.0, 45.0, 10.0], [0.0, 0.0, 45.0, -90.0]
+    )
     expected = [[1, 0, 0], [0, 1, 0], [0.5, 0.5, np.sqrt(0.5)], [0, 0, -1]]
     np.testing.assert_allclose(obs.directions_icrs, expected, atol=1e-16)
     np.testing.assert_array_equal(obs.xy, np.column_stack([np.zeros(4), np.arange(4)]))
@@ -148,7 +166,12 @@ def test_hash_depends_on_values_alone():
     assert len(obs.data_hash) == 64
     x = obs.x_px.copy()
     x[3] = np.nextafter(x[3], np.inf)
-    changes = [{"x_px": x}, {"mag": None}, {"star_id": obs.star_id[::-1]}, {"x_px": obs.y_px, "y_px": obs.x_px}]
+    changes = [
+        {"x_px": x},
+        {"mag": None},
+        {"star_id": obs.star_id[::-1]},
+        {"x_px": obs.y_px, "y_px": obs.x_px},
+    ]
     assert len({obs.data_hash, *(random_table(**c).data_hash for c in changes)}) == 5
     assert random_table(x_px=np.zeros(20)).data_hash == random_table(x_px=-np.zeros(20)).data_hash
 
@@ -221,13 +244,17 @@ def test_check_of_a_table_in_memory():
     x = obs.x_px.copy()
     x[[6, 9]] = 2000.0
     random_table(x_px=x).check()
-    with pytest.raises(ObservationError, match=r"^observations, row 7, column x_px: 2000.0 .* \(1 more bad row\)\.$"):
+    with pytest.raises(
+        ObservationError,
+        match=r"^observations, row 7, column x_px: 2000.0 .* \(1 more bad row\)\.$",
+    ):
         random_table(x_px=x).check(CAMERA)
     with pytest.raises(ObservationError, match="row 1, column time_utc"):
         random_table(time_utc=["noon"] * 20).check()
 
 
-# ---- files -------------------------------------------------------------------------------------------------------
+# ---- files
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -254,11 +281,21 @@ def test_required_columns_alone_are_enough(tmp_path, ending):
 
 @pytest.mark.extra("images")
 def test_meta_with_numpy_values_is_saved_as_plain_values(tmp_path):
-    obs = random_table(meta={"seed": np.int64(3), "observer_velocity_km_s": np.array([1.0, 2.0, 3.0]), "p": Path("a")})
+    obs = random_table(
+        meta={
+            "seed": np.int64(3),
+            "observer_velocity_km_s": np.array([1.0, 2.0, 3.0]),
+            "p": Path("a"),
+        }
+    )
     for ending in (".ecsv", ".parquet"):
         obs.save(tmp_path / f"obs{ending}")
         meta = load_observations(tmp_path / f"obs{ending}").meta
-        assert (meta["seed"], meta["observer_velocity_km_s"], meta["p"]) == (3, [1.0, 2.0, 3.0], "a")
+        assert (meta["seed"], meta["observer_velocity_km_s"], meta["p"]) == (
+            3,
+            [1.0, 2.0, 3.0],
+            "a",
+        )
 
 
 def test_csv_is_plain(tmp_path):
@@ -274,7 +311,9 @@ def test_csv_is_plain(tmp_path):
 
 
 def test_csv_from_elsewhere(tmp_path):
-    """Byte order mark, Windows line ends, comments, blank lines, padded cells, ids that are numbers."""
+    """Byte order mark, Windows line ends, comments, blank lines, padded cells, ids that are
+    numbers.
+    """
     text = (
         '\ufeff# made by "hand\r\n'
         "frame, x_px ,y_px,ra_deg,dec_deg,star_id\r\n"
@@ -382,7 +421,8 @@ def test_parquet_written_by_pandas(tmp_path):
     frame.to_parquet(tmp_path / "bad.parquet", index=False)
     error = caught(tmp_path / "bad.parquet")
     assert str(error).endswith(
-        "bad.parquet, row 5, column frame: the value is missing; fill it in or remove the row (1 more bad row)."
+        "bad.parquet, row 5, column frame: the value is missing; fill it in or remove the row (1 "
+        "more bad row)."
     )
     assert "row 8, column dec_deg: 100.0 is outside -90..90 deg" in error.problems[1]
 
@@ -393,11 +433,21 @@ def test_columns_of_other_names(tmp_path):
     np.testing.assert_array_equal(obs.frame_ids, [3, 4])
     assert obs.meta["columns"] == {"frame": "image", "ra_deg": "alpha"}
     # Messages name the column as it is called in the file.
-    bad = write_csv(tmp_path / "bad.csv", changed(ra_deg_1="400"), ["image", "x_px", "y_px", "alpha", "dec_deg"])
-    assert "line 3, column alpha: 400.0 is outside" in str(caught(bad, columns={"frame": "image", "ra_deg": "alpha"}))
-    assert "column beta is missing" in str(caught(path, columns={"frame": "image", "ra_deg": "beta"}))
-    assert "column snr is missing" in str(caught(path, columns={"mag": "snr", "frame": "image", "ra_deg": "alpha"}))
-    assert "'ra' is no column of observations; use frame" in str(caught(path, columns={"ra": "alpha"}))
+    bad = write_csv(
+        tmp_path / "bad.csv", changed(ra_deg_1="400"), ["image", "x_px", "y_px", "alpha", "dec_deg"]
+    )
+    assert "line 3, column alpha: 400.0 is outside" in str(
+        caught(bad, columns={"frame": "image", "ra_deg": "alpha"})
+    )
+    assert "column beta is missing" in str(
+        caught(path, columns={"frame": "image", "ra_deg": "beta"})
+    )
+    assert "column snr is missing" in str(
+        caught(path, columns={"mag": "snr", "frame": "image", "ra_deg": "alpha"})
+    )
+    assert "'ra' is no column of observations; use frame" in str(
+        caught(path, columns={"ra": "alpha"})
+    )
 
 
 @pytest.mark.extra("images")
@@ -407,7 +457,9 @@ def test_other_directions_are_undeclared(tmp_path):
     table["ra_apparent_deg"] = table["ra_deg"] * 1.0
     table.write(tmp_path / "obs.ecsv", format="ascii.ecsv")
     assert load_observations(tmp_path / "obs.ecsv").directions_declared
-    assert not load_observations(tmp_path / "obs.ecsv", columns={"ra_deg": "ra_apparent_deg"}).directions_declared
+    assert not load_observations(
+        tmp_path / "obs.ecsv", columns={"ra_deg": "ra_apparent_deg"}
+    ).directions_declared
     table.meta["directions"] = "nice"
     table.write(tmp_path / "bad.ecsv", format="ascii.ecsv")
     assert "bad.ecsv: its metadata say directions = 'nice'" in str(caught(tmp_path / "bad.ecsv"))
@@ -428,7 +480,8 @@ def test_real_star_camera_table(real_data):
     assert apparent.data_hash != obs.data_hash
 
 
-# ---- bad rows ----------------------------------------------------------------------------------------------------
+# ---- bad rows
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -443,12 +496,32 @@ def test_real_star_camera_table(real_data):
         ({"frame_1": "three"}, 3, "frame", "'three' is not a whole number"),
         ({"frame_1": "nan"}, 3, "frame", "'nan' is not a whole number"),
         ({"frame_1": "9" * 30}, 3, "frame", "is not a whole number"),
-        ({"x_px_3": "1023.51"}, 5, "x_px", "1023.51 is outside the detector, -0.5..1023.5 px; check"),
+        (
+            {"x_px_3": "1023.51"},
+            5,
+            "x_px",
+            "1023.51 is outside the detector, -0.5..1023.5 px; check",
+        ),
         ({"y_px_3": "-0.6"}, 5, "y_px", "-0.6 is outside the detector, -0.5..767.5 px"),
-        ({"dec_deg_4": "91"}, 6, "dec_deg", "91.0 is outside -90..90 deg; correct or remove the row."),
+        (
+            {"dec_deg_4": "91"},
+            6,
+            "dec_deg",
+            "91.0 is outside -90..90 deg; correct or remove the row.",
+        ),
         ({"ra_deg_4": "-1"}, 6, "ra_deg", "-1.0 is outside 0..360 deg"),
-        ({"frame_5": "5"}, 5, "frame", "frame 4 has 2 stars, and 3 are needed; add stars or remove the frame"),
-        ({"ra_deg_5": "2.0", "dec_deg_5": "-6.0"}, 7, "ra_deg", "the same direction occurs twice in frame 4 (also in"),
+        (
+            {"frame_5": "5"},
+            5,
+            "frame",
+            "frame 4 has 2 stars, and 3 are needed; add stars or remove the frame",
+        ),
+        (
+            {"ra_deg_5": "2.0", "dec_deg_5": "-6.0"},
+            7,
+            "ra_deg",
+            "the same direction occurs twice in frame 4 (also in",
+        ),
         (
             {"x_px_4": "10.5", "y_px_4": "20.5"},
             6,
@@ -472,7 +545,12 @@ def test_bad_row_is_named(tmp_path, cells, line, column, reason):
         ("sigma_px", ["0.1", "0.1", "", "0.1", "0.1", "0.1"], 4, "the value is missing"),
         ("mag", ["1", "inf", "1", "1", "1", "1"], 3, "inf is not a finite number"),
         ("mag", ["1", "bright", "1", "1", "1", "1"], 3, "'bright' is not a number"),
-        ("star_id", ["a", "b", "a", "a", "", ""], 4, "the same star occurs twice in frame 3 (also in line 2)"),
+        (
+            "star_id",
+            ["a", "b", "a", "a", "", ""],
+            4,
+            "the same star occurs twice in frame 3 (also in line 2)",
+        ),
         ("time_utc", [""] + [TIME] * 5, 2, "the value is missing"),
     ],
 )
@@ -485,7 +563,14 @@ def test_bad_optional_value_is_named(tmp_path, column, values, line, reason):
 
 @pytest.mark.parametrize(
     "text",
-    ["noon", "2026-02-29T01:02:03", "2026-11-21T01:02:03+02:00", "2026-11-21", "2026-11-21T12:59:60", "20261121"],
+    [
+        "noon",
+        "2026-02-29T01:02:03",
+        "2026-11-21T01:02:03+02:00",
+        "2026-11-21",
+        "2026-11-21T12:59:60",
+        "20261121",
+    ],
 )
 def test_bad_time_is_named(tmp_path, text):
     error = caught(write_csv(tmp_path / "obs.csv", *extended("time_utc", [TIME] * 5 + [text])))
@@ -495,7 +580,9 @@ def test_bad_time_is_named(tmp_path, text):
 
 def test_all_bad_rows_are_found(tmp_path):
     rows = changed(y_px_2="abc", dec_deg_2="x", ra_deg_4="999", x_px_0="nan")
-    path = write_csv(tmp_path / "obs.csv", [*rows[:3], ["4", "1"], *rows[3:]], comment="# a comment\n\n")
+    path = write_csv(
+        tmp_path / "obs.csv", [*rows[:3], ["4", "1"], *rows[3:]], comment="# a comment\n\n"
+    )
     error = caught(path)
     assert str(error).startswith(f"{path}, line 4, column x_px: nan is not a finite number; ")
     assert str(error).endswith("; correct or remove the row (3 more bad rows).")
@@ -532,35 +619,53 @@ def test_frames_are_not_counted_while_a_frame_number_is_unknown(tmp_path):
 
 
 def test_same_star_in_two_frames_is_no_duplicate(tmp_path):
-    obs = load_observations(write_csv(tmp_path / "obs.csv", *extended("star_id", ["a", "b", "c"] * 2)))
+    obs = load_observations(
+        write_csv(tmp_path / "obs.csv", *extended("star_id", ["a", "b", "c"] * 2))
+    )
     assert obs.n_stars == 6
-    assert load_observations(write_csv(tmp_path / "obs.csv", changed(ra_deg_0="360.0"))).ra_deg[0] == 360.0
+    assert (
+        load_observations(write_csv(tmp_path / "obs.csv", changed(ra_deg_0="360.0"))).ra_deg[0]
+        == 360.0
+    )
 
 
 def test_columns_in_other_units_frames_by_name_and_semicolons(tmp_path):
     path, plain = tmp_path / "mine.csv", load_observations(write_csv(tmp_path / "obs.csv", ROWS))
-    lines = [f"night {r[0]}.tif;{float(r[1]) + 1!r};{r[2]};{float(r[3]) / 15!r};{r[4]}".replace(".", ",") for r in ROWS]
+    lines = [
+        f"night {r[0]}.tif;{float(r[1]) + 1!r};{r[2]};{float(r[3]) / 15!r};{r[4]}".replace(".", ",")
+        for r in ROWS
+    ]
     path.write_text("\n".join(["Image;X - 1;X [px];RA [h];Dec", *lines]))
-    columns = {"frame": "Image", "x_px": "X - 1 - 1", "y_px": "X [px]", "ra_deg": "RA [h] * 15", "dec_deg": "Dec"}
+    columns = {
+        "frame": "Image",
+        "x_px": "X - 1 - 1",
+        "y_px": "X [px]",
+        "ra_deg": "RA [h] * 15",
+        "dec_deg": "Dec",
+    }
     obs = load_observations(path, columns=columns)
     for name in ("x_px", "y_px", "ra_deg", "dec_deg"):
         np.testing.assert_allclose(obs.columns[name], plain.columns[name], rtol=1e-14)
     np.testing.assert_array_equal(obs.frame, np.searchsorted(plain.frame_ids, plain.frame))
     assert obs.meta["frame_names"].startswith("0 is 'night ") and obs.meta["ignored_columns"] == []
     # A column that is called so goes before what could be reckoned.
-    assert load_observations(path, columns=columns | {"x_px": "X - 1"}).x_px[0] == plain.x_px[0] + 1.0
+    assert (
+        load_observations(path, columns=columns | {"x_px": "X - 1"}).x_px[0] == plain.x_px[0] + 1.0
+    )
     with pytest.raises(ObservationError, match="column star_id holds no quantities"):
         load_observations(path, columns=columns | {"star_id": "RA [h] * 15"})
 
 
-# ---- bad files ---------------------------------------------------------------------------------------------------
+# ---- bad files
+# --------------------------------------------------------------------------------------------------
 
 
 def test_missing_columns(tmp_path):
     path = write_csv(tmp_path / "obs.csv", [row[:3] for row in ROWS], ["frame", "x_px", "why"])
     error = caught(path)
     assert str(error) == (
-        f'{path}: column y_px is missing (so are ra_deg, dec_deg); say which it is, as by --column "y_px=NAME" or '
+        f"{path}: column y_px is missing (so are ra_deg, dec_deg); say which it is, as by "
+        '--column "y_px=NAME" or '
         "columns={...}, of those in the file (frame, x_px, why)."
     )
     assert (error.row, error.column, len(error.problems)) == (None, "y_px", 3)
@@ -577,12 +682,24 @@ def test_missing_columns(tmp_path):
         ("empty.parquet", b"", "the file is empty"),
         ("comment.csv", b"# nothing\n", "comments only"),
         ("header.csv", b"frame,x_px,y_px,ra_deg,dec_deg\n", "a header but no rows"),
-        ("latin.csv", b"frame,x_px,y_px,ra_deg,dec_deg\n1,2,3,4,\xe9\n", "line 2: the text is not UTF-8"),
+        (
+            "latin.csv",
+            b"frame,x_px,y_px,ra_deg,dec_deg\n1,2,3,4,\xe9\n",
+            "line 2: the text is not UTF-8",
+        ),
         ("quote.csv", b'frame,x_px,y_px,ra_deg,dec_deg\n1,2,3,4,"5\n', "check its quotation marks"),
         ("binary.parquet", b"frame,x_px\n1,2\n", "is not a readable table"),
         ("plain.ecsv", b"frame,x_px\n1,2\n", "line 1: '# %ECSV 1.0' is missing"),
-        ("yaml.ecsv", b"# %ECSV 1.0\n# ---\n# a: [\nframe\n1\n", "the ECSV header is not valid YAML"),
-        ("obs.xlsx", b"PK", "the ending .xlsx is unknown; use .csv, .ecsv, .parquet, .fits, .corr, .json."),
+        (
+            "yaml.ecsv",
+            b"# %ECSV 1.0\n# ---\n# a: [\nframe\n1\n",
+            "the ECSV header is not valid YAML",
+        ),
+        (
+            "obs.xlsx",
+            b"PK",
+            "the ending .xlsx is unknown; use .csv, .ecsv, .parquet, .fits, .corr, .json.",
+        ),
         ("obs", b"frame", "the ending (none) is unknown"),
     ],
 )
@@ -596,7 +713,10 @@ def test_bad_file_is_named(tmp_path, name, content, message):
 
 
 def test_missing_file_and_directory(tmp_path):
-    assert str(caught(tmp_path / "none.csv")) == f"{tmp_path / 'none.csv'}: the file does not exist; check the path."
+    assert (
+        str(caught(tmp_path / "none.csv"))
+        == f"{tmp_path / 'none.csv'}: the file does not exist; check the path."
+    )
     assert "is a directory; name a file of observations, or open a folder" in str(caught(tmp_path))
 
 
@@ -637,13 +757,17 @@ def test_failed_save_leaves_the_old_file_and_nothing_else(tmp_path, ending, monk
 
 
 def test_save_needs_a_known_ending(tmp_path):
-    with pytest.raises(ObservationError, match=r"the ending \.txt is unknown; use .*\.fits, \.corr\."):
+    with pytest.raises(
+        ObservationError, match=r"the ending \.txt is unknown; use .*\.fits, \.corr\."
+    ):
         random_table().save(tmp_path / "obs.txt")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_large_table_is_read_quickly(tmp_path):
-    """15,000 rows, the paper's experiment: as text half as long as sorting a million numbers, in Parquet a tenth."""
+    """15,000 rows, the paper's experiment: as text half as long as sorting a million numbers, in
+    Parquet a tenth.
+    """
     obs = Observations(*(getattr(random_table(1000, 15), name) for name in HEADER))
     for ending, sorts in ((".csv", 2.4), (".parquet", 0.36)):
         path = tmp_path / f"obs{ending}"
@@ -655,15 +779,25 @@ def test_large_table_is_read_quickly(tmp_path):
 def test_columns_that_look_exchanged_are_said_so():
     c = campaign(np.random.default_rng(1), n_frames=4)
     sheet = Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
-    good = c.columns | {"ra_deg": 200.0 + 0.1 * c.columns["ra_deg"], "dec_deg": 0.5 * np.abs(c.columns["dec_deg"])}
+    good = c.columns | {
+        "ra_deg": 200.0 + 0.1 * c.columns["ra_deg"],
+        "dec_deg": 0.5 * np.abs(c.columns["dec_deg"]),
+    }
     swapped = {"ra_deg": good["dec_deg"], "dec_deg": good["ra_deg"]}
-    wide, tall = sheet.replace(height_px=700, y0_px=350.0), {"x_px": 0.6 * good["x_px"], "y_px": good["y_px"]}
+    wide, tall = (
+        sheet.replace(height_px=700, y0_px=350.0),
+        {"x_px": 0.6 * good["x_px"], "y_px": good["y_px"]},
+    )
     far = {"x_px": np.append(good["x_px"][:-1], 5000.0)}
     for columns, used, words in (
         (swapped, sheet, "exchange ra_deg and dec_deg, which look swapped"),
         (tall, wide, "exchange x_px and y_px, which look swapped"),
         (far, sheet, "check the camera file"),
-        ({"dec_deg": np.where(good["frame"] == 0, 95.0, good["dec_deg"])}, sheet, "correct or remove the row"),
+        (
+            {"dec_deg": np.where(good["frame"] == 0, 95.0, good["dec_deg"])},
+            sheet,
+            "correct or remove the row",
+        ),
     ):
         with pytest.raises(ObservationError, match=words):
             Observations(**(good | columns)).check(used)

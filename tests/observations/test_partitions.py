@@ -19,7 +19,11 @@ def table(frames: list[int], n: int = 4, **more: object) -> sc.Observations:
     frame = np.repeat(frames, n)
     size = len(frame)
     xy = rng.uniform(0.0, 100.0, (2, size))
-    columns = {"ra_deg": rng.uniform(0.0, 360.0, size), "dec_deg": rng.uniform(-90.0, 90.0, size), **more}
+    columns = {
+        "ra_deg": rng.uniform(0.0, 360.0, size),
+        "dec_deg": rng.uniform(-90.0, 90.0, size),
+        **more,
+    }
     return sc.Observations(frame=frame, x_px=xy[0], y_px=xy[1], **columns)  # type: ignore[arg-type]
 
 
@@ -54,7 +58,9 @@ def test_sample_is_spread_over_the_files_with_all_columns(tmp_path: Path) -> Non
 def test_frame_numbers_of_two_files(tmp_path: Path, statistics: bool) -> None:
     for name, frames in (("a", [1, 3, 5]), ("b", [2, 4, 5])):
         columns = {key: pa.array(values) for key, values in table(frames).columns.items()}
-        parquet.write_table(pa.table(columns), tmp_path / f"{name}.parquet", write_statistics=statistics)
+        parquet.write_table(
+            pa.table(columns), tmp_path / f"{name}.parquet", write_statistics=statistics
+        )
     with pytest.raises(ObservationError, match=r"b.parquet: frame 5 is in a.parquet too"):
         open_partitions(tmp_path)
     table([2, 4, 6]).save(tmp_path / "b.parquet", force=True)
@@ -74,10 +80,14 @@ def test_damaged_or_mismatched_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ObservationError, match=r"b.parquet: is not a readable table"):
         open_partitions(tmp_path)
     table([2], sigma_px=np.full(4, 0.1)).save(path, force=True)
-    with pytest.raises(ObservationError, match=r"a.parquet: column sigma_px is missing, and .*b.parquet has it"):
+    with pytest.raises(
+        ObservationError, match=r"a.parquet: column sigma_px is missing, and .*b.parquet has it"
+    ):
         open_partitions(tmp_path)
     table([2]).with_meta(directions="apparent").save(path, force=True)
-    with pytest.raises(ObservationError, match=r"b.parquet: its directions are apparent, those of .* undeclared"):
+    with pytest.raises(
+        ObservationError, match=r"b.parquet: its directions are apparent, those of .* undeclared"
+    ):
         open_partitions(tmp_path)
     parquet.write_table(pa.table({"frame": [1], "x_px": [1.0]}), path)
     with pytest.raises(ObservationError, match=r"b.parquet: column y_px is missing"):

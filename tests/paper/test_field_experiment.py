@@ -39,7 +39,12 @@ ARCSEC = np.degrees(1.0) * 3600.0
 
 def test_table_3_is_complete() -> None:
     assert len(TABLE_3) == 16
-    assert [printed_field(method, RATE).text for method in FIELD_METHODS] == ["89", "93", "95", "96"]
+    assert [printed_field(method, RATE).text for method in FIELD_METHODS] == [
+        "89",
+        "93",
+        "95",
+        "96",
+    ]
     assert printed_field(UNCALIBRATED, AXES[2]).text == "127.2"
 
 
@@ -50,7 +55,9 @@ def test_reading_is_one_consistent_sensor(name: str) -> None:
     kept = {fact: good for fact, _, good, _ in printed_sensor(reading)}
     assert kept["field"] == (name == "window") and len(kept) == 5
     assert (abs(truth.fov_deg[0] - FIELD_DEG) < 0.05) == kept["field"]
-    assert (truth.x0_px + reading.offset_px, truth.y0_px + reading.offset_px) == pytest.approx((X0_PX, Y0_PX))
+    assert (truth.x0_px + reading.offset_px, truth.y0_px + reading.offset_px) == pytest.approx(
+        (X0_PX, Y0_PX)
+    )
     # The window is the middle of the detector, so that both readings have one centre.
     assert truth.centre_px[0] + reading.offset_px == 1023.5
     reach = 1.2 * truth.corner_radius_px
@@ -106,7 +113,8 @@ def test_parts_add_up_and_are_told_apart() -> None:
     shift = (reading.truth.theta - reading.nominal().theta)[:2] / reading.truth.focal_px * ARCSEC
     assert np.abs(errors.common[:2]) == pytest.approx(np.abs(shift[::-1]), rel=0.02)
     assert errors.aligned[0] < 0.1 * errors.rms[0]
-    # Negative control: a focal length is nearly all rest, and a rotation of all frames is not in the rest.
+    # Negative control: a focal length is nearly all rest, and a rotation of all frames is not in
+    # the rest.
     faults = single_faults(reading.truth, reading.nominal())
     focal = attitude_errors(stars, faults["focal length"])
     assert np.all(np.abs(focal.common[:2]) < 0.02 * np.abs(errors.common[:2]))
@@ -127,11 +135,15 @@ def test_frames_can_be_drawn_again() -> None:
     again = stars.frames(np.array([4, 0, 4]))
     assert again.n_frames == 3 and again.starts.tolist() == [0, 9, 18, 27]
     errors = attitude_errors(stars, READINGS["window"].nominal()).total
-    assert attitude_errors(again, READINGS["window"].nominal()).total == pytest.approx(errors[[4, 0, 4]])
+    assert attitude_errors(again, READINGS["window"].nominal()).total == pytest.approx(
+        errors[[4, 0, 4]]
+    )
 
 
 def test_stars_behind_the_camera_have_no_place() -> None:
-    place = true_pixels(READINGS["window"].truth, np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 1], [0, 0, -1]]))
+    place = true_pixels(
+        READINGS["window"].truth, np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 1], [0, 0, -1]])
+    )
     assert np.isfinite(place[0]).all() and np.isnan(place[1]).all()
 
 
@@ -160,7 +172,9 @@ def test_ctrl_c_leaves_no_results(tmp_path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        field_experiment(tmp_path / "out", n_frames=20, n_calibration_frames=20, workers=0, progress=stop)
+        field_experiment(
+            tmp_path / "out", n_frames=20, n_calibration_frames=20, workers=0, progress=stop
+        )
     # But what it goes on with.
     assert [path.name for path in (tmp_path / "out").iterdir()] == [".unfinished"]
 
@@ -179,7 +193,9 @@ def small_sizes():
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory, small_sizes):
-    """The experiment, interrupted in each of its parts and gone on with, and what its progress callback was told."""
+    """The experiment, interrupted in each of its parts and gone on with, and what its progress
+    callback was told.
+    """
     folder = tmp_path_factory.mktemp("field") / "out"
     seen: list[int] = []
     end = 0
@@ -206,7 +222,10 @@ def test_writes_report_and_tables(small) -> None:
     found, seen = small
     names = {"table_3", "rates", "parts", "sources", "data_sheets", "cameras", "frames"}
     assert {path.stem for path in found.path.glob("*.csv")} == names
-    assert {path.name for path in (found.path / "figures").iterdir()} == {"field_rates.png", "field_errors.png"}
+    assert {path.name for path in (found.path / "figures").iterdir()} == {
+        "field_rates.png",
+        "field_errors.png",
+    }
     page = found.report.read_text(encoding="utf-8")
     assert "http" not in page and "<script" not in page and not re.search(r"\b(nan|None)\b", page)
     assert "127.2" in page and found.text.split(".")[0] in page
@@ -217,16 +236,28 @@ def test_writes_report_and_tables(small) -> None:
 
 def test_table_says_what_comes_out(small) -> None:
     table = small[0].table_3()
-    assert len(table) == 16 and set(table["agrees"]) <= {"yes", AS_IT_STANDS, ALIGNED, BOTH, NEITHER}
+    assert len(table) == 16 and set(table["agrees"]) <= {
+        "yes",
+        AS_IT_STANDS,
+        ALIGNED,
+        BOTH,
+        NEITHER,
+    }
     rates = table[table["quantity"] == RATE]
-    inside = (rates["low"] <= rates["printed"].astype(float)) & (rates["printed"].astype(float) <= rates["high"])
+    inside = (rates["low"] <= rates["printed"].astype(float)) & (
+        rates["printed"].astype(float) <= rates["high"]
+    )
     assert list(rates["agrees"] == "yes") == list(inside)
 
 
 def test_control_has_noise_alone(small) -> None:
     found = small[0]
     errors = found.errors[TRUE_CAMERA]
-    assert np.all(np.abs(errors.common) < 1e-3) and np.all(errors.rest < 1e-3) and np.all(errors.noise > 0.3)
+    assert (
+        np.all(np.abs(errors.common) < 1e-3)
+        and np.all(errors.rest < 1e-3)
+        and np.all(errors.noise > 0.3)
+    )
     # The uncalibrated camera is the negative control of this control.
     if UNCALIBRATED in found.errors:
         assert np.all(found.errors[UNCALIBRATED].rest > 1.0)
@@ -240,7 +271,9 @@ def test_does_not_depend_on_processes(small, tmp_path) -> None:
     again = field_experiment(tmp_path / "out", workers=2, **SMALL)
     # Nor on interrupts.
     for name in ("table_3", "rates", "parts", "frames", "cameras"):
-        assert (found.path / f"{name}.csv").read_bytes() == (again.path / f"{name}.csv").read_bytes()
+        assert (found.path / f"{name}.csv").read_bytes() == (
+            again.path / f"{name}.csv"
+        ).read_bytes()
 
 
 @pytest.mark.slow
@@ -250,11 +283,14 @@ def test_the_full_experiment(tmp_path) -> None:
     # A third of random attitudes show more than six stars, as 200 of the paper's 600 frames.
     assert 0.25 < found.frames.share < 0.42
     assert found.identified(TRUE_CAMERA).correct.sum() >= 95
-    assert not any(result.wrong.any() for (name, _), result in found.sweep.items() if name == TRUE_CAMERA)
+    assert not any(
+        result.wrong.any() for (name, _), result in found.sweep.items() if name == TRUE_CAMERA
+    )
     # The better the camera the smaller the rest, on every axis.
     for worse, better in itertools.pairwise(FIELD_METHODS):
         assert np.all(errors[worse].rest > errors[better].rest)
-    # Least squares and Samaan's method are hundreds of arcsec off in common; the printed numbers cannot contain that.
+    # Least squares and Samaan's method are hundreds of arcsec off in common; the printed numbers
+    # cannot contain that.
     for method in FIELD_METHODS[:3]:
         assert np.hypot(*errors[method].common[:2]) > 1000.0
     # Of the proposed method next to nothing is left but noise after alignment.
@@ -264,4 +300,7 @@ def test_the_full_experiment(tmp_path) -> None:
     assert (control["rest"] < 1e-3).all() and (control["common"].abs() < 1e-3).all()
     # A wrong focal length costs identifications where the tolerance is small.
     rates = {name: found.identified(name).correct.sum() for name in FIELD_CAMERAS}
-    assert rates[UNCALIBRATED] < 0.6 * rates["least_squares"] and rates["least_squares"] <= rates[TRUE_CAMERA]
+    assert (
+        rates[UNCALIBRATED] < 0.6 * rates["least_squares"]
+        and rates["least_squares"] <= rates[TRUE_CAMERA]
+    )

@@ -1,4 +1,6 @@
-"""The interaction study: who is biased by the distortion, where that outweighs noise, and that nobody else is."""
+"""The interaction study: who is biased by the distortion, where that outweighs noise, and that
+nobody else is.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +95,9 @@ def test_each_axis_varies_what_it_says_and_nothing_else():
             assert (c.truth.width_px, c.truth.pixel_um) == (1024, 12.0)
             # As many stars on average.
             density = np.sum(sky.mag <= c.campaign.max_mag) * solid_angle_sr(c.truth)
-            assert density == pytest.approx(np.sum(sky.mag <= 6.0) * solid_angle_sr(base.truth), rel=2e-3)
+            assert density == pytest.approx(
+                np.sum(sky.mag <= 6.0) * solid_angle_sr(base.truth), rel=2e-3
+            )
             assert c.start.focal_mm / c.truth.focal_mm == pytest.approx(72.0 / 70.2262)
         else:
             assert c.truth.focal_mm == 70.2262
@@ -118,7 +122,9 @@ def test_a_field_beyond_the_catalogue_says_so(monkeypatch):
 
 
 def test_shared_stages_are_the_methods():
-    """One calibration stands for three methods: each of them, called by its name, gives the same."""
+    """One calibration stands for three methods: each of them, called by its name, gives the
+    same.
+    """
     obs = observations(n_frames=40)
     found = dict(zip(HANDLING, estimates(obs, sc.paper.paper_start(), 0.05), strict=True))
     options = {"samaan": RecursionOptions(sigma_px=0.05)}
@@ -151,11 +157,15 @@ def test_small_distortion_biases_in_proportion(study):
 
 def test_workers_do_not_change_a_bit_and_progress_is_told(study):
     calls = []
-    both = interaction_study(workers=2, progress=lambda done, total: calls.append((done, total)), **SMALL)
+    both = interaction_study(
+        workers=2, progress=lambda done, total: calls.append((done, total)), **SMALL
+    )
     assert both.table.equals(study.table)
     # Nine points, of which three are where the axes cross.
     assert calls[-1] == (3 * 6, 3 * 6)
-    other = interaction_study(workers=0, **(SMALL | {"seed": 4, "frames": (), "max_mags": (), "fields_deg": ()}))
+    other = interaction_study(
+        workers=0, **(SMALL | {"seed": 4, "frames": (), "max_mags": (), "fields_deg": ()})
+    )
     assert other.table["bias"].iloc[-12] != study.table["bias"].iloc[24]
 
 
@@ -218,9 +228,13 @@ def test_bad_settings_are_one_sentence(options, words):
 def test_table(study):
     table = study.table
     assert len(table) == 9 * 4 * 3
-    wanted = "axis value corner_px corner_size_px field_deg n_frames stars_per_frame max_mag method handling parameter "
+    wanted = (
+        "axis value corner_px corner_size_px field_deg n_frames stars_per_frame max_mag method "
+        "handling parameter "
+    )
     wanted += (
-        "unit n failed bias bias_se design_spread noise noise_se spread spread_se noise_shift noise_shift_se rmse "
+        "unit n failed bias bias_se design_spread noise noise_se spread spread_se noise_shift "
+        "noise_shift_se rmse "
     )
     wanted += "crlb bias_over_noise bias_over_noise_low bias_over_noise_high"
     assert set(wanted.split()) <= set(table.columns)
@@ -230,7 +244,10 @@ def test_table(study):
 
 
 def test_text_and_html(study):
-    assert "least squares, which ignores the distortion; samaan, which decouples the distortion" in study.text
+    assert (
+        "least squares, which ignores the distortion; samaan, which decouples the distortion"
+        in study.text
+    )
     assert "nowhere for three stages and efficient" in study.text
     html = study._repr_html_()
     assert html.count("<tr") == 1 + 4 * 3
@@ -257,7 +274,8 @@ def test_save_and_load_lose_nothing(study, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"a,b\n1,2\n", b"axis,method,handling,parameter,unit,bias,spread\n,,,,,x,1\n", None]
+    "content",
+    [b"", b"a,b\n1,2\n", b"axis,method,handling,parameter,unit,bias,spread\n,,,,,x,1\n", None],
 )
 def test_a_file_that_is_no_study(tmp_path, content):
     path = tmp_path / "interaction.csv"
@@ -306,7 +324,9 @@ def test_ignoring_and_decoupling_cost_more_than_noise(whole):
 def test_coupling_has_no_bias_anywhere(whole):
     rows = whole.table[whole.table["method"].isin(COUPLED)]
     assert rows["bias_over_noise"].max() < 1e-3
-    assert {t.side for t in whole.thresholds if t.kind == "bias" and t.method in COUPLED} == {"never"}
+    assert {t.side for t in whole.thresholds if t.kind == "bias" and t.method in COUPLED} == {
+        "never"
+    }
     # Nor does noise make one, within what the replicates know.
     z = (rows["noise_shift"] / rows["noise_shift_se"]).abs()
     assert z.max() < 5.0
@@ -322,7 +342,9 @@ def test_spread_falls_with_frames_and_meets_the_bound(whole):
         assert slope == pytest.approx(-0.5, abs=0.2)
     ratio = {}
     for method in COUPLED:
-        rows = whole.table[(whole.table["method"] == method) & (whole.table["axis"] != "distortion")]
+        rows = whole.table[
+            (whole.table["method"] == method) & (whole.table["axis"] != "distortion")
+        ]
         ratio[method] = float(np.sqrt(np.mean((rows["spread"] / rows["crlb"]) ** 2)))
     assert ratio["efficient"] == pytest.approx(1.0, abs=0.15)
     assert ratio["three stages"] > 1.05 * ratio["efficient"]
@@ -330,12 +352,20 @@ def test_spread_falls_with_frames_and_meets_the_bound(whole):
 
 @pytest.mark.slow
 def test_coupling_costs_where_there_is_no_distortion(whole):
-    """Three times in the focal length, nothing in the principal point; it pays from hundredths of a pixel on."""
+    """Three times in the focal length, nothing in the principal point; it pays from hundredths of a
+    pixel on.
+    """
     price = {}
     for parameter in OPTICS:
-        one, two = (value(whole, "distortion", 0.0, m, parameter, "crlb") for m in ("efficient", "least squares"))
+        one, two = (
+            value(whole, "distortion", 0.0, m, parameter, "crlb")
+            for m in ("efficient", "least squares")
+        )
         assert one == two
-        spreads = [value(whole, "distortion", 0.0, m, parameter, "spread") for m in ("efficient", "least squares")]
+        spreads = [
+            value(whole, "distortion", 0.0, m, parameter, "spread")
+            for m in ("efficient", "least squares")
+        ]
         price[parameter] = spreads[0] / spreads[1]
     assert price["f"] > 1.5
     assert price["x0"] < 1.5 and price["y0"] < 1.5

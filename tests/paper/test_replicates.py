@@ -1,4 +1,6 @@
-"""Replicates of the paper's experiment: right claims are called honest, wrong ones by their name, chance neither."""
+"""Replicates of the paper's experiment: right claims are called honest, wrong ones by their name,
+chance neither.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,13 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.errors import CalibrationError, CatalogueError, RunFolderError, SamplingError, SettingError
+from starcal_uq.core.errors import (
+    CalibrationError,
+    CatalogueError,
+    RunFolderError,
+    SamplingError,
+    SettingError,
+)
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.maths.intervals import holm, wilson_interval
@@ -21,9 +29,20 @@ from tests.helpers.scenes import camera, observations
 
 ALL = ("x0", "y0", "f", "k1", "k2")
 OPTICS = ALL[:3]
-PAIRS = tuple(method for method in METHODS if method.label in ("least squares", "three stages", "efficient"))
+PAIRS = tuple(
+    method for method in METHODS if method.label in ("least squares", "three stages", "efficient")
+)
 SMALL = {"methods": PAIRS, "n_frames": 12, "seed": 4}
-ARRAYS = ("replicate", "estimates", "claimed", "classical", "crlb", "map_px", "map_arcsec", "reprojection_px")
+ARRAYS = (
+    "replicate",
+    "estimates",
+    "claimed",
+    "classical",
+    "crlb",
+    "map_px",
+    "map_arcsec",
+    "reprojection_px",
+)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +52,9 @@ def found():
 
 
 def artificial(error, claimed, truth=None, classical=None):
-    """Replicates with given errors (M, n, p) and claims; the rest is of the right shape and says nothing."""
+    """Replicates with given errors (M, n, p) and claims; the rest is of the right shape and says
+    nothing.
+    """
     truth = sc.paper.paper_camera() if truth is None else truth
     m, n, p = error.shape
     nothing = np.full((m, n), np.nan)
@@ -44,7 +65,9 @@ def artificial(error, claimed, truth=None, classical=None):
         replicate=np.arange(n),
         estimates=error + truth.theta,
         claimed=np.broadcast_to(claimed, error.shape).copy(),
-        classical=np.full(error.shape, np.nan) if classical is None else np.broadcast_to(classical, error.shape),
+        classical=np.full(error.shape, np.nan)
+        if classical is None
+        else np.broadcast_to(classical, error.shape),
         crlb=np.ones((n, p)),
         map_px=nothing,
         map_arcsec=nothing,
@@ -88,7 +111,9 @@ def test_holm():
 
 def test_efficiency_and_ratio_say_what_they_should():
     rng = np.random.default_rng(2)
-    row = summarise(2.0 * rng.standard_normal(40_000) + 3.0, np.full(40_000, 1.0), np.full(40_000, np.nan), 1.5)
+    row = summarise(
+        2.0 * rng.standard_normal(40_000) + 3.0, np.full(40_000, 1.0), np.full(40_000, np.nan), 1.5
+    )
     assert row["bias"] == pytest.approx(3.0, abs=0.04)
     assert row["bias_over_spread"] == pytest.approx(1.5, rel=0.02)
     assert row["spread"] == pytest.approx(2.0, rel=0.02)
@@ -103,7 +128,9 @@ def test_efficiency_and_ratio_say_what_they_should():
 
 
 def test_chance_is_not_called_a_finding():
-    """A hundred tables of honest methods: one in a hundred may object; single tests object in nearly all."""
+    """A hundred tables of honest methods: one in a hundred may object; single tests object in
+    nearly all.
+    """
     rng = np.random.default_rng(3)
     objections, single = 0, 0
     for _ in range(100):
@@ -131,7 +158,9 @@ def test_wrong_methods_are_called_by_their_fault():
     assert words[4].startswith("slightly biased by 0.")
     assert found.row("method 0", "f")["verdict_classical"].startswith("claims too little: 0.3")
     wrong = found.table().set_index("method")["claim_wrong"]
-    assert [wrong[f"method {i}"].tolist() for i in range(5)] == [[i in (1, 2)] * 5 for i in range(5)]
+    assert [wrong[f"method {i}"].tolist() for i in range(5)] == [
+        [i in (1, 2)] * 5 for i in range(5)
+    ]
     assert "honest: method 0; biased: method 3 and method 4" in found.text
     assert "claiming too little: method 1; claiming too much: method 2" in found.text
 
@@ -166,13 +195,16 @@ def test_bound_is_that_of_the_marginal_information():
     )
     normal = MarginalLikelihood(obs, "brown").evaluate(sc.paper.paper_camera().theta)
     scale = np.sqrt(np.diag(normal.matrix))
-    expected = 0.05 * np.sqrt(np.diag(np.linalg.inv(normal.matrix / np.outer(scale, scale)))) / scale
+    expected = (
+        0.05 * np.sqrt(np.diag(np.linalg.inv(normal.matrix / np.outer(scale, scale)))) / scale
+    )
     np.testing.assert_allclose(found.crlb[1], expected, rtol=1e-12)
     # Every method got these data.
     for i, method in enumerate(PAIRS):
         cal = method.calibrate(obs, sc.paper.paper_start())
         q = len(cal.theta)
-        # The three stages are taken from the efficient fit, which reached the attitudes on another way.
+        # The three stages are taken from the efficient fit, which reached the attitudes on another
+        # way.
         np.testing.assert_array_equal(found.estimates[i, 1, :q], cal.theta)
         np.testing.assert_allclose(found.claimed[i, 1, :q], cal.sigmas, rtol=1e-10)
         assert np.isnan(found.estimates[i, 1, q:]).all()
@@ -184,14 +216,24 @@ def test_classical_claims_are_those_of_textbooks(shared):
     obs = observations(n_frames=30)
     frames = StarFrames.from_observations(obs)
     methods = tuple(method for method in METHODS if shared or method.method != "efficient")
-    found = dict(zip((m.label for m in methods), solve_all(methods, obs, frames, sc.paper.paper_start()), strict=True))
+    found = dict(
+        zip(
+            (m.label for m in methods),
+            solve_all(methods, obs, frames, sc.paper.paper_start()),
+            strict=True,
+        )
+    )
     for label, model in (("three stages", "brown"), ("least squares", "none")):
         theta = found[label].camera.theta
         residuals, jacobian = PairObjective(frames, model).residuals(theta)
         scale = np.linalg.norm(jacobian, axis=0)
-        covariance = np.linalg.inv((jacobian / scale).T @ (jacobian / scale)) / np.outer(scale, scale)
+        covariance = np.linalg.inv((jacobian / scale).T @ (jacobian / scale)) / np.outer(
+            scale, scale
+        )
         variance = residuals @ residuals / (len(residuals) - len(theta))
-        np.testing.assert_allclose(found[label].classical, np.sqrt(np.diag(covariance) * variance), rtol=1e-6)
+        np.testing.assert_allclose(
+            found[label].classical, np.sqrt(np.diag(covariance) * variance), rtol=1e-6
+        )
     cal = sc.calibrate(obs, sc.paper.paper_start(), method="samaan")
     own = next(s for s in cal.stages if s.name == "filter").sigmas[-1][:3]
     np.testing.assert_allclose(found["samaan"].classical[:3], own, rtol=1e-12)
@@ -222,7 +264,9 @@ def test_streams_give_filters_the_same(label):
     method = next(method for method in METHODS if method.label == label)
     obs = observations(n_frames=40)
     stream = method.calibrate(obs, sc.paper.paper_start())
-    table = sc.calibrate(obs, sc.paper.paper_start(), method=method.method, recursion=method.recursion)
+    table = sc.calibrate(
+        obs, sc.paper.paper_start(), method=method.method, recursion=method.recursion
+    )
     np.testing.assert_allclose(stream.theta, table.theta, rtol=1e-12)
     np.testing.assert_allclose(stream.sigmas, table.sigmas, rtol=1e-9)
 
@@ -251,7 +295,10 @@ def test_a_method_that_never_works_is_an_error(monkeypatch):
         raise CalibrationError("the stars do not suffice: add some.")
 
     monkeypatch.setattr(Method, "calibrate", fail)
-    with pytest.raises(CalibrationError, match="'least squares' never gave a result; first reason: the stars do not"):
+    with pytest.raises(
+        CalibrationError,
+        match="'least squares' never gave a result; first reason: the stars do not",
+    ):
         replicate(n_replicates=3, workers=0, **SMALL)
 
 
@@ -266,7 +313,9 @@ def _same(a, b):
 def test_workers_do_not_change_a_bit_and_progress_is_told():
     calls = []
     alone = replicate(n_replicates=7, workers=0, **SMALL)
-    both = replicate(n_replicates=7, workers=2, progress=lambda done, total: calls.append((done, total)), **SMALL)
+    both = replicate(
+        n_replicates=7, workers=2, progress=lambda done, total: calls.append((done, total)), **SMALL
+    )
     _same(alone, both)
     assert calls[-1] == (7, 7)
     shorter = replicate(n_replicates=3, workers=0, **SMALL)
@@ -295,7 +344,13 @@ def test_interrupted_replicates_go_on_with_what_was_kept(tmp_path):
 
     assert replicate(n_replicates=4, workers=0, keep=tmp_path, progress=press, **SMALL).interrupted
     told = []
-    resumed = replicate(n_replicates=4, workers=0, keep=tmp_path, progress=lambda done, _: told.append(done), **SMALL)
+    resumed = replicate(
+        n_replicates=4,
+        workers=0,
+        keep=tmp_path,
+        progress=lambda done, _: told.append(done),
+        **SMALL,
+    )
     assert told == [3, 4]
     _same(resumed, replicate(n_replicates=4, workers=0, **SMALL))
 
@@ -341,10 +396,17 @@ def test_table(found):
     rows = {label: tuple(table["parameter"][table["method"] == label]) for label in found.labels}
     assert rows["least squares"] == rows["griffith"] == OPTICS
     assert all(
-        rows[label] == ALL for label in ("samaan", "samaan, diagonal", "griffith, all", "three stages", "efficient")
+        rows[label] == ALL
+        for label in ("samaan", "samaan, diagonal", "griffith, all", "three stages", "efficient")
     )
-    wanted = "truth bias bias_se spread spread_se crlb efficiency claimed claimed_classical claimed_over_spread "
-    wanted += "claimed_over_spread_low claimed_over_spread_high coverage95 coverage95_low coverage95_high verdict"
+    wanted = (
+        "truth bias bias_se spread spread_se crlb efficiency claimed claimed_classical "
+        "claimed_over_spread "
+    )
+    wanted += (
+        "claimed_over_spread_low claimed_over_spread_high coverage95 coverage95_low "
+        "coverage95_high verdict"
+    )
     assert set(wanted.split()) <= set(table.columns)
     assert (table["n"] == 12).all()
     assert (table["claimed_over_spread_low"] < table["claimed_over_spread"]).all()
@@ -398,7 +460,9 @@ def test_a_file_that_holds_no_replicates(tmp_path, content):
 
 @pytest.fixture(scope="module")
 def many():
-    """120 data sets of a hundred frames, by every method: a spread is known to 6.5 %, a bias to a tenth of it."""
+    """120 data sets of a hundred frames, by every method: a spread is known to 6.5 %, a bias to a
+    tenth of it.
+    """
     return replicate(n_replicates=120, n_frames=100)
 
 
@@ -440,13 +504,18 @@ def test_textbook_claims_are_too_little(many):
             assert row["verdict_classical"].startswith("claims too little"), row
             assert row["claimed_classical_over_spread_high"] < 0.6
     # With the right model and the full covariance of the angles, a filter's own claim is right.
-    assert all(many.row("griffith, all", parameter)["verdict_classical"] == HONEST for parameter in ALL)
+    assert all(
+        many.row("griffith, all", parameter)["verdict_classical"] == HONEST for parameter in ALL
+    )
 
 
 @pytest.mark.slow
 def test_claims_that_are_a_third_too_small_would_be_found(many):
     found = dataclasses.replace(many, claimed=many.claimed * 0.7)
-    assert all(found.row("efficient", parameter)["verdict"].startswith("claims too little") for parameter in ALL)
+    assert all(
+        found.row("efficient", parameter)["verdict"].startswith("claims too little")
+        for parameter in ALL
+    )
     biased = many.estimates.copy()
     biased[-1] += 0.5 * many.bound
     found = dataclasses.replace(many, estimates=biased)

@@ -32,7 +32,14 @@ from starcal_uq.paper.errors import (
     undistorted,
 )
 from starcal_uq.paper.judgement import MAX_CHANCE, Judged, Outcome, trial
-from starcal_uq.paper.published import LEAST_SQUARES, PAPER_METHODS, PROPOSED, SAMAAN, Printed, printed
+from starcal_uq.paper.published import (
+    LEAST_SQUARES,
+    PAPER_METHODS,
+    PROPOSED,
+    SAMAAN,
+    Printed,
+    printed,
+)
 from starcal_uq.paper.readings import AS_PRINTED, OTHER_EQUATION, READINGS, fit_angles, run_readings
 from starcal_uq.paper.replicates import METHODS, is_slow, replicate
 from starcal_uq.paper.result import Reproduction, row_tests
@@ -42,7 +49,14 @@ from tests.helpers.scenes import observations
 
 # Table 1 of the paper, and where sections 3.2 and 3.3 say that the estimation starts.
 PRINTED_TRUTH = {
-    **{"width_px": 1024, "height_px": 1024, "pixel_um": 12.0, "focal_mm": 70.2262, "x0_px": 500.0, "y0_px": 530.0},
+    **{
+        "width_px": 1024,
+        "height_px": 1024,
+        "pixel_um": 12.0,
+        "focal_mm": 70.2262,
+        "x0_px": 500.0,
+        "y0_px": 530.0,
+    },
     **{"k1": 2.0e-10, "k2": -3.5e-15},
 }
 PRINTED_START = {"focal_mm": 72.0, "x0_px": 512.0, "y0_px": 512.0}
@@ -55,7 +69,8 @@ def points(n: int = 40, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.0, 1023.0, (n, 2))
 
 
-# --- what is printed ------------------------------------------------------------------------------------------------
+# --- what is printed
+# ------------------------------------------------------------------------------------------------
 
 
 def test_the_cameras_are_those_of_the_paper() -> None:
@@ -80,7 +95,8 @@ def test_numbers_are_kept_as_printed() -> None:
         printed(LEAST_SQUARES, "k1")
 
 
-# --- measures of error ----------------------------------------------------------------------------------------------
+# --- measures of error
+# ----------------------------------------------------------------------------------------------
 
 
 def undistorted_by_hand(camera: sc.Camera, xy: np.ndarray, how: str) -> np.ndarray:
@@ -91,7 +107,9 @@ def undistorted_by_hand(camera: sc.Camera, xy: np.ndarray, how: str) -> np.ndarr
         dx, dy = x - camera.x0_px, y - camera.y0_px
         seen = np.hypot(dx, dy)
         if how == "eq14":
-            ideal = brentq(lambda r, s=seen: r * (1 + k1 * r**2 + k2 * r**4) - s, 0.0, 2.0 * seen, xtol=1e-12)
+            ideal = brentq(
+                lambda r, s=seen: r * (1 + k1 * r**2 + k2 * r**4) - s, 0.0, 2.0 * seen, xtol=1e-12
+            )
         elif how == "eq14_measured":
             ideal = seen / (1 + k1 * seen**2 + k2 * seen**4)
         else:
@@ -103,7 +121,9 @@ def undistorted_by_hand(camera: sc.Camera, xy: np.ndarray, how: str) -> np.ndarr
 @pytest.mark.parametrize("how", ["eq14", "eq14_measured", "eq6"])
 def test_eq16_against_a_direct_calculation(how: str) -> None:
     xy = points()
-    np.testing.assert_allclose(undistorted(WRONG, xy, how), undistorted_by_hand(WRONG, xy, how), atol=1e-9)
+    np.testing.assert_allclose(
+        undistorted(WRONG, xy, how), undistorted_by_hand(WRONG, xy, how), atol=1e-9
+    )
     ideal = undistorted_by_hand(TRUTH, xy, "eq14")
     hat = undistorted_by_hand(WRONG, xy, how)
     squares = [(x - u) ** 2 + (y - v) ** 2 for (x, y), (u, v) in zip(ideal, hat, strict=True)]
@@ -117,7 +137,13 @@ def test_each_model_undistorts_by_its_own_equation() -> None:
     for convention, how in (("eq14", "eq14"), ("eq6", "eq6")):
         camera = paper_camera(convention)
         np.testing.assert_allclose(undistorted(camera, xy), undistorted(camera, xy, how), atol=1e-9)
-        assert np.abs(undistorted(camera, xy) - undistorted(camera, xy, "eq6" if how == "eq14" else "eq14")).max() > 0.1
+        assert (
+            np.abs(
+                undistorted(camera, xy)
+                - undistorted(camera, xy, "eq6" if how == "eq14" else "eq14")
+            ).max()
+            > 0.1
+        )
     with pytest.raises(ValueError, match="use one of model"):
         undistorted(TRUTH, xy, "eq15")
     with pytest.raises(ValueError, match="use one of truth"):
@@ -129,7 +155,10 @@ def test_eq16_is_zero_for_the_truth_and_the_noise_for_noise() -> None:
     noise = 0.05 * np.random.default_rng(1).standard_normal(xy.shape)
     for how in ("model", "eq14"):
         for optics in OPTICS:
-            assert reprojection_error_px(TRUTH, TRUTH, xy, undistortion=how, optics=optics).max_px < 1e-9
+            assert (
+                reprojection_error_px(TRUTH, TRUTH, xy, undistortion=how, optics=optics).max_px
+                < 1e-9
+            )
     noisy = reprojection_error_px(TRUTH, TRUTH, xy, noise_px=noise)
     assert noisy.rms_px == pytest.approx(0.05 * 2**0.5, rel=0.02)
     # Negative control: the other equation is no inverse, and is seen.
@@ -142,7 +171,9 @@ def test_eq16_is_blind_to_the_focal_length_unless_it_makes_the_ideal_points() ->
     assert reprojection_error_px(TRUTH, longer, xy, optics="focal").max_px > 0.3
     moved = TRUTH.replace(x0_px=502.0)
     assert reprojection_error_px(TRUTH, moved, xy).max_px < 0.01
-    assert reprojection_error_px(TRUTH, moved, xy, optics="estimate").rms_px == pytest.approx(2.0, rel=0.01)
+    assert reprojection_error_px(TRUTH, moved, xy, optics="estimate").rms_px == pytest.approx(
+        2.0, rel=0.01
+    )
 
 
 def test_map_error_is_zero_for_the_truth() -> None:
@@ -193,7 +224,9 @@ def test_grid_weights_make_the_mean_over_the_detector() -> None:
     u, v = (x - 511.5) / 512.0, (y - 511.5) / 512.0
     assert weight.sum() == pytest.approx(1.0)
     assert np.sum(weight * u**2 * v**2) == pytest.approx(1.0 / 9.0, rel=1e-4)
-    assert np.sum(weight * (u**2 + v**2) ** 5) == pytest.approx(detector_mean_of_tenth_power(), rel=1e-3)
+    assert np.sum(weight * (u**2 + v**2) ** 5) == pytest.approx(
+        detector_mean_of_tenth_power(), rel=1e-3
+    )
     with pytest.raises(ValueError, match="at least 2 points"):
         detector_grid(TRUTH, 1)
 
@@ -210,20 +243,27 @@ def test_every_error_reading_is_computed() -> None:
         truth = paper_camera(convention)
         estimate = truth.replace(focal_mm=70.226, coefficients=(2.2e-10, -3.5e-15))
         found = list(error_sizes(truth, estimate, points(), noise))
-        assert [r.key for q, r, _ in found if q == "reprojection_px"] == [r.key for r in REPROJECTION]
+        assert [r.key for q, r, _ in found if q == "reprojection_px"] == [
+            r.key for r in REPROJECTION
+        ]
         assert [r.key for q, r, _ in found if q == "max_residual_px"] == [r.key for r in MAXIMUM]
         values = {(q, r.key): value for q, r, value in found}
-        assert values["reprojection_px", "eq16 per axis"] == pytest.approx(values["reprojection_px", "eq16"] / 2**0.5)
+        assert values["reprojection_px", "eq16 per axis"] == pytest.approx(
+            values["reprojection_px", "eq16"] / 2**0.5
+        )
         assert values["reprojection_px", "eq16 noisy"] > 0.06 > values["reprojection_px", "map"]
         assert len(UNDISTORTIONS) == 4
 
 
-# --- readings -------------------------------------------------------------------------------------------------------
+# --- readings
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("convention", "focal_mm"), [("eq14", 70.211), ("eq6", 70.242)])
 def test_focal_length_of_least_squares_tells_the_equation(convention: str, focal_mm: float) -> None:
-    obs = simulate(sc.load_catalogue(max_mag=6.0), paper_camera(convention), n_frames=1000, seed=2017)
+    obs = simulate(
+        sc.load_catalogue(max_mag=6.0), paper_camera(convention), n_frames=1000, seed=2017
+    )
     cal = sc.calibrate(obs, paper_start(convention), method="least_squares")
     assert cal.camera.focal_mm == pytest.approx(focal_mm, abs=0.001)
 
@@ -252,7 +292,9 @@ def test_angles_against_brute_force() -> None:
     # Another weighting is another answer where the model is wrong, and the same where it is right.
     assert abs(found[2] - start[2]) > 0.05
     clean = observations(n_frames=12, seed=5, sigma_px=0.0)
-    np.testing.assert_allclose(fit_angles(clean, "brown", TRUTH.theta * 1.0001), TRUTH.theta, rtol=1e-6)
+    np.testing.assert_allclose(
+        fit_angles(clean, "brown", TRUTH.theta * 1.0001), TRUTH.theta, rtol=1e-6
+    )
 
 
 def test_readings_repeat_and_do_not_depend_on_processes() -> None:
@@ -261,13 +303,17 @@ def test_readings_repeat_and_do_not_depend_on_processes() -> None:
     assert one.keys == two.keys
     np.testing.assert_array_equal(one.draws, two.draws)
     assert {key.reading for key in one.keys} == {r.key for r in READINGS} - {"diagonal"}
-    f = {r: one.of(r, LEAST_SQUARES, "f_mm").mean() for r in (AS_PRINTED, OTHER_EQUATION, "angles", "weighted pairs")}
+    f = {
+        r: one.of(r, LEAST_SQUARES, "f_mm").mean()
+        for r in (AS_PRINTED, OTHER_EQUATION, "angles", "weighted pairs")
+    }
     assert f[AS_PRINTED] < f["angles"] < f[OTHER_EQUATION]
     assert f[AS_PRINTED] < f["weighted pairs"] < f[OTHER_EQUATION]
     assert len(one.of("angles", SAMAAN, "f_mm")) == 0
 
 
-# --- judgement ------------------------------------------------------------------------------------------------------
+# --- judgement
+# --------------------------------------------------------------------------------------------------
 
 NUMBER = Printed(PROPOSED, "f_mm", "70.2259", "Table 2, row 3")
 
@@ -284,7 +330,9 @@ def test_z_of_a_new_draw() -> None:
         assert np.std(z) == pytest.approx(np.sqrt((n - 1) / (n - 3)), rel=0.25)
     assert abs(trial(NUMBER, "r", True, [70.2259] * 5).z) < 1e-9
     assert trial(NUMBER, "r", True, [70.2259, 70.2259 + 1e-13]).spread == 0.0
-    assert trial(printed(SAMAAN, "k2"), "r", True, [-1.88e-15, -1.89e-15]).spread == pytest.approx(1e-17 / 2**0.5)
+    assert trial(printed(SAMAAN, "k2"), "r", True, [-1.88e-15, -1.89e-15]).spread == pytest.approx(
+        1e-17 / 2**0.5
+    )
 
 
 def test_error_sizes_are_compared_on_a_logarithmic_scale() -> None:
@@ -297,7 +345,9 @@ def test_error_sizes_are_compared_on_a_logarithmic_scale() -> None:
         trial(number, "r", True, [0.1, np.nan])
 
 
-@pytest.mark.parametrize(("spread", "digits"), [(1e-5, 0), (2e-4, 0), (3e-4, 1), (2.4e-3, 1), (2.7e-3, 2)])
+@pytest.mark.parametrize(
+    ("spread", "digits"), [(1e-5, 0), (2e-4, 0), (3e-4, 1), (2.4e-3, 1), (2.7e-3, 2)]
+)
 def test_noise_digits(spread: float, digits: int) -> None:
     draws = 70.226 + spread * norm.ppf((np.arange(999) + 0.5) / 999)
     assert trial(NUMBER, "r", True, draws).noise_digits == digits
@@ -307,7 +357,9 @@ def judged(main: float, *others: tuple[float, float, bool]) -> Judged:
     """NUMBER with a main reading at a mean, and others at means with spreads; all by 40 draws."""
     unit = norm.ppf((np.arange(40) + 0.5) / 40)
     trials = [trial(NUMBER, "main", True, main + 1e-4 * unit)]
-    trials += [trial(NUMBER, f"other {i}", ok, mean + sd * unit) for i, (mean, sd, ok) in enumerate(others)]
+    trials += [
+        trial(NUMBER, f"other {i}", ok, mean + sd * unit) for i, (mean, sd, ok) in enumerate(others)
+    ]
     return Judged(NUMBER, tuple(trials))
 
 
@@ -326,7 +378,8 @@ def test_outcomes() -> None:
     assert judged(far, *many).outcome is Outcome.BY_CHOICE
     assert judged(far, *many).by_chance == pytest.approx(1.0, abs=0.2)
     few = judged(far, (at, 1e-4, True))
-    # Three standard deviations on one side of 0.01 on both, and the main reading, which accepts as much of it.
+    # Three standard deviations on one side of 0.01 on both, and the main reading, which accepts as
+    # much of it.
     assert 0.0 < few.by_chance < MAX_CHANCE
     assert np.isnan(judged(far).by_chance)
 
@@ -344,36 +397,45 @@ def test_judgement_over_seeds() -> None:
     assert accepted[6.0] <= 6
 
 
-# --- the paper against itself ---------------------------------------------------------------------------------------
+# --- the paper against itself
+# ---------------------------------------------------------------------------------------
 
 
 def test_the_paper_against_itself() -> None:
     xy, weight = detector_grid(TRUTH, 65)
     ideal = undistorted(TRUTH, xy)
     rms = np.sqrt(np.sum(weight * np.sum((xy - ideal) ** 2, axis=1)))
-    sigmas = {m: {"x0": 0.17, "y0": 0.17, "f": 0.03, "k1": 4e-11, "k2": 8e-17} for m in PAPER_METHODS}
+    sigmas = {
+        m: {"x0": 0.17, "y0": 0.17, "f": 0.03, "k1": 4e-11, "k2": 8e-17} for m in PAPER_METHODS
+    }
     checks = {check.statement: check for check in paper_checks(TRUTH, points(20_000), sigmas)}
     row_1 = checks["Reprojection error of row 1, px"]
     # Without coefficients, eq. 16 is the distortion itself, whatever the optics.
     assert float(row_1.follows.split()[0]) == pytest.approx(rms, rel=0.05)
     assert row_1.agrees == NO
     assert checks["Error of both other methods in y₀, px"].follows.startswith("2.30 and 1.23")
-    ratio = next(check for name, check in checks.items() if name.endswith("ratio of the largest residuals"))
+    ratio = next(
+        check for name, check in checks.items() if name.endswith("ratio of the largest residuals")
+    )
     assert (ratio.follows, ratio.agrees) == ("54 and 8", NO)
     assert checks["Coefficients k₁, k₂ of the proposed method"].agrees == WITHIN_NOISE
     assert checks["Coefficients k₁, k₂ of Samaan’s method"].agrees == NO
-    # Control: a paper without noise that printed two different coefficients would contradict itself.
+    # Control: a paper without noise that printed two different coefficients would contradict
+    # itself.
     exact = {m: dict.fromkeys(values, 0.0) for m, values in sigmas.items()}
     assert all(check.agrees != WITHIN_NOISE for check in paper_checks(TRUTH, points(100), exact))
     assert printed_camera(TRUTH, LEAST_SQUARES).distortion == "none"
 
 
-# --- the whole ------------------------------------------------------------------------------------------------------
+# --- the whole
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reproduction, list[tuple[int, int]]]:
-    """A reproduction of few frames, interrupted and gone on with, and what its progress callback was told."""
+    """A reproduction of few frames, interrupted and gone on with, and what its progress callback
+    was told.
+    """
     told: list[tuple[int, int]] = []
     folder = tmp_path_factory.mktemp("reproduction") / "out"
     with pytest.MonkeyPatch.context() as patch:
@@ -395,16 +457,22 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reproduction, list[
 def test_tables(small: tuple[Reproduction, list[tuple[int, int]]]) -> None:
     found, _ = small
     table = pd.read_csv(found.path / "table_2.csv", dtype={"printed": str})
-    row = table[(table["method"] == found.run.label(PROPOSED)) & (table["quantity"] == "f_mm")].iloc[0]
+    row = table[
+        (table["method"] == found.run.label(PROPOSED)) & (table["quantity"] == "f_mm")
+    ].iloc[0]
     cal = found.run.of(PROPOSED)
     assert row["printed"] == "70.2259"
     assert row["ours"] == pytest.approx(cal.camera.focal_mm)
     assert row["sigma_claimed"] == pytest.approx(cal.sigmas[2] * 0.012)
     assert row["sigma_crlb"] == pytest.approx(found.run.crlb[2] * 0.012)
-    estimates = found.replicates.estimates[found.replicates.labels.index(row["method"]), :, 2] * 0.012
+    estimates = (
+        found.replicates.estimates[found.replicates.labels.index(row["method"]), :, 2] * 0.012
+    )
     assert row["mean"] == pytest.approx(estimates.mean())
     assert row["spread"] == pytest.approx(estimates.std(ddof=1))
-    distance = (70.2259 - estimates.mean()) / np.sqrt(estimates.var(ddof=1) * (1 + 1 / 8) + 1e-8 / 12)
+    distance = (70.2259 - estimates.mean()) / np.sqrt(
+        estimates.var(ddof=1) * (1 + 1 / 8) + 1e-8 / 12
+    )
     assert row["z_printed"] == pytest.approx(distance)
     assert set(table["method"]) == set(found.replicates.labels)
     numbers = pd.read_csv(found.path / "published.csv", dtype={"printed": str})
@@ -523,7 +591,10 @@ def test_interrupt_leaves_nothing_behind(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_what_comes_out_and_what_does_not(tmp_path: Path) -> None:
     found = command.reproduce(tmp_path / "out", n_replicates=12, study=False)
-    outcomes = {(one.printed.method, one.printed.quantity, one.printed.place): one.outcome for one in found.judged}
+    outcomes = {
+        (one.printed.method, one.printed.quantity, one.printed.place): one.outcome
+        for one in found.judged
+    }
     # The paper's own method is reproduced, to digits that are noise.
     own = [outcome for (method, _, _), outcome in outcomes.items() if method == PROPOSED]
     assert set(own) <= {Outcome.REPRODUCED, Outcome.WITHIN_NOISE}
@@ -531,4 +602,6 @@ def test_what_comes_out_and_what_does_not(tmp_path: Path) -> None:
     assert outcomes[LEAST_SQUARES, "f_mm", "Table 2, row 1"] is Outcome.AGAINST_TEXT
     for quantity in ("f_mm", "k1", "k2"):
         assert outcomes[SAMAAN, quantity, "Table 2, row 2"] is Outcome.NOT_REPRODUCED
-    assert found.readings.of(OTHER_EQUATION, LEAST_SQUARES, "f_mm").mean() == pytest.approx(70.242, abs=0.001)
+    assert found.readings.of(OTHER_EQUATION, LEAST_SQUARES, "f_mm").mean() == pytest.approx(
+        70.242, abs=0.001
+    )

@@ -25,14 +25,18 @@ def test_counts_are_the_catalogue_s() -> None:
     assert stars_in_field(square_camera(90.0), 7.0) == pytest.approx(COUNTS[7.0] / 6.0)
 
 
-@pytest.mark.parametrize(("fov_deg", "limit"), [(20.0, 7.0), (12.0, 7.0), (3.0, 8.5), (2.0, 9.5), (1.0, 10.0)])
+@pytest.mark.parametrize(
+    ("fov_deg", "limit"), [(20.0, 7.0), (12.0, 7.0), (3.0, 8.5), (2.0, 9.5), (1.0, 10.0)]
+)
 def test_narrow_fields_ask_for_fainter_stars(fov_deg: float, limit: float) -> None:
     table: Any = SimpleNamespace(stars_per_frame=np.array([12, 2, 11, 13]))
     assert depth_for(table, square_camera(fov_deg)) == limit
 
 
 def small_wide(n: int) -> tuple[Any, Any]:
-    """Frames of a camera of 256 px and 60 degrees, whose principal point is off by 1 % of the width."""
+    """Frames of a camera of 256 px and 60 degrees, whose principal point is off by 1 % of the
+    width.
+    """
     focal, off = 128.0 / np.tan(np.radians(30.0)), np.array([2.5, -2.0])
     camera = sc.Camera(256, 256, 5.0, focal * 5e-3, 127.5 + off[0], 127.5 + off[1])
     table, names, _ = random_frames(sc.load_catalogue(3.8), camera, n, 5, missing=0.6)
@@ -52,23 +56,31 @@ def test_a_wide_field_on_a_small_detector(sheet: bool) -> None:
 
 
 def test_a_failed_search_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stars at random places: however deep the catalogue, each level is compared with a frame and its mirror once."""
+    """Stars at random places: however deep the catalogue, each level is compared with a frame and
+    its mirror once.
+    """
     n, rng = 2, np.random.default_rng(3)
     table, _ = small_wide(n)
     table.x_px, table.y_px = rng.uniform(1.0, 254.0, (2, len(table.frame)))
     searched: list[tuple[Any, ...]] = []
     matches = []
 
-    def solve(self: BlindSearch, u: Any, sigma: Any, sizes: list[int], focal_px: tuple[float, float]) -> None:
+    def solve(
+        self: BlindSearch, u: Any, sigma: Any, sizes: list[int], focal_px: tuple[float, float]
+    ) -> None:
         searched.extend((u.tobytes(), size, focal_px) for size in sizes)
 
     monkeypatch.setattr(BlindSearch, "solve", solve)
     # Loaded sooner than what deep levels ask for.
     monkeypatch.setattr("starcal_uq.pipeline.depth._SEARCHED", {20_000: 7.0, 500_000: 7.5})
-    monkeypatch.setattr("starcal_uq.identification.search.match_frame", lambda *_, **__: matches.append(1))
+    monkeypatch.setattr(
+        "starcal_uq.identification.search.match_frame", lambda *_, **__: matches.append(1)
+    )
     _, found = identify_to_depth(table, None, 2016.0, cache=False)
     assert found.n_identified == 0
-    assert len(searched) == len(set(searched)) == 2 * n * sum(size <= COUNTS[7.5] for size in LEVELS)
+    assert (
+        len(searched) == len(set(searched)) == 2 * n * sum(size <= COUNTS[7.5] for size in LEVELS)
+    )
     assert not matches
     # With a sheet the range near its focal length comes first, and is left out of the rest.
     camera = sc.Camera(256, 256, 5.0, 400 * 5e-3, 127.5, 127.5)
@@ -83,7 +95,9 @@ def test_a_failed_search_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_search_ends_where_too_many_triangles_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stars at random places, a camera of which next to nothing is known: the work is bounded, whatever fits."""
+    """Stars at random places, a camera of which next to nothing is known: the work is bounded,
+    whatever fits.
+    """
     table, _ = small_wide(1)
     table.x_px, table.y_px = np.random.default_rng(3).uniform(1.0, 254.0, (2, len(table.frame)))
     camera = sc.Camera(256, 256, 5.0, 400 * 5e-3, 127.5, 127.5)
@@ -107,7 +121,9 @@ def test_a_search_ends_where_too_many_triangles_fit(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.slow
 def test_a_field_of_three_degrees() -> None:
-    """At the limit of 7 most frames have too few stars; as deep as the frames see all are found, sheet or none."""
+    """At the limit of 7 most frames have too few stars; as deep as the frames see all are found,
+    sheet or none.
+    """
     stars, camera = sc.load_catalogue(8.5), square_camera(3.0)
     table, names, _ = random_frames(stars, camera, 12, 3)
     table.stars_per_frame = np.bincount(table.frame, minlength=12)

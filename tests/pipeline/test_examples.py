@@ -28,7 +28,12 @@ def test_the_example_is_whole_and_says_whose_it_is() -> None:
 def test_it_is_saved_as_it_is_shipped(tmp_path: Path) -> None:
     esa = sc.example_data()
     files = esa.save(tmp_path / "new")
-    assert sorted(path.name for path in files) == ["NOTICE", "camera.toml", "site.toml", "stars.ecsv"]
+    assert sorted(path.name for path in files) == [
+        "NOTICE",
+        "camera.toml",
+        "site.toml",
+        "stars.ecsv",
+    ]
     again = sc.load_observations(tmp_path / "new" / "stars.ecsv")
     assert np.array_equal(again.x_px, esa.observations.x_px)
     with pytest.raises(RunFolderError, match="exists already"):
@@ -37,7 +42,9 @@ def test_it_is_saved_as_it_is_shipped(tmp_path: Path) -> None:
 
 
 def test_refraction_moves_the_focal_length_as_it_does_in_a_separate_fit() -> None:
-    """An independent bundle fit of other centroids of these images: f = 5116.54 +- 0.28 px, 2.2 px less without air."""
+    """An independent bundle fit of other centroids of these images: f = 5116.54 +- 0.28 px, 2.2 px
+    less without air.
+    """
     esa = sc.example_data("esa")
     seen = sc.sky.make_apparent(esa.observations, site=esa.site)
     cal = sc.calibrate(seen, esa.camera, noise="model")
@@ -45,7 +52,8 @@ def test_refraction_moves_the_focal_length_as_it_does_in_a_separate_fit() -> Non
     untold = sc.sky.make_apparent(esa.observations)
     without = sc.calibrate(untold, esa.camera, noise="model")
     assert 1.5 < cal.theta[2] - without.theta[2] < 3.0
-    # The stars, weighed with the noise that was fitted, tell the latitude; as the table states them, they do not.
+    # The stars, weighed with the noise that was fitted, tell the latitude; as the table states
+    # them, they do not.
     air = sc.diagnostics.air_test(untold, without)
     assert air is not None and air.is_air
     assert abs(air.latitude_deg - esa.site.latitude_deg) < 3.0 * air.latitude_std_deg < 6.0
@@ -62,4 +70,6 @@ def test_the_images_give_the_table_again() -> None:
     assert np.array_equal(measured.frame, shipped.frame)
     for name in ("x_px", "y_px", "sigma_px", "ra_deg", "dec_deg"):
         # The last digit may be rounded otherwise.
-        np.testing.assert_allclose(getattr(measured, name), getattr(shipped, name), atol=2e-4, rtol=0.0)
+        np.testing.assert_allclose(
+            getattr(measured, name), getattr(shipped, name), atol=2e-4, rtol=0.0
+        )

@@ -16,7 +16,9 @@ from starcal_uq.presentation.report.tables import image_context
 @pytest.fixture(scope="module")
 def paper_calibration() -> sc.Calibration:
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    return sc.calibrate(sc.simulate(stars, sc.paper.paper_camera(), n_frames=20, seed=1), sc.paper.paper_start())
+    return sc.calibrate(
+        sc.simulate(stars, sc.paper.paper_camera(), n_frames=20, seed=1), sc.paper.paper_start()
+    )
 
 
 NAMES = ("x0", "y0", "f", "k1", "k2")
@@ -26,15 +28,27 @@ def record(n: int, left_out: int = 1) -> ImageRecord:
     """`n` images, the last ones of which are too dark."""
     rounds = tuple(
         RoundRecord(
-            n - left_out, stars, new, 0, {name: (value, 0.1) for name, value in zip(NAMES, v, strict=True)}, s, 1.1
+            n - left_out,
+            stars,
+            new,
+            0,
+            {name: (value, 0.1) for name, value in zip(NAMES, v, strict=True)},
+            s,
+            1.1,
         )
         for stars, new, v, s in (
             (80, 0, (500.0, 530.0, 5850.0, 2e-10, 0.0), "sigma_scale"),
             (96, 16, (500.1, 530.0, 5850.2, 2e-10, 0.0), "sigma_scale"),
         )
     )
-    used = [ImageRow(k, f"{k}.fits", "2026-11-21T00:00:00", 12, "identified", 8, 10) for k in range(n - left_out)]
-    dark = [ImageRow(k, f"{k}.fits", "", 0, "no star is bright enough.", 0, 0) for k in range(n - left_out, n)]
+    used = [
+        ImageRow(k, f"{k}.fits", "2026-11-21T00:00:00", 12, "identified", 8, 10)
+        for k in range(n - left_out)
+    ]
+    dark = [
+        ImageRow(k, f"{k}.fits", "", 0, "no star is bright enough.", 0, 0)
+        for k in range(n - left_out, n)
+    ]
     return ImageRecord(rounds, (*used, *dark), 3, "mirrored")
 
 
@@ -58,7 +72,9 @@ def test_broken_files_are_named(tmp_path: Path, text: str) -> None:
 
 def test_summary_counts_what_was_used_and_what_was_not() -> None:
     words = record(5).text
-    assert words.startswith("4 of 5 images used; 48 star images were found in them, and 40 of these were identified.")
+    assert words.startswith(
+        "4 of 5 images used; 48 star images were found in them, and 40 of these were identified."
+    )
     assert "3 stars left out" in words
     assert "mirror images" in words
     plain = replace(record(5, 0), n_disturbed=0, parity="normal").text
@@ -85,6 +101,8 @@ def test_of_many_images_only_those_left_out_are_listed(paper_calibration: sc.Cal
 
 
 def test_pairs_need_names() -> None:
-    obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera(), n_frames=2, seed=1)
+    obs = sc.simulate(
+        sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera(), n_frames=2, seed=1
+    )
     assert len(identified_pairs(obs)) == obs.n_stars
     assert identified_pairs(replace(obs, star_id=None)) == set()

@@ -1,4 +1,6 @@
-"""Frames of a run from images: every detection and every star is what it is said to be, and the page shows them."""
+"""Frames of a run from images: every detection and every star is what it is said to be, and the
+page shows them.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,11 @@ import pytest
 from PIL import Image
 
 import starcal_uq as sc
-from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation, rotation_to_quaternion
+from starcal_uq.attitude.rotations import (
+    exp_rotation,
+    quaternion_to_rotation,
+    rotation_to_quaternion,
+)
 from starcal_uq.camera.projection import project
 from starcal_uq.images.centroids import COLUMNS, Centroids
 from starcal_uq.pipeline.inspection import IDENTIFIED, LEFT_OUT, NOT_MATCHED, Frames
@@ -28,7 +34,8 @@ STRANGE_NAME = '<script>alert("1")</script>.fits'
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory: pytest.TempPathFactory) -> Frames:
-    """Twenty simulated frames with a false detection each, from the second of which the brightest star is missing.
+    """Twenty simulated frames with a false detection each, from the second of which the brightest
+    star is missing.
 
     The last star of the first frame was left out; two more frames failed.
     """
@@ -71,7 +78,11 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> Frames:
     )
     folder = tmp_path_factory.mktemp("images")
     camera = cal.camera
-    pixels = np.random.default_rng(2).normal(100.0, 3.0, (camera.height_px, camera.width_px)).clip(0, 255)
+    pixels = (
+        np.random.default_rng(2)
+        .normal(100.0, 3.0, (camera.height_px, camera.width_px))
+        .clip(0, 255)
+    )
     Image.fromarray(pixels.astype(np.uint8)).save(folder / "0.png")
     return Frames(
         "run",
@@ -127,16 +138,21 @@ def test_centre_roll_and_north_are_those_of_the_image(frames: Frames) -> None:
         ra, dec = np.array([0.0, 0.0, 0.01]), np.array([0.0, 0.01, 0.0])
         places = project(
             camera,
-            unit_vectors(frame.ra_deg + ra / np.cos(np.radians(frame.dec_deg)), frame.dec_deg + dec) @ rotation.T,
+            unit_vectors(frame.ra_deg + ra / np.cos(np.radians(frame.dec_deg)), frame.dec_deg + dec)
+            @ rotation.T,
         )
-        np.testing.assert_allclose(places[0], [0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)], atol=1e-6)
+        np.testing.assert_allclose(
+            places[0], [0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)], atol=1e-6
+        )
         north, east = places[1] - places[0], places[2] - places[0]
         if flipped:
             north[0], east[0] = -north[0], -east[0]
         angle = np.degrees(np.arctan2(north[0], -north[1]))
         assert (frame.north - angle + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.01)
         # East is left of north, or right of it in a mirror image.
-        assert (north[0] * east[1] - north[1] * east[0] < 0.0) == frame.east_is_left == (not flipped)
+        assert (
+            (north[0] * east[1] - north[1] * east[0] < 0.0) == frame.east_is_left == (not flipped)
+        )
         # On the sky, the position angle of the image's up.
         roll = np.radians(-frame.roll_deg if flipped else frame.roll_deg)
         assert np.cos(np.radians(frame.north) - roll) > 1.0 - 1e-9
@@ -152,14 +168,18 @@ def test_those_that_tell_most_are_chosen(frames: Frames) -> None:
     assert frames.telling(100) is frames
     assert few.text.startswith("6 frames of 22: some that failed")
     assert len(few.centroids) < len(frames.centroids)
-    with pytest.raises(sc.errors.ImageError, match=r"no frame of this number or name; the last one is 21"):
+    with pytest.raises(
+        sc.errors.ImageError, match=r"no frame of this number or name; the last one is 21"
+    ):
         frames["other.fits"]
 
 
-def test_the_page_shows_every_frame_with_its_reason_and_what_to_do(frames: Frames, tmp_path: Path) -> None:
-    page = write_frames(frames.select(0, 1, DARK, STRANGE_NAME, large=True), tmp_path / "frames.html").read_text(
-        "utf-8"
-    )
+def test_the_page_shows_every_frame_with_its_reason_and_what_to_do(
+    frames: Frames, tmp_path: Path
+) -> None:
+    page = write_frames(
+        frames.select(0, 1, DARK, STRANGE_NAME, large=True), tmp_path / "frames.html"
+    ).read_text("utf-8")
     assert "<script" not in page
     assert "&lt;script&gt;" in page
     for name in ("0.png", "1.png", "dark.png"):
@@ -172,8 +192,9 @@ def test_the_page_shows_every_frame_with_its_reason_and_what_to_do(frames: Frame
         assert f"{frame.ra_deg:.4f}°" in shown
     assert "starcal-uq centroid dark.png --camera run/camera.toml -o stars.csv --threshold" in page
     assert (
-        "starcal-uq identify run/centroids.parquet run/camera.toml -o found.csv --calibration run --max-mag 7<" in page
-    )
+        "starcal-uq identify run/centroids.parquet run/camera.toml -o found.csv --calibration "
+        "run --max-mag 7<"
+    ) in page
     # A star's name, and a mark of each kind with a shape of its own.
     star = frames[0].detections["star_id"].iloc[0]
     assert f"<title>{star}, G " in page

@@ -32,13 +32,24 @@ def test_a_time_beside_the_table_is_that_of_its_rows(tmp_path: Path) -> None:
     wanted = observations_from_table(timed, camera, directions="catalogue")
     assert wanted.ra_deg[0] != obs.ra_deg[0]
     for found in (
-        observations_from_table(tmp_path / "bare.parquet", camera, directions="catalogue", time_utc=f"{TIME}Z"),
-        next(iter(partitions_from_folder(tmp_path / "parts", camera, directions="catalogue", time_utc=TIME))),
+        observations_from_table(
+            tmp_path / "bare.parquet", camera, directions="catalogue", time_utc=f"{TIME}Z"
+        ),
+        next(
+            iter(
+                partitions_from_folder(
+                    tmp_path / "parts", camera, directions="catalogue", time_utc=TIME
+                )
+            )
+        ),
     ):
         np.testing.assert_array_equal(found.ra_deg, wanted.ra_deg)
     undeclared = partitions_from_folder(tmp_path / "parts", camera, time_utc=TIME)
-    assert undeclared.meta["directions"] == "undeclared" and set(undeclared.sample().time_utc) == {TIME}
-    # With a file beside it whose rows have times a folder is as it was; where all have, the time means nothing.
+    assert undeclared.meta["directions"] == "undeclared" and set(undeclared.sample().time_utc) == {
+        TIME
+    }
+    # With a file beside it whose rows have times a folder is as it was; where all have, the time
+    # means nothing.
     full = tmp_path / "full"
     full.mkdir()
     for number, folder in enumerate((full, full, tmp_path / "parts"), 1):
@@ -46,6 +57,7 @@ def test_a_time_beside_the_table_is_that_of_its_rows(tmp_path: Path) -> None:
     assert partitions_from_folder(tmp_path / "parts", camera, time_utc=TIME).n_stars == 24
     for path, read in ((timed, observations_from_table), (full, partitions_from_folder)):
         with pytest.raises(
-            sc.errors.ObservationError, match=rf"{path}: every row has a time \(column time_utc\): leave out --time"
+            sc.errors.ObservationError,
+            match=rf"{path}: every row has a time \(column time_utc\): leave out --time",
         ):
             read(path, camera, time_utc=TIME)

@@ -35,7 +35,9 @@ ARCSEC = 648_000.0 / np.pi
 
 @pytest.fixture(autouse=True)
 def smaller_sweeps(monkeypatch):
-    """Points of the sweeps over fewer attitudes: what they show is many times larger than the scatter."""
+    """Points of the sweeps over fewer attitudes: what they show is many times larger than the
+    scatter.
+    """
     from starcal_uq.planning import plan
 
     for name in ("_SWEEP_GEOMETRIES", "_TRIED_ATTITUDES"):
@@ -62,10 +64,13 @@ def fresh(**options: object) -> Plan:
     return plan(camera(), sky(7.0), max_mag=6.0, **settings)  # type: ignore[arg-type]
 
 
-# --- quantiles of two axes -------------------------------------------------------------------------------------------
+# --- quantiles of two axes
+# -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("confidence", "factor"), [(0.95, 2.44775), (0.997, 3.40856), (0.9973, 3.43933)])
+@pytest.mark.parametrize(
+    ("confidence", "factor"), [(0.95, 2.44775), (0.997, 3.40856), (0.9973, 3.43933)]
+)
 def test_equal_axes_have_rayleighs_quantile(confidence, factor):
     assert mixture_radius(4.0 * np.eye(2), confidence) == pytest.approx(2.0 * factor, rel=1e-5)
 
@@ -87,7 +92,9 @@ def test_unequal_axes_and_mixtures_against_sampling():
 def test_the_budget_says_the_same_of_unequal_axes():
     for small in (0.0, 0.3, 1.0):
         expected = two_axis_radius(0.997, 2.0, 2.0 * small)
-        assert mixture_radius(np.diag([4.0, 4.0 * small**2]), 0.997) == pytest.approx(expected, rel=1e-4)
+        assert mixture_radius(np.diag([4.0, 4.0 * small**2]), 0.997) == pytest.approx(
+            expected, rel=1e-4
+        )
 
 
 def test_a_confidence_that_is_no_probability_is_refused():
@@ -95,18 +102,25 @@ def test_a_confidence_that_is_no_probability_is_refused():
         mixture_radius(np.eye(2), 99.7)
 
 
-# --- information -----------------------------------------------------------------------------------------------------
+# --- information
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("model", list(COEFFICIENTS))
 def test_information_is_that_of_a_calibration(model):
     obs = observations(model)
     cal = sc.calibrate(obs, camera(model))
-    found = look_at(sc.load_catalogue(max_mag=6.0, epoch=2026.9), cal.camera, _rotations(cal), cal.sigma, 3)
+    found = look_at(
+        sc.load_catalogue(max_mag=6.0, epoch=2026.9), cal.camera, _rotations(cal), cal.sigma, 3
+    )
     # The stars are the same but for a few at the edge, which noise has moved.
     assert found.n_stars.sum() == pytest.approx(obs.n_stars, rel=0.005)
-    assert np.sqrt(np.diag(inverses(found.information.sum(axis=0)))) == pytest.approx(cal.sigmas, rel=0.02)
-    turned, expected = (response * cal.sigmas for response in (found.common, cal.rotation_per_theta))
+    assert np.sqrt(np.diag(inverses(found.information.sum(axis=0)))) == pytest.approx(
+        cal.sigmas, rel=0.02
+    )
+    turned, expected = (
+        response * cal.sigmas for response in (found.common, cal.rotation_per_theta)
+    )
     assert turned == pytest.approx(expected, abs=0.01 * np.abs(expected).max())
 
 
@@ -119,7 +133,9 @@ def _rotations(cal: sc.Calibration) -> np.ndarray:
 def test_noise_of_the_attitude_is_quests():
     found = some_frames()
     b = sc.camera.unproject(camera(), found.frames.pixel.T)
-    result = sc.attitude.quest(b, found.frames.r.T, found.frames.starts, sigma_rad=0.05 / camera().focal_px)
+    result = sc.attitude.quest(
+        b, found.frames.r.T, found.frames.starts, sigma_rad=0.05 / camera().focal_px
+    )
     expected = ARCSEC * np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2).mean(axis=0))
     assert nea_arcsec(found) == pytest.approx(expected, rel=0.02)
 
@@ -152,17 +168,22 @@ def test_noise_by_magnitude_weights_the_stars():
 def test_window_of_the_detector():
     found = some_frames(200)
     whole = found.seen_within(1.0)
-    assert whole == pytest.approx(found.information, rel=1e-6, abs=1e-6 * np.abs(found.information).max())
+    assert whole == pytest.approx(
+        found.information, rel=1e-6, abs=1e-6 * np.abs(found.information).max()
+    )
     traces = [np.trace(found.seen_within(part)[:, :3, :3].sum(axis=0)) for part in (0.2, 0.5, 1.0)]
     assert traces[0] < traces[1] < traces[2]
     assert not found.seen_within(1e-4).any()
 
 
-# --- forecast --------------------------------------------------------------------------------------------------------
+# --- forecast
+# --------------------------------------------------------------------------------------------------
 
 
 def test_paper_set_up():
-    """The bound of the paper's 1000 frames: 0.15 px of principal point, 5 arcsec in common, 0.007 of rest."""
+    """The bound of the paper's 1000 frames: 0.15 px of principal point, 5 arcsec in common, 0.007
+    of rest.
+    """
     forecast = made(sweeps=False).forecast
     row = {name: forecast.of(name)[list(forecast.n_frames).index(1000)] for name in forecast.names}
     assert row["x0_px"] == pytest.approx(0.14, rel=0.1)
@@ -175,7 +196,10 @@ def test_paper_set_up():
 
 
 def test_same_seed_same_plan_and_more_frames_are_better():
-    one, again = (plan(camera(), sky(), n_geometries=200, n_campaigns=40, sweeps=False, seed=5) for _ in range(2))
+    one, again = (
+        plan(camera(), sky(), n_geometries=200, n_campaigns=40, sweeps=False, seed=5)
+        for _ in range(2)
+    )
     assert np.array_equal(one.forecast.sigma, again.forecast.sigma)
     assert (np.diff(one.forecast.sigma, axis=0) < 0.0).all()
     assert (one.forecast.low <= one.forecast.sigma).all()
@@ -183,13 +207,19 @@ def test_same_seed_same_plan_and_more_frames_are_better():
 
 
 def test_quantities_are_what_they_say():
-    """Displacement at the corner, common rotation and rest of drawn parameters scatter as the forms say."""
+    """Displacement at the corner, common rotation and rest of drawn parameters scatter as the forms
+    say.
+    """
     mission, cam = some_frames(), camera()
     covariance = inverses(mission.information.sum(axis=0))
     drawn = np.random.default_rng(0).multivariate_normal(np.zeros(5), covariance, 4000)
     measured = quantities(mission)
     sigma = dict(
-        zip([q.name for q in measured], spreads(np.stack([q.form for q in measured]), covariance), strict=True)
+        zip(
+            [q.name for q in measured],
+            spreads(np.stack([q.form for q in measured]), covariance),
+            strict=True,
+        )
     )
     u, v = -0.5 - cam.x0_px, -0.5 - cam.y0_px
     u = max(u, cam.width_px - 0.5 - cam.x0_px, key=abs)
@@ -200,12 +230,16 @@ def test_quantities_are_what_they_say():
     phi = ARCSEC * np.einsum("kap,np->nka", mission.response, drawn)
     common = phi.mean(axis=1)
     assert sigma["common_yaw_arcsec"] == pytest.approx(common[:, 1].std(), rel=0.05)
-    assert sigma["rest_roll_arcsec"] == pytest.approx(np.sqrt(np.mean((phi - common[:, None])[..., 2] ** 2)), rel=0.05)
+    assert sigma["rest_roll_arcsec"] == pytest.approx(
+        np.sqrt(np.mean((phi - common[:, None])[..., 2] ** 2)), rel=0.05
+    )
 
 
 @lru_cache
 def small_check() -> ForecastCheck:
-    return check_forecast(camera(), sky(), n_frames=(10, 30), n_campaigns=40, n_geometries=1000, workers=0, seed=3)
+    return check_forecast(
+        camera(), sky(), n_frames=(10, 30), n_campaigns=40, n_geometries=1000, workers=0, seed=3
+    )
 
 
 def test_forecast_is_what_small_campaigns_state_and_do():
@@ -217,7 +251,9 @@ def test_forecast_is_what_small_campaigns_state_and_do():
 
 
 def test_a_forecast_that_forgets_the_attitudes_fails():
-    """Control: with the attitudes known, the principal point would be known a hundred times better."""
+    """Control: with the attitudes known, the principal point would be known a hundred times
+    better.
+    """
     found, cam = some_frames(), camera()
     likelihood = MarginalLikelihood(found.frames, cam.distortion)
     state, _ = likelihood.profile(cam.theta, found.rotations)
@@ -252,20 +288,30 @@ def test_forecast_against_simulation_from_10_to_3000_frames():
 
 @pytest.mark.slow
 def test_a_plan_is_what_calibrations_of_a_second_make_scatter_by():
-    """Errors of parameters and of the common rotation in simulated campaigns, in units of the forecast."""
+    """Errors of parameters and of the common rotation in simulated campaigns, in units of the
+    forecast.
+    """
     errors = []
-    for field, corner_px, sigma_px in ((8.0, (3.0, -1.0), 0.1), (15.0, (-4.0, 1.0), 0.05), (40.0, (20.0, -5.0), 0.2)):
+    for field, corner_px, sigma_px in (
+        (8.0, (3.0, -1.0), 0.1),
+        (15.0, (-4.0, 1.0), 0.05),
+        (40.0, (20.0, -5.0), 0.2),
+    ):
         conditions = {"stars_per_frame": 20, "field_deg": field, "corner_px": corner_px}
         clear = campaign(np.random.default_rng(0), n_frames=12, sigma_px=0.0, **conditions)
         x0, y0, _, k1, k2 = clear.theta
-        sheet = sc.Camera(**(clear.camera_toml(0.0) | {"x0_px": x0, "y0_px": y0}), coefficients=(k1, k2))
+        sheet = sc.Camera(
+            **(clear.camera_toml(0.0) | {"x0_px": x0, "y0_px": y0}), coefficients=(k1, k2)
+        )
         half = np.sin(np.radians(0.5 * field)) ** 2
         stars = even_sky(round(20 * np.pi / np.arcsin(half)))
         options = {"min_stars": 3, "sweeps": False, "n_geometries": 400, "n_campaigns": 40}
         forecast = plan(sheet, stars, sigma_px=sigma_px, n_frames=[20], **options).forecast
         common = [forecast.of(f"common_{axis}_arcsec")[0] for axis in ("pitch", "yaw")]
         for seed in range(70):
-            c = campaign(np.random.default_rng([17, seed]), n_frames=20, sigma_px=sigma_px, **conditions)
+            c = campaign(
+                np.random.default_rng([17, seed]), n_frames=20, sigma_px=sigma_px, **conditions
+            )
             nominal = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
             theta = sc.calibrate(sc.Observations(**c.columns), nominal, model="brown").theta
             turn = attitude_errors(clear, theta).mean(axis=0)[:2]
@@ -284,18 +330,32 @@ def even_sky(n: int) -> sc.StarCatalogue:
     ra, dec = rng.uniform(0.0, 360.0, n), np.degrees(np.arcsin(rng.uniform(-1.0, 1.0, n)))
     names, still = np.array([f"S{i}" for i in range(n)]), np.zeros(n)
     return sc.StarCatalogue(
-        names, ra, dec, rng.uniform(2.0, 6.0, n), still, still, still > 1, 2026.9, "G", False, "even"
+        names,
+        ra,
+        dec,
+        rng.uniform(2.0, 6.0, n),
+        still,
+        still,
+        still > 1,
+        2026.9,
+        "G",
+        False,
+        "even",
     )
 
 
-# --- frames for a target ---------------------------------------------------------------------------------------------
+# --- frames for a target
+# ---------------------------------------------------------------------------------------------
 
 
 def test_frames_needed_keep_the_target_and_fewer_do_not():
     forecaster = Forecaster(some_frames().information, 17.7, some_frames(), n_campaigns=100)
     for target in (100.0, 20.0, 5.0):
         needed = forecaster.frames_needed(target)
-        radius = [forecaster.radii(forecaster.covariances(n), n).mean() for n in (needed, int(0.95 * needed) - 1)]
+        radius = [
+            forecaster.radii(forecaster.covariances(n), n).mean()
+            for n in (needed, int(0.95 * needed) - 1)
+        ]
         assert radius[0] <= target < radius[1]
         assert forecaster.frames_needed(target, share=0.95) > needed
 
@@ -305,7 +365,9 @@ def test_first_order_law_of_the_target():
 
     def needed(target_arcsec: float, sigma_px: float = 0.05) -> int | None:
         frames = random_frames(sky(), camera(), sigma_px, n_frames=500, min_stars=10, seed=0)
-        return Forecaster(frames.information, frames.mean_stars, frames, n_campaigns=100).frames_needed(target_arcsec)
+        return Forecaster(
+            frames.information, frames.mean_stars, frames, n_campaigns=100
+        ).frames_needed(target_arcsec)
 
     needs = [needed(10.0), needed(5.0)]
     assert needs[1] == pytest.approx(4 * needs[0], rel=0.02)
@@ -316,7 +378,9 @@ def test_first_order_law_of_the_target():
 
 def test_radius_is_the_rayleigh_quantile_of_the_common_rotation():
     forecast = made(sweeps=False).forecast
-    sigma = np.sqrt(0.5 * (forecast.of("common_pitch_arcsec") ** 2 + forecast.of("common_yaw_arcsec") ** 2))
+    sigma = np.sqrt(
+        0.5 * (forecast.of("common_pitch_arcsec") ** 2 + forecast.of("common_yaw_arcsec") ** 2)
+    )
     # Small campaigns: axes differ, and the noise is estimated.
     assert forecast.radius[3:] / sigma[3:] == pytest.approx(np.full(3, 3.4086), rel=0.005)
     assert forecast.radius[0] / sigma[0] > 3.42
@@ -326,7 +390,9 @@ def test_estimated_noise_widens_as_students_distribution():
     assert student_factor(0.997, 1e7) == pytest.approx(1.0, abs=1e-5)
     rng = np.random.default_rng(1)
     ratio = np.hypot(*rng.standard_normal((2, 400_000))) / np.sqrt(rng.chisquare(60, 400_000) / 60)
-    assert 3.40856 * student_factor(0.997, 60.0) == pytest.approx(np.quantile(ratio, 0.997), rel=0.01)
+    assert 3.40856 * student_factor(0.997, 60.0) == pytest.approx(
+        np.quantile(ratio, 0.997), rel=0.01
+    )
 
 
 def test_scopes_differ_and_noise_is_a_floor():
@@ -350,7 +416,8 @@ def test_data_that_are_there_already_count():
         plan(camera("none"), sky(), after=cal)
 
 
-# --- sweeps ----------------------------------------------------------------------------------------------------------
+# --- sweeps
+# --------------------------------------------------------------------------------------------------
 
 
 def test_sweeps_change_one_thing():
@@ -369,7 +436,9 @@ def test_sweeps_change_one_thing():
         rows[np.isclose(rows["value"], at)].iloc[0]
         for rows, at in ((magnitudes, 6.0), (noise, 0.05), (groups["part of the detector"], 1.0))
     ]
-    assert [row["radius_arcsec"] for row in here] == pytest.approx([here[0]["radius_arcsec"]] * 3, rel=0.05)
+    assert [row["radius_arcsec"] for row in here] == pytest.approx(
+        [here[0]["radius_arcsec"]] * 3, rel=0.05
+    )
 
 
 def test_the_noise_model_of_a_calibration_gives_stars_the_noise_of_their_place():
@@ -377,7 +446,15 @@ def test_the_noise_model_of_a_calibration_gives_stars_the_noise_of_their_place()
     empty, nothing = np.zeros(0), np.zeros(0, dtype=np.int64)
     model = NoiseModel(
         ("radius",),
-        *(np.array([2.0]), np.array([0.1]), 0.05, False, np.array(camera().centre_px), corner, np.array([0.0, 1.0])),
+        *(
+            np.array([2.0]),
+            np.array([0.1]),
+            0.05,
+            False,
+            np.array(camera().centre_px),
+            corner,
+            np.array([0.0, 1.0]),
+        ),
         *(np.zeros(2), 0.0, None, nothing, empty, 1.0),
     )
     frames = random_frames(sky(), camera(), model, n_frames=50, min_stars=10, seed=1)
@@ -388,7 +465,8 @@ def test_the_noise_model_of_a_calibration_gives_stars_the_noise_of_their_place()
     assert (noisy.forecast.of("f_px") > 1.5 * quiet.forecast.of("f_px")).all()
 
 
-# --- distortion that the sheet leaves open ---------------------------------------------------------------------------
+# --- distortion that the sheet leaves open
+# ---------------------------------------------------------------------------
 
 
 def sheet(percent: float = 0.0, distortion: str = "brown") -> sc.Camera:
@@ -407,7 +485,13 @@ def sheet(percent: float = 0.0, distortion: str = "brown") -> sc.Camera:
     return with_distortion(bare, percent) if percent else bare
 
 
-SMALL = {"max_mag": 5.0, "n_geometries": 200, "n_campaigns": 40, "sweeps": False, "n_frames": (30, 300)}
+SMALL = {
+    "max_mag": 5.0,
+    "n_geometries": 200,
+    "n_campaigns": 40,
+    "sweeps": False,
+    "n_frames": (30, 300),
+}
 
 
 def test_a_sheet_without_distortion_leaves_a_range_and_known_distortion_none(monkeypatch):
@@ -425,7 +509,9 @@ def test_a_sheet_without_distortion_leaves_a_range_and_known_distortion_none(mon
         assert known.frames_needed == pytest.approx(frames, rel=0.1) and known.frames_range is None
         assert "distortion" not in known.text
     assert f"{frames_words(int(least)).split()[0]} to {frames_words(int(most))}" in found.text
-    assert "principal point" in distortion_sentence(found) and "2.1 % of barrel" in distortion_sentence(found)
+    assert "principal point" in distortion_sentence(
+        found
+    ) and "2.1 % of barrel" in distortion_sentence(found)
     table = found.to_dataframe()
     assert (table["radius_least_arcsec"] < table["radius_arcsec"]).all()
     assert (table["radius_arcsec"] < table["radius_most_arcsec"]).all()
@@ -437,7 +523,10 @@ def test_a_sheet_without_distortion_leaves_a_range_and_known_distortion_none(mon
 
 def test_the_inverse_model_bends_the_same_way():
     for name in ("brown", "inverse", "k1"):
-        images = (sc.camera.project(sheet(percent, name), [[0.1, 0.0, 1.0]]) for percent in (-2.0, 0.0, 2.0))
+        images = (
+            sc.camera.project(sheet(percent, name), [[0.1, 0.0, 1.0]])
+            for percent in (-2.0, 0.0, 2.0)
+        )
         radii = [float(np.hypot(*(xy[0] - 511.5))) for xy in images]
         assert radii[0] < radii[1] < radii[2]
 
@@ -467,22 +556,32 @@ def test_distortion_of_a_wide_field_is_left_open_as_far_as_it_does_not_fold(widt
     # The control: a little more, and the corner has no direction.
     with pytest.raises(DistortionError):
         sc.camera.unproject(with_distortion(wide, 1.2 * low), corners)
-    with pytest.raises(PlanningError, match=r"distortion_percent is -20 to 0: one coefficient .* stay within -\d"):
+    with pytest.raises(
+        PlanningError, match=r"distortion_percent is -20 to 0: one coefficient .* stay within -\d"
+    ):
         open_distortion.open_range(wide, (-20.0, 0.0), False)
 
 
 @pytest.mark.slow
 def test_calibrations_of_a_second_make_err_as_much_more_with_barrel_distortion():
-    """The range is no property of our formula: errors of the principal point in simulated campaigns have it, too."""
+    """The range is no property of our formula: errors of the principal point in simulated campaigns
+    have it, too.
+    """
 
     def spread(percent: float) -> float:
         corner = (0.01 * percent * 512.0 * np.sqrt(2.0), 0.0)
         errors = []
         for seed in range(40):
             c = campaign(
-                np.random.default_rng([13, seed]), n_frames=12, stars_per_frame=30, field_deg=20.0, corner_px=corner
+                np.random.default_rng([13, seed]),
+                n_frames=12,
+                stars_per_frame=30,
+                field_deg=20.0,
+                corner_px=corner,
             )
-            cal = sc.calibrate(sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
+            cal = sc.calibrate(
+                sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+            )
             errors.append(cal.theta[:2] - c.theta[:2])
         return float(np.sqrt(np.mean(np.square(errors))))
 
@@ -492,7 +591,8 @@ def test_calibrations_of_a_second_make_err_as_much_more_with_barrel_distortion()
     assert spread(2.07) / plain == pytest.approx(0.56, rel=0.3)
 
 
-# --- refusals, words and files ---------------------------------------------------------------------------------------
+# --- refusals, words and files
+# ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -528,7 +628,9 @@ def test_words():
     assert frames_words(667) == "667 frames"
     assert frames_words(None) == "no number of frames"
     verdict = made(target_arcsec=5.0).text
-    assert verdict.startswith("To keep 5 arcsec across the boresight at 99.7\xa0% for the common rotation takes")
+    assert verdict.startswith(
+        "To keep 5 arcsec across the boresight at 99.7\xa0% for the common rotation takes"
+    )
     assert "only the rest counts: 1 frame" in verdict
     assert "centroid noise of" in made(sweeps=False).text
 
@@ -540,9 +642,21 @@ def test_folder_of_a_plan(tmp_path):
     assert "http" not in re.sub(r"data:image/svg\+xml,[^\"]*", "", text)
     assert text.count("data:image/svg") == 2
     assert found.text.split(".")[0] in text
-    written = {path.relative_to(page.parent).as_posix() for path in page.parent.rglob("*") if path.is_file()}
+    written = {
+        path.relative_to(page.parent).as_posix()
+        for path in page.parent.rglob("*")
+        if path.is_file()
+    }
     assert written == {
-        *("plan.html", "plan.csv", "sweeps.csv", "plan.json", "figures/forecast.svg", "figures/sweeps.svg", "run.json")
+        *(
+            "plan.html",
+            "plan.csv",
+            "sweeps.csv",
+            "plan.json",
+            "figures/forecast.svg",
+            "figures/sweeps.svg",
+            "run.json",
+        )
     }
     record = json.loads((page.parent / "plan.json").read_text())
     assert record["needs"][0]["frames"] == found.frames_needed
@@ -581,7 +695,9 @@ def test_one_distortion_less_one_column_less():
     found = plan(camera("none"), sky(), n_geometries=100, n_campaigns=20, sweeps=False)
     assert "distortion_corner_px" not in found.forecast.names
     found.plot.forecast()
-    tangential = plan(camera("brown_tangential"), sky(), n_geometries=100, n_campaigns=20, sweeps=False)
+    tangential = plan(
+        camera("brown_tangential"), sky(), n_geometries=100, n_campaigns=20, sweeps=False
+    )
     assert {"p1_per_px", "p2_per_px", "k2_per_px4"} < set(tangential.forecast.names)
 
 
@@ -593,6 +709,10 @@ def test_coupling_of_a_plan_is_that_of_a_calibration() -> None:
     np.testing.assert_allclose(foretold.sigma_marginal, after.sigma_marginal, rtol=0.25)
     strong = np.abs(after.extended_correlation) > 0.5
     assert strong.sum() > 12
-    np.testing.assert_allclose(foretold.extended_correlation[strong], after.extended_correlation[strong], atol=0.25)
+    np.testing.assert_allclose(
+        foretold.extended_correlation[strong], after.extended_correlation[strong], atol=0.25
+    )
     # Without a target it is what 1000 frames give.
-    assert sc.coupling(made()).sigma_marginal[2] == pytest.approx(foretold.sigma_marginal[2] * np.sqrt(60 / 1000))
+    assert sc.coupling(made()).sigma_marginal[2] == pytest.approx(
+        foretold.sigma_marginal[2] * np.sqrt(60 / 1000)
+    )

@@ -1,4 +1,6 @@
-"""Which frames to take next: optimal choice against random pointing, in theory and by simulation."""
+"""Which frames to take next: optimal choice against random pointing, in theory and by
+simulation.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ def fresh(n_frames: int = 30, **options: object) -> FrameChoice:
 
 
 @pytest.mark.parametrize(
-    "options", [{"criterion": "D"}, {"scope": "common"}, {"scope": "rest"}, {"scope": "calibration"}]
+    "options",
+    [{"criterion": "D"}, {"scope": "common"}, {"scope": "rest"}, {"scope": "calibration"}],
 )
 def test_chosen_frames_beat_every_random_set(options):
     found = chosen(**options)
@@ -43,14 +46,21 @@ def test_chosen_frames_beat_every_random_set(options):
 
 
 def test_each_criterion_is_best_at_its_own():
-    found = {scope: chosen(scope=scope) for scope in ("common", "rest")} | {"D": chosen(criterion="D")}
+    found = {scope: chosen(scope=scope) for scope in ("common", "rest")} | {
+        "D": chosen(criterion="D")
+    }
 
     def cross(choice, part):
-        values = [choice.after[choice.names.index(f"{part}_{axis}_arcsec")] for axis in ("pitch", "yaw")]
+        values = [
+            choice.after[choice.names.index(f"{part}_{axis}_arcsec")] for axis in ("pitch", "yaw")
+        ]
         return np.hypot(*values)
 
     for part in ("common", "rest"):
-        assert all(cross(found[part], part) <= cross(other, part) * (1.0 + 1e-9) for other in found.values())
+        assert all(
+            cross(found[part], part) <= cross(other, part) * (1.0 + 1e-9)
+            for other in found.values()
+        )
 
 
 def test_greedy_with_exchange_finds_the_best_of_all_sets():
@@ -62,7 +72,9 @@ def test_greedy_with_exchange_finds_the_best_of_all_sets():
     from starcal_uq.planning.information import look_at, random_frames
 
     rotations = random_rotations(16, np.random.default_rng(4))
-    found = choose_frames(camera(), sky(), n_frames=4, candidates=rotations, min_stars=6, n_geometries=100)
+    found = choose_frames(
+        camera(), sky(), n_frames=4, candidates=rotations, min_stars=6, n_geometries=100
+    )
     pool = look_at(sky(), camera(), rotations, 0.05, 6)
     mission = random_frames(sky(), camera(), 0.05, n_frames=100, min_stars=6, seed=0)
     forms = {q.name: q.form for q in quantities(mission)}
@@ -90,12 +102,16 @@ def test_table_points_where_the_frames_are():
     assert list(table["order"]) == list(range(1, 31))
     rotations = quaternion_to_rotation(table[["qx", "qy", "qz", "qw"]].to_numpy())
     assert rotations == pytest.approx(chosen().rotations, abs=1e-12)
-    ra, dec, roll = (np.radians(table[name].to_numpy()) for name in ("ra_deg", "dec_deg", "roll_deg"))
+    ra, dec, roll = (
+        np.radians(table[name].to_numpy()) for name in ("ra_deg", "dec_deg", "roll_deg")
+    )
     boresight = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
     assert rotations[:, 2] == pytest.approx(boresight, abs=1e-12)
     north = np.stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], axis=1)
     east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=1)
-    assert rotations[:, 1] == pytest.approx(np.cos(roll)[:, None] * north + np.sin(roll)[:, None] * east, abs=1e-9)
+    assert rotations[:, 1] == pytest.approx(
+        np.cos(roll)[:, None] * north + np.sin(roll)[:, None] * east, abs=1e-9
+    )
     assert len(set(table["candidate"])) == 30
 
 
@@ -104,7 +120,9 @@ def test_files_words_and_figure(tmp_path):
 
     found = chosen()
     found.to_dataframe().to_csv(tmp_path / "frames.csv", index=False)
-    assert pd.read_csv(tmp_path / "frames.csv")["qx"].to_numpy() == pytest.approx(found.quaternions[:, 0], abs=1e-15)
+    assert pd.read_csv(tmp_path / "frames.csv")["qx"].to_numpy() == pytest.approx(
+        found.quaternions[:, 0], abs=1e-15
+    )
     assert found.text.startswith("30 frames of")
     assert "parameters as a whole" in chosen(criterion="D").text
     assert list(found.worth()["quantity"]) == list(found.names)
@@ -131,12 +149,16 @@ def test_settings_that_cannot_work_are_refused(options, words):
 
 @pytest.mark.slow
 def test_chosen_frames_beat_random_ones_in_simulated_campaigns():
-    """Errors of calibrations, not their forecast: rms principal-point error smaller by the factor that is stated."""
+    """Errors of calibrations, not their forecast: rms principal-point error smaller by the factor
+    that is stated.
+    """
     found = choose_frames(camera(), sky(), n_frames=30, candidates=3000, seed=1)
     errors = {"chosen": [], "random": []}
     for seed in range(150):
         for name, options in (("chosen", {"attitudes": found.rotations}), ("random", {})):
-            obs = sc.simulate(sky(), camera(), n_frames=30, min_stars=10, seed=1000 + seed, **options)
+            obs = sc.simulate(
+                sky(), camera(), n_frames=30, min_stars=10, seed=1000 + seed, **options
+            )
             errors[name].append(sc.calibrate(obs, camera()).theta[:2] - camera().theta[:2])
     rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in errors.items()}
     stated = found.factor("x0_px")[0]

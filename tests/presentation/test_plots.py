@@ -1,4 +1,6 @@
-"""The figures show the numbers they are made from, in every model, legibly, and leave no trace in the process."""
+"""The figures show the numbers they are made from, in every model, legibly, and leave no trace in
+the process.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(scope="module", params=["brown", "none", "brown_tangential"])
 def run(request):
-    """A run per distortion model; the noise of the one without coefficients is given and not sampled."""
+    """A run per distortion model; the noise of the one without coefficients is given and not
+    sampled.
+    """
     truth = camera(request.param)
     obs = observations(request.param, n_frames=60)
     cal = sc.calibrate(obs, nominal(truth))
@@ -94,10 +98,14 @@ def overlapping(figure):
             shown = [
                 tick.label1
                 for tick in axis.get_major_ticks()
-                if tick.label1.get_visible() and tick.label1.get_text() and low <= tick.get_loc() <= high
+                if tick.label1.get_visible()
+                and tick.label1.get_text()
+                and low <= tick.get_loc() <= high
             ]
             boxes = [(label.get_text(), label.get_window_extent()) for label in shown]
-            pairs += [(a[0], b[0]) for a, b in itertools.combinations(boxes, 2) if a[1].overlaps(b[1])]
+            pairs += [
+                (a[0], b[0]) for a, b in itertools.combinations(boxes, 2) if a[1].overlaps(b[1])
+            ]
     return pairs
 
 
@@ -106,7 +114,9 @@ def test_corner_shows_every_sampled_parameter(run):
     n = len(run.post.sampled)
     assert len(figure.axes) == n * (n + 1) // 2
     titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
-    assert [title.split(" ")[0] for title in titles] == [symbol(run.post.parameters[i].name) for i in run.post.sampled]
+    assert [title.split(" ")[0] for title in titles] == [
+        symbol(run.post.parameters[i].name) for i in run.post.sampled
+    ]
     assert overlapping(figure) == []
 
 
@@ -119,7 +129,12 @@ def test_labels_of_neighbouring_panels_do_not_touch(half):
         ax.set_xlim(-half, half)
         sparse(ax, y=False)
     figure.draw_without_rendering()
-    labels = [label for ax in figure.axes for label in ax.get_xticklabels() if abs(label.get_position()[0]) <= half]
+    labels = [
+        label
+        for ax in figure.axes
+        for label in ax.get_xticklabels()
+        if abs(label.get_position()[0]) <= half
+    ]
     assert len(labels) >= 12
     boxes = [label.get_window_extent() for label in labels]
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
@@ -241,7 +256,9 @@ def test_attitude_bars_are_with_the_misfit_found_and_lines_if_the_model_holds(er
     found = MisfitFound(2.0, np.array([3.0, 0.0, 0.0]), np.array([0.5, 0.1, 0.0]))
     ax = plot_attitude(dataclasses.replace(attitude, misfit=found))
     bars = np.array([bar.get_height() for bar in ax.patches])
-    assert bars[3] == pytest.approx(np.hypot(2.0 * 5.4, 3.0)) and bars[6] == pytest.approx(np.hypot(0.04, 0.5))
+    assert bars[3] == pytest.approx(np.hypot(2.0 * 5.4, 3.0)) and bars[6] == pytest.approx(
+        np.hypot(0.04, 0.5)
+    )
     lines = [line.get_ydata()[0] for line in ax.lines]
     assert lines == pytest.approx([0.5, 0.5, 7.0, 5.4, 5.5, 0.1, 0.02, 0.02, 0.2])
     drawn(ax)
@@ -253,7 +270,8 @@ def test_field_map_has_a_colour_bar_for_each_panel(errors):
     assert len(figure.axes) == 4
     assert figure.axes[0].get_ylim()[0] > figure.axes[0].get_ylim()[1]
     assert overlapping(figure) == []
-    # The compensated map spans a factor of fifty: levels in equal ratios, printed without powers of ten.
+    # The compensated map spans a factor of fifty: levels in equal ratios, printed without powers of
+    # ten.
     bar = figure.axes[3]
     assert bar.get_yscale() == "log"
     assert "0.01" in [label.get_text() for label in bar.get_yticklabels()]
@@ -308,6 +326,11 @@ def test_the_gallery_has_every_figure(monkeypatch):
     from gallery_figures import SCENES
 
     tables = (views.VIEWS, paper.VIEWS)
-    figures = {f"{cls.__name__}.{name}" for table in tables for cls, view in table.items() for name in view.figures}
+    figures = {
+        f"{cls.__name__}.{name}"
+        for table in tables
+        for cls, view in table.items()
+        for name in view.figures
+    }
     shown = [name for scene in SCENES for name in scene.figures]
     assert (set(shown), len(shown)) == (figures, len(figures))

@@ -1,4 +1,6 @@
-"""The report of a run: complete, self-contained, honest about what is missing, and written all or nothing."""
+"""The report of a run: complete, self-contained, honest about what is missing, and written all or
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -134,13 +136,24 @@ def test_one_file_without_network_or_script(full):
 def test_first_page_says_what_can_be_used_and_the_rest_is_folded(full):
     text = full.report.read_text(encoding="utf-8")
     first, rest = text.split('id="appendix"')
-    for words_of in ("Can be used", "Not, or with care", "Common rotation", "Frame-dependent rest", "Estimate ± σ"):
+    for words_of in (
+        "Can be used",
+        "Not, or with care",
+        "Common rotation",
+        "Frame-dependent rest",
+        "Estimate ± σ",
+    ):
         assert words_of in first and "<details" not in first
     assert rest.count('<details class="part">') == len(SECTIONS)
     # Unfolded on paper, where no script runs.
-    assert "details::details-content { content-visibility: visible" in text and "prefers-color-scheme: dark" in text
+    assert (
+        "details::details-content { content-visibility: visible" in text
+        and "prefers-color-scheme: dark" in text
+    )
     paragraph = rest[rest.index("<blockquote") : rest.index("</blockquote>")]
-    assert "emcee" in paragraph and "100 kept steps, seed 1" in paragraph and "starcal_uq" in paragraph
+    assert (
+        "emcee" in paragraph and "100 kept steps, seed 1" in paragraph and "starcal_uq" in paragraph
+    )
 
 
 def test_summary_fits_80_columns_and_its_commands_can_be_put_together(full):
@@ -168,11 +181,15 @@ def test_without_a_browser_a_pdf_takes_one_sentence(run, monkeypatch, tmp_path):
     made = sc.report(run.path)
     monkeypatch.setattr(printing, "browsers", lambda: iter(()))
     monkeypatch.setitem(sys.modules, "weasyprint", None)
-    with pytest.raises(sc.errors.MissingExtraError, match="install Chromium, Chrome or Edge, or `pip install weasy"):
+    with pytest.raises(
+        sc.errors.MissingExtraError, match="install Chromium, Chrome or Edge, or `pip install weasy"
+    ):
         sc.report(run.path, format="pdf")
     broken, good = tmp_path / "broken", tmp_path / "good"
     broken.write_text("#!/bin/sh\nexit 3\n")
-    good.write_text('#!/bin/sh\nfor a; do case "$a" in --print-to-pdf=*) echo %PDF > "${a#*=}";; esac; done\n')
+    good.write_text(
+        '#!/bin/sh\nfor a; do case "$a" in --print-to-pdf=*) echo %PDF > "${a#*=}";; esac; done\n'
+    )
     for script in (broken, good):
         script.chmod(0o755)
     monkeypatch.setattr(printing, "browsers", lambda: iter([str(broken)]))
@@ -205,7 +222,11 @@ def test_figures_are_files_too(full):
 
 def test_verdict_comes_first_in_words(full):
     text = page(full).text
-    assert text.index("every check passed") < text.index("stars in 60 frames") < text.index("95 % interval")
+    assert (
+        text.index("every check passed")
+        < text.index("stars in 60 frames")
+        < text.index("95 % interval")
+    )
     for question in ("Did it converge?", "Can it be trusted?", "What limits it?"):
         assert question in text
 
@@ -215,9 +236,9 @@ def test_parameters_are_those_of_the_posterior(full):
     rows = parameter_rows(results)
     assert len(rows) == 7
     post = results.posterior
-    assert [float(row["estimate"].replace("−", "-")) for row in rows if row["unit"] != "mm"] == pytest.approx(
-        post.draws.mean(axis=0) / np.array([1, 1, 1, 1e-10, 1e-15, 1]), abs=0.5
-    )
+    assert [
+        float(row["estimate"].replace("−", "-")) for row in rows if row["unit"] != "mm"
+    ] == pytest.approx(post.draws.mean(axis=0) / np.array([1, 1, 1, 1e-10, 1e-15, 1]), abs=0.5)
     focal = rows[3]
     assert float(focal["estimate"]) == pytest.approx(results.posterior.mean[2] * 0.012, abs=1e-3)
     assert focal["truth"] == "70.2262"
@@ -266,7 +287,15 @@ def test_without_posterior_the_report_says_which_command_makes_it(run, unpainted
     found = page(run)
     assert f"starcal-uq sample {run.path}" in found.text
     assert f"starcal-uq propagate {run.path}" in found.text
-    assert found.ids >= {"parameters", "coupling", "residuals", "convergence", "checks", "method", "provenance"}
+    assert found.ids >= {
+        "parameters",
+        "coupling",
+        "residuals",
+        "convergence",
+        "checks",
+        "method",
+        "provenance",
+    }
     assert not found.ids & {"attitude", "posterior", "diagnostics"}
     assert {link.removeprefix("#") for link in found.links} <= found.ids
     assert "not been sampled" in found.text
@@ -290,7 +319,9 @@ def test_misfit_section_shows_tests_jackknife_models_and_replicates(full):
 
 def test_without_diagnosis_or_with_that_of_another_estimate_the_command_is_named(unrecorded):
     text = unrecorded.diagnosis.read_text(encoding="utf-8")
-    unrecorded.diagnosis.write_text(text.replace('"theta": [\n  5', '"theta": [\n  6'), encoding="utf-8")
+    unrecorded.diagnosis.write_text(
+        text.replace('"theta": [\n  5', '"theta": [\n  6'), encoding="utf-8"
+    )
     for _ in range(2):
         found = words(unrecorded)
         assert f"starcal-uq diagnose {unrecorded.path}" in found
@@ -302,7 +333,9 @@ def test_undeclared_directions_are_warned_of_before_any_table(unrecorded):
     obs = sc.load_observations(unrecorded.observations)
     obs.with_meta(directions="undeclared").save(unrecorded.observations, force=True)
     text = words(unrecorded)
-    assert text.index("Neither time nor observer velocity was declared") < text.index("95 % interval")
+    assert text.index("Neither time nor observer velocity was declared") < text.index(
+        "95 % interval"
+    )
     assert "not declared as apparent" in text
 
 
@@ -320,7 +353,9 @@ def test_a_failed_check_turns_the_verdict_red(full):
     results = sc.Run(full.path).results
     diagnostics = dataclasses.replace(results.posterior.diagnostics, rhat=np.full(6, 1.2))
     post = dataclasses.replace(results.posterior, diagnostics=diagnostics)
-    post = dataclasses.replace(post, diagnostics=dataclasses.replace(diagnostics, checks=check_draws(post)))
+    post = dataclasses.replace(
+        post, diagnostics=dataclasses.replace(diagnostics, checks=check_draws(post))
+    )
     results = dataclasses.replace(results, posterior=post)
     text = render(results, {})
     assert "Do not use these numbers: R-hat failed." in Page(text).text
@@ -341,7 +376,9 @@ def test_names_from_outside_are_text_and_not_markup(full):
 def test_mixed_runs_are_refused_and_nothing_is_touched(run):
     before = run.report.read_bytes()
     observations(n_frames=60, seed=4).save(run.observations, force=True)
-    with pytest.raises(sc.errors.RunFolderError, match="parquet: is not the file that this run has written"):
+    with pytest.raises(
+        sc.errors.RunFolderError, match="parquet: is not the file that this run has written"
+    ):
         sc.Run(run.path).report(force=True)
     (run.path / "run.json").unlink()
     with pytest.raises(sc.errors.RunFolderError, match="other observations"):
@@ -352,7 +389,9 @@ def test_mixed_runs_are_refused_and_nothing_is_touched(run):
 def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
-    monkeypatch.setattr("starcal_uq.presentation.report.drawing.draw_figures", lambda *_: {"corner": b"new"})
+    monkeypatch.setattr(
+        "starcal_uq.presentation.report.drawing.draw_figures", lambda *_: {"corner": b"new"}
+    )
     monkeypatch.setattr("starcal_uq.presentation.report.page.prepared", lambda *_: lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         sc.Run(run.path).report(force=True)
@@ -376,7 +415,8 @@ def test_a_report_takes_figures_that_are_drawn(run, monkeypatch):
     asked = []
     ahead = (run.figures / "convergence.svg").read_bytes()
     monkeypatch.setattr(
-        "starcal_uq.presentation.report.drawing.draw_figures", lambda _, names, *rest: asked.extend(names) or {}
+        "starcal_uq.presentation.report.drawing.draw_figures",
+        lambda _, names, *rest: asked.extend(names) or {},
     )
     sc.Run(run.path).report(lambda: {"corner": ahead}, force=True)
     assert sorted([*asked, "corner"]) == sorted(FIGURES)
@@ -390,7 +430,9 @@ def test_no_calibration_no_report(tmp_path):
 
 @pytest.mark.parametrize("model", ["none", "brown_tangential", "inverse"])
 def test_every_model_and_a_given_noise(model, tmp_path):
-    """Nothing is written for five parameters: without coefficients, with four, and in the other direction."""
+    """Nothing is written for five parameters: without coefficients, with four, and in the other
+    direction.
+    """
     truth = camera(model)
     obs = observations(model, n_frames=60)
     run = sc.runs.RunFolder(tmp_path / "run").create()
@@ -405,7 +447,9 @@ def test_every_model_and_a_given_noise(model, tmp_path):
 
 
 def test_real_data(real_data, tmp_path):
-    """Centroids of a real camera: noise and optics as known, and the warning on undeclared directions."""
+    """Centroids of a real camera: noise and optics as known, and the warning on undeclared
+    directions.
+    """
     start = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
     obs = sc.load_observations(real_data / "esa_tetra3_observations.csv", start)
     run = sc.runs.RunFolder(tmp_path / "run").create()
@@ -419,9 +463,13 @@ def test_real_data(real_data, tmp_path):
 
 
 def both_figures(error) -> dict[str, list[str]]:
-    """What every place must say of the rest of the calibration, pitch, yaw and roll, by its two names."""
+    """What every place must say of the rest of the calibration, pitch, yaw and roll, by its two
+    names.
+    """
     return {
-        "with the misfit found": [significant(float(v)) for v in error.with_misfit_found_arcsec[2, :3]],
+        "with the misfit found": [
+            significant(float(v)) for v in error.with_misfit_found_arcsec[2, :3]
+        ],
         "if the model holds": [significant(float(v)) for v in error.if_model_holds_arcsec[2, :3]],
     }
 
@@ -435,10 +483,17 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
     from starcal_uq.presentation.words.budgeting import contributors_table
 
     opened = sc.Run(run.path)
-    names = {"with the misfit found": "with_misfit_found_arcsec", "if the model holds": "if_model_holds_arcsec"}
+    names = {
+        "with the misfit found": "with_misfit_found_arcsec",
+        "if the model holds": "if_model_holds_arcsec",
+    }
 
     def of_rows(rows, contributor: str) -> dict[str, list[str]]:
-        mine = {row["axis"]: row for row in rows if contributor in (row.get("contributor"), row.get("name"))}
+        mine = {
+            row["axis"]: row
+            for row in rows
+            if contributor in (row.get("contributor"), row.get("name"))
+        }
         return {
             name: [significant(float(mine[axis][column])) for axis in ("pitch", "yaw", "roll")]
             for name, column in names.items()
@@ -446,7 +501,10 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
 
     def of_text(text: str) -> dict[str, list[str]]:
         after = text[text.lower().index("calibration, rest") :]
-        return {name: re.findall(r"[0-9.]+(?:×10\S+)?", after[after.index(name) + len(name) :])[:3] for name in names}
+        return {
+            name: re.findall(r"[0-9.]+(?:×10\S+)?", after[after.index(name) + len(name) :])[:3]
+            for name in names
+        }
 
     rest, found = "calibration, rest", {}
     with open(run.attitude, encoding="utf-8") as file:
@@ -459,7 +517,9 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
     results = {"run": run.path, "attitude": opened.attitude, "spectrum": None}
     found["JSON"] = of_rows(document("propagate", results, 0)["attitude"]["contributors"], rest)
     results = {"run": run.path, "files": [], "template": None, "budget": opened.error_budget}
-    found["JSON of the budget"] = of_rows(document("budget", results, 0)["budget"]["contributors"], rest)
+    found["JSON of the budget"] = of_rows(
+        document("budget", results, 0)["budget"]["contributors"], rest
+    )
     out.width = 150
     show_attitude(opened.attitude)
     found["terminal"] = of_text(capsys.readouterr().out)
@@ -471,7 +531,9 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
     found["notebook, budget"] = of_text(Page(opened.error_budget._repr_html_()).text.lower())
     cells = contributors_table(opened.error_budget).rows
     place = next(i for i, row in enumerate(cells) if row[0] == rest)
-    found["terminal, budget"] = {row[0].strip(): list(row[2:5]) for row in cells[place + 1 : place + 3]}
+    found["terminal, budget"] = {
+        row[0].strip(): list(row[2:5]) for row in cells[place + 1 : place + 3]
+    }
     bars = [text.get_text().removesuffix("″") for text in opened.attitude.plot.contributors().texts]
     figure = {
         "with the misfit found": bars[6:9],
@@ -479,9 +541,13 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
     }
     found["figure"] = figure
     # The card and the sentences say it across the boresight.
-    across = opened.attitude.with_misfit_found_arcsec[2, 3], opened.attitude.if_model_holds_arcsec[2, 3]
+    across = (
+        opened.attitude.with_misfit_found_arcsec[2, 3],
+        opened.attitude.if_model_holds_arcsec[2, 3],
+    )
     words = (
-        f"{significant(float(across[0]))} arcsec with the misfit found ({significant(float(across[1]))} if the model"
+        f"{significant(float(across[0]))} arcsec with the misfit found "
+        f"({significant(float(across[1]))} if the model"
     )
     assert html.count(words) == 3 and words in opened.attitude.text
     return found
@@ -489,7 +555,9 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
 
 @pytest.mark.usefixtures("unpainted")
 def test_every_place_shows_the_same_two_figures_under_the_same_two_names(unrecorded, capsys):
-    found = MisfitFound(1.3, np.array([0.7, 0.3, 0.02]), np.array([0.52, 0.41, 7.3]), ("test",), ("test",))
+    found = MisfitFound(
+        1.3, np.array([0.7, 0.3, 0.02]), np.array([0.52, 0.41, 7.3]), ("test",), ("test",)
+    )
     error = dataclasses.replace(AttitudeError.load(unrecorded.attitude), misfit=found)
     error.save(unrecorded.attitude)
     sc.Run(unrecorded.path).budget()
@@ -499,11 +567,17 @@ def test_every_place_shows_the_same_two_figures_under_the_same_two_names(unrecor
     assert len(places) == 11
     assert {place: figures for place, figures in places.items() if figures != wanted} == {}
     # Control: one source that has its own idea is noticed.
-    other = dataclasses.replace(error, misfit=dataclasses.replace(found, rest_arcsec=2.0 * found.rest_arcsec))
+    other = dataclasses.replace(
+        error, misfit=dataclasses.replace(found, rest_arcsec=2.0 * found.rest_arcsec)
+    )
     forget = (unrecorded.path / "run.json").unlink
     forget()
     other.save(unrecorded.attitude)
-    differing = {place for place, figures in stated_everywhere(unrecorded, capsys).items() if figures != wanted}
+    differing = {
+        place
+        for place, figures in stated_everywhere(unrecorded, capsys).items()
+        if figures != wanted
+    }
     assert "attitude.csv" in differing and "budget.csv" not in differing
     # Never equal to the first by silence.
     forget(missing_ok=True)
@@ -522,12 +596,17 @@ def test_every_place_shows_the_same_two_figures_under_the_same_two_names(unrecor
     assert "misfit of the camera model" in opened.error_budget.not_assessed
 
 
-def test_the_first_page_on_paper_names_failures_before_warnings_and_leaves_commands_to_the_appendix(full):
+def test_the_first_page_on_paper_names_failures_before_warnings_and_leaves_commands_to_the_appendix(
+    full,
+):
     first, rest = full.report.read_text(encoding="utf-8").split('id="appendix"')
     levels = re.findall(r'<div class="note (fail|warning)', first)
     assert levels == sorted(levels) and first.count('<p class="paper">') == bool(levels)
     # In the appendix every command stands with its check; the first page hides them on paper.
-    assert rest.count('class="try"') == first.count('class="try"') and "#summary .try, #summary .later" in first
+    assert (
+        rest.count('class="try"') == first.count('class="try"')
+        and "#summary .try, #summary .later" in first
+    )
     table = rest[rest.index('<table class="checks">') :]
     found = re.findall(r'<tr><td class="key">.*?<span class="badge (\w+)', table)
     assert found == sorted(found, key=["fail", "warning", "pass"].index)
@@ -539,7 +618,15 @@ def test_a_table_that_just_fits_the_terminal_keeps_its_last_column(monkeypatch, 
     from starcal_uq.cli import console
     from starcal_uq.presentation.tables import TextTable
 
-    heads = ("quantity", "unit", "coverage 95", "coverage low", "coverage high", "coverage p", "rank p")
+    heads = (
+        "quantity",
+        "unit",
+        "coverage 95",
+        "coverage low",
+        "coverage high",
+        "coverage p",
+        "rank p",
+    )
     row = ("log_likelihood", "arcsec", "0.945", "0.904", "0.972", "0.744", "0.0231")
     monkeypatch.setattr(console, "out", Console(width=80))
     console.print_table(TextTable(heads, (row,)))

@@ -1,4 +1,6 @@
-"""Coupling studies: sentences against studies whose answer is known, figures that draw, a page that holds together."""
+"""Coupling studies: sentences against studies whose answer is known, figures that draw, a page that
+holds together.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ from starcal_uq.core.display import view_of
 from starcal_uq.presentation.figures.style import figure_of, png_bytes
 from starcal_uq.presentation.pages.studies import render_study
 from starcal_uq.presentation.pages.write import write_page
-from starcal_uq.presentation.words.studies import study_answer, study_limits, study_table, study_text
+from starcal_uq.presentation.words.studies import (
+    study_answer,
+    study_limits,
+    study_table,
+    study_text,
+)
 from starcal_uq.presentation.words.study_advice import study_advice
 from starcal_uq.studies.result import Study
 from tests.helpers.studies import NAMES, made_study
@@ -25,24 +32,35 @@ COUPLING = dict(zip(FIELDS, (-0.97, -0.8, -0.3), strict=True))
 
 @pytest.fixture(scope="module")
 def decoupled() -> Study:
-    """The field decouples f and k1, frames do not; the error falls as one over the root of frames."""
+    """The field decouples f and k1, frames do not; the error falls as one over the root of
+    frames.
+    """
     return made_study(
         {"fov_deg": FIELDS, "frames": FRAMES},
         lambda cell: {("f", "k1"): COUPLING[cell["fov_deg"]]},
         size=lambda cell: (8.0 if cell["fov_deg"] == 20.0 else 10.0) / np.sqrt(cell["frames"]),
-        failing=lambda cell: "too few stars." if cell["fov_deg"] == 5.0 and cell["frames"] == 10 else "ok",
+        failing=lambda cell: (
+            "too few stars." if cell["fov_deg"] == 5.0 and cell["frames"] == 10 else "ok"
+        ),
     )
 
 
 def test_the_axis_that_decouples_is_named_with_its_numbers(decoupled: Study) -> None:
     text = study_text(decoupled)
     assert text.startswith("f and k1 are coupled most (correlation −0.97 to −0.30")
-    assert "The field of view changes how f–k1 are coupled: from 0.97 with a field of 5° to 0.30" in text
+    assert (
+        "The field of view changes how f–k1 are coupled: from 0.97 with a field of 5° to 0.30"
+        in text
+    )
     answer = " ".join(study_answer(decoupled))
     assert "The number of frames does little to the couplings" in answer
-    assert "The weakest direction turns with the field of view: f against k1 from a field of 5° to 10" in answer
     assert (
-        "(proportional to its power −0.50)" in answer and "The target of 0.5 arcsec is met in 3 of 8 places: " in answer
+        "The weakest direction turns with the field of view: f against k1 from a field of 5° to 10"
+        in answer
+    )
+    assert (
+        "(proportional to its power −0.50)" in answer
+        and "The target of 0.5 arcsec is met in 3 of 8 places: " in answer
     )
     assert "from 1000 frames on" in answer
     assert "The target of 0.050 px for f is met in 3 of 8 places: from 1000 frames on" in answer
@@ -58,20 +76,31 @@ def test_nothing_is_claimed_where_nothing_couples() -> None:
     rng = np.random.default_rng(3)
     study = made_study(
         {"fov_deg": FIELDS, "frames": FRAMES},
-        lambda cell: {(a, b): 0.1 * rng.normal() for i, a in enumerate(NAMES) for b in NAMES[i + 1 :]},
+        lambda cell: {
+            (a, b): 0.1 * rng.normal() for i, a in enumerate(NAMES) for b in NAMES[i + 1 :]
+        },
         bias_arcsec=lambda cell: 9.0,
     )
-    assert study_text(study).startswith("No pair of parameters is coupled: the largest correlation anywhere is ")
+    assert study_text(study).startswith(
+        "No pair of parameters is coupled: the largest correlation anywhere is "
+    )
     told = " ".join([*study_answer(study), *study_advice(study)])
     assert "decouple" not in told and "apart" not in told and "coupled most" not in told
     assert "No combination of parameters is much worse determined" in told
-    assert "whatever field of view and number of frames may be" in told and "The model none would do nowhere" in told
+    assert (
+        "whatever field of view and number of frames may be" in told
+        and "The model none would do nowhere" in told
+    )
 
 
 def test_a_coupling_that_only_seeds_change_has_no_remedy() -> None:
     """Other seeds move the correlation as much as the axis seems to: no axis may be named."""
-    study = made_study({"fov_deg": FIELDS, "frames": FRAMES}, lambda cell: {("f", "k1"): -0.9}, jitter=0.03)
-    assert "Nothing that was varied (field of view and number of frames) decouples" in study_text(study)
+    study = made_study(
+        {"fov_deg": FIELDS, "frames": FRAMES}, lambda cell: {("f", "k1"): -0.9}, jitter=0.03
+    )
+    assert "Nothing that was varied (field of view and number of frames) decouples" in study_text(
+        study
+    )
     assert "Do not expect f–k1 to come apart" in " ".join(study_advice(study))
 
 
@@ -85,7 +114,9 @@ def test_coverage_is_judged_with_its_bounds() -> None:
 
 
 def test_figures_draw(decoupled: Study) -> None:
-    simulated = made_study({"pointing": ("random", "stare")}, lambda cell: {("f", "k1"): -0.9}, covered=0.95)
+    simulated = made_study(
+        {"pointing": ("random", "stare")}, lambda cell: {("f", "k1"): -0.9}, covered=0.95
+    )
     # The page draws the others, each once.
     for study, names in (
         (decoupled, {"map", "matrices", "inflation"}),
@@ -97,10 +128,14 @@ def test_figures_draw(decoupled: Study) -> None:
             figure = drawn if isinstance(drawn, Figure) else figure_of(drawn)
             assert png_bytes(figure, dpi=30).startswith(b"\x89PNG")
     many = {"fov_deg": tuple(range(5, 15)), "frames": tuple(range(100, 1000, 100))}
-    wide = made_study(many, lambda cell: {}, size=lambda cell: 1.0 / np.sqrt(cell["frames"]), seeds=1)
+    wide = made_study(
+        many, lambda cell: {}, size=lambda cell: 1.0 / np.sqrt(cell["frames"]), seeds=1
+    )
     contours = [artist for artist in wide.plot.map().collections if isinstance(artist, ContourSet)]
     assert len(contours) == 1 and len(contours[0].levels) >= 3
-    assert "0.00" in wide.plot.map("correlation", parameter="f", parameter_2="k1").texts[0].get_text()
+    assert (
+        "0.00" in wide.plot.map("correlation", parameter="f", parameter_2="k1").texts[0].get_text()
+    )
     lines = decoupled.plot.correlation([("f", "k1")]).axes[0].get_lines()
     np.testing.assert_allclose(lines[1].get_ydata(), [0.97, 0.8, 0.3], atol=0.003)
     with pytest.raises(ValueError, match='mode = "simulate"'):
@@ -111,10 +146,16 @@ def test_figures_draw(decoupled: Study) -> None:
 
 def test_page_holds_answer_advice_and_provenance(decoupled: Study, tmp_path: Path) -> None:
     page = write_page(decoupled, tmp_path / "study").read_text("utf-8")
-    assert len(page) < 2_000_000 and "A study &lt;made&gt; by hand" in page and "<script" not in page
+    assert (
+        len(page) < 2_000_000 and "A study &lt;made&gt; by hand" in page and "<script" not in page
+    )
     for words in (study_text(decoupled), "go to a field of 20°", "too few stars", "study: seeds"):
         assert words in page
-    assert len(list((tmp_path / "study" / "figures").glob("*.svg"))) == page.count("data:image/svg") == 7
+    assert (
+        len(list((tmp_path / "study" / "figures").glob("*.svg")))
+        == page.count("data:image/svg")
+        == 7
+    )
     table = study_table(decoupled)
     assert table is not None and len(table.rows) == 6 and "1000" in [row[1] for row in table.rows]
 

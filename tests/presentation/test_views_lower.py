@@ -21,7 +21,9 @@ from starcal_uq.presentation.views import VIEWS
 @pytest.fixture(scope="module")
 def paper_calibration() -> sc.Calibration:
     stars = sc.load_catalogue(max_mag=6.0)
-    return sc.calibrate(sc.simulate(stars, sc.paper.paper_camera(), n_frames=20, seed=1), sc.paper.paper_start())
+    return sc.calibrate(
+        sc.simulate(stars, sc.paper.paper_camera(), n_frames=20, seed=1), sc.paper.paper_start()
+    )
 
 
 def results(cal: sc.Calibration) -> list[Shown]:
@@ -82,11 +84,22 @@ def test_what_nobody_shows_says_so() -> None:
 
 def test_no_module_below_writes_html() -> None:
     """Pages and tables are composed above the results."""
-    wings = ("attitude", "camera", "observations", "sky", "images", "identification", "pipeline", "estimation")
+    wings = (
+        "attitude",
+        "camera",
+        "observations",
+        "sky",
+        "images",
+        "identification",
+        "pipeline",
+        "estimation",
+    )
     root = Path(sc.__file__).parent
     for path in (path for wing in (*wings, "inference") for path in (root / wing).rglob("*.py")):
         text = path.read_text(encoding="utf-8")
-        assert not any(mark in text for mark in ("<table", "<p>", "_repr_html_", "presentation")), path
+        assert not any(mark in text for mark in ("<table", "<p>", "_repr_html_", "presentation")), (
+            path
+        )
 
 
 def test_at_the_prompt_a_result_fits_the_screen(paper_calibration: sc.Calibration) -> None:

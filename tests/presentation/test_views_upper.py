@@ -1,4 +1,6 @@
-"""Every result of propagation, diagnostics, comparison, planning and budgeting can draw, tell and lay itself out."""
+"""Every result of propagation, diagnostics, comparison, planning and budgeting can draw, tell and
+lay itself out.
+"""
 
 from __future__ import annotations
 
@@ -102,18 +104,29 @@ def results() -> dict[type, Any]:
     error = sc.propagate(post, obs, n_draws=50)
     slewing = sc.simulation.profile_frames(stars, camera(), slew(60, 1.0, rate_deg_s=0.5))
     asked = Requirement("R-1", "cross-boresight", 1.0, 0.997)
-    budget = sc.budget(post, obs, error, file=sc.budgeting.BudgetFile(requirements=(asked,)), n_samples=20_000)
-    plan = sc.plan(camera(), stars, n_frames=(10, 30), target_arcsec=20.0, n_geometries=100, n_campaigns=20)
+    budget = sc.budget(
+        post, obs, error, file=sc.budgeting.BudgetFile(requirements=(asked,)), n_samples=20_000
+    )
+    plan = sc.plan(
+        camera(), stars, n_frames=(10, 30), target_arcsec=20.0, n_geometries=100, n_campaigns=20
+    )
     diagnosis = sc.diagnose(obs, cal, models=("k1", "brown"), n_starts=0)
     made = [
         *(error, error.agreement, sc.coupling(cal), sc.propagation.field_map(post, obs, 9)),
-        *(sc.propagation.distortion_curve(post, obs, n=11, n_draws=50), validation(), plan, plan.needs[0]),
+        *(
+            sc.propagation.distortion_curve(post, obs, n=11, n_draws=50),
+            validation(),
+            plan,
+            plan.needs[0],
+        ),
         sc.propagation.error_spectrum(post, slewing, n_draws=5),
         *(diagnosis, diagnosis.misfit, diagnosis.jackknife, diagnosis.stars, judge(obs, cal)),
         *(diagnosis.comparison, diagnosis.predictive),
         sc.comparison.compare_halves(obs, nominal(camera())),
         sc.planning.choose_frames(camera(), stars, n_frames=5, candidates=100, n_geometries=100),
-        sc.planning.check_forecast(camera(), stars, n_frames=(5, 10), n_campaigns=2, n_geometries=100, workers=0),
+        sc.planning.check_forecast(
+            camera(), stars, n_frames=(5, 10), n_campaigns=2, n_geometries=100, workers=0
+        ),
         *(budget, budget.outcomes[0]),
     ]
     return {type(result): result for result in made}

@@ -1,4 +1,6 @@
-"""What alignment removes: against a star sensor of a second make that aligns on some frames and flies on others."""
+"""What alignment removes: against a star sensor of a second make that aligns on some frames and
+flies on others.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from starcal_uq.propagation.propagate import propagate
 
 ARCSEC = 648_000.0 / np.pi
 THETA = np.array([500.0, 530.0, 5800.0, 2.0e-10, -3.5e-15])
-# Standard deviations and one strong correlation: the principal point is loose, the focal length coarse.
+# Standard deviations and one strong correlation: the principal point is loose, the focal length
+# coarse.
 SIGMA = np.array([0.3, 0.3, 0.6, 1.0e-10, 2.0e-16])
 NOISE_PX = 0.05
 
@@ -31,7 +34,10 @@ class Draws:
         self.theta_draws = THETA + SIGMA * rng.standard_normal((n, 5))
         self.sigma_draws = np.full(n, NOISE_PX)
         self.draws = np.column_stack((self.theta_draws, self.sigma_draws))
-        self.mean, self.covariance = self.theta_draws.mean(axis=0), np.cov(self.theta_draws, rowvar=False)
+        self.mean, self.covariance = (
+            self.theta_draws.mean(axis=0),
+            np.cov(self.theta_draws, rowvar=False),
+        )
         self.sigma_name = "sigma"
         self.provenance: dict[str, str] = {}
         self.star_error_px = 0.0
@@ -73,7 +79,9 @@ def directions(theta: np.ndarray, xy: np.ndarray) -> np.ndarray:
 
 
 def turn(theta: np.ndarray, xy: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Left rotation vector (3,) arcsec of the best attitude, by singular values, from that of the true directions."""
+    """Left rotation vector (3,) arcsec of the best attitude, by singular values, from that of the
+    true directions.
+    """
     u, _, vt = np.linalg.svd(directions(theta, xy).T @ true)
     r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     return 0.5 * ARCSEC * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
@@ -85,7 +93,9 @@ def skies(rng: np.random.Generator, n_frames: int, stars: int = 12) -> list[np.n
 
 def slew(rng: np.random.Generator, n_frames: int) -> list[np.ndarray]:
     """Stars that move along x, 100 px a frame."""
-    stars = np.column_stack((rng.uniform(0.0, 1023.0 + 100.0 * n_frames, 24), rng.uniform(0.0, 1023.0, 24)))
+    stars = np.column_stack(
+        (rng.uniform(0.0, 1023.0 + 100.0 * n_frames, 24), rng.uniform(0.0, 1023.0, 24))
+    )
     frames = []
     for k in range(n_frames):
         xy = stars - [100.0 * k, 0.0]
@@ -94,9 +104,15 @@ def slew(rng: np.random.Generator, n_frames: int) -> list[np.ndarray]:
 
 
 def flown(
-    align: list[np.ndarray], mission: list[np.ndarray], thetas: np.ndarray, n_noise: int, *, old: bool = False
+    align: list[np.ndarray],
+    mission: list[np.ndarray],
+    thetas: np.ndarray,
+    n_noise: int,
+    *,
+    old: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Root mean squares (3,) arcsec: what alignment removes, what it leaves of the camera, and its own noise.
+    """Root mean squares (3,) arcsec: what alignment removes, what it leaves of the camera, and its
+    own noise.
 
     Attitudes of the alignment are weighted by the inverse of their covariance from noise.
     """
@@ -200,23 +216,32 @@ def test_a_random_sky_is_uniform_on_the_sphere_and_off_folded_places() -> None:
     wide = copy(POST)
     wide.mean = np.array([511.5, 511.5, 600.0, 0.0, 0.0])
     wide.draws = np.tile(np.append(wide.mean, NOISE_PX), (20, 1))
-    like = replace(table([np.full((n, 2), 500.0) for n in (5, 11)]), sigma_px=np.arange(1.0, 17.0), mag=np.arange(16.0))
+    like = replace(
+        table([np.full((n, 2), 500.0) for n in (5, 11)]),
+        sigma_px=np.arange(1.0, 17.0),
+        mag=np.arange(16.0),
+    )
     sky = random_sky(wide, like, 600, seed=1)  # type: ignore[arg-type]
     b = np.column_stack((sky.xy - 511.5, np.full(len(sky), 600.0)))
-    np.testing.assert_allclose(sky.directions_icrs, b / np.linalg.norm(b, axis=1)[:, None], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        sky.directions_icrs, b / np.linalg.norm(b, axis=1)[:, None], rtol=0, atol=1e-12
+    )
     # A pixel of a pinhole camera covers a solid angle in proportion to cos^3.
     x, y = np.meshgrid(*[np.arange(1023.0) - 511.0] * 2)
     r2 = x**2 + y**2
     weight = (1.0 + r2 / 600.0**2) ** -1.5
     seen = np.sum((sky.xy - 511.5) ** 2, axis=1)
     assert abs(seen.mean() - np.average(r2, weights=weight)) < 4.0 * seen.std() / np.sqrt(len(sky))
-    assert np.average(r2) - seen.mean() > 20.0 * seen.std() / np.sqrt(len(sky))  # the control: uniform in pixels
+    assert np.average(r2) - seen.mean() > 20.0 * seen.std() / np.sqrt(
+        len(sky)
+    )  # the control: uniform in pixels
     assert np.all(sky.xy.min(axis=0) < 1.0) and np.all(sky.xy.min(axis=0) >= 0.0)
     assert np.all(sky.xy.max(axis=0) > 1022.0) and np.all(sky.xy.max(axis=0) <= 1023.0)
     counts = np.diff(sky.frame_starts)
     assert len(counts) == 600 and set(counts) == {5, 11} and abs(np.mean(counts == 5) - 0.5) < 0.08
     assert set(sky.sigma_px) == set(like.sigma_px) and set(sky.mag) == set(like.mag)
-    # A draw that folds beyond 267 px keeps stars away from there; one that is defined nowhere leaves no place.
+    # A draw that folds beyond 267 px keeps stars away from there; one that is defined nowhere
+    # leaves no place.
     wide.draws[7, 3] = -1.0 / (3.0 * 400.0**2)
     within = random_sky(wide, like, 100, seed=1)  # type: ignore[arg-type]
     assert 250.0 < np.sqrt(np.max(np.sum((within.xy - 511.5) ** 2, axis=1))) < 267.0
@@ -256,8 +281,18 @@ def test_the_file_keeps_alignment_and_covariances(tmp_path) -> None:  # type: ig
     found.save(tmp_path / "attitude.csv")
     again = AttitudeError.load(tmp_path / "attitude.csv")
     assert again.alignment == found.alignment
-    for name in ("total_arcsec", "rest_constant_arcsec", "covariance_arcsec2", "alignment_covariance_arcsec2"):
+    for name in (
+        "total_arcsec",
+        "rest_constant_arcsec",
+        "covariance_arcsec2",
+        "alignment_covariance_arcsec2",
+    ):
         np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
     sigma = [np.sqrt(np.diag(matrix)) for matrix in found.covariance_arcsec2[:4]]
-    parts = [found.nea_arcsec, found.common_arcsec, found.rest_arcsec, found.calibration_total_arcsec]
+    parts = [
+        found.nea_arcsec,
+        found.common_arcsec,
+        found.rest_arcsec,
+        found.calibration_total_arcsec,
+    ]
     np.testing.assert_allclose(sigma, parts, rtol=1e-9)

@@ -23,7 +23,9 @@ def found(calibrated):
 
 
 def test_correlations_of_the_paper_set_up(found):
-    """Focal length and distortion trade against each other; the principal point is on its own (DESIGN's figures)."""
+    """Focal length and distortion trade against each other; the principal point is on its own
+    (DESIGN's figures).
+    """
     c = found.correlation
     assert c[2, 3] == pytest.approx(-0.94, abs=0.02)
     assert c[2, 4] == pytest.approx(0.84, abs=0.03)
@@ -41,8 +43,12 @@ def test_weak_direction_is_said_in_words(found):
 
 @pytest.mark.parametrize("r", [0.25, 0.5, -0.9])
 def test_directions_of_two_correlated_parameters(r):
-    """Variances 1 + r and 1 - r: within 0.7 and 1.4 times that of uncoupled parameters nothing is coupled."""
-    first, *rest = weak_directions(np.array([[1.0, r, 0.0], [r, 1.0, 0.0], [0.0, 0.0, 1.0]]), ("a", "b", "c"))
+    """Variances 1 + r and 1 - r: within 0.7 and 1.4 times that of uncoupled parameters nothing is
+    coupled.
+    """
+    first, *rest = weak_directions(
+        np.array([[1.0, r, 0.0], [r, 1.0, 0.0], [0.0, 0.0, 1.0]]), ("a", "b", "c")
+    )
     assert [d.variance for d in (first, *rest)] == pytest.approx([1.0 + abs(r), 1.0, 1.0 - abs(r)])
     assert rest[0].words == "c: not coupled to the others"
     for direction, word, together in ((first, "poorly", r > 0.0), (rest[1], "well", r < 0.0)):
@@ -50,8 +56,13 @@ def test_directions_of_two_correlated_parameters(r):
         if abs(r) < 0.3:
             assert said == "not coupled to the others"
             continue
-        assert said == f"{word} determined, {direction.variance:.2g} times the variance of uncoupled parameters"
-        assert names in ({"a and b together", "b and a together"} if together else {"a against b", "b against a"})
+        assert said == (
+            f"{word} determined, {direction.variance:.2g} times the variance of uncoupled "
+            "parameters"
+        )
+        assert names in (
+            {"a and b together", "b and a together"} if together else {"a against b", "b against a"}
+        )
 
 
 def test_inflation_is_the_price_of_not_knowing_the_others(found):
@@ -65,7 +76,9 @@ def test_inflation_is_the_price_of_not_knowing_the_others(found):
 def test_contraction_is_the_share_of_the_prior_variance_that_went(calibrated, found):
     priors = SimpleNamespace(sd=lambda names: 3.0 * found.sigma_marginal)
     names = ("camera", "covariance", "information", "rotation_per_theta", "attitude_noise")
-    contracted = sc.coupling(SimpleNamespace(priors=priors, **{name: getattr(calibrated, name) for name in names}))
+    contracted = sc.coupling(
+        SimpleNamespace(priors=priors, **{name: getattr(calibrated, name) for name in names})
+    )
     assert np.allclose(contracted.contraction, 8.0 / 9.0, rtol=1e-12)
     assert np.array_equal(contracted.covariance, found.covariance)
     assert np.array_equal(contracted.to_dataframe()["contraction"], contracted.contraction)
@@ -78,10 +91,14 @@ def test_principal_point_and_boresight_are_one_near_gauge(calibrated, found):
     assert e[names.index("x0"), names.index("yaw")] == pytest.approx(-1.0, abs=1e-3)
     assert e[names.index("y0"), names.index("pitch")] == pytest.approx(1.0, abs=1e-3)
     turned = calibrated.rotation_per_theta @ found.covariance @ calibrated.rotation_per_theta.T
-    assert np.allclose(found.common_rotation_arcsec, np.rad2deg(np.sqrt(np.diag(turned))) * 3600.0, rtol=1e-9)
+    assert np.allclose(
+        found.common_rotation_arcsec, np.rad2deg(np.sqrt(np.diag(turned))) * 3600.0, rtol=1e-9
+    )
     single = np.sqrt(np.diag(turned + calibrated.attitude_noise))
     joint = found.single_frame_correlation * np.outer(found.sigma_marginal, single)
-    assert np.allclose(joint, found.covariance @ calibrated.rotation_per_theta.T, rtol=1e-9, atol=0.0)
+    assert np.allclose(
+        joint, found.covariance @ calibrated.rotation_per_theta.T, rtol=1e-9, atol=0.0
+    )
     # 1 px of principal point is 1 / f of boresight.
     expected = np.rad2deg(found.sigma_marginal[0] / 5852.0) * 3600.0
     assert found.common_rotation_arcsec[1] == pytest.approx(expected, rel=0.02)

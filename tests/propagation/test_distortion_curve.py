@@ -14,7 +14,9 @@ from tests.helpers.gaussian_camera import COVARIANCE
 from tests.helpers.scenes import camera, observations
 
 
-def gaussian_posterior(model: str = "brown", covariance: np.ndarray = COVARIANCE) -> SimpleNamespace:
+def gaussian_posterior(
+    model: str = "brown", covariance: np.ndarray = COVARIANCE
+) -> SimpleNamespace:
     cam = camera(model)
     sd = np.sqrt(np.diag(covariance))
     root = sd[:, None] * np.linalg.cholesky(covariance / np.outer(sd, sd))
@@ -23,7 +25,9 @@ def gaussian_posterior(model: str = "brown", covariance: np.ndarray = COVARIANCE
         draws = cam.theta + np.random.default_rng(seed).standard_normal((n, len(sd))) @ root.T
         return np.column_stack([draws, np.full(n, 0.05)])
 
-    return SimpleNamespace(camera=cam, calibrated_camera=cam, mean=cam.theta, covariance=covariance, thin=thin)
+    return SimpleNamespace(
+        camera=cam, calibrated_camera=cam, mean=cam.theta, covariance=covariance, thin=thin
+    )
 
 
 DECENTRED = np.diag([0.15, 0.15, 0.028, 1e-10, 1e-16, 1e-9, 1e-9]) ** 2
@@ -35,23 +39,31 @@ def paper_curve() -> DistortionCurve:
 
 
 def test_mean_is_the_formula() -> None:
-    """Distorted minus ideal is u (k1 u^2 + k2 u^4) at the ideal radius u of a point seen at radius r."""
+    """Distorted minus ideal is u (k1 u^2 + k2 u^4) at the ideal radius u of a point seen at radius
+    r.
+    """
     found = paper_curve()
     k1, k2 = camera("brown").coefficients
     r = found.radius_px
     u = r.copy()
     for _ in range(20):
         u = r - u * (k1 * u**2 + k2 * u**4)
-    np.testing.assert_allclose(found.mean_px[0], r - u, atol=4 * found.sd_px[0].max() / np.sqrt(2000) + 1e-12)
+    np.testing.assert_allclose(
+        found.mean_px[0], r - u, atol=4 * found.sd_px[0].max() / np.sqrt(2000) + 1e-12
+    )
     assert found.mean_px.shape == (1, 41)
-    np.testing.assert_allclose(found.radius_px, np.arange(41) * np.hypot(523.5, 530.5) / 40.0, rtol=1e-12)
+    np.testing.assert_allclose(
+        found.radius_px, np.arange(41) * np.hypot(523.5, 530.5) / 40.0, rtol=1e-12
+    )
     f = camera("brown").theta[2]
     assert found.arcsec_per_px[0] == pytest.approx(206264.806 / f)
     assert found.arcsec_per_px[-1] < found.arcsec_per_px[0]
 
 
 def test_both_directions_of_a_model_give_the_same_sign() -> None:
-    """``inverse`` maps distorted to ideal points; the curve shows distorted minus ideal all the same."""
+    """``inverse`` maps distorted to ideal points; the curve shows distorted minus ideal all the
+    same.
+    """
     covariance = np.diag(np.diag(COVARIANCE))
     found = distortion_curve(gaussian_posterior("inverse", covariance), n=21, n_draws=300)
     k1, k2 = camera("inverse").coefficients
@@ -90,11 +102,22 @@ def test_decentring_is_shown_along_azimuths() -> None:
     p1, p2 = camera("brown_tangential").coefficients[2:]
     r = found.radius_px[-1]
     # Along +x and -x the radial parts differ by twice 3 p2 r^2, along y they hold 3 p1 r^2.
-    np.testing.assert_allclose(found.mean_px[0, -1] - found.mean_px[2, -1], 6 * p2 * r**2, rtol=0.05)
+    np.testing.assert_allclose(
+        found.mean_px[0, -1] - found.mean_px[2, -1], 6 * p2 * r**2, rtol=0.05
+    )
     mean = 0.5 * (found.mean_px[0, -1] + found.mean_px[2, -1])
     np.testing.assert_allclose(found.mean_px[1, -1] - mean, 3 * p1 * r**2, rtol=0.05)
-    assert distortion_curve(post, n=3, n_draws=50).azimuth_deg.tolist() == [45.0 * step for step in range(8)]
-    assert len(distortion_curve(gaussian_posterior(), n=3, n_draws=50, azimuths_deg=(0, 90)).azimuth_deg) == 1
+    assert distortion_curve(post, n=3, n_draws=50).azimuth_deg.tolist() == [
+        45.0 * step for step in range(8)
+    ]
+    assert (
+        len(
+            distortion_curve(
+                gaussian_posterior(), n=3, n_draws=50, azimuths_deg=(0, 90)
+            ).azimuth_deg
+        )
+        == 1
+    )
 
 
 def test_shows_itself() -> None:
@@ -109,10 +132,14 @@ def test_shows_itself() -> None:
     assert list(table.columns[:4]) == ["azimuth_deg", "radius_px", "mean_px", "sd_px"]
     assert len(table) == 41
     for name in ("mean", "sd"):
-        np.testing.assert_allclose(table[f"{name}_arcsec"], table[f"{name}_px"] * found.arcsec_per_px, rtol=1e-12)
+        np.testing.assert_allclose(
+            table[f"{name}_arcsec"], table[f"{name}_px"] * found.arcsec_per_px, rtol=1e-12
+        )
     assert 600 < found.star_radius_px < 745
     assert np.isnan(distortion_curve(gaussian_posterior(), n=3, n_draws=50).star_radius_px)
-    decentred = distortion_curve(gaussian_posterior("brown_tangential", DECENTRED), n=11, n_draws=100)
+    decentred = distortion_curve(
+        gaussian_posterior("brown_tangential", DECENTRED), n=11, n_draws=100
+    )
     assert isinstance(decentred.plot.curve(), Figure)
     assert "from the x axis" in decentred.text
 

@@ -1,4 +1,6 @@
-"""Spectrum of the attitude error along a slew, against SciPy's periodograms of attitudes solved here."""
+"""Spectrum of the attitude error along a slew, against SciPy's periodograms of attitudes solved
+here.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,9 @@ def rest_of_draws(post, obs: Observations) -> np.ndarray:
         b = unproject_theta("brown", theta, obs.xy)
         return quest(b, obs.directions_icrs, obs.frame_starts).quaternions
 
-    phi = ARCSEC * np.stack([left_error(solve(theta), solve(post.mean)) for theta in post.theta_draws])
+    phi = ARCSEC * np.stack(
+        [left_error(solve(theta), solve(post.mean)) for theta in post.theta_draws]
+    )
     return phi - phi.mean(axis=1, keepdims=True)
 
 
@@ -63,9 +67,12 @@ def test_is_the_mean_periodogram_of_the_draws(n: int, scale: float) -> None:
     found = error_spectrum(post, obs, n_draws=40)
     rest = rest_of_draws(post, obs)
     f, psd = periodogram(rest, fs=1.0, axis=1, detrend=False)
-    # First order gives the posterior's covariance, with one draw less in the divisor, and no mean of draws.
+    # First order gives the posterior's covariance, with one draw less in the divisor, and no mean
+    # of draws.
     shift = rest.mean(axis=0)
-    expected = (psd.sum(axis=0) - 40 * periodogram(shift, fs=1.0, axis=0, detrend=False)[1])[1:] / 39.0
+    expected = (psd.sum(axis=0) - 40 * periodogram(shift, fs=1.0, axis=0, detrend=False)[1])[
+        1:
+    ] / 39.0
     np.testing.assert_allclose(found.frequency_hz, f[1:], rtol=1e-12)
     tolerance = 1e-4 if scale == 1.0 else 0.06
     top = expected.max(axis=0)
@@ -82,7 +89,9 @@ def test_integral_is_the_variance_and_that_of_the_table() -> None:
     changing = np.sqrt(table.rest_arcsec**2 - table.rest_constant_arcsec**2)
     np.testing.assert_allclose(found.rest_arcsec, changing, rtol=1e-3)
     np.testing.assert_allclose(found.nea_arcsec, table.nea_arcsec, rtol=1e-5)
-    np.testing.assert_allclose(np.sqrt(np.mean(found.sigma_arcsec**2, axis=0)), found.rest_arcsec, rtol=1e-3)
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(found.sigma_arcsec**2, axis=0)), found.rest_arcsec, rtol=1e-3
+    )
     # The floor of white noise holds the variance of a frame over all frequencies.
     np.testing.assert_allclose(found.nea_psd_arcsec2_hz * 0.5, found.nea_arcsec**2, rtol=1e-12)
     np.testing.assert_allclose(found.share_below(1.0), 1.0)
@@ -108,7 +117,9 @@ def test_correlation_is_that_of_the_draws() -> None:
     found = error_spectrum(post, obs, n_draws=40)
     rest = rest_of_draws(post, obs)
     for lag in (1, 10, 100):
-        expected = np.mean(rest[:, lag:] * rest[:, : len(found.time_s) - lag], axis=(0, 1)) / np.mean(rest**2, (0, 1))
+        expected = np.mean(
+            rest[:, lag:] * rest[:, : len(found.time_s) - lag], axis=(0, 1)
+        ) / np.mean(rest**2, (0, 1))
         np.testing.assert_allclose(found.autocorrelation[lag], expected, atol=0.03)
 
 
@@ -139,7 +150,8 @@ def test_averages_are_those_of_the_series() -> None:
     for axis, time in enumerate(after):
         assert np.greater(*quiet.averaged_arcsec(time))[axis]
     assert "it comes to exceed centroid noise: pitch after" in quiet.text
-    # Noise that equals it after 20 s: from there on, to the next of the averages tried, and not before.
+    # Noise that equals it after 20 s: from there on, to the next of the averages tried, and not
+    # before.
     level = dataclasses.replace(found, nea_arcsec=np.sqrt(20.0) * found.averaged_arcsec(20.0)[0])
     assert np.all((level.dominates_after_s >= 20.0) & (level.dominates_after_s < 21.5))
     for seconds in (0.5, 200.0):
@@ -180,7 +192,9 @@ def test_times_that_are_no_series_are_refused() -> None:
     post, obs = posterior(), frames()
     uneven = np.arange(601.0)
     uneven[300:] += 0.4
-    sparse = obs.select(np.isin(obs.frame, np.flatnonzero(np.arange(601) % 4 != 1)[:200]) | (obs.frame > 400))
+    sparse = obs.select(
+        np.isin(obs.frame, np.flatnonzero(np.arange(601) % 4 != 1)[:200]) | (obs.frame > 400)
+    )
     for table, times, message in (
         (observations(), None, "these frames carry no times"),
         (obs, np.arange(600.0), r"has shape \(600,\), but there are 601 frames"),
@@ -204,7 +218,9 @@ def test_times_that_are_no_series_are_refused() -> None:
 
 def test_slower_frames_have_the_same_errors_at_lower_frequencies() -> None:
     post, obs = posterior(), frames()
-    one, four = (error_spectrum(post, obs, step * np.arange(601.0), n_draws=5) for step in (1.0, 4.0))
+    one, four = (
+        error_spectrum(post, obs, step * np.arange(601.0), n_draws=5) for step in (1.0, 4.0)
+    )
     np.testing.assert_allclose(4.0 * four.frequency_hz, one.frequency_hz, rtol=1e-12)
     for density in ("psd_arcsec2_hz", "nea_psd_arcsec2_hz"):
         np.testing.assert_allclose(getattr(four, density), 4.0 * getattr(one, density), rtol=1e-9)
@@ -218,7 +234,9 @@ def test_file_is_lossless(tmp_path: Path) -> None:
     found.save(tmp_path / "spectrum.npz")
     loaded = ErrorSpectrum.load(tmp_path / "spectrum.npz")
     for field in dataclasses.fields(ErrorSpectrum):
-        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(found, field.name), err_msg=field.name)
+        np.testing.assert_array_equal(
+            getattr(loaded, field.name), getattr(found, field.name), err_msg=field.name
+        )
     (tmp_path / "bad.npz").write_bytes(b"no")
     for name, message in (("bad.npz", "is not an error spectrum"), ("none.npz", "cannot be read")):
         with pytest.raises(RunFolderError, match=message):
@@ -229,7 +247,12 @@ def test_shows_itself() -> None:
     from matplotlib.axes import Axes
 
     found = spectrum()
-    assert list(found.to_dataframe().columns) == ["frequency_hz", "axis", "rest_arcsec2_hz", "nea_arcsec2_hz"]
+    assert list(found.to_dataframe().columns) == [
+        "frequency_hz",
+        "axis",
+        "rest_arcsec2_hz",
+        "nea_arcsec2_hz",
+    ]
     assert len(found.to_dataframe()) == 3 * len(found.frequency_hz)
     ax = found.plot.spectrum()
     assert isinstance(ax, Axes)
@@ -248,7 +271,9 @@ def test_a_camera_without_error_has_no_spectrum() -> None:
     post.covariance = np.zeros((5, 5))
     found = error_spectrum(post, frames(), n_draws=5)
     assert np.isnan(found.correlation_time_s).all() or (found.rest_arcsec < 1e-6).all()
-    assert "no frame-dependent part" in dataclasses.replace(found, variance_arcsec2=np.zeros(3)).text
+    assert (
+        "no frame-dependent part" in dataclasses.replace(found, variance_arcsec2=np.zeros(3)).text
+    )
     found.plot.spectrum()
 
 
@@ -274,7 +299,9 @@ def test_limits_of_a_series() -> None:
         if fine:
             assert error_spectrum(post, some, times, n_draws=2).gap_share == pytest.approx(4 / 20)
         else:
-            with pytest.raises(AttitudeProfileError, match=r"5 of 21 evenly .*longest gap begins at 14 s"):
+            with pytest.raises(
+                AttitudeProfileError, match=r"5 of 21 evenly .*longest gap begins at 14 s"
+            ):
                 error_spectrum(post, some, times, n_draws=2)
     with pytest.raises(AttitudeProfileError, match="must be finite"):
         error_spectrum(post, some, np.append(np.arange(15.0), np.inf))
@@ -312,7 +339,10 @@ def test_figures_of_a_spectrum_are_those_of_its_numbers() -> None:
     # Sixty times, evenly in their logarithm: where noise is overtaken is good to that.
     level = dataclasses.replace(found, nea_arcsec=np.sqrt(2.0) * found.averaged_arcsec(2.0)[0])
     times = np.geomspace(1.0, 5.0, 60)
-    later = [next((t for t in times if np.greater(*level.averaged_arcsec(t))[axis]), np.nan) for axis in range(2)]
+    later = [
+        next((t for t in times if np.greater(*level.averaged_arcsec(t))[axis]), np.nan)
+        for axis in range(2)
+    ]
     np.testing.assert_array_equal(level.dominates_after_s[:2], later)
     table = found.to_dataframe()
     assert table["frequency_hz"].tolist() == [0.1] * 3 + [0.2] * 3 + [0.3] * 3

@@ -87,7 +87,9 @@ def test_worst_direction_bounds_the_mean_of_the_axes() -> None:
         assert (worst <= sigma * np.sqrt(2) * (1 + 1e-12)).all()
     # A focal length moves directions along the radius only.
     only_f = field_map(posterior(np.diag([0, 0, 0.028**2, 0, 0])), observations(), n=4)
-    np.testing.assert_allclose(only_f.worst_absolute_arcsec, np.sqrt(2) * only_f.sigma_absolute_arcsec, rtol=1e-6)
+    np.testing.assert_allclose(
+        only_f.worst_absolute_arcsec, np.sqrt(2) * only_f.sigma_absolute_arcsec, rtol=1e-6
+    )
 
 
 def test_file_is_lossless(tmp_path: Path) -> None:
@@ -113,7 +115,10 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     np.save(tmp_path / "array.npy", np.zeros(3))
     with pytest.raises(RunFolderError, match="is not a field map"):
         FieldMap.load(tmp_path / "array.npy")
-    with pytest.raises(RunFolderError, match=r"none\.npz: cannot be read .*; run `starcal-uq propagate RUN --force`"):
+    with pytest.raises(
+        RunFolderError,
+        match=r"none\.npz: cannot be read .*; run `starcal-uq propagate RUN --force`",
+    ):
         FieldMap.load(tmp_path / "none.npz")
 
 
@@ -124,7 +129,12 @@ def test_shows_itself() -> None:
     assert "best rotation removed" in found._repr_html_()
     table = found.to_dataframe()
     assert len(table) == 625
-    assert list(table.columns[:4]) == ["x_px", "y_px", "sigma_absolute_arcsec", "sigma_compensated_arcsec"]
+    assert list(table.columns[:4]) == [
+        "x_px",
+        "y_px",
+        "sigma_absolute_arcsec",
+        "sigma_compensated_arcsec",
+    ]
     row = table[(table["x_px"] == found.x_px[3]) & (table["y_px"] == found.y_px[7])]
     assert row["sigma_compensated_arcsec"].item() == found.sigma_compensated_arcsec[7, 3]
     assert isinstance(found.plot.maps(), Figure)
@@ -144,7 +154,9 @@ def test_equivalent_principal_point() -> None:
     only_x0 = field_map(posterior(np.diag([0.15**2, 0, 0, 0, 0])), observations())
     np.testing.assert_allclose(only_x0.equivalent_principal_point_px, [0.15, 0.0], atol=1e-9)
     arcsec = 0.15 / camera("brown").theta[2] * ARCSEC
-    np.testing.assert_allclose(only_x0.equivalent_principal_point_arcsec, [arcsec, 0.0], atol=0.02 * arcsec)
+    np.testing.assert_allclose(
+        only_x0.equivalent_principal_point_arcsec, [arcsec, 0.0], atol=0.02 * arcsec
+    )
     # A focal length error turns the field only because the principal point is off the centre.
     only_f = field_map(posterior(np.diag([0, 0, 0.028**2, 0, 0])), observations())
     assert 0.0 < only_f.equivalent_principal_point_px[1] < 0.028 * 50 / 5852
@@ -152,14 +164,20 @@ def test_equivalent_principal_point() -> None:
     assert (found.equivalent_principal_point_px >= 0.149).all()
     assert "Equivalent principal point" in found._repr_html_()
     # Pitch goes with y0 and yaw with x0, not the other way round.
-    assert only_x0.rotation_covariance_arcsec2[0, 0] < 1e-6 * only_x0.rotation_covariance_arcsec2[1, 1]
+    assert (
+        only_x0.rotation_covariance_arcsec2[0, 0] < 1e-6 * only_x0.rotation_covariance_arcsec2[1, 1]
+    )
 
 
 def test_files_of_earlier_versions_lack_the_ellipses_only(tmp_path: Path) -> None:
     from matplotlib.figure import Figure
 
     found = paper_map()
-    old = {f.name: getattr(found, f.name) for f in dataclasses.fields(FieldMap) if not f.name.endswith("2")}
+    old = {
+        f.name: getattr(found, f.name)
+        for f in dataclasses.fields(FieldMap)
+        if not f.name.endswith("2")
+    }
     np.savez(tmp_path / "field_map.npz", **old)
     loaded = FieldMap.load(tmp_path / "field_map.npz")
     assert loaded.covariance_absolute_arcsec2 is None

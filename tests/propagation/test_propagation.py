@@ -1,4 +1,6 @@
-"""Attitude errors from the posterior: against attitudes solved one by one, and against simulated campaigns."""
+"""Attitude errors from the posterior: against attitudes solved one by one, and against simulated
+campaigns.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,14 @@ from starcal_uq.propagation.propagate import FrameGeometry
 from starcal_uq.propagation.propagate import propagate as propagate_aligned
 from starcal_uq.simulation.mission import mission_frames, noise_by_magnitude
 from starcal_uq.sky.catalogue import load_catalogue
-from tests.helpers.attitude_campaigns import clean_frames, failures, fly, linear_estimator, some_frames, with_noise
+from tests.helpers.attitude_campaigns import (
+    clean_frames,
+    failures,
+    fly,
+    linear_estimator,
+    some_frames,
+    with_noise,
+)
 from tests.helpers.gaussian_camera import gaussian_posterior
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
@@ -43,7 +52,9 @@ def scene(model: str = "brown", stated: bool = False) -> tuple[Observations, Cal
 
 
 def propagate(post: Any, obs: Observations, **options: Any) -> AttitudeError:
-    """With an alignment on the same frames, by which common rotation and rest are parts of one table."""
+    """With an alignment on the same frames, by which common rotation and rest are parts of one
+    table.
+    """
     return propagate_aligned(post, obs, **{"alignment": "observed", **options})
 
 
@@ -63,9 +74,13 @@ def test_with_all_draws_sigmas_are_plain_standard_deviations() -> None:
     obs, cal = scene()
     post = gaussian_posterior(cal, n=60)
     found = propagate(post, obs, n_draws=60)
-    reference = quest(unproject_theta("brown", post.mean, obs.xy), obs.directions_icrs, obs.frame_starts)
+    reference = quest(
+        unproject_theta("brown", post.mean, obs.xy), obs.directions_icrs, obs.frame_starts
+    )
     b = np.stack([unproject_theta("brown", theta, obs.xy) for theta in post.theta_draws])
-    phi = ARCSEC * left_error(quest(b, obs.directions_icrs, obs.frame_starts).quaternions, reference.quaternions)
+    phi = ARCSEC * left_error(
+        quest(b, obs.directions_icrs, obs.frame_starts).quaternions, reference.quaternions
+    )
     common = aligned(post, obs, phi)[:, None]
     np.testing.assert_allclose(found.common_arcsec, common[:, 0].std(axis=0, ddof=1), rtol=1e-8)
     rest = (phi - common).std(axis=0, ddof=1)
@@ -95,18 +110,25 @@ def test_sampled_and_first_order_agree(model: str, stated: bool) -> None:
     assert found.agreement.largest < 5e-3
     assert found.agreement.ratio.shape == (3, 3)
     assert "agree within" in found.agreement.text
-    # The likelihood's own linearisation weights pixels, QUEST directions: across the boresight hardly a difference.
-    common = ARCSEC * np.sqrt(np.diag(post.rotation_per_theta @ post.covariance @ post.rotation_per_theta.T))
+    # The likelihood's own linearisation weights pixels, QUEST directions: across the boresight
+    # hardly a difference.
+    common = ARCSEC * np.sqrt(
+        np.diag(post.rotation_per_theta @ post.covariance @ post.rotation_per_theta.T)
+    )
     np.testing.assert_allclose(found.common_arcsec[:2], common[:2], rtol=0.01)
     K = FrameGeometry.of(post, obs).response.mean(axis=0)
     # About it, frames count alike there, and by their noise in an alignment.
     mean = ARCSEC * np.sqrt(np.diag(K @ post.covariance @ K.T))
     np.testing.assert_allclose(mean[2], common[2], rtol=0.15)
-    np.testing.assert_allclose(found.nea_arcsec, ARCSEC * np.sqrt(np.diag(post.attitude_noise)), rtol=0.02)
+    np.testing.assert_allclose(
+        found.nea_arcsec, ARCSEC * np.sqrt(np.diag(post.attitude_noise)), rtol=0.02
+    )
 
 
 def test_sampling_sees_what_first_order_does_not() -> None:
-    """Principal points wrong by tens of pixels and k1 by a hundred sigmas: their product is no longer small."""
+    """Principal points wrong by tens of pixels and k1 by a hundred sigmas: their product is no
+    longer small.
+    """
     obs, cal = scene()
     found = propagate(gaussian_posterior(cal, n=500, scale=100.0), obs, n_draws=500)
     raw = found.common_draws_arcsec.std(axis=0, ddof=1)
@@ -120,11 +142,15 @@ def test_sampling_sees_what_first_order_does_not() -> None:
     # Nothing of one beside something of the other is no agreement; nothing of both has none.
     nothing = dataclasses.replace(found, nea_arcsec=np.full(3, 1e-9))
     assert np.allclose(nothing.agreement.ratio[0], 0.0, rtol=0, atol=1e-6)
-    assert np.isnan(dataclasses.replace(nothing, analytic_nea_arcsec=np.full(3, 1e-9)).agreement.ratio[0]).all()
+    assert np.isnan(
+        dataclasses.replace(nothing, analytic_nea_arcsec=np.full(3, 1e-9)).agreement.ratio[0]
+    ).all()
 
 
 @pytest.mark.parametrize("alignment", ["random", "observed"])
-def test_a_sample_of_the_frames_says_what_all_do(monkeypatch: pytest.MonkeyPatch, alignment: str) -> None:
+def test_a_sample_of_the_frames_says_what_all_do(
+    monkeypatch: pytest.MonkeyPatch, alignment: str
+) -> None:
     """With a posterior so wide that first order alone is off by a tenth."""
     obs, cal = scene()
     post = gaussian_posterior(cal, n=500, scale=100.0)
@@ -143,7 +169,9 @@ def test_a_sample_of_the_frames_says_what_all_do(monkeypatch: pytest.MonkeyPatch
 
 
 def test_interaction_is_what_the_sum_of_the_parts_misses() -> None:
-    """Both at once, solved here, against the parts; it is a product of the two, so that each scales it."""
+    """Both at once, solved here, against the parts; it is a product of the two, so that each scales
+    it.
+    """
     obs, cal = scene()
     base = propagate(gaussian_posterior(cal), obs).interaction_arcsec
     wide = propagate(gaussian_posterior(cal, scale=10.0), obs).interaction_arcsec
@@ -159,13 +187,16 @@ def test_interaction_is_what_the_sum_of_the_parts_misses() -> None:
 
     def attitudes(thetas: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         return quest(
-            np.stack([unproject_theta("brown", t, p) for t, p in zip(thetas, pixels, strict=True)]), r, starts
+            np.stack([unproject_theta("brown", t, p) for t, p in zip(thetas, pixels, strict=True)]),
+            r,
+            starts,
         ).quaternions
 
     same, pixels = np.repeat(post.mean[None], n, axis=0), np.broadcast_to(obs.xy, e.shape)
     reference = attitudes(same[:1], pixels[:1])
     phi = [
-        left_error(attitudes(*pair), reference) for pair in ((shift, obs.xy + e), (shift, pixels), (same, obs.xy + e))
+        left_error(attitudes(*pair), reference)
+        for pair in ((shift, obs.xy + e), (shift, pixels), (same, obs.xy + e))
     ]
     found = ARCSEC * np.sqrt(np.mean((phi[0] - phi[1] - phi[2]) ** 2, axis=(0, 1)))
     np.testing.assert_allclose(found, base, rtol=0.3)
@@ -184,7 +215,9 @@ def test_frames_of_a_mission_count_and_not_those_of_the_calibration() -> None:
     assert observed.frames == "observed frames"
     # Noise falls with the root of the stars; the common rotation stays, because it is the camera's.
     ratio = (deep.n_stars / deep.n_frames) / (obs.n_stars / obs.n_frames)
-    np.testing.assert_allclose(observed.nea_arcsec[:2] / found.nea_arcsec[:2], np.sqrt(ratio), rtol=0.1)
+    np.testing.assert_allclose(
+        observed.nea_arcsec[:2] / found.nea_arcsec[:2], np.sqrt(ratio), rtol=0.1
+    )
     np.testing.assert_allclose(found.common_arcsec[:2], observed.common_arcsec[:2], rtol=0.01)
     assert (found.rest_arcsec < observed.rest_arcsec).all()
     assert found.agreement.largest < 2e-3
@@ -198,7 +231,8 @@ def test_stated_noise_is_carried_over_by_magnitude() -> None:
         propagate(post, mission_frames(stars, cal.camera, n_frames=20), n_draws=5)
     frames = mission_frames(stars, cal.camera, n_frames=100, noise_like=obs)
     found, own = propagate(post, frames, n_draws=20), propagate(post, obs, n_draws=20)
-    # The median of the stated noise says less than all of it: stars of little noise carry an attitude.
+    # The median of the stated noise says less than all of it: stars of little noise carry an
+    # attitude.
     assert np.all((found.nea_arcsec > own.nea_arcsec) & (found.nea_arcsec < 3.0 * own.nea_arcsec))
     with pytest.raises(ObservationError, match="noise_like has no column sigma_px"):
         mission_frames(stars, cal.camera, n_frames=20, noise_like=scene()[0])
@@ -222,7 +256,8 @@ def test_principal_point_is_a_rotation_of_the_camera() -> None:
     post.thin = lambda n, seed: post.draws
     post.mean, post.covariance = theta.mean(axis=0), np.cov(theta, rowvar=False)
     found = propagate(post, obs)
-    # x0 larger: every direction moves to -x, which is a negative yaw (rotation about +Y) of the camera-frame vectors.
+    # x0 larger: every direction moves to -x, which is a negative yaw (rotation about +Y) of the
+    # camera-frame vectors.
     expected = np.array([[0, 1, 0], [0, -1, 0], [0, 0, 0]]) * ARCSEC / f
     np.testing.assert_allclose(found.common_draws_arcsec, expected, atol=0.02 * ARCSEC / f)
     assert found.rest_arcsec[1] < 0.01 * found.common_arcsec[1]
@@ -232,10 +267,14 @@ def test_principal_point_is_a_rotation_of_the_camera() -> None:
 def test_noise_term_is_that_of_noisy_frames(stated: bool) -> None:
     obs, cal = scene(stated=stated)
     post = gaussian_posterior(cal)
-    sigma = post.sigma_draws.mean() * (np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px)
+    sigma = post.sigma_draws.mean() * (
+        np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px
+    )
     weights = None if obs.sigma_px is None else obs.sigma_px**-2.0
     rng = np.random.default_rng(5)
-    clean = quest(unproject_theta("brown", post.mean, obs.xy), obs.directions_icrs, obs.frame_starts, weights)
+    clean = quest(
+        unproject_theta("brown", post.mean, obs.xy), obs.directions_icrs, obs.frame_starts, weights
+    )
     noise = sigma[:, None] * rng.standard_normal((1000, obs.n_stars, 2))
     b = np.stack([unproject_theta("brown", post.mean, obs.xy + e) for e in noise])
     noisy = quest(b, obs.directions_icrs, obs.frame_starts, weights)
@@ -260,7 +299,9 @@ def test_quantiles_are_those_of_the_draws() -> None:
     np.testing.assert_allclose(found.p95_arcsec[1], np.quantile(draws, 0.95, axis=0), rtol=2e-3)
     np.testing.assert_allclose(found.p997_arcsec[1], np.quantile(draws, 0.997, axis=0), rtol=3e-3)
     # Gaussian draws, two alike axes: 2.45 sigma, not 1.96.
-    assert found.p95_arcsec[1, 3] / np.sqrt(np.mean(found.common_arcsec[:2] ** 2)) == pytest.approx(2.45, abs=0.1)
+    assert found.p95_arcsec[1, 3] / np.sqrt(np.mean(found.common_arcsec[:2] ** 2)) == pytest.approx(
+        2.45, abs=0.1
+    )
     assert found.p95_arcsec[1, 0] / found.common_arcsec[0] == pytest.approx(1.96, abs=0.1)
     # The mixture over frames has longer tails than a Gaussian.
     assert (found.p997_arcsec[2, :3] > 2.97 * found.rest_arcsec).all()
@@ -286,7 +327,9 @@ def test_batches_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_what_the_model_misses_is_added_to_the_calibration() -> None:
-    """Equal errors of pitch and yaw make the angle across a Rayleigh variable, whose quantiles are known."""
+    """Equal errors of pitch and yaw make the angle across a Rayleigh variable, whose quantiles are
+    known.
+    """
     held = dataclasses.replace(
         error(), nea_arcsec=np.array([3.0, 3.0, 9.0]), common_arcsec=np.array([1.0, 1.0, 2.0]),
         rest_arcsec=np.array([0.5, 0.5, 1.0]), total_arcsec=np.array([1.1, 1.1, 2.2]),
@@ -295,14 +338,19 @@ def test_what_the_model_misses_is_added_to_the_calibration() -> None:
     sigma = held.if_model_holds_arcsec
     np.testing.assert_array_equal(sigma[:, 3], sigma[:, 0])
     quantiles = [
-        np.array([norm.isf(0.5 * (1.0 - share))] * 3 + [np.sqrt(-2.0 * np.log(1.0 - share))]) for share in (0.95, 0.997)
+        np.array([norm.isf(0.5 * (1.0 - share))] * 3 + [np.sqrt(-2.0 * np.log(1.0 - share))])
+        for share in (0.95, 0.997)
     ]
-    # The rest and the total have tails a fifth longer than Gaussian ones, the noise a tenth; none is Gaussian.
+    # The rest and the total have tails a fifth longer than Gaussian ones, the noise a tenth; none
+    # is Gaussian.
     longer = np.array([1.1, 1.15, 1.2, 1.2, 1.3])[:, None]
     p95, p997 = (quantile * longer * sigma for quantile in quantiles)
     misfit = MisfitFound(1.5, np.array([0.3, 0.4, 0.5]), np.array([0.6, 0.6, 0.8]), ())
     held = dataclasses.replace(held, p95_arcsec=p95, p997_arcsec=p997)
-    assert np.isnan(held.with_misfit_found_arcsec).all() and held.headline_arcsec is not held.with_misfit_found_arcsec
+    assert (
+        np.isnan(held.with_misfit_found_arcsec).all()
+        and held.headline_arcsec is not held.with_misfit_found_arcsec
+    )
     np.testing.assert_array_equal(held.headline_arcsec, sigma)
     found = dataclasses.replace(held, misfit=misfit)
     common = np.sqrt(1.5**2 * sigma[1, :3] ** 2 + np.array([0.3, 0.4, 0.5]) ** 2)
@@ -315,15 +363,25 @@ def test_what_the_model_misses_is_added_to_the_calibration() -> None:
     np.testing.assert_array_equal(found.headline_arcsec, found.with_misfit_found_arcsec)
     # The excess of a tail shrinks with the share that has it.
     share = (1.5 * 0.5) ** 2 / (1.5**2 * 0.5**2 + 0.6**2)
-    for widths, quantile, own in zip(found.half_widths_with_misfit_found_arcsec, quantiles, (p95, p997), strict=True):
+    for widths, quantile, own in zip(
+        found.half_widths_with_misfit_found_arcsec, quantiles, (p95, p997), strict=True
+    ):
         np.testing.assert_allclose(widths[[0, 4]], own[[0, 4]], rtol=1e-6)
         # Of all of the total, that part is the model's own tail, whatever the noise has.
         share_of_both = (1.5 * sigma[3, 0] / both[0]) ** 2
-        np.testing.assert_allclose(widths[3, 0], quantile[0] * (1.0 + 0.2 * share_of_both) * both[0], rtol=1e-6)
+        np.testing.assert_allclose(
+            widths[3, 0], quantile[0] * (1.0 + 0.2 * share_of_both) * both[0], rtol=1e-6
+        )
         share_of_common = (1.5 * sigma[1, :3] / common) ** 2
-        np.testing.assert_allclose(widths[1, :3], quantile[:3] * (1.0 + 0.15 * share_of_common) * common, rtol=1e-6)
-        np.testing.assert_allclose(widths[2, 0], quantile[0] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6)
-        np.testing.assert_allclose(widths[2, 3], quantile[3] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6)
+        np.testing.assert_allclose(
+            widths[1, :3], quantile[:3] * (1.0 + 0.15 * share_of_common) * common, rtol=1e-6
+        )
+        np.testing.assert_allclose(
+            widths[2, 0], quantile[0] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6
+        )
+        np.testing.assert_allclose(
+            widths[2, 3], quantile[3] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6
+        )
 
 
 def test_table_has_one_row_per_contributor_and_axis() -> None:
@@ -347,7 +405,9 @@ def test_table_has_one_row_per_contributor_and_axis() -> None:
     absorbed = table.groupby("contributor", sort=False)["absorbed_by_alignment"].first()
     assert list(absorbed) == ["no", "yes", "no", "in part", "no"]
     linear = (
-        table.set_index(["contributor", "axis"])["first_order_arcsec"].unstack().loc[list(CONTRIBUTORS), list(AXES)]
+        table.set_index(["contributor", "axis"])["first_order_arcsec"]
+        .unstack()
+        .loc[list(CONTRIBUTORS), list(AXES)]
     )
     parts = (found.analytic_common_arcsec, found.analytic_rest_arcsec)
     np.testing.assert_allclose(linear.to_numpy()[1:3], parts, rtol=1e-12)
@@ -373,7 +433,9 @@ def test_file_keeps_every_digit(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["attitude.csv"]
     loaded = AttitudeError.load(path)
     for field in dataclasses.fields(AttitudeError)[:10]:
-        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(found, field.name), err_msg=field.name)
+        np.testing.assert_array_equal(
+            getattr(loaded, field.name), getattr(found, field.name), err_msg=field.name
+        )
     np.testing.assert_array_equal(loaded.interaction_arcsec, found.interaction_arcsec)
     assert loaded.frames == found.frames
     assert loaded.common_draws_arcsec is None
@@ -388,7 +450,9 @@ def test_file_of_an_earlier_version_is_read_and_the_interaction_not_known(tmp_pa
     found, path = error(), tmp_path / "attitude.csv"
     found.save(path)
     table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    table[~table["contributor"].str.startswith("interaction")].drop(columns="frames").to_csv(path, index=False)
+    table[~table["contributor"].str.startswith("interaction")].drop(columns="frames").to_csv(
+        path, index=False
+    )
     loaded = AttitudeError.load(path)
     np.testing.assert_array_equal(loaded.rest_arcsec, found.rest_arcsec)
     np.testing.assert_array_equal(loaded.p95_arcsec[:4], found.p95_arcsec[:4])
@@ -413,22 +477,37 @@ def test_one_number_is_taken_apart() -> None:
     found = error()
     assert "what remains in flight is" in found.text
     # A figure that nobody has assessed is not one.
-    assert found.text.count("with the misfit found: not assessed") == 2 and "starcal-uq diagnose" in found.text
-    swapped = dataclasses.replace(found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec)
+    assert (
+        found.text.count("with the misfit found: not assessed") == 2
+        and "starcal-uq diagnose" in found.text
+    )
+    swapped = dataclasses.replace(
+        found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec
+    )
     assert "no alignment absorbs it" in swapped.text
     none = dataclasses.replace(found, rest_arcsec=np.zeros(3))
     assert "is a common rotation of" in none.text
 
 
 @pytest.mark.parametrize(
-    "text", ["", "contributor,axis\n", "contributor,axis,sigma_arcsec\na,b,c\n", "\x00\x01", "a,b\n1,2,3\n4\n"]
+    "text",
+    [
+        "",
+        "contributor,axis\n",
+        "contributor,axis,sigma_arcsec\na,b,c\n",
+        "\x00\x01",
+        "a,b\n1,2,3\n4\n",
+    ],
 )
 def test_broken_files_are_named(tmp_path: Path, text: str) -> None:
     path = tmp_path / "attitude.csv"
     path.write_text(text)
     with pytest.raises(RunFolderError, match=r"attitude\.csv: is not a table of attitude errors"):
         AttitudeError.load(path)
-    with pytest.raises(RunFolderError, match=r"none\.csv: cannot be read .*; run `starcal-uq propagate RUN --force`"):
+    with pytest.raises(
+        RunFolderError,
+        match=r"none\.csv: cannot be read .*; run `starcal-uq propagate RUN --force`",
+    ):
         AttitudeError.load(tmp_path / "none.csv")
 
 
@@ -439,7 +518,9 @@ def test_what_cannot_be_propagated_is_said() -> None:
         propagate(post, obs, n_draws=1)
     folded = gaussian_posterior(cal)
     folded.theta_draws[::2, 3] = folded.draws[::2, 3] = -1e-5
-    with pytest.raises(DistortionError, match="at 3 of 10 posterior draws the distortion 'brown' folds over"):
+    with pytest.raises(
+        DistortionError, match="at 3 of 10 posterior draws the distortion 'brown' folds over"
+    ):
         propagate(folded, obs, n_draws=10)
     scaled = gaussian_posterior(scene(stated=True)[1])
     with pytest.raises(ObservationError, match="no sigma_px"):
@@ -454,10 +535,11 @@ def test_plots_itself() -> None:
 
 @pytest.mark.slow
 def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
-    """A thousand frames: one campaign from pixels to its posterior, six thousand others that it must foretell.
+    """A thousand frames: one campaign from pixels to its posterior, six thousand others that it
+    must foretell.
 
-    Attitudes are those of every third frame: they are more than `propagate` takes through QUEST, and what they leave
-    open is nothing beside what the number of campaigns does.
+    Attitudes are those of every third frame: they are more than `propagate` takes through QUEST,
+    and what they leave open is nothing beside what the number of campaigns does.
     """
     clean = clean_frames(1000)
     rng = np.random.default_rng(0)
@@ -468,34 +550,47 @@ def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
     found = propagate(post, seen)
 
     # The linear estimator of the campaigns is what `calibrate` does.
-    G, truth, sd = linear_estimator(clean, camera("brown")), camera("brown").theta, np.sqrt(np.diag(cal.covariance))
+    G, truth, sd = (
+        linear_estimator(clean, camera("brown")),
+        camera("brown").theta,
+        np.sqrt(np.diag(cal.covariance)),
+    )
     for _ in range(3):
         e = 0.05 * rng.standard_normal(clean.xy.shape)
         linear = truth + np.einsum("na,pna->p", e, G)
-        assert np.abs((calibrate(with_noise(clean, e), paper_start()).theta - linear) / sd).max() < 0.05
+        assert (
+            np.abs((calibrate(with_noise(clean, e), paper_start()).theta - linear) / sd).max()
+            < 0.05
+        )
 
     narrow = dataclasses.replace(post, draws=post.draws.copy())
     narrow.draws[:, :-1] += 0.1 * (post.mean - post.draws[:, :-1])
     quiet = dataclasses.replace(post, draws=post.draws * np.append(np.ones(5), 0.9))
     rows = [0, 2, 1, 3, 4]
     confused = dataclasses.replace(
-        found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec, p95_arcsec=found.p95_arcsec[rows]
+        found,
+        common_arcsec=found.rest_arcsec,
+        rest_arcsec=found.common_arcsec,
+        p95_arcsec=found.p95_arcsec[rows],
     )
     errors = (found, propagate(narrow, seen), propagate(quiet, seen), confused)
     flown = fly(clean, errors, n=6000, every=3)
     assert failures(flown[0], errors[0]) == set()
-    # Controls: a posterior 10 % too narrow, noise 10 % too small, and the two parts of the calibration confused.
+    # Controls: a posterior 10 % too narrow, noise 10 % too small, and the two parts of the
+    # calibration confused.
     assert failures(flown[1], errors[1]) == {"common", "rest"}
     assert failures(flown[2], errors[2]) == {"nea"}
     assert failures(flown[3], errors[3]) == {"common", "rest"}
 
-    # Noise and calibration are uncorrelated even on the calibration's own frames, so that squares add up.
+    # Noise and calibration are uncorrelated even on the calibration's own frames, so that squares
+    # add up.
     assert np.abs(flown[0].correlation).max() < 0.01
     parts = np.sqrt(sum(values**2 for values in flown[0].rms.values()))
     np.testing.assert_allclose(flown[0].together, parts, rtol=0.005)
     np.testing.assert_allclose(flown[0].interaction, found.interaction_arcsec, rtol=0.2)
 
-    # The set-up of Ye & Yang (2017): noise, a constant ten times as large, and next to nothing that remains.
+    # The set-up of Ye & Yang (2017): noise, a constant ten times as large, and next to nothing that
+    # remains.
     nea, common, rest = found.nea_arcsec, found.common_arcsec, found.rest_arcsec
     assert np.all((nea[:2] > 0.43) & (nea[:2] < 0.5)) and 6.0 < nea[2] < 7.2
     assert np.all((common[:2] > 4.3) & (common[:2] < 5.6))
@@ -504,7 +599,9 @@ def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
 
 @pytest.mark.slow
 def test_errors_of_simulated_campaigns_are_as_predicted() -> None:
-    """Two hundred campaigns on one set of frames: attitudes at the estimate against the true ones."""
+    """Two hundred campaigns on one set of frames: attitudes at the estimate against the true
+    ones.
+    """
     from scipy import stats
 
     clean = observations(n_frames=60, sigma_px=0.0)
@@ -519,7 +616,9 @@ def test_errors_of_simulated_campaigns_are_as_predicted() -> None:
         obs = dataclasses.replace(clean, x_px=clean.x_px + noise[0], y_px=clean.y_px + noise[1])
         theta = calibrate(obs, nominal(truth)).theta
         # The calibration alone: its camera with the pixels it has not been fitted to.
-        phi = ARCSEC * left_error(quest(unproject_theta("brown", theta, clean.xy), r, starts).quaternions, true)
+        phi = ARCSEC * left_error(
+            quest(unproject_theta("brown", theta, clean.xy), r, starts).quaternions, true
+        )
         common[i] = aligned(gaussian_posterior(scene()[1]), clean, phi[None])[0]
         rest[i] = phi - common[i]
     post = gaussian_posterior(calibrate(obs, nominal(truth)))
@@ -527,14 +626,25 @@ def test_errors_of_simulated_campaigns_are_as_predicted() -> None:
     chi2 = np.sum(common**2, axis=0) / predicted.common_arcsec**2
     assert (stats.chi2.cdf(chi2, n) > 1e-3).all()
     assert (stats.chi2.sf(chi2, n) > 1e-3).all()
-    np.testing.assert_allclose(np.sqrt(np.mean(rest**2, axis=(0, 1))), predicted.rest_arcsec, rtol=0.15)
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(rest**2, axis=(0, 1))), predicted.rest_arcsec, rtol=0.15
+    )
     # Control: whoever takes the rest for the whole is wrong by far.
-    assert np.max(stats.chi2.sf(np.sum(common[:, :2] ** 2, axis=0) / predicted.rest_arcsec[:2] ** 2, n)) < 1e-12
+    assert (
+        np.max(
+            stats.chi2.sf(np.sum(common[:, :2] ** 2, axis=0) / predicted.rest_arcsec[:2] ** 2, n)
+        )
+        < 1e-12
+    )
 
 
 def test_quaternions_of_the_calibration_are_those_of_quest() -> None:
-    """The attitudes that the likelihood profiles and those of QUEST differ by a small part of the noise."""
+    """The attitudes that the likelihood profiles and those of QUEST differ by a small part of the
+    noise.
+    """
     obs, cal = scene()
-    found = quest(unproject_theta("brown", cal.theta, obs.xy), obs.directions_icrs, obs.frame_starts)
+    found = quest(
+        unproject_theta("brown", cal.theta, obs.xy), obs.directions_icrs, obs.frame_starts
+    )
     difference = ARCSEC * left_error(rotation_to_quaternion(found.rotations), cal.quaternions)
     assert (np.sqrt(np.mean(difference**2, axis=0)) < 0.2 * error().nea_arcsec).all()

@@ -1,4 +1,6 @@
-"""Every number of a propagated attitude error a second time: attitudes by singular values, responses by differences."""
+"""Every number of a propagated attitude error a second time: attitudes by singular values,
+responses by differences.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,12 @@ from starcal_uq.observations.splits import frame_sample
 from starcal_uq.observations.table import Observations
 from starcal_uq.propagation import propagate as propagating
 from starcal_uq.propagation.alignment import random_sky
-from starcal_uq.propagation.attitude_error import CONTRIBUTORS, AttitudeError, MisfitFound, two_figures
+from starcal_uq.propagation.attitude_error import (
+    CONTRIBUTORS,
+    AttitudeError,
+    MisfitFound,
+    two_figures,
+)
 from starcal_uq.propagation.coupling import coupling
 from starcal_uq.propagation.distortion import distortion_curve
 from starcal_uq.propagation.field import field_map
@@ -30,20 +37,28 @@ from tests.propagation.test_alignment import ARCSEC, POST, THETA, directions, sk
 SEED, SAMPLES = 5, 4000
 
 
-def attitudes(theta: np.ndarray, pixels: np.ndarray, obs: Observations, weights: np.ndarray) -> Rotation:
+def attitudes(
+    theta: np.ndarray, pixels: np.ndarray, obs: Observations, weights: np.ndarray
+) -> Rotation:
     """The best attitudes of all frames."""
-    products = (weights[:, None] * directions(theta, pixels))[:, :, None] * obs.directions_icrs[:, None]
+    products = (weights[:, None] * directions(theta, pixels))[:, :, None] * obs.directions_icrs[
+        :, None
+    ]
     u, _, vt = np.linalg.svd(np.add.reduceat(products, obs.frame_starts[:-1], axis=0))
     u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
     return Rotation.from_matrix(u @ vt)
 
 
 class Second:
-    """What frames say of a camera: their rotations and their first-order responses, by central differences."""
+    """What frames say of a camera: their rotations and their first-order responses, by central
+    differences.
+    """
 
     def __init__(self, post: Any, obs: Observations) -> None:
         self.post, self.obs = post, obs
-        sigma = np.mean(post.sigma_draws) * (np.ones(len(obs)) if obs.sigma_px is None else obs.sigma_px)
+        sigma = np.mean(post.sigma_draws) * (
+            np.ones(len(obs)) if obs.sigma_px is None else obs.sigma_px
+        )
         self.noise = np.sqrt(sigma**2 + post.star_error_px**2)
         self.weights = np.ones(len(obs)) if obs.sigma_px is None else obs.sigma_px**-2.0
         self.reference = attitudes(post.mean, obs.xy, obs, self.weights)
@@ -60,7 +75,9 @@ class Second:
         for axis in range(2):
             for each in range(place.max() + 1):
                 moved = np.where((place == each)[:, None], 1e-3 * np.eye(2)[axis], 0.0)
-                slope = (self.phi(post.mean, obs.xy + moved) - self.phi(post.mean, obs.xy - moved)) / 2e-3
+                slope = (
+                    self.phi(post.mean, obs.xy + moved) - self.phi(post.mean, obs.xy - moved)
+                ) / 2e-3
                 chosen = place == each
                 self.by_star[axis, chosen] = slope[frame[chosen]] * self.noise[chosen, None]
         self.covariance = np.zeros((obs.n_frames, 3, 3))
@@ -77,10 +94,14 @@ class Second:
 
 def widths(errors: np.ndarray) -> np.ndarray:
     e = np.abs(errors.reshape(-1, 3))
-    return ARCSEC * np.quantile(np.column_stack((e, np.linalg.norm(e[:, :2], axis=1))), [0.95, 0.997], axis=0)
+    return ARCSEC * np.quantile(
+        np.column_stack((e, np.linalg.norm(e[:, :2], axis=1))), [0.95, 0.997], axis=0
+    )
 
 
-def second(post: Any, obs: Observations, align: Observations, n_draws: int, limit: int) -> dict[str, Any]:
+def second(
+    post: Any, obs: Observations, align: Observations, n_draws: int, limit: int
+) -> dict[str, Any]:
     """Fields of an `AttitudeError` as its module describes them."""
     draws = post.thin(n_draws, SEED)[:, :-1]
     shift = draws - post.mean
@@ -96,7 +117,9 @@ def second(post: Any, obs: Observations, align: Observations, n_draws: int, limi
         return np.einsum("...ip,pq,...iq->...i", response, covariance, response)
 
     phi = np.array([few.phi(theta) for theta in draws])
-    common = np.array([np.einsum("kij,kj->i", few_other.shares, few_other.phi(theta)) for theta in draws])
+    common = np.array(
+        [np.einsum("kij,kj->i", few_other.shares, few_other.phi(theta)) for theta in draws]
+    )
     rest = phi - common[:, None]
 
     def beyond(values: np.ndarray, response: np.ndarray) -> np.ndarray:
@@ -110,25 +133,38 @@ def second(post: Any, obs: Observations, align: Observations, n_draws: int, limi
     sigma_common = np.sqrt(first(together, K) + beyond(common, sampled_together))
     rest_variance = first(apart, K) + over(beyond(rest, few_apart))
     total = np.sqrt(np.mean(first(every.response, K) + over(beyond(phi, few.response)), axis=0))
-    steady = np.sqrt(first(apart.mean(axis=0), K) + beyond(rest.mean(axis=1), few_apart.mean(axis=0)))
+    steady = np.sqrt(
+        first(apart.mean(axis=0), K) + beyond(rest.mean(axis=1), few_apart.mean(axis=0))
+    )
     sigma_rest = np.sqrt(rest_variance.mean(axis=0))
-    # Forty draws with noise, which does something of its own, and something together with the camera.
+    # Forty draws with noise, which does something of its own, and something together with the
+    # camera.
     n = min(40, len(draws))
     e = np.random.default_rng(SEED).standard_normal((n, len(some), 2))
     noisy = [some.xy + few.noise[:, None] * own_noise for own_noise in e]
     alone = np.array([few.phi(post.mean, xy) for xy in noisy])
     both = np.array([few.phi(theta, xy) for theta, xy in zip(draws, noisy, strict=False)])
     met = both - phi[:n] - alone
-    linear = np.add.reduceat(np.einsum("dna,ani->dni", e, few.by_star), some.frame_starts[:-1], axis=1)
+    linear = np.add.reduceat(
+        np.einsum("dna,ani->dni", e, few.by_star), some.frame_starts[:-1], axis=1
+    )
     excess = np.mean(alone**2 - linear**2, axis=(0, 1))
     variances = np.diagonal(every.covariance, axis1=1, axis2=2)
     nea = np.sqrt(variances.mean(axis=0) + excess)
     root = np.linalg.cholesky(every.covariance)
-    white = np.random.default_rng(SEED).standard_normal((SAMPLES // obs.n_frames, obs.n_frames, 3, 1))
+    white = np.random.default_rng(SEED).standard_normal(
+        (SAMPLES // obs.n_frames, obs.n_frames, 3, 1)
+    )
     rng = np.random.default_rng(SEED)
-    drawn, framed = rng.integers(len(post.theta_draws), size=SAMPLES), rng.integers(obs.n_frames, size=SAMPLES)
+    drawn, framed = (
+        rng.integers(len(post.theta_draws), size=SAMPLES),
+        rng.integers(obs.n_frames, size=SAMPLES),
+    )
     deviations = post.theta_draws - post.mean
-    commons, rests = deviations @ together.T, np.einsum("np,nip->ni", deviations[drawn], apart[framed])
+    commons, rests = (
+        deviations @ together.T,
+        np.einsum("np,nip->ni", deviations[drawn], apart[framed]),
+    )
     commons *= sigma_common / np.sqrt(np.mean(commons**2, axis=0))
     rests *= sigma_rest / np.sqrt(np.mean(rests**2, axis=0))
     parts = (root @ white, commons, rests, rests + commons[drawn], met)
@@ -181,7 +217,11 @@ def wide(**changes: Any) -> Any:
     centred = POST.theta_draws[:200] - POST.theta_draws[:200].mean(axis=0)
     theta = THETA + [50.0, 50.0, 30.0, 20.0, 20.0] * centred
     post = SimpleNamespace(**{**vars(POST), "star_error_px": 10.0, **changes})
-    post.theta_draws, post.mean, post.covariance = theta, theta.mean(axis=0), np.cov(theta, rowvar=False)
+    post.theta_draws, post.mean, post.covariance = (
+        theta,
+        theta.mean(axis=0),
+        np.cov(theta, rowvar=False),
+    )
     post.sigma_draws = np.linspace(15.0, 25.0, 200)
     post.draws = np.column_stack((theta, post.sigma_draws))
     post.thin = lambda n, seed: post.draws[np.random.default_rng(seed).permutation(200)[:n]]
@@ -194,7 +234,9 @@ def frames(seed: int, stars: tuple[int, ...], stated: bool) -> Observations:
     return dataclasses.replace(made, sigma_px=rng.uniform(0.5, 1.5, len(made))) if stated else made
 
 
-@pytest.mark.parametrize(("stated", "alignment", "limit"), [(False, "observed", 300), (True, "table", 3)])
+@pytest.mark.parametrize(
+    ("stated", "alignment", "limit"), [(False, "observed", 300), (True, "table", 3)]
+)
 def test_all_of_an_attitude_error_is_that_of_a_second_make(
     monkeypatch: pytest.MonkeyPatch, stated: bool, alignment: str, limit: int
 ) -> None:
@@ -204,7 +246,9 @@ def test_all_of_an_attitude_error_is_that_of_a_second_make(
     post = wide(sigma_name="sigma_scale" if stated else "sigma")
     obs, other = frames(1, (9, 7, 11, 8), stated), frames(2, (10, 8, 9, 7, 12), stated)
     align = obs if alignment == "observed" else other
-    found = propagate(post, obs, n_draws=45, seed=SEED, alignment="observed" if align is obs else align)
+    found = propagate(
+        post, obs, n_draws=45, seed=SEED, alignment="observed" if align is obs else align
+    )
     expected = second(post, obs, align, 45, limit)
     assert found.seen is obs and found.aligned is align
     assert found.alignment == ("4 frames (the same)" if align is obs else "5 frames (given)")
@@ -243,7 +287,13 @@ def test_a_camera_without_error_leaves_noise_alone(monkeypatch: pytest.MonkeyPat
     post.theta_draws = np.tile(post.mean, (200, 1))
     post.draws[:, :-1], post.covariance = post.mean, np.zeros((5, 5))
     found = propagate(post, frames(1, (9,), False), n_draws=5)
-    for name in ("common_arcsec", "rest_arcsec", "total_arcsec", "rest_constant_arcsec", "interaction_arcsec"):
+    for name in (
+        "common_arcsec",
+        "rest_arcsec",
+        "total_arcsec",
+        "rest_constant_arcsec",
+        "interaction_arcsec",
+    ):
         np.testing.assert_allclose(getattr(found, name), 0.0, rtol=0, atol=1e-6)
     assert np.all(np.abs(found.covariance_arcsec2[1:]) < 1e-12)
     # One frame is Gaussian.
@@ -252,7 +302,9 @@ def test_a_camera_without_error_leaves_noise_alone(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_random_sky_is_drawn_by_solid_angle() -> None:
-    """The places are those of the seed, with the solid angle of a pinhole's pixels by its formula."""
+    """The places are those of the seed, with the solid angle of a pinhole's pixels by its
+    formula.
+    """
     post = wide()
     f, draws = 900.0, np.tile([400.0, 380.0, 900.0, 0.0, 0.0, 0.05], (200, 1))
     post.mean, post.draws = draws[0, :-1], draws
@@ -267,7 +319,9 @@ def test_a_random_sky_is_drawn_by_solid_angle() -> None:
     star = rng.integers(len(like), size=counts.sum())
     np.testing.assert_array_equal(found.xy, xy[chosen])
     np.testing.assert_array_equal(np.diff(found.frame_starts), counts)
-    np.testing.assert_array_equal((found.sigma_px, found.mag), (like.sigma_px[star], like.mag[star]))
+    np.testing.assert_array_equal(
+        (found.sigma_px, found.mag), (like.sigma_px[star], like.mag[star])
+    )
     b = seen[chosen] / np.linalg.norm(seen[chosen], axis=1)[:, None]
     np.testing.assert_allclose(found.directions_icrs, b, rtol=0, atol=1e-13)
     assert found.meta["frames"] == "7 frames of random sky"
@@ -282,31 +336,70 @@ def test_what_is_taken_where_nothing_is_said() -> None:
     for function, defaults in (
         (propagate, {"n_draws": 300, "seed": 0, "alignment": None, "alignment_frames": None}),
         (error_spectrum, {"times_s": None, "n_draws": 100, "seed": 0}),
-        (distortion_curve, {"obs": None, "n": 101, "n_draws": 2000, "level": 0.95, "azimuths_deg": None, "seed": 0}),
+        (
+            distortion_curve,
+            {
+                "obs": None,
+                "n": 101,
+                "n_draws": 2000,
+                "level": 0.95,
+                "azimuths_deg": None,
+                "seed": 0,
+            },
+        ),
         (field_map, {"n": 25}),
     ):
         options = inspect.signature(function).parameters.values()
-        assert {o.name: o.default for o in options if o.default is not inspect.Parameter.empty} == defaults
+        assert {
+            o.name: o.default for o in options if o.default is not inspect.Parameter.empty
+        } == defaults
     sigma = np.ones(3)
-    bare = AttitudeError(sigma, sigma, 2.0 * sigma, *(np.ones((5, 4)),) * 2, sigma, sigma, sigma, 10, 20)
-    unknown = {"interaction_arcsec": (3,), "covariance_arcsec2": (5, 3, 3), "alignment_covariance_arcsec2": (3, 3)}
+    bare = AttitudeError(
+        sigma, sigma, 2.0 * sigma, *(np.ones((5, 4)),) * 2, sigma, sigma, sigma, 10, 20
+    )
+    unknown = {
+        "interaction_arcsec": (3,),
+        "covariance_arcsec2": (5, 3, 3),
+        "alignment_covariance_arcsec2": (3, 3),
+    }
     for name, shape in unknown.items():
         assert getattr(bare, name).shape == shape and np.isnan(getattr(bare, name)).all()
     assert bare.rest_constant_arcsec.tolist() == [0.0] * 3 and np.isnan(bare.alignment_arcsec).all()
-    assert (bare.frames, bare.alignment, bare.n_sampled_frames) == ("observed frames", "the frames themselves", 0)
+    assert (bare.frames, bare.alignment, bare.n_sampled_frames) == (
+        "observed frames",
+        "the frames themselves",
+        0,
+    )
     np.testing.assert_allclose(bare.calibration_total_arcsec, np.sqrt(5.0) * sigma)
-    nothing = ("misfit", "seen", "aligned", "total_arcsec", "analytic_total_arcsec", "common_draws_arcsec")
+    nothing = (
+        "misfit",
+        "seen",
+        "aligned",
+        "total_arcsec",
+        "analytic_total_arcsec",
+        "common_draws_arcsec",
+    )
     assert all(getattr(bare, name) is None for name in nothing) and bare.axes == AXES
     for n_sampled, told in ((0, "20"), (20, "20"), (7, "7 of 20")):
-        assert dataclasses.replace(bare, n_sampled_frames=n_sampled).told_frames == f"{told} frames (observed frames)"
+        assert (
+            dataclasses.replace(bare, n_sampled_frames=n_sampled).told_frames
+            == f"{told} frames (observed frames)"
+        )
     # More than half of the variance of the rest.
     constant = np.sqrt([0.49, 0.51, 1.0]) * bare.rest_arcsec
-    assert dataclasses.replace(bare, rest_constant_arcsec=constant).stays.tolist() == [False, True, True]
+    assert dataclasses.replace(bare, rest_constant_arcsec=constant).stays.tolist() == [
+        False,
+        True,
+        True,
+    ]
     found = MisfitFound(1.0, sigma, sigma, ("a", "b"), ("b", "c"))
     assert found.reasons == ("a", "b", "c") and found.notes == ()
     assert two_figures(2.0, 1.0) == "2.0 arcsec with the misfit found (1.0 if the model holds)"
     assert two_figures(1.001, 1.0) == "1.0 arcsec"
-    assert two_figures(np.nan, 1.0) == "1.0 arcsec if the model holds (with the misfit found: not assessed)"
+    assert (
+        two_figures(np.nan, 1.0)
+        == "1.0 arcsec if the model holds (with the misfit found: not assessed)"
+    )
 
 
 def test_ratios_of_next_to_nothing_are_none() -> None:
@@ -331,7 +424,13 @@ def test_a_file_holds_each_number_in_its_column(tmp_path: Path) -> None:
     root = rng.standard_normal((6, 3, 3))
     matrices = root @ np.swapaxes(root, 1, 2)
     made = AttitudeError(
-        *(sizes[0], sizes[1], sizes[2], rng.uniform(2.0, 3.0, (5, 4)), rng.uniform(3.0, 4.0, (5, 4))),
+        *(
+            sizes[0],
+            sizes[1],
+            sizes[2],
+            rng.uniform(2.0, 3.0, (5, 4)),
+            rng.uniform(3.0, 4.0, (5, 4)),
+        ),
         *(analytic[0], analytic[1], analytic[2]),
         n_draws=31,
         n_frames=41,
@@ -344,7 +443,14 @@ def test_a_file_holds_each_number_in_its_column(tmp_path: Path) -> None:
         covariance_arcsec2=matrices[:5],
         alignment="9 frames",
         alignment_covariance_arcsec2=matrices[5],
-        misfit=MisfitFound(1.2, rng.uniform(0.0, 1.0, 3), rng.uniform(0.0, 1.0, 3), ("one",), ("two", "three"), ("n",)),
+        misfit=MisfitFound(
+            1.2,
+            rng.uniform(0.0, 1.0, 3),
+            rng.uniform(0.0, 1.0, 3),
+            ("one",),
+            ("two", "three"),
+            ("n",),
+        ),
     )
     made.save(tmp_path / "attitude.csv")
     table = pd.read_csv(tmp_path / "attitude.csv", dtype=str, keep_default_na=False)
@@ -355,7 +461,9 @@ def test_a_file_holds_each_number_in_its_column(tmp_path: Path) -> None:
             np.testing.assert_array_equal(one, other, err_msg=field.name)
             assert type(one) is type(other), field.name
     for field in dataclasses.fields(MisfitFound):
-        np.testing.assert_array_equal(getattr(made.misfit, field.name), getattr(again.misfit, field.name))
+        np.testing.assert_array_equal(
+            getattr(made.misfit, field.name), getattr(again.misfit, field.name)
+        )
     pd.testing.assert_frame_equal(again.to_dataframe(), made.to_dataframe(), check_exact=True)
 
     def across(values: np.ndarray) -> np.ndarray:
@@ -370,12 +478,21 @@ def test_a_file_holds_each_number_in_its_column(tmp_path: Path) -> None:
         "p997_if_model_holds_arcsec": made.p997_arcsec.ravel(),
         "first_order_arcsec": np.concatenate([across(row) for row in (*analytic, zero)]),
         "absorbed_by_alignment": np.repeat(["no", "yes", "no", "in part", "no"], 4),
-        **{"n_draws": 31, "n_frames": 41, "n_sampled_frames": 17, "frames": "a night", "alignment": "9 frames"},
+        **{
+            "n_draws": 31,
+            "n_frames": 41,
+            "n_sampled_frames": 17,
+            "frames": "a night",
+            "alignment": "9 frames",
+        },
         "rest_constant_arcsec": np.tile(across(made.rest_constant_arcsec), 5),
         "alignment_sigma_arcsec": np.tile(across(np.sqrt(np.diag(matrices[5]))), 5),
     }
     for i, axis in enumerate(AXES):
-        for prefix, several in (("", matrices[:5]), ("alignment_", np.repeat(matrices[5:], 5, axis=0))):
+        for prefix, several in (
+            ("", matrices[:5]),
+            ("alignment_", np.repeat(matrices[5:], 5, axis=0)),
+        ):
             column = np.column_stack((several[:, :, i], np.full(5, np.nan)))
             expected[f"{prefix}covariance_{axis}_arcsec2"] = column.ravel()
     for name, values in expected.items():
@@ -400,42 +517,83 @@ def test_a_field_map_is_that_of_a_second_make() -> None:
     xy = np.column_stack([g.ravel() for g in np.meshgrid(x, x)])
     b = directions(post.mean, xy)
     steps = np.diag(1e-3 * np.sqrt(np.diag(post.covariance)))
-    B = np.stack([(directions(post.mean + e, xy) - directions(post.mean - e, xy)) / (2.0 * e.max()) for e in steps], 2)
+    B = np.stack(
+        [
+            (directions(post.mean + e, xy) - directions(post.mean - e, xy)) / (2.0 * e.max())
+            for e in steps
+        ],
+        2,
+    )
     weight = np.outer([0.5, 1, 1, 1, 0.5], [0.5, 1, 1, 1, 0.5]).ravel()
     normal = np.einsum("n,nij->ij", weight, np.eye(3) - b[:, :, None] * b[:, None])
-    turned = np.linalg.solve(normal, np.einsum("n,nip->ip", weight, np.cross(b[:, :, None], B, axis=1)))
+    turned = np.linalg.solve(
+        normal, np.einsum("n,nip->ip", weight, np.cross(b[:, :, None], B, axis=1))
+    )
     rest = B - np.cross(turned[None], b[:, :, None], axis=1)
     for derivatives, sigma, worst, ellipse in (
-        (B, found.sigma_absolute_arcsec, found.worst_absolute_arcsec, found.covariance_absolute_arcsec2),
-        (rest, found.sigma_compensated_arcsec, found.worst_compensated_arcsec, found.covariance_compensated_arcsec2),
+        (
+            B,
+            found.sigma_absolute_arcsec,
+            found.worst_absolute_arcsec,
+            found.covariance_absolute_arcsec2,
+        ),
+        (
+            rest,
+            found.sigma_compensated_arcsec,
+            found.worst_compensated_arcsec,
+            found.covariance_compensated_arcsec2,
+        ),
     ):
         covariance = derivatives @ post.covariance @ np.swapaxes(derivatives, 1, 2) * ARCSEC**2
         values = np.linalg.eigvalsh(covariance)
         np.testing.assert_allclose(sigma.ravel(), np.sqrt(0.5 * values.sum(axis=1)), rtol=1e-6)
         np.testing.assert_allclose(worst.ravel(), np.sqrt(values[:, 2]), rtol=1e-6)
-        np.testing.assert_allclose(np.linalg.eigvalsh(ellipse).reshape(25, 2), values[:, 1:], rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(
+            np.linalg.eigvalsh(ellipse).reshape(25, 2), values[:, 1:], rtol=1e-5, atol=1e-9
+        )
         size = np.sqrt(np.einsum("nii,njj->nij", covariance, covariance))[:, :2, :2]
-        np.testing.assert_allclose(ellipse.reshape(25, 2, 2) / size, covariance[:, :2, :2] / size, rtol=0, atol=0.03)
+        np.testing.assert_allclose(
+            ellipse.reshape(25, 2, 2) / size, covariance[:, :2, :2] / size, rtol=0, atol=0.03
+        )
     rotation = turned @ post.covariance @ turned.T * ARCSEC**2
-    np.testing.assert_allclose(found.rotation_covariance_arcsec2, rotation, rtol=1e-5, atol=1e-9 * rotation.max())
+    np.testing.assert_allclose(
+        found.rotation_covariance_arcsec2, rotation, rtol=1e-5, atol=1e-9 * rotation.max()
+    )
     shift = np.linalg.inv(turned[:2, :2]) @ turned[:2]
     equal = shift @ post.covariance @ shift.T
-    np.testing.assert_allclose(found.equivalent_covariance_px2, equal, rtol=1e-5, atol=1e-9 * equal.max())
-    np.testing.assert_allclose(found.equivalent_principal_point_px, np.sqrt(np.diag(equal)), rtol=1e-6)
-    np.testing.assert_allclose(found.equivalent_principal_point_arcsec, np.sqrt(np.diag(rotation))[[1, 0]], rtol=1e-6)
+    np.testing.assert_allclose(
+        found.equivalent_covariance_px2, equal, rtol=1e-5, atol=1e-9 * equal.max()
+    )
+    np.testing.assert_allclose(
+        found.equivalent_principal_point_px, np.sqrt(np.diag(equal)), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        found.equivalent_principal_point_arcsec, np.sqrt(np.diag(rotation))[[1, 0]], rtol=1e-6
+    )
     table = found.to_dataframe()
-    assert table["x_px"].tolist() == xy[:, 0].tolist() and table["y_px"].tolist() == xy[:, 1].tolist()
+    assert (
+        table["x_px"].tolist() == xy[:, 0].tolist() and table["y_px"].tolist() == xy[:, 1].tolist()
+    )
     for kind in ("absolute", "compensated"):
         matrices = getattr(found, f"covariance_{kind}_arcsec2").reshape(25, 2, 2)
-        for name, entry in (("xx", matrices[:, 0, 0]), ("xy", matrices[:, 1, 0]), ("yy", matrices[:, 1, 1])):
+        for name, entry in (
+            ("xx", matrices[:, 0, 0]),
+            ("xy", matrices[:, 1, 0]),
+            ("yy", matrices[:, 1, 1]),
+        ):
             np.testing.assert_allclose(table[f"{kind}_{name}_arcsec2"], entry, rtol=1e-9)
         for name in ("sigma", "worst"):
-            assert table[f"{name}_{kind}_arcsec"].tolist() == getattr(found, f"{name}_{kind}_arcsec").ravel().tolist()
+            assert (
+                table[f"{name}_{kind}_arcsec"].tolist()
+                == getattr(found, f"{name}_{kind}_arcsec").ravel().tolist()
+            )
     assert len(table.columns) == 12
 
 
 def test_a_coupling_is_its_covariance_said_otherwise() -> None:
-    """Every field and column from the covariance, the information, the prior and the responses, each by its formula."""
+    """Every field and column from the covariance, the information, the prior and the responses,
+    each by its formula.
+    """
     rng = np.random.default_rng(2)
     scale = np.array([0.3, 0.2, 0.5, 1e-10, 1e-16])
     root = rng.standard_normal((5, 5))
@@ -479,27 +637,55 @@ def test_a_coupling_is_its_covariance_said_otherwise() -> None:
     ):
         np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-8, err_msg=name)
     values, vectors = np.linalg.eigh(extended[:5, :5])
-    for direction, value, vector in zip(found.weak_directions, values[::-1], vectors.T[::-1], strict=True):
+    for direction, value, vector in zip(
+        found.weak_directions, values[::-1], vectors.T[::-1], strict=True
+    ):
         assert direction.variance == pytest.approx(value)
         sign = np.sign(vector[np.argmax(np.abs(vector))])
         np.testing.assert_allclose(direction.weights, sign * vector, rtol=1e-6, atol=1e-12)
     pairs = {(a, b): extended[i, j] for i, a in enumerate(found.parameter_names)
              for j, b in enumerate(found.parameter_names) if i < j}  # fmt: skip
     for least in (0.5, 0.1):
-        strong = sorted((pair for pair in pairs if abs(pairs[pair]) >= least), key=lambda pair: -abs(pairs[pair]))
+        strong = sorted(
+            (pair for pair in pairs if abs(pairs[pair]) >= least),
+            key=lambda pair: -abs(pairs[pair]),
+        )
         assert [pair[:2] for pair in found.pairs(least)] == strong and 0 < len(strong) < 10
-        np.testing.assert_allclose([pair[2] for pair in found.pairs(least)], [pairs[pair] for pair in strong])
+        np.testing.assert_allclose(
+            [pair[2] for pair in found.pairs(least)], [pairs[pair] for pair in strong]
+        )
     assert found.pairs() == found.pairs(0.5)
     table = found.to_dataframe()
-    names = ["sigma_marginal", "sigma_conditional", "variance_inflation", "crlb_sigma", "prior_sigma", "contraction"]
-    assert table.columns.tolist() == ["parameter", "unit", *names, *(f"corr_{name}" for name in found.extended_names)]
+    names = [
+        "sigma_marginal",
+        "sigma_conditional",
+        "variance_inflation",
+        "crlb_sigma",
+        "prior_sigma",
+        "contraction",
+    ]
+    assert table.columns.tolist() == [
+        "parameter",
+        "unit",
+        *names,
+        *(f"corr_{name}" for name in found.extended_names),
+    ]
     for name in names:
         assert table[name].tolist() == getattr(found, name).tolist()
-    np.testing.assert_array_equal(table.iloc[:, 8:].to_numpy(dtype=float), found.extended_correlation[:5])
-    assert (table["parameter"].tolist(), table["unit"].tolist()) == ([*found.parameter_names], [*found.units])
+    np.testing.assert_array_equal(
+        table.iloc[:, 8:].to_numpy(dtype=float), found.extended_correlation[:5]
+    )
+    assert (table["parameter"].tolist(), table["unit"].tolist()) == (
+        [*found.parameter_names],
+        [*found.units],
+    )
     del result.priors
     bare = coupling(result)
-    assert bare.prior_sigma is None and bare.contraction is None and len(bare.to_dataframe().columns) == 14
+    assert (
+        bare.prior_sigma is None
+        and bare.contraction is None
+        and len(bare.to_dataframe().columns) == 14
+    )
 
 
 def test_a_curve_is_that_of_its_draws() -> None:
@@ -529,14 +715,33 @@ def test_a_curve_is_that_of_its_draws() -> None:
         ("lower_simultaneous_px", mean - multiplier * sd),
         ("upper_simultaneous_px", mean + multiplier * sd),
     ):
-        np.testing.assert_allclose(getattr(found, name)[0], expected, rtol=1e-6, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(found, name)[0], expected, rtol=1e-6, atol=1e-9, err_msg=name
+        )
     np.testing.assert_allclose(found.arcsec_per_px, ARCSEC * f / (f**2 + radius**2), rtol=1e-12)
     assert found.multiplier == pytest.approx(multiplier, rel=1e-6)
-    assert (found.level, found.model, found.n_draws, found.azimuth_deg.tolist()) == (0.9, "brown", 50, [0.0])
-    assert found.star_radius_px == pytest.approx(np.linalg.norm(obs.xy - post.mean[:2], axis=1).max())
+    assert (found.level, found.model, found.n_draws, found.azimuth_deg.tolist()) == (
+        0.9,
+        "brown",
+        50,
+        [0.0],
+    )
+    assert found.star_radius_px == pytest.approx(
+        np.linalg.norm(obs.xy - post.mean[:2], axis=1).max()
+    )
     table = found.to_dataframe()
-    assert table["radius_px"].tolist() == radius.tolist() and table["azimuth_deg"].tolist() == [0.0] * 6
-    for name in ("mean_px", "sd_px", "lower_px", "upper_px", "lower_simultaneous_px", "upper_simultaneous_px"):
+    assert (
+        table["radius_px"].tolist() == radius.tolist()
+        and table["azimuth_deg"].tolist() == [0.0] * 6
+    )
+    for name in (
+        "mean_px",
+        "sd_px",
+        "lower_px",
+        "upper_px",
+        "lower_simultaneous_px",
+        "upper_simultaneous_px",
+    ):
         assert table[name].tolist() == getattr(found, name)[0].tolist()
     for wrong in ({"n": 1}, {"level": 0.0}, {"level": 1.0}):
         with pytest.raises(ValueError, match=r"at least 2|level"):

@@ -47,7 +47,9 @@ def test_covariance_draws_and_tables(run, tmp_path):
     lines = sc.export(run, "markdown", tmp_path / "t.md").path.read_text().splitlines()
     assert len(lines) == 2 + len(run.posterior.parameter_names)
     assert {line.count("|") for line in lines} == {10}
-    assert sc.export(run, "latex", tmp_path / "t.tex").path.read_text().startswith(r"\begin{tabular}")
+    assert (
+        sc.export(run, "latex", tmp_path / "t.tex").path.read_text().startswith(r"\begin{tabular}")
+    )
 
 
 @pytest.mark.slow
@@ -63,7 +65,9 @@ def test_arviz_reads_what_is_written_for_it(run, tmp_path):
             data[group].to_dataset() if hasattr(data[group], "to_dataset") else data[group]
             for data in (again, expected)
         )
-        assert set(one.variables) == set(other.variables) and set(one.coords) == set(other.coords), group
+        assert set(one.variables) == set(other.variables) and set(one.coords) == set(
+            other.coords
+        ), group
         for name in other.variables:
             assert np.array_equal(one[name].values, other[name].values), (group, name)
             assert one[name].attrs.get("units") == other[name].attrs.get("units")

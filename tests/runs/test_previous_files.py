@@ -1,4 +1,6 @@
-"""Files that the version before wrote are read. They are small ones of every kind, in ``data/previous``."""
+"""Files that the version before wrote are read. They are small ones of every kind, in
+``data/previous``.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def content(path: Path) -> Any:
         return path.read_bytes()
     arrays = read_arrays(path)
     text = str(arrays.pop("document")) if "document" in arrays else "{}"
-    return json.loads(text), {name: (value.dtype, value.tobytes()) for name, value in arrays.items()}
+    return json.loads(text), {
+        name: (value.dtype, value.tobytes()) for name, value in arrays.items()
+    }
 
 
 # Columns that tables no longer have; they may have further ones.
@@ -79,7 +83,9 @@ def holds(again: Any, before: Any) -> bool:
 def test_a_result_is_read_and_written_again_as_it_was(tmp_path: Path, name: str) -> None:
     SAVED[name].load(PREVIOUS / name).save(tmp_path / name)
     if name in GONE:
-        again, before = (pd.read_csv(folder / name, dtype=str).fillna("") for folder in (tmp_path, PREVIOUS))
+        again, before = (
+            pd.read_csv(folder / name, dtype=str).fillna("") for folder in (tmp_path, PREVIOUS)
+        )
         kept = [column for column in before if column in again]
         assert set(before) - set(kept) == GONE[name]
         assert again[kept][: len(before)].equals(before[kept])
@@ -88,14 +94,19 @@ def test_a_result_is_read_and_written_again_as_it_was(tmp_path: Path, name: str)
     if name in ("calibration.json", "filtered.json"):
         assert content(tmp_path / arrays.name) == content(arrays)
     if name in ("diagnosis.json", "images.json", "calibration.json", "filtered.json"):
-        assert holds(json.loads((tmp_path / name).read_text()), json.loads((PREVIOUS / name).read_text()))
+        assert holds(
+            json.loads((tmp_path / name).read_text()), json.loads((PREVIOUS / name).read_text())
+        )
         return
     assert content(tmp_path / name) == content(PREVIOUS / name)
 
 
 def test_a_comparison_is_read_and_written_again_as_it_was(tmp_path: Path) -> None:
     comparison = CameraComparison.load(PREVIOUS / "comparison.json")
-    write_json({"verdict": comparison.verdict, **to_plain(comparison, null=True)}, tmp_path / "comparison.json")
+    write_json(
+        {"verdict": comparison.verdict, **to_plain(comparison, null=True)},
+        tmp_path / "comparison.json",
+    )
     assert content(tmp_path / "comparison.json") == content(PREVIOUS / "comparison.json")
 
 
@@ -110,7 +121,12 @@ def test_results_hold_what_they_held() -> None:
     assert calibration.status is Status.CONVERGED
     assert calibration.provenance["data_sha256"] == observations.data_hash
     assert calibration.residuals_px.shape == (observations.n_stars, 2)
-    assert [stage.name for stage in calibration.stages] == ["optics", "distortion", "all", "refinement"]
+    assert [stage.name for stage in calibration.stages] == [
+        "optics",
+        "distortion",
+        "all",
+        "refinement",
+    ]
     diagnosis = Diagnosis.load(PREVIOUS / "diagnosis.json")
     assert diagnosis.is_of(calibration)
     assert any(np.isnan(test.size_px) for test in diagnosis.misfit.tests)

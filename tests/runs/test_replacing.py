@@ -1,4 +1,6 @@
-"""Nothing is lost and nothing is mixed: at every moment a folder holds the old run or the new one."""
+"""Nothing is lost and nothing is mixed: at every moment a folder holds the old run or the new
+one.
+"""
 
 from __future__ import annotations
 
@@ -44,13 +46,18 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same results again where the same was asked before, and reports of one line and one figure."""
+    """The same results again where the same was asked before, and reports of one line and one
+    figure.
+    """
     for place, name in HEAVY.items():
         module = importlib.import_module(f"starcal_uq.{place}")
         monkeypatch.setattr(module, name, _remembering(getattr(module, name)))
-    monkeypatch.setattr("starcal_uq.presentation.report.drawing.draw_figures", lambda *_: {"figure": b"png"})
     monkeypatch.setattr(
-        "starcal_uq.presentation.report.page.prepared", lambda results: lambda *_: f"report of {results.name}"
+        "starcal_uq.presentation.report.drawing.draw_figures", lambda *_: {"figure": b"png"}
+    )
+    monkeypatch.setattr(
+        "starcal_uq.presentation.report.page.prepared",
+        lambda results: lambda *_: f"report of {results.name}",
     )
 
 
@@ -59,10 +66,20 @@ def _remembering(function: Callable[..., Any]) -> Callable[..., Any]:
         if isinstance(value, sc.Observations):
             return value.data_hash
         numbers = getattr(value, "draws", getattr(value, "theta", None))
-        return value if isinstance(value, int | str | None) else b"" if numbers is None else numbers.tobytes()
+        return (
+            value
+            if isinstance(value, int | str | None)
+            else b""
+            if numbers is None
+            else numbers.tobytes()
+        )
 
     def remembered(*given: Any, **options: Any) -> Any:
-        key = (function.__name__, *map(mark, given), *((name, mark(value)) for name, value in sorted(options.items())))
+        key = (
+            function.__name__,
+            *map(mark, given),
+            *((name, mark(value)) for name, value in sorted(options.items())),
+        )
         if key not in _results:
             _results[key] = function(*given, **options)
         elif "checkpoint" in options:
@@ -91,9 +108,15 @@ def make(folder: Path, seed: int, *, force: bool = False, stop: str | None = Non
                 continue
             if step == "calibrate":
                 obs = observations(n_frames=12, seed=seed)
-                run.calibrate(obs, sc.paper.paper_start(), **({} if hasattr(run, "did") else {"force": force}))
+                run.calibrate(
+                    obs, sc.paper.paper_start(), **({} if hasattr(run, "did") else {"force": force})
+                )
             else:
-                more = {"force": True} if force and step == "sample" and not hasattr(run, "did") else {}
+                more = (
+                    {"force": True}
+                    if force and step == "sample" and not hasattr(run, "did")
+                    else {}
+                )
                 getattr(run, step)(**options.get(step, {}), **more)
 
 
@@ -102,7 +125,11 @@ def content(folder: Path) -> str:
     run = sc.Run(folder)
     posterior = run.posterior
     assert posterior.provenance["data_sha256"] == run.observations.data_hash
-    tables = [run.attitude.to_written().to_csv(), run.error_budget.to_dataframe().to_csv(), str(run.field_map)]
+    tables = [
+        run.attitude.to_written().to_csv(),
+        run.error_budget.to_dataframe().to_csv(),
+        str(run.field_map),
+    ]
     if not run.folder.report.exists() or not run.folder.coupling.exists():
         raise RunFolderError(f"{folder}: not whole")
     whole = run.calibration.theta.tobytes() + posterior.draws.tobytes() + "".join(tables).encode()
@@ -133,7 +160,9 @@ def notes(folder: Path) -> bool:
     return (folder / "notes.txt").read_text() == (folder / "mine" / "data.csv").read_text() == NOTES
 
 
-def test_at_every_moment_there_is_the_old_run_or_the_new_one(whole: dict[int, Path], run: Path, tmp_path: Path) -> None:
+def test_at_every_moment_there_is_the_old_run_or_the_new_one(
+    whole: dict[int, Path], run: Path, tmp_path: Path
+) -> None:
     old, new = content(run), content(whole[SECOND])
     assert old != new
     with snapshots(run.parent, tmp_path / "states") as states:
@@ -146,7 +175,11 @@ def test_at_every_moment_there_is_the_old_run_or_the_new_one(whole: dict[int, Pa
         assert notes(state / "run")
         # Files whose writer was stopped are put into their places; the same files are the same run.
         read_manifest(state / "run")
-        files = sorted(path for path in (state / "run").rglob("*") if path.is_file() and path.parent.name[0] != ".")
+        files = sorted(
+            path
+            for path in (state / "run").rglob("*")
+            if path.is_file() and path.parent.name[0] != "."
+        )
         mark = hash(tuple((path.name, path.read_bytes()) for path in files))
         try:
             known[mark] = known.get(mark) or content(state / "run")
@@ -154,10 +187,14 @@ def test_at_every_moment_there_is_the_old_run_or_the_new_one(whole: dict[int, Pa
         except (RunFolderError, OSError):
             found.append(False)
     assert len(found) > 20
-    assert sum(found) == len(found), f"{len(found) - sum(found)} of {len(found)} states hold no whole run"
+    assert sum(found) == len(found), (
+        f"{len(found) - sum(found)} of {len(found)} states hold no whole run"
+    )
 
 
-def test_a_new_sample_is_never_believed_with_what_rested_on_the_old(run: Path, tmp_path: Path) -> None:
+def test_a_new_sample_is_never_believed_with_what_rested_on_the_old(
+    run: Path, tmp_path: Path
+) -> None:
     old = sc.Run(run).posterior.draws
     told: list[str] = []
     with snapshots(run.parent, tmp_path / "states") as states:
@@ -167,14 +204,19 @@ def test_a_new_sample_is_never_believed_with_what_rested_on_the_old(run: Path, t
         found = sc.Run(state / "run")
         is_old, is_new = (np.array_equal(found.posterior.draws, draws) for draws in (old, new))
         assert is_old != is_new
-        assert all(found.has(name) == is_old for name in ("coupling", "attitude", "field_map", "budget", "report"))
+        assert all(
+            found.has(name) == is_old
+            for name in ("coupling", "attitude", "field_map", "budget", "report")
+        )
         assert found.verdict.headline
     (sentence,) = told
     assert "report.html, verdict.json: removed, because it rested on what is replaced" in sentence
     assert f"`starcal-uq propagate {run}`" in sentence
 
 
-@pytest.mark.parametrize("stop", ["sample", *(pytest.param(s, marks=pytest.mark.slow) for s in STEPS if s != "sample")])
+@pytest.mark.parametrize(
+    "stop", ["sample", *(pytest.param(s, marks=pytest.mark.slow) for s in STEPS if s != "sample")]
+)
 def test_an_interrupted_run_goes_on_to_the_same_result(
     stop: str, whole: dict[int, Path], run: Path, tmp_path: Path
 ) -> None:
@@ -209,7 +251,10 @@ def test_an_unfinished_run_of_other_settings_starts_again_and_the_first_one_stay
     "largest", [8000, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 1000, 30_000, 60_000))]
 )
 def test_a_full_disk_leaves_the_old_run(largest: int, whole: dict[int, Path], run: Path) -> None:
-    with small_files(largest), pytest.raises(RunFolderError, match=r"cannot be written .*free space"):
+    with (
+        small_files(largest),
+        pytest.raises(RunFolderError, match=r"cannot be written .*free space"),
+    ):
         make(run, SECOND, force=True)
     assert content(run) == content(whole[FIRST])
     assert notes(run)
@@ -221,7 +266,9 @@ def test_what_the_run_has_not_written_is_never_overwritten(tmp_path: Path) -> No
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "camera.toml").write_text(NOTES)
-    with pytest.raises(RunFolderError, match=r"camera\.toml: is in the way .* not of this run: move it elsewhere"):
+    with pytest.raises(
+        RunFolderError, match=r"camera\.toml: is in the way .* not of this run: move it elsewhere"
+    ):
         make(folder, FIRST, force=True)
     assert [path.name for path in folder.iterdir()] == ["camera.toml"]
     assert (folder / "camera.toml").read_text() == NOTES
@@ -234,16 +281,22 @@ def test_a_hidden_folder_that_is_a_link_is_refused_and_what_it_names_survives(
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text(NOTES)
     (run / hidden).symlink_to(tmp_path / "mine")
-    with pytest.raises(RunFolderError, match=rf"{hidden}: is not a folder that a run has made; move it elsewhere"):
+    with pytest.raises(
+        RunFolderError, match=rf"{hidden}: is not a folder that a run has made; move it elsewhere"
+    ):
         if hidden == ".new":
             make(run, SECOND, force=True)
         sc.Run(run).couple(force=True)
-    assert (run / hidden).is_symlink() and [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+    assert (run / hidden).is_symlink() and [
+        path.name for path in (tmp_path / "mine").iterdir()
+    ] == ["notes.txt"]
     (run / hidden).unlink()
     assert content(run) == content(whole[FIRST])
 
 
-def test_a_file_of_the_users_in_the_hidden_folder_of_a_new_run_survives(whole: dict[int, Path], run: Path) -> None:
+def test_a_file_of_the_users_in_the_hidden_folder_of_a_new_run_survives(
+    whole: dict[int, Path], run: Path
+) -> None:
     with pytest.raises(KeyboardInterrupt):
         make(run, SECOND, force=True, stop="couple")
     mine = run / ".new" / "figures" / "notes.txt"
@@ -257,7 +310,8 @@ def test_a_file_of_the_users_in_the_hidden_folder_of_a_new_run_survives(whole: d
         lambda: again.write(again.calibration, again.observations),
     ):
         with pytest.raises(
-            RunFolderError, match=r"notes\.txt: is not of a run, .*; move it elsewhere, and start again"
+            RunFolderError,
+            match=r"notes\.txt: is not of a run, .*; move it elsewhere, and start again",
         ):
             call()
         assert mine.read_text() == NOTES and content(run) == content(whole[FIRST])
@@ -300,13 +354,17 @@ def test_a_file_that_is_not_of_this_run_is_refused_by_name(
     flipped = good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :]
     for content in ((whole[SECOND] / name).read_bytes() + b" ", good[:-20], flipped, b""):
         (run / name).write_bytes(content)
-        with pytest.raises(RunFolderError, match=rf"{name}: is not the file .* run `starcal-uq {remedy}`"):
+        with pytest.raises(
+            RunFolderError, match=rf"{name}: is not the file .* run `starcal-uq {remedy}`"
+        ):
             getattr(sc.Run(run), step)
     (run / name).write_bytes(good)
     getattr(sc.Run(run), step)
 
 
-def test_a_file_of_another_run_where_there_was_none_is_refused(whole: dict[int, Path], tmp_path: Path) -> None:
+def test_a_file_of_another_run_where_there_was_none_is_refused(
+    whole: dict[int, Path], tmp_path: Path
+) -> None:
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path / "run", SECOND, stop="sample")
     shutil.copy(whole[FIRST] / "posterior.nc", tmp_path / "run")
@@ -314,7 +372,9 @@ def test_a_file_of_another_run_where_there_was_none_is_refused(whole: dict[int, 
         sc.Run(tmp_path / "run").report()
 
 
-def test_a_folder_of_a_version_without_records_is_read_and_gets_one(whole: dict[int, Path], run: Path) -> None:
+def test_a_folder_of_a_version_without_records_is_read_and_gets_one(
+    whole: dict[int, Path], run: Path
+) -> None:
     (run / "run.json").unlink()
     assert content(run) == content(whole[FIRST])
     sc.Run(run).report(force=True)
@@ -324,7 +384,9 @@ def test_a_folder_of_a_version_without_records_is_read_and_gets_one(whole: dict[
         content(run)
 
 
-def test_one_process_at_a_time_writes_into_a_folder(whole: dict[int, Path], run: Path, tmp_path: Path) -> None:
+def test_one_process_at_a_time_writes_into_a_folder(
+    whole: dict[int, Path], run: Path, tmp_path: Path
+) -> None:
     """A lock by another handle is what another process holds; it ends with the process."""
     stars, camera = sc.load_catalogue(max_mag=5.0), sc.paper.paper_camera()
     writers = {
@@ -332,14 +394,18 @@ def test_one_process_at_a_time_writes_into_a_folder(whole: dict[int, Path], run:
         "report": lambda: sc.Run(run).report(force=True),
         "run": lambda: make(run, SECOND, force=True),
         "write": lambda: sc.Run(run).write(sc.Run(whole[SECOND]).calibration, None),
-        "simulate": lambda: sc.simulation.simulate_partitions(stars, camera, run, n_frames=5, force=True),
+        "simulate": lambda: sc.simulation.simulate_partitions(
+            stars, camera, run, n_frames=5, force=True
+        ),
     }
     before = content(run)
     other = os.open(run, os.O_RDONLY)
     fcntl.flock(other, fcntl.LOCK_EX)
     try:
         for writer in writers.values():
-            with pytest.raises(RunFolderError, match=r"run: another process is writing there; wait for"):
+            with pytest.raises(
+                RunFolderError, match=r"run: another process is writing there; wait for"
+            ):
                 writer()
         assert content(run) == before
         assert sc.Run(run).report().exists()
@@ -350,5 +416,8 @@ def test_one_process_at_a_time_writes_into_a_folder(whole: dict[int, Path], run:
 
 def test_a_damaged_record_is_named(run: Path) -> None:
     (run / "run.json").write_text("{")
-    with pytest.raises(RunFolderError, match=r"run\.json: is not the record of a run .*; delete it, and the folder is"):
+    with pytest.raises(
+        RunFolderError,
+        match=r"run\.json: is not the record of a run .*; delete it, and the folder is",
+    ):
         sc.Run(run).report(force=True)

@@ -1,4 +1,6 @@
-"""A run: each result is loaded once, what is stale goes, and data of another calibration are refused."""
+"""A run: each result is loaded once, what is stale goes, and data of another calibration are
+refused.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 def test_a_demo_reads_each_file_once_at_most_and_is_judged_once(
     calls: Counter[str], unpainted: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["starcal-uq", "demo", "--frames", "60", "--out", str(tmp_path / "demo")])
+    monkeypatch.setattr(
+        sys, "argv", ["starcal-uq", "demo", "--frames", "60", "--out", str(tmp_path / "demo")]
+    )
     with pytest.raises(SystemExit):
         main()
     assert max(calls.values()) == 1
@@ -115,12 +119,19 @@ def test_a_run_shows_what_its_folder_holds_now(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("step", ["sample", "diagnose", "report"])
-def test_data_of_another_calibration_are_refused_with_one_sentence(step: str, tmp_path: Path) -> None:
+def test_data_of_another_calibration_are_refused_with_one_sentence(
+    step: str, tmp_path: Path
+) -> None:
     sc.Run(tmp_path).calibrate(observations(), sc.paper.paper_start())
     observations(seed=4).save(tmp_path / "observations.parquet", force=True)
-    with pytest.raises(sc.errors.RunFolderError, match=r"not the file that this run .* run `starcal-uq calibrate"):
+    with pytest.raises(
+        sc.errors.RunFolderError, match=r"not the file that this run .* run `starcal-uq calibrate"
+    ):
         getattr(sc.Run(tmp_path), step)()
     # A folder of a version without records.
     (tmp_path / "run.json").unlink()
-    with pytest.raises(sc.errors.RunFolderError, match=r"made from other observations .* run `starcal-uq calibrate`"):
+    with pytest.raises(
+        sc.errors.RunFolderError,
+        match=r"made from other observations .* run `starcal-uq calibrate`",
+    ):
         getattr(sc.Run(tmp_path), step)()

@@ -94,7 +94,15 @@ def test_provenance_is_plain_and_imports_nothing_heavy():
     assert not {"casadi", "emcee", "arviz", "scipy"} & (set(sys.modules) - before)
     assert json.loads(json.dumps(record)) == record
     assert set(record) == {"created_utc", "seed", "settings", "data_sha256", "versions"}
-    assert set(record["versions"]) == {"python", "starcal_uq", "numpy", "scipy", "casadi", "emcee", "arviz"}
+    assert set(record["versions"]) == {
+        "python",
+        "starcal_uq",
+        "numpy",
+        "scipy",
+        "casadi",
+        "emcee",
+        "arviz",
+    }
     assert record["versions"]["python"] == ".".join(map(str, sys.version_info[:3]))
     assert record["versions"]["numpy"]
     assert record["created_utc"].endswith("Z")
@@ -122,11 +130,15 @@ def test_run_folder_names(tmp_path):
 
 def test_require_names_the_command(tmp_path):
     run = RunFolder(tmp_path / "run")
-    with pytest.raises(RunFolderError, match="does not exist; check the path, or run `starcal-uq calibrate"):
+    with pytest.raises(
+        RunFolderError, match="does not exist; check the path, or run `starcal-uq calibrate"
+    ):
         run.require("calibration")
     assert run.create() is run
     run.create()
-    with pytest.raises(RunFolderError, match=r"has no posterior\.nc; run `starcal-uq sample RUN` first\."):
+    with pytest.raises(
+        RunFolderError, match=r"has no posterior\.nc; run `starcal-uq sample RUN` first\."
+    ):
         run.require("posterior")
     run.posterior.write_bytes(b"")
     assert run.require("posterior") == run.posterior
@@ -141,7 +153,11 @@ def test_a_budget_makes_what_rests_on_it_older_and_takes_nothing_away(tmp_path):
         with run.step(step, {}) as files:
             atomic_write_text(files.path / name, step)
 
-    for step, name in (("propagate", "attitude.csv"), ("budget", "budget.csv"), ("report", "report.html")):
+    for step, name in (
+        ("propagate", "attitude.csv"),
+        ("budget", "budget.csv"),
+        ("report", "report.html"),
+    ):
         do(step, name)
     do("notebook", "report.ipynb")
     assert not any(map(run.is_older, run.manifest.steps))
@@ -152,7 +168,11 @@ def test_a_budget_makes_what_rests_on_it_older_and_takes_nothing_away(tmp_path):
     assert [step for step in run.manifest.steps if run.is_older(step)] == ["notebook"]
     # Control: another step takes away what rests on its result.
     do("propagate", "attitude.csv")
-    assert list(run.manifest.steps) == ["propagate"] and not run.report.exists() and not run.budget.exists()
+    assert (
+        list(run.manifest.steps) == ["propagate"]
+        and not run.report.exists()
+        and not run.budget.exists()
+    )
 
 
 def test_a_file_is_no_run_folder(tmp_path):

@@ -32,7 +32,8 @@ def test_files_depend_on_seed_and_number_alone(sky, tmp_path: Path) -> None:
     whole = sc.load_observations(five.parts[0].path)
     again = sc.simulate(stars, camera, n_frames=20, seed=4)
     assert set(whole.columns) == set(again.columns) and whole.meta["directions"] == "apparent"
-    # Not the table of the same seed, but one like it: another noise on the same pixels of the same stars.
+    # Not the table of the same seed, but one like it: another noise on the same pixels of the same
+    # stars.
     assert not np.array_equal(whole.x_px[:10], again.x_px[:10])
     clean = sc.simulate(stars, camera, n_frames=20, seed=4, sigma_px=0.0)
     assert np.std(again.x_px - clean.x_px) == pytest.approx(0.05, rel=0.15)
@@ -71,7 +72,9 @@ def test_files_of_another_call_are_replaced_at_once(sky, tmp_path: Path) -> None
         new = simulate_partitions(stars, camera, folder, n_frames=20, seed=1, force=True, **options)
     assert new.n_frames == 20 and len(list(folder.glob("*.parquet"))) == 2
     found = [sc.observations.open_partitions(state / "parts").data_hash for state in states]
-    assert set(found) == {old, new.data_hash} and found == sorted(found, key=[old, new.data_hash].index)
+    assert set(found) == {old, new.data_hash} and found == sorted(
+        found, key=[old, new.data_hash].index
+    )
     # What nobody has recorded would be read with the new ones.
     (folder / "mine.parquet").write_bytes((folder / "part-000000.parquet").read_bytes())
     with pytest.raises(RunFolderError, match="1 other files that would mix"):
@@ -79,7 +82,9 @@ def test_files_of_another_call_are_replaced_at_once(sky, tmp_path: Path) -> None
     assert (folder / "mine.parquet").exists() and not (folder / UNFINISHED).exists()
 
 
-def test_tree_finds_the_stars_that_a_look_at_all_finds(sky, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tree_finds_the_stars_that_a_look_at_all_finds(
+    sky, monkeypatch: pytest.MonkeyPatch
+) -> None:
     stars, camera = sky
     rotations = random_rotations(200, np.random.default_rng(3))
     fast = Sky(stars, camera, 0.3).views(rotations)

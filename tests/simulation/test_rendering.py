@@ -1,4 +1,6 @@
-"""Rendered frames: light where the camera model puts it, noise of the stated size, files that carry their truth."""
+"""Rendered frames: light where the camera model puts it, noise of the stated size, files that carry
+their truth.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,13 @@ from scipy import stats
 from starcal_uq.attitude.rotations import exp_rotation, random_rotations, rotation_vector
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project, unproject
-from starcal_uq.core.errors import CatalogueError, ImageError, RunFolderError, SensorError, SettingError
+from starcal_uq.core.errors import (
+    CatalogueError,
+    ImageError,
+    RunFolderError,
+    SensorError,
+    SettingError,
+)
 from starcal_uq.images.image import read_image
 from starcal_uq.paper.camera import paper_camera
 from starcal_uq.simulation.campaign import render_frames
@@ -28,7 +36,12 @@ from tests.helpers.speed import times_as_long
 
 # Light and nothing else, in electrons.
 LIGHT = Sensor(
-    background_e_px_s=0.0, dark_e_px_s=0.0, read_noise_e=0.0, gain_e_per_count=1.0, offset_counts=0.0, full_well_e=1e12
+    background_e_px_s=0.0,
+    dark_e_px_s=0.0,
+    read_noise_e=0.0,
+    gain_e_per_count=1.0,
+    offset_counts=0.0,
+    full_well_e=1e12,
 )
 SMALL = paper_camera().replace(width_px=200, height_px=150, x0_px=95.0, y0_px=80.0)
 ATTITUDE = exp_rotation(np.array([0.3, -0.7, 1.1]))
@@ -59,8 +72,12 @@ def sky_of(pixels: Any, camera: Camera = SMALL, mag: float = 3.0) -> StarCatalog
     )
 
 
-def light_of(pixels: Any, camera: Camera = SMALL, sensor: Sensor = LIGHT, **options: Any) -> np.ndarray[Any, Any]:
-    return render(sky_of(pixels, camera), camera, ATTITUDE, sensor, noise=False, quantise=False, **options).data
+def light_of(
+    pixels: Any, camera: Camera = SMALL, sensor: Sensor = LIGHT, **options: Any
+) -> np.ndarray[Any, Any]:
+    return render(
+        sky_of(pixels, camera), camera, ATTITUDE, sensor, noise=False, quantise=False, **options
+    ).data
 
 
 def moments(image: np.ndarray[Any, Any]) -> tuple[float, float, np.ndarray[Any, Any]]:
@@ -73,7 +90,8 @@ def moments(image: np.ndarray[Any, Any]) -> tuple[float, float, np.ndarray[Any, 
     return float(cx), float(cy), np.array(covariance)
 
 
-# --- light ---------------------------------------------------------------------------------------------------------
+# --- light
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.8, 1.0, 2.5])
@@ -88,7 +106,9 @@ def test_all_light_of_an_interior_star_arrives(sigma: float) -> None:
 def test_the_centroid_is_the_projected_position(psf: str, sigma: float) -> None:
     rng = np.random.default_rng(1)
     for place in rng.uniform(40.0, 100.0, (12, 2)):
-        x, y, covariance = moments(light_of([place], sensor=LIGHT.replace(psf_sigma_px=sigma, psf=psf)))
+        x, y, covariance = moments(
+            light_of([place], sensor=LIGHT.replace(psf_sigma_px=sigma, psf=psf))
+        )
         assert np.allclose((x, y), place, atol=1e-3)
         # Integration over a pixel adds the variance of the pixel.
         wanted = sigma**2 + (1.0 / 12.0 if psf == "gaussian" else 0.0)
@@ -123,7 +143,9 @@ def test_truth_is_what_the_camera_model_says(stars: StarCatalogue) -> None:
 
 
 def test_a_star_beyond_the_edge_sends_light_and_is_not_in_the_truth() -> None:
-    frame = render(sky_of([[-1.0, 70.0], [-40.0, 20.0]]), SMALL, ATTITUDE, LIGHT, noise=False, quantise=False)
+    frame = render(
+        sky_of([[-1.0, 70.0], [-40.0, 20.0]]), SMALL, ATTITUDE, LIGHT, noise=False, quantise=False
+    )
     assert len(frame.truth) == 0
     # The detector begins half a pixel from the star: 31 % of a Gaussian of 1 px.
     assert frame.data.sum() / LIGHT.electrons(3.0) == pytest.approx(stats.norm.sf(0.5), rel=1e-4)
@@ -148,7 +170,8 @@ def test_a_profile_is_the_integral_of_the_gaussian() -> None:
     assert np.allclose(fraction[0], np.diff(stats.norm.cdf(edges, 10.3, 0.9)), atol=1e-12)
 
 
-# --- smear ---------------------------------------------------------------------------------------------------------
+# --- smear
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length_px", [0.5, 3.0, 20.0, 60.0])
@@ -171,17 +194,20 @@ def test_a_smear_is_the_convolution_with_a_line() -> None:
     t = (np.arange(4000) + 0.5) / 4000 - 0.5
     path = 95.0 + SMALL.focal_px * np.tan(length / SMALL.focal_px * t)
     x = np.arange(200)
-    wanted = np.mean([stats.norm.cdf(x + 0.5, p) - stats.norm.cdf(x - 0.5, p) for p in path], axis=0) * LIGHT.electrons(
-        3.0
-    )
+    wanted = np.mean(
+        [stats.norm.cdf(x + 0.5, p) - stats.norm.cdf(x - 0.5, p) for p in path], axis=0
+    ) * LIGHT.electrons(3.0)
     assert np.abs(profile - wanted).max() < 1e-5 * wanted.max()
 
 
 def test_the_sky_turns_against_the_camera() -> None:
-    # Half an exposure later the attitude is exp(-w t / 2) R: the truth there is where the smear ends.
+    # Half an exposure later the attitude is exp(-w t / 2) R: the truth there is where the smear
+    # ends.
     rate = np.array([0.004, -0.007, 0.05])
     place = [[150.0, 40.0]]
-    middle = render(sky_of(place), SMALL, ATTITUDE, LIGHT, rate_rad_s=rate, noise=False, quantise=False)
+    middle = render(
+        sky_of(place), SMALL, ATTITUDE, LIGHT, rate_rad_s=rate, noise=False, quantise=False
+    )
     xy = []
     for part in np.linspace(-0.5, 0.5, 101):
         turned = exp_rotation(-rate * part * LIGHT.exposure_s) @ ATTITUDE
@@ -191,7 +217,9 @@ def test_the_sky_turns_against_the_camera() -> None:
     x, y, covariance = moments(middle.data)
     assert np.allclose((x, y), path.mean(axis=0), atol=5e-3)
     motion = path[-1] - path[0]
-    assert np.allclose(covariance - (13.0 / 12.0) * np.eye(2), np.outer(motion, motion) / 12.0, atol=0.02)
+    assert np.allclose(
+        covariance - (13.0 / 12.0) * np.eye(2), np.outer(motion, motion) / 12.0, atol=0.02
+    )
     # A positive rate about y turns the boresight towards +x, so that stars move towards -x.
     assert np.sign(motion[0]) == -np.sign(rate[1])
 
@@ -204,17 +232,22 @@ def test_a_roll_smears_the_corner_and_not_the_boresight() -> None:
     assert moved[1, 1] == pytest.approx(13.0 / 12.0 + (90.0 * 0.05) ** 2 / 12.0, rel=5e-3)
 
 
-# --- noise ---------------------------------------------------------------------------------------------------------
+# --- noise
+# --------------------------------------------------------------------------------------------------
 
 
 def noise_table(claimed: Sensor) -> np.ndarray[Any, Any]:
-    """z of the mean and of the variance of sky and star pixels over frames, against what `claimed` says."""
+    """z of the mean and of the variance of sky and star pixels over frames, against what `claimed`
+    says.
+    """
     sensor = Sensor(gain_e_per_count=2.0, offset_counts=300.0, read_noise_e=6.0)
     sky = sky_of([[30.2, 25.6]], SMALL_DETECTOR, mag=2.0)
     scene = Scene(sky, SMALL_DETECTOR, sensor)
     rng = np.random.default_rng(7)
     frames = np.array([scene.render(ATTITUDE, rng).data for _ in range(400)]).astype(float)
-    expected = Scene(sky, SMALL_DETECTOR, claimed).render(ATTITUDE, None, noise=False, quantise=False).data
+    expected = (
+        Scene(sky, SMALL_DETECTOR, claimed).render(ATTITUDE, None, noise=False, quantise=False).data
+    )
     electrons = (expected - claimed.offset_counts) * claimed.gain_e_per_count
     variance = (electrons + claimed.read_noise_e**2) / claimed.gain_e_per_count**2 + 1.0 / 12.0
     n = len(frames)
@@ -223,7 +256,12 @@ def noise_table(claimed: Sensor) -> np.ndarray[Any, Any]:
     z_variance = (frames.var(axis=0, ddof=1) / variance - 1.0) * np.sqrt((n - 1) / 2.0)
     star = np.zeros(frames.shape[1:], dtype=bool)
     star[24:28, 28:33] = True
-    return np.array([[z[part].sum() / np.sqrt(part.sum()) for part in (star, ~star)] for z in (z_mean, z_variance)])
+    return np.array(
+        [
+            [z[part].sum() / np.sqrt(part.sum()) for part in (star, ~star)]
+            for z in (z_mean, z_variance)
+        ]
+    )
 
 
 SMALL_DETECTOR = paper_camera().replace(width_px=60, height_px=50, x0_px=28.0, y0_px=26.0)
@@ -234,7 +272,9 @@ def test_mean_and_variance_are_those_of_shot_and_read_noise() -> None:
     assert np.abs(noise_table(truth)).max() < 4.0
 
 
-@pytest.mark.parametrize("wrong", [{"read_noise_e": 5.8}, {"gain_e_per_count": 2.1}, {"background_e_px_s": 84.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"read_noise_e": 5.8}, {"gain_e_per_count": 2.1}, {"background_e_px_s": 84.0}]
+)
 def test_the_noise_test_notices_a_wrong_sensor(wrong: dict[str, float]) -> None:
     truth = Sensor(gain_e_per_count=2.0, offset_counts=300.0, read_noise_e=6.0)
     assert np.abs(noise_table(truth.replace(**wrong))).max() > 8.0
@@ -252,7 +292,9 @@ def test_shot_noise_is_poisson(mean: float) -> None:
     assert stats.chi2.sf(chi2, max(1, kept.sum() - 1)) > 1e-4
     wrong = stats.poisson.cdf(edges, mean * 1.02 + 0.002)
     wrong_share = np.diff(np.concatenate([[0.0], wrong, [1.0]]))
-    wrong_chi2 = np.sum((count[kept] - wrong_share[kept] * drawn.size) ** 2 / (wrong_share[kept] * drawn.size))
+    wrong_chi2 = np.sum(
+        (count[kept] - wrong_share[kept] * drawn.size) ** 2 / (wrong_share[kept] * drawn.size)
+    )
     assert stats.chi2.sf(wrong_chi2, max(1, kept.sum() - 1)) < 1e-4
 
 
@@ -267,18 +309,26 @@ def test_the_stated_accuracy_is_reached_by_a_matched_fit() -> None:
         scene = Scene(sky, SMALL_DETECTOR, sensor)
         flux = sensor.electrons(5.0)
         (_, low), (_, ex), (_, high) = (
-            profiles(np.array([place + d]), sensor.psf_sigma_px, sensor.psf) for d in (-1e-4, 0.0, 1e-4)
+            profiles(np.array([place + d]), sensor.psf_sigma_px, sensor.psf)
+            for d in (-1e-4, 0.0, 1e-4)
         )
         _, ey = profiles(np.array([26.1]), sensor.psf_sigma_px, sensor.psf)
-        first = profiles(np.array([place]), 1.0, "gaussian")[0][0], profiles(np.array([26.1]), 1.0, "gaussian")[0][0]
+        first = (
+            profiles(np.array([place]), 1.0, "gaussian")[0][0],
+            profiles(np.array([26.1]), 1.0, "gaussian")[0][0],
+        )
         window = slice(first[1], first[1] + ey.size), slice(first[0], first[0] + ex.size)
-        expected = scene.render(ATTITUDE, None, noise=False, quantise=False).data[window] * sensor.gain_e_per_count
+        expected = (
+            scene.render(ATTITUDE, None, noise=False, quantise=False).data[window]
+            * sensor.gain_e_per_count
+        )
         slope = flux * np.outer(ey[0], (high - low)[0] / 2e-4)
         weight = 1.0 / (flux * np.outer(ey[0], ex[0]) + sensor.pixel_variance_e2)
         for _ in range(500):
             drawn = scene.render(ATTITUDE, rng).data[window] * sensor.gain_e_per_count
             error.append(np.sum(weight * slope * (drawn - expected)) / np.sum(weight * slope**2))
-    # 2000 fits determine the standard deviation to 1.6 %; the bound is that of the position given the flux as well.
+    # 2000 fits determine the standard deviation to 1.6 %; the bound is that of the position given
+    # the flux as well.
     assert np.std(error) == pytest.approx(wanted, rel=0.06)
     assert np.std(error) != pytest.approx(1.2 * wanted, rel=0.06)
 
@@ -290,7 +340,8 @@ def test_the_default_star_of_magnitude_six_is_located_to_a_twentieth_of_a_pixel(
     assert float(Sensor().electrons(6.0)) == pytest.approx(1035.0, abs=1.0)
 
 
-# --- electronics ---------------------------------------------------------------------------------------------------
+# --- electronics
+# --------------------------------------------------------------------------------------------------
 
 
 def test_bright_stars_stop_at_the_full_well_and_at_the_end_of_the_converter() -> None:
@@ -306,7 +357,9 @@ def test_bright_stars_stop_at_the_full_well_and_at_the_end_of_the_converter() ->
 
 
 def test_counts_do_not_become_negative() -> None:
-    frame = render(sky_of([[70.0, 60.0]]), SMALL, ATTITUDE, Sensor(offset_counts=0.0, read_noise_e=40.0))
+    frame = render(
+        sky_of([[70.0, 60.0]]), SMALL, ATTITUDE, Sensor(offset_counts=0.0, read_noise_e=40.0)
+    )
     assert frame.data.min() == 0 and frame.data.max() < 4095
 
 
@@ -322,7 +375,9 @@ def test_hot_pixels_stay_in_their_places() -> None:
     sky = sky_of([[-90.0, 20.0]])
     where, level = sensor.hot_pixels(SMALL.width_px, SMALL.height_px)
     assert len(where) == 30 and len(np.unique(where)) == 30
-    first, second = (render(sky, SMALL, ATTITUDE, sensor, seed=seed).data.ravel() for seed in (1, 2))
+    first, second = (
+        render(sky, SMALL, ATTITUDE, sensor, seed=seed).data.ravel() for seed in (1, 2)
+    )
     clear = where[level > 400.0]
     assert set(clear) == {i for i in np.flatnonzero(first > 140) if i in set(where[level > 400.0])}
     assert np.all(first[clear] > 140) and np.all(second[clear] > 140)
@@ -333,7 +388,8 @@ def test_hot_pixels_stay_in_their_places() -> None:
 def test_a_seed_repeats_bit_for_bit() -> None:
     sky = sky_of([[70.0, 60.0]])
     one, again, other, next_frame = (
-        render(sky, SMALL, ATTITUDE, seed=seed, frame=frame).data for seed, frame in ((1, 0), (1, 0), (2, 0), (1, 1))
+        render(sky, SMALL, ATTITUDE, seed=seed, frame=frame).data
+        for seed, frame in ((1, 0), (1, 0), (2, 0), (1, 1))
     )
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other) and not np.array_equal(one, next_frame)
@@ -354,7 +410,8 @@ def test_rendering_is_quick_beyond_its_noise_arrays(stars: StarCatalogue) -> Non
     assert ratio < 1.5
 
 
-# --- the sensor ----------------------------------------------------------------------------------------------------
+# --- the sensor
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_psf_radius_becomes_a_sigma() -> None:
@@ -382,7 +439,10 @@ def test_a_sensor_goes_through_its_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[sensor]\npsf_sigma_px = 0", "psf_sigma_px is 0; write a number of pixels from 0.1 to 100"),
+        (
+            "[sensor]\npsf_sigma_px = 0",
+            "psf_sigma_px is 0; write a number of pixels from 0.1 to 100",
+        ),
         ("[sensor]\nbits = 17", "bits is 17; write a whole number from 1 to 16"),
         ("[sensor]\nbits = 12.5", "write a whole number"),
         ("[sensor]\nexposure_s = 0.0", "write a number of seconds above 0"),
@@ -418,15 +478,25 @@ def test_what_cannot_be_rendered_is_said(options: dict[str, Any], message: str) 
         render(sky_of([[70.0, 60.0]]), SMALL, rotation, **options)
 
 
-# --- files ---------------------------------------------------------------------------------------------------------
+# --- files
+# --------------------------------------------------------------------------------------------------
 
 
 def test_frames_are_those_of_the_simulation(stars: StarCatalogue, tmp_path: Path) -> None:
     camera, done = paper_camera(), []
     paths = render_frames(
-        stars, camera, tmp_path / "frames", n_frames=3, seed=5, progress=lambda *step: done.append(step)
+        stars,
+        camera,
+        tmp_path / "frames",
+        n_frames=3,
+        seed=5,
+        progress=lambda *step: done.append(step),
     )
-    assert [path.name for path in paths] == ["frame_00000.fits", "frame_00001.fits", "frame_00002.fits"]
+    assert [path.name for path in paths] == [
+        "frame_00000.fits",
+        "frame_00001.fits",
+        "frame_00002.fits",
+    ]
     assert done == [(1, 3), (2, 3), (3, 3)]
     table = truth_table(paths)
     seen = simulate(stars, camera, n_frames=3, seed=5)
@@ -478,13 +548,20 @@ def test_a_file_carries_the_truth_of_its_frame(tmp_path: Path) -> None:
     image = read_image(path, SMALL)
     assert image.data.dtype == np.uint16 and np.array_equal(image.data, frame.data)
     assert image.time_utc == truth.time_utc and image.exposure_s == sensor.exposure_s
-    assert image.saturation == sensor.saturation_counts and image.gain_e_per_count == sensor.gain_e_per_count
+    assert (
+        image.saturation == sensor.saturation_counts
+        and image.gain_e_per_count == sensor.gain_e_per_count
+    )
     assert frame.image.saturation == image.saturation
 
 
 def test_frames_repeat_to_the_byte(tmp_path: Path) -> None:
     sky = sky_of([[70.3, 60.2], [20.0, 30.0], [120.0, 110.0]])
-    kwargs: dict[str, Any] = {"min_stars": 3, "attitudes": np.array([ATTITUDE, ATTITUDE]), "seed": 4}
+    kwargs: dict[str, Any] = {
+        "min_stars": 3,
+        "attitudes": np.array([ATTITUDE, ATTITUDE]),
+        "seed": 4,
+    }
     one = render_frames(sky, SMALL, tmp_path / "one", **kwargs)
     two = render_frames(sky, SMALL, tmp_path / "two", **kwargs)
     assert [path.read_bytes() for path in one] == [path.read_bytes() for path in two]
@@ -499,9 +576,15 @@ def test_times_and_rates_go_to_their_frames(tmp_path: Path) -> None:
     times = ["2026-11-21T01:02:03", "2026-11-21T01:02:04Z"]
     paths = render_frames(sky, SMALL, tmp_path / "a", rates_rad_s=rates, times_utc=times, **kwargs)
     truths = [read_truth(path) for path in paths]
-    assert [truth.time_utc for truth in truths] == ["2026-11-21T01:02:03.000000", "2026-11-21T01:02:04.000000"]
+    assert [truth.time_utc for truth in truths] == [
+        "2026-11-21T01:02:03.000000",
+        "2026-11-21T01:02:04.000000",
+    ]
     assert np.array_equal([truth.rate_rad_s for truth in truths], rates)
-    assert list(truth_table(paths).time_utc)[::3] == ["2026-11-21T01:02:03.000000", "2026-11-21T01:02:04.000000"]  # type: ignore[arg-type]
+    assert list(truth_table(paths).time_utc)[::3] == [
+        "2026-11-21T01:02:03.000000",
+        "2026-11-21T01:02:04.000000",
+    ]  # type: ignore[arg-type]
     for bad, message in (
         ({"rates_rad_s": [1.0]}, "shape"),
         ({"times_utc": times[:1]}, "1 times for 2 frames"),

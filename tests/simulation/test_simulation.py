@@ -34,7 +34,9 @@ def test_noise_free_pixels_are_projections_at_one_attitude_per_frame():
     obs = observations(sigma_px=0.0)
     b = sc.camera.unproject(camera(), obs.xy)
     result = sc.attitude.quest(b, obs.directions_icrs, obs.frame_starts)
-    rotated = np.einsum("nij,nj->ni", np.repeat(result.rotations, obs.stars_per_frame, axis=0), obs.directions_icrs)
+    rotated = np.einsum(
+        "nij,nj->ni", np.repeat(result.rotations, obs.stars_per_frame, axis=0), obs.directions_icrs
+    )
     assert np.max(np.abs(rotated - b)) < 1e-13
 
 
@@ -69,7 +71,9 @@ def test_attitudes_are_uniform():
     assert stats.kstest(boresight[:, 2], "uniform", args=(-1, 2)).pvalue > 0.001
     angle = np.arctan2(boresight[:, 1], boresight[:, 0])
     assert stats.kstest(angle, "uniform", args=(-np.pi, 2 * np.pi)).pvalue > 0.001
-    assert stats.kstest(np.arcsin(boresight[:, 2]), "uniform", args=(-np.pi / 2, np.pi)).pvalue < 0.001
+    assert (
+        stats.kstest(np.arcsin(boresight[:, 2]), "uniform", args=(-np.pi / 2, np.pi)).pvalue < 0.001
+    )
 
 
 def test_impossible_requests_are_named():
@@ -82,9 +86,12 @@ def test_impossible_requests_are_named():
         sc.simulate(stars, camera(), min_stars=2)
 
 
-def test_a_field_that_hardly_ever_shows_enough_stars_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_that_hardly_ever_shows_enough_stars_is_refused_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    # About one attitude in some hundred: each by itself is found, but a thousand would take minutes.
+    # About one attitude in some hundred: each by itself is found, but a thousand would take
+    # minutes.
     narrow = sc.paper.paper_camera().replace(focal_mm=350.0)
     tried, views = [], Sky.views
 
@@ -93,7 +100,9 @@ def test_a_field_that_hardly_ever_shows_enough_stars_is_refused_at_once(monkeypa
         return views(self, rotations)
 
     monkeypatch.setattr(Sky, "views", counted)
-    with pytest.raises(sc.errors.CatalogueError, match=r"raise max_mag \(--max-mag\), or lower min_stars"):
+    with pytest.raises(
+        sc.errors.CatalogueError, match=r"raise max_mag \(--max-mag\), or lower min_stars"
+    ):
         sc.simulate(stars, narrow, n_frames=3000, min_stars=5, seed=1)
     # For three thousand frames, more than a million would have to be tried.
     assert sum(tried) < 10_000

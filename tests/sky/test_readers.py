@@ -1,4 +1,6 @@
-"""Readers of a user's catalogue: named columns, and the byte layouts of the CDS with real stars in them."""
+"""Readers of a user's catalogue: named columns, and the byte layouts of the CDS with real stars in
+them.
+"""
 
 from __future__ import annotations
 
@@ -81,15 +83,19 @@ Byte-by-byte Description of file: h_dm_com.dat
 
 
 def bsc_line(hr: int, ra: str, dec: str, v: str, pm: str) -> str:
-    """A line of V/50 with the fields that matter: RA hhmmss.s at byte 76, Dec at 84, V at 103, motions at 149."""
+    """A line of V/50 with the fields that matter: RA hhmmss.s at byte 76, Dec at 84, V at 103,
+    motions at 149.
+    """
     return at_bytes(197, hr=(1, f"{hr:>4d}"), ra=(76, ra), dec=(84, dec), v=(103, v), pm=(149, pm))
 
 
 BSC = [
     # Two lines of the catalogue, byte for byte.
-    "2491  9Alp CMaBD-16 1591  48915151881 257I   5423           064044.6-163444064508.9-164258227.22-08.88-1.46"
+    "2491  9Alp CMaBD-16 1591  48915151881 257I   5423           "
+    "064044.6-163444064508.9-164258227.22-08.88-1.46"
     "   0.00 -0.05 -0.03   A1Vm               -0.553-1.205 +.375-008SBO    13 10.3  11.2AB   4*",
-    "2061 58Alp OriBD+07 1055  39801113271 224I   4506  Alp Ori  054945.4+072319055510.3+072425199.79-08.96 0.50"
+    "2061 58Alp OriBD+07 1055  39801113271 224I   4506  Alp Ori  "
+    "054945.4+072319055510.3+072425199.79-08.96 0.50"
     "  +1.85 +2.06 +1.28   M1-2Ia-Iab        e+0.026+0.009 +.005+021SB         9.9 174.4AE   6*",
     # One of the fourteen numbers that turned out not to be stars.
     "  92 NOVA 1572                                     B Cas",
@@ -125,7 +131,9 @@ Note (1): These fields are all blanks for stars removed from
 
 
 def sao_line(number: int, flag: str, v: str, ra: str, pm_ra: str, dec: str, pm_dec: str) -> str:
-    """A line of sao.dat: the B1950 fields that must not be taken (all nines here), and the J2000 ones."""
+    """A line of sao.dat: the B1950 fields that must not be taken (all nines here), and the J2000
+    ones.
+    """
     line = at_bytes(
         204,
         number=(1, f"{number:>6d}{flag}"),
@@ -161,7 +169,8 @@ def separation_arcsec(ra: float, dec: float, other_ra: float, other_dec: float) 
     return float(np.degrees(np.linalg.norm(a - b)) * 3600.0)
 
 
-# ICRS at J2000 from Hipparcos 2, hence independent of what is read here; the two editions differ by 10 mas for Vega.
+# ICRS at J2000 from Hipparcos 2, hence independent of what is read here; the two editions differ by
+# 10 mas for Vega.
 SIRIUS_J2000 = (101.28715533, -16.71611586)
 VEGA_J2000 = (279.23473479, 38.78368896)
 
@@ -214,7 +223,9 @@ def test_sao(tmp_path: Path) -> None:
     assert separation_arcsec(stars.ra_deg[0], stars.dec_deg[0], *SIRIUS_J2000) < 1.0
     assert separation_arcsec(stars.ra_deg[1], stars.dec_deg[1], *VEGA_J2000) < 0.3
     # Seconds of time a year without cos(dec) become mas a year with it.
-    assert stars.pm_ra_mas_yr[0] == pytest.approx(-0.0385 * 15e3 * np.cos(np.radians(16.716)), abs=2.0)
+    assert stars.pm_ra_mas_yr[0] == pytest.approx(
+        -0.0385 * 15e3 * np.cos(np.radians(16.716)), abs=2.0
+    )
     assert stars.pm_dec_mas_yr[1] == pytest.approx(286.0, abs=2.0)
     # 99.9 stands for no magnitude.
     assert np.isnan(stars.mag[2])
@@ -227,10 +238,19 @@ def test_fk5_becomes_icrs_as_in_astropy(tmp_path: Path) -> None:
     from astropy.coordinates import FK5, SkyCoord
 
     stars = read_catalogue(write(tmp_path, "sao.dat", SAO[:2]))
-    fk5 = SkyCoord(["06h45m08.871s", "18h36m56.332s"], ["-16d42m57.99s", "38d47m01.17s"], frame=FK5(equinox="J2000"))
+    fk5 = SkyCoord(
+        ["06h45m08.871s", "18h36m56.332s"],
+        ["-16d42m57.99s", "38d47m01.17s"],
+        frame=FK5(equinox="J2000"),
+    )
     for row, expected in enumerate(fk5.icrs):
         # Astropy's rotation leaves out the frame's epoch-dependent spin, which is zero at J2000.
-        assert separation_arcsec(stars.ra_deg[row], stars.dec_deg[row], expected.ra.deg, expected.dec.deg) < 0.002
+        assert (
+            separation_arcsec(
+                stars.ra_deg[row], stars.dec_deg[row], expected.ra.deg, expected.dec.deg
+            )
+            < 0.002
+        )
     assert u.deg is fk5.ra.unit
 
 
@@ -251,7 +271,10 @@ def test_readme_that_moved_a_column_is_followed(tmp_path: Path) -> None:
 def test_cds_errors_name_line_and_column(tmp_path: Path) -> None:
     broken = HIPPARCOS[1].replace("+38.78299311", "+38.7829x311")
     path = write(tmp_path, "hip_main.dat", ["", HIPPARCOS[0], broken])
-    with pytest.raises(CatalogueError, match=r"main\.dat, line 3, column 'DEICRS': '\+38\.7829x311' is not a number"):
+    with pytest.raises(
+        CatalogueError,
+        match=r"main\.dat, line 3, column 'DEICRS': '\+38\.7829x311' is not a number",
+    ):
         read_catalogue(path)
     far = HIPPARCOS[1].replace("+38.78299311", "+98.78299311")
     with pytest.raises(CatalogueError, match=r"line 2, column 'DEICRS': 98\.783 is outside"):
@@ -265,13 +288,17 @@ def test_cds_errors_name_line_and_column(tmp_path: Path) -> None:
         read_catalogue(write(tmp_path, "sao.dat", [""]))
     wrong = tmp_path / "ReadMe.bsc"
     wrong.write_text(BSC_README)
-    with pytest.raises(CatalogueError, match=r"ReadMe\.bsc: does not describe The Hipparcos Catalogue"):
+    with pytest.raises(
+        CatalogueError, match=r"ReadMe\.bsc: does not describe The Hipparcos Catalogue"
+    ):
         read_catalogue(write(tmp_path, "hip_main.dat", HIPPARCOS), readme=wrong)
     with pytest.raises(CatalogueError, match="are fixed"):
         read_catalogue(write(tmp_path, "hip_main.dat", HIPPARCOS), file_epoch=2000.0)
     bad = tmp_path / "hip_main.dat.gz"
     bad.write_bytes(b"\x1f\x8b broken")
-    with pytest.raises(CatalogueError, match=r"hip_main\.dat\.gz: is not a readable text \(it ends too"):
+    with pytest.raises(
+        CatalogueError, match=r"hip_main\.dat\.gz: is not a readable text \(it ends too"
+    ):
         read_catalogue(bad)
 
 
@@ -295,7 +322,9 @@ def test_csv_with_guessed_columns(tmp_path: Path) -> None:
 def test_explicit_columns_come_before_guesses(tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     path.write_text("hip,ra,dec,better_ra,better_dec,imag\n7,1,2,3,4,5.5\n8,1,2,13,14,6.5\n")
-    stars = read_catalogue(path, {"ra_deg": "better_ra", "dec_deg": "better_dec", "mag": "imag"}, file_epoch=2020.0)
+    stars = read_catalogue(
+        path, {"ra_deg": "better_ra", "dec_deg": "better_dec", "mag": "imag"}, file_epoch=2020.0
+    )
     assert stars.ra_deg == pytest.approx([3.0, 13.0])
     assert stars.star_id.tolist() == ["HIP 7", "HIP 8"]
     assert stars.band == "the file's own band (column 'imag')"
@@ -351,14 +380,38 @@ def test_epoch_of_the_metadata_is_used(tmp_path: Path) -> None:
     ("text", "options", "message"),
     [
         (CSV, {}, r"does not say the epoch .* file_epoch=2016\.0"),
-        (CSV.replace("38.78299311", "138.7"), EPOCH, r"line 3, column 'dec': 138\.7 deg is outside"),
-        (CSV.replace("279.23410832", "-9"), EPOCH, r"line 3, column 'ra': -9 deg is outside \[0, 360\]"),
+        (
+            CSV.replace("38.78299311", "138.7"),
+            EPOCH,
+            r"line 3, column 'dec': 138\.7 deg is outside",
+        ),
+        (
+            CSV.replace("279.23410832", "-9"),
+            EPOCH,
+            r"line 3, column 'ra': -9 deg is outside \[0, 360\]",
+        ),
         (CSV.replace("279.23410832", ""), EPOCH, r"line 3, column 'ra': has no value"),
-        (CSV.replace("101.28854105", "06:45:09"), EPOCH, r"line 2, column 'ra': '06:45:09' is not a number"),
-        ("# note\n\n" + CSV.replace("0.03", "dim"), EPOCH, r"line 5, column 'Vmag': 'dim' is not a number"),
-        (CSV.replace("-546.01", "-54601"), EPOCH, r"line 2, column 'pmRA': .* faster than any star"),
+        (
+            CSV.replace("101.28854105", "06:45:09"),
+            EPOCH,
+            r"line 2, column 'ra': '06:45:09' is not a number",
+        ),
+        (
+            "# note\n\n" + CSV.replace("0.03", "dim"),
+            EPOCH,
+            r"line 5, column 'Vmag': 'dim' is not a number",
+        ),
+        (
+            CSV.replace("-546.01", "-54601"),
+            EPOCH,
+            r"line 2, column 'pmRA': .* faster than any star",
+        ),
         (CSV.replace("pmDE", "other"), EPOCH, r"no pm_dec_mas_yr; name it, among name, ra, dec"),
-        (CSV.replace(",ra,", ",RAB1950,"), EPOCH, r"no column is known as ra_deg.* among name, RAB1950"),
+        (
+            CSV.replace(",ra,", ",RAB1950,"),
+            EPOCH,
+            r"no column is known as ra_deg.* among name, RAB1950",
+        ),
         (CSV, {"columns": {"ra_deg": "RA_x"}}, r"has no column 'RA_x' for ra_deg; it has name, ra"),
         (CSV, {"columns": {"alpha": "ra"}}, r"columns names 'alpha', which is none of star_id"),
         (CSV, {"file_epoch": 2451545.0}, r"not a Julian year"),
@@ -367,7 +420,11 @@ def test_epoch_of_the_metadata_is_used(tmp_path: Path) -> None:
         ("name,ra,dec\n", EPOCH, r"holds no stars"),
         ("", {}, r"mine\.csv: no column is known as ra_deg"),
         ("ra,dec\n1,2\n3,4,5\n", {}, r"mine\.csv: is not readable as CSV"),
-        ("ra,dec,epoch\n1,2,2000\n3,4,2451545\n", {}, r"line 3, column 'epoch': 2\.45154e\+06 is not a Julian year"),
+        (
+            "ra,dec,epoch\n1,2,2000\n3,4,2451545\n",
+            {},
+            r"line 3, column 'epoch': 2\.45154e\+06 is not a Julian year",
+        ),
     ],
 )
 def test_bad_tables_are_refused_in_one_sentence(
@@ -388,7 +445,9 @@ def test_unknown_units_and_places_are_refused(tmp_path: Path) -> None:
 
     path = tmp_path / "mine.fits"
     Table({"ra": [1.0] * u.m, "dec": [2.0] * u.deg}).write(path)
-    with pytest.raises(CatalogueError, match=r"column 'ra': the unit 'm' cannot be converted to deg"):
+    with pytest.raises(
+        CatalogueError, match=r"column 'ra': the unit 'm' cannot be converted to deg"
+    ):
         read_catalogue(path, file_epoch=2000.0)
     Table({"ra": [1.0, 2.0], "dec": [2.0, 95.0]}).write(path, overwrite=True)
     with pytest.raises(CatalogueError, match=r"mine\.fits, row 2, column 'dec': 95 deg is outside"):

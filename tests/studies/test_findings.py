@@ -1,4 +1,6 @@
-"""What is said of a sweep: medians as pandas takes them, no change out of missing cells, hypercubes in parts."""
+"""What is said of a sweep: medians as pandas takes them, no change out of missing cells, hypercubes
+in parts.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,22 @@ FIELDS, FRAMES = (5.0, 10.0, 20.0), (10, 100, 1000)
 
 
 def test_medians_ranges_and_counts_are_those_of_pandas() -> None:
-    study = made_study({"fov_deg": FIELDS, "frames": FRAMES}, lambda cell: {("f", "k1"): -0.9}, seeds=4, jitter=0.05)
+    study = made_study(
+        {"fov_deg": FIELDS, "frames": FRAMES},
+        lambda cell: {("f", "k1"): -0.9},
+        seeds=4,
+        jitter=0.05,
+    )
     r = study.values("correlation", parameter="f", parameter_2="k1")
     table = pd.DataFrame({"fov_deg": study.data["fov_deg"], "frames": study.data["frames"], "r": r})
     by_place = table.groupby(["fov_deg", "frames"])["r"]
-    for ours, theirs in {"median": "median", "low": "min", "high": "max", "mean": "mean", "count": "count"}.items():
+    for ours, theirs in {
+        "median": "median",
+        "low": "min",
+        "high": "max",
+        "mean": "mean",
+        "count": "count",
+    }.items():
         expected = by_place.agg(theirs).to_numpy().reshape(3, 3)
         np.testing.assert_allclose(study.sweep.over(r, ours), expected, rtol=1e-12)
     lines = study.sweep.lines(r, "frames", "fov_deg")
@@ -28,7 +41,9 @@ def test_medians_ranges_and_counts_are_those_of_pandas() -> None:
 
 
 def test_missing_cells_do_not_pass_for_a_change() -> None:
-    """Strong coupling in narrow fields only, and many frames only in wide ones: frames change nothing."""
+    """Strong coupling in narrow fields only, and many frames only in wide ones: frames change
+    nothing.
+    """
     study = made_study(
         {"fov_deg": FIELDS, "frames": FRAMES},
         lambda cell: {("f", "k1"): -0.99 if cell["fov_deg"] < 20.0 else -0.5},
@@ -44,7 +59,9 @@ def test_missing_cells_do_not_pass_for_a_change() -> None:
 
 
 def test_chance_passes_for_a_change_once_in_a_thousand_times() -> None:
-    """Numbers without any effect, 400 times for 2 and for 5 seeds; an effect of six standard deviations is seen."""
+    """Numbers without any effect, 400 times for 2 and for 5 seeds; an effect of six standard
+    deviations is seen.
+    """
     rng = np.random.default_rng(7)
     step = np.repeat([0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0], 5)
     for seeds in (2, 5):
@@ -59,9 +76,14 @@ def test_a_hypercube_is_told_in_parts_that_are_judged_by_their_scatter() -> None
     """An axis that acts is named; one that does not is not, although its parts differ by chance."""
     rng = np.random.default_rng(5)
     fields, noise = rng.uniform(5.0, 25.0, 120), rng.uniform(0.02, 0.2, 120)
-    of_field = dict(zip(fields, np.linspace(0.99, 0.6, 120)[np.argsort(np.argsort(fields))], strict=True))
+    of_field = dict(
+        zip(fields, np.linspace(0.99, 0.6, 120)[np.argsort(np.argsort(fields))], strict=True)
+    )
     study = made_study(
-        {"fov_deg": tuple(fields)}, lambda cell: {("f", "k1"): -of_field[cell["fov_deg"]]}, seeds=1, jitter=0.005
+        {"fov_deg": tuple(fields)},
+        lambda cell: {("f", "k1"): -of_field[cell["fov_deg"]]},
+        seeds=1,
+        jitter=0.005,
     )
     data = study.data.assign_coords(sigma_px=("cell", noise))
     definition = dataclasses.replace(study.definition, sweep={}, latin={}, latin_n=0)

@@ -1,4 +1,6 @@
-"""Simulated cells: do estimates scatter and intervals cover as a study says, and does it show where they do not?"""
+"""Simulated cells: do estimates scatter and intervals cover as a study says, and does it show where
+they do not?
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,8 @@ def test_a_simulated_cell_is_a_calibration_and_its_posterior() -> None:
     assert found.ok.all(), found.problems
     data = found.data
     np.testing.assert_allclose(data["sigma"][0], data["sigma_predicted"][0], rtol=0.15)
-    # Likelihood and prior come after the frames: the data, and what does not depend on either, are the same.
+    # Likelihood and prior come after the frames: the data, and what does not depend on either, are
+    # the same.
     np.testing.assert_array_equal(data["estimate"][0], data["estimate"][2])
     np.testing.assert_array_equal(data["sigma_data"][0], data["sigma_data"][3])
     sigma_f = data["sigma"].sel(parameter="f").values
@@ -55,7 +58,10 @@ def test_a_simulated_cell_is_a_calibration_and_its_posterior() -> None:
 
 def test_what_a_method_does_not_estimate_has_no_numbers() -> None:
     sweep = {"method": ("griffith", "efficient"), "noise_per_mag": (0.0, 0.2)}
-    found = sc.study(definition(sweep=sweep, observation={"frames": 12, "min_stars": 10}, posterior="none"), workers=0)
+    found = sc.study(
+        definition(sweep=sweep, observation={"frames": 12, "min_stars": 10}, posterior="none"),
+        workers=0,
+    )
     assert found.ok.all(), found.problems
     missing = np.isnan(found.data["sigma"].values)
     assert missing[:2, 3:].all() and not missing[:2, :3].any() and not missing[2:].any()
@@ -90,9 +96,13 @@ def test_intervals_cover_and_sigmas_are_the_scatter_and_naive_pairs_are_found_ou
     np.testing.assert_allclose(good["sigma"].mean("cell") / scatter, 1.0, atol=0.2)
     # Information from other frames of the same sky.
     fisher = sc.study(
-        definition(mode="fisher", sweep={"frames": (50,)}, observation={"min_stars": 10}, seeds=(0, 1, 2))
+        definition(
+            mode="fisher", sweep={"frames": (50,)}, observation={"min_stars": 10}, seeds=(0, 1, 2)
+        )
     )
-    np.testing.assert_allclose(fisher.data["sigma"].median("cell"), good["sigma_predicted"].median("cell"), rtol=0.12)
+    np.testing.assert_allclose(
+        fisher.data["sigma"].median("cell"), good["sigma_predicted"].median("cell"), rtol=0.12
+    )
 
 
 SCRIPT = """
@@ -157,7 +167,9 @@ def test_cells_foretell_the_scatter_of_calibrations_of_another_make_of_sensor() 
     n, theta = 100, None
     estimates = []
     for seed in range(n):
-        seen = campaign(np.random.default_rng([6, seed]), n_frames=40, stars_per_frame=15, sigma_px=0.08)
+        seen = campaign(
+            np.random.default_rng([6, seed]), n_frames=40, stars_per_frame=15, sigma_px=0.08
+        )
         sheet = sc.Camera(**seen.camera_toml(), coefficients=(0.0, 0.0))
         estimates.append(sc.calibrate(sc.Observations(**seen.columns), sheet).theta)
         theta = seen.theta

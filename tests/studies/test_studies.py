@@ -1,4 +1,6 @@
-"""Studies: cells against analytic scalings, the paper's set-up, plans and derivatives made by hand; definitions."""
+"""Studies: cells against analytic scalings, the paper's set-up, plans and derivatives made by hand;
+definitions.
+"""
 
 from __future__ import annotations
 
@@ -41,11 +43,14 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """A list that grows by one with every cell that is computed."""
     calls: list[int] = []
     compute = cells.FisherCells.numbers
-    monkeypatch.setattr(cells.FisherCells, "numbers", lambda self, cell: calls.append(1) or compute(self, cell))
+    monkeypatch.setattr(
+        cells.FisherCells, "numbers", lambda self, cell: calls.append(1) or compute(self, cell)
+    )
     return calls
 
 
-# --- what a cell says ------------------------------------------------------------------------------------------------
+# --- what a cell says
+# ------------------------------------------------------------------------------------------------
 
 
 def test_parameters_of_a_study_have_their_own_units(small: Study, tmp_path: Path) -> None:
@@ -54,8 +59,14 @@ def test_parameters_of_a_study_have_their_own_units(small: Study, tmp_path: Path
     small.save(tmp_path)
     units = {"x0": "px", "y0": "px", "f": "px", "k1": "px^-2", "k2": "px^-4"}
     with xr.open_dataset(tmp_path / "study.nc", engine="h5netcdf") as file:
-        assert dict(zip(file["parameter"].values, file["parameter_unit"].values, strict=True)) == units
-        along = [name for name, array in file.data_vars.items() if "parameter" in array.dims and "units" in array.attrs]
+        assert (
+            dict(zip(file["parameter"].values, file["parameter_unit"].values, strict=True)) == units
+        )
+        along = [
+            name
+            for name, array in file.data_vars.items()
+            if "parameter" in array.dims and "units" in array.attrs
+        ]
         assert {file[name].units for name in along} == {", ".join(units.values())}
         assert {"truth", "sigma", "sigma_curve"} <= set(along)
     table = small.table()
@@ -69,7 +80,8 @@ def test_sigma_follows_noise_exactly_and_frames_by_the_root(small: Study) -> Non
     sigma = small.data["sigma"].values
     assert sigma.shape == (6, 5)
     np.testing.assert_allclose(sigma[1], 2.0 * sigma[0], rtol=1e-9)
-    # Stars near the edge are left out, and more of them where the noise is larger; with them go some frames.
+    # Stars near the edge are left out, and more of them where the noise is larger; with them go
+    # some frames.
     np.testing.assert_allclose(sigma[2], 4.0 * sigma[0], rtol=0.1)
     # Another campaign of four times the frames: the root but for the choice of frames.
     np.testing.assert_allclose(sigma[0] / sigma[3], 2.0, rtol=0.15)
@@ -82,7 +94,9 @@ def test_cells_of_the_papers_set_up(small: Study) -> None:
     cell = small.data.isel(cell=3)
     correlation = cell["correlation"]
     assert float(correlation.sel(parameter="f", parameter_2="k1")) == pytest.approx(-0.94, abs=0.01)
-    assert float(correlation.sel(parameter="k1", parameter_2="k2")) == pytest.approx(-0.97, abs=0.01)
+    assert float(correlation.sel(parameter="k1", parameter_2="k2")) == pytest.approx(
+        -0.97, abs=0.01
+    )
     assert float(cell["sigma"].sel(parameter="f")) == pytest.approx(0.028, rel=0.15)
     assert float(cell["sigma"].sel(parameter="x0")) == pytest.approx(0.15, rel=0.15)
     assert str(cell["weak_words"].values).startswith("k1 against k2 and f")
@@ -91,13 +105,19 @@ def test_cells_of_the_papers_set_up(small: Study) -> None:
 
 def test_a_cell_agrees_with_a_plan(small: Study) -> None:
     plan = sc.plan(
-        paper_camera(), sc.load_catalogue(6.0, 2026.9), n_frames=(1000,), sweeps=False, n_geometries=600, seed=3
+        paper_camera(),
+        sc.load_catalogue(6.0, 2026.9),
+        n_frames=(1000,),
+        sweeps=False,
+        n_geometries=600,
+        seed=3,
     )
     names = ("x0_px", "y0_px", "f_px", "k1_per_px2", "k2_per_px4")
     expected = [plan.forecast.of(name)[0] for name in names]
     np.testing.assert_allclose(small.data["sigma"].values[3], expected, rtol=0.08)
     cell = small.data.isel(cell=3)
-    # The roll that is common to all frames is a mean of rolls of either sign: chance, for any number of frames.
+    # The roll that is common to all frames is a mean of rolls of either sign: chance, for any
+    # number of frames.
     for name, axis in (("pitch", 0), ("yaw", 1)):
         assert cell["common_rotation_arcsec"].values[axis] == pytest.approx(
             plan.forecast.of(f"common_{name}_arcsec")[0], rel=0.1
@@ -114,7 +134,9 @@ def frames_by_hand(n: int) -> Geometry:
 
 
 def test_information_and_response_by_differences_of_a_formula_of_our_own() -> None:
-    """Nothing of the package but the frames: Brown's formula, derivatives by differences, attitudes eliminated."""
+    """Nothing of the package but the frames: Brown's formula, derivatives by differences, attitudes
+    eliminated.
+    """
     geometry = frames_by_hand(4)
     found = statements(geometry, np.full(len(geometry.star), 0.05), False)
     theta = paper_camera().theta
@@ -132,7 +154,13 @@ def test_information_and_response_by_differences_of_a_formula_of_our_own() -> No
 
         zero = np.zeros(3)
         np.testing.assert_allclose(seen(zero, theta), geometry.pixel[stars].T.ravel(), atol=1e-7)
-        h = np.stack([(seen(zero, theta + d) - seen(zero, theta - d)) / (2.0 * d.sum()) for d in np.diag(steps)], 1)
+        h = np.stack(
+            [
+                (seen(zero, theta + d) - seen(zero, theta - d)) / (2.0 * d.sum())
+                for d in np.diag(steps)
+            ],
+            1,
+        )
         a = np.stack([(seen(d, theta) - seen(-d, theta)) / 2e-6 for d in 1e-6 * np.eye(3)], 1)
         response = np.linalg.lstsq(a, h, rcond=None)[0]
         responses.append(-response)
@@ -140,17 +168,24 @@ def test_information_and_response_by_differences_of_a_formula_of_our_own() -> No
         information = remainder.T @ remainder
         scale = np.sqrt(np.diag(information))
         np.testing.assert_allclose(
-            found.information[k] / np.outer(scale, scale), information / np.outer(scale, scale), atol=1e-5
+            found.information[k] / np.outer(scale, scale),
+            information / np.outer(scale, scale),
+            atol=1e-5,
         )
     size = np.abs(np.mean(responses, axis=0)).max(axis=0)
     np.testing.assert_allclose(found.common / size, np.mean(responses, axis=0) / size, atol=1e-5)
 
 
 def test_a_prior_narrows_what_it_is_about() -> None:
-    """The covariance is the inverse of the sum of both informations; a set's other entries stay free."""
+    """The covariance is the inverse of the sum of both informations; a set's other entries stay
+    free.
+    """
     priors = {"ground": {"focal_fraction": 1e-6}, "axis": {"principal_point_px": 0.01}}
     found = sc.study(
-        definition(sweep={"prior": ("flat", "ground", "axis")}, priors=priors, observation={"frames": 100}), workers=0
+        definition(
+            sweep={"prior": ("flat", "ground", "axis")}, priors=priors, observation={"frames": 100}
+        ),
+        workers=0,
     )
     sigma, data = found.data["sigma"].values, found.data["sigma_data"].values
     np.testing.assert_allclose(data, np.broadcast_to(data[0], data.shape))
@@ -159,14 +194,18 @@ def test_a_prior_narrows_what_it_is_about() -> None:
     correlation, s = found.data["correlation"].values[0], data[0]
     # Conditioning on f by a measurement of its own.
     gain = s[2] ** 2 / (s[2] ** 2 + focal**2)
-    np.testing.assert_allclose(sigma[1], s * np.sqrt(1.0 - correlation[:, 2] ** 2 * gain), rtol=1e-6)
+    np.testing.assert_allclose(
+        sigma[1], s * np.sqrt(1.0 - correlation[:, 2] ** 2 * gain), rtol=1e-6
+    )
     assert sigma[2, 0] < 0.01 < data[2, 0]
     assert sigma[2, 2] == pytest.approx(data[2, 2], rel=0.01)
 
 
 def test_what_only_a_prior_determines_has_no_sigma_of_the_data() -> None:
     """One attitude with three stars says three numbers about five parameters."""
-    priors = {"all": {"principal_point_px": 1.0, "focal_fraction": 1e-4, "distortion_corner_px": 1.0}}
+    priors = {
+        "all": {"principal_point_px": 1.0, "focal_fraction": 1e-4, "distortion_corner_px": 1.0}
+    }
     sweep = {"prior": ("flat", "all")}
     observation = {"pointing": "stare", "stars": 3}
     found = sc.study(definition(sweep=sweep, priors=priors, observation=observation), workers=0)
@@ -190,15 +229,17 @@ def test_frames_that_a_target_takes_give_it() -> None:
     )
     assert first.needed("sigma_px")["median"].is_monotonic_increasing
     assert np.isnan(first.data["frames_needed_sigma"].sel(parameter="x0").values).all()
-    assert first.met("sigma_px", float(np.sqrt(error[3] * error[4])), at={"frames": 1000})[0] == pytest.approx(
-        0.075, abs=0.01
-    )
+    assert first.met("sigma_px", float(np.sqrt(error[3] * error[4])), at={"frames": 1000})[
+        0
+    ] == pytest.approx(0.075, abs=0.01)
 
 
 def test_errors_of_the_stars_leave_a_floor() -> None:
     """A staring camera sees the same errors in every frame: no number of frames averages them."""
     sweep = {"direction_mas": (0.0, 500.0), "frames": (50, 5000)}
-    found = sc.study(definition(sweep=sweep, observation={"pointing": "stare"}, target_arcsec=0.001), workers=0)
+    found = sc.study(
+        definition(sweep=sweep, observation={"pointing": "stare"}, target_arcsec=0.001), workers=0
+    )
     sigma = found.values("sigma", parameter="f")
     assert sigma[0] / sigma[1] == pytest.approx(10.0, rel=1e-6)
     assert sigma[2] / sigma[3] < 1.5
@@ -222,12 +263,16 @@ def test_patterns_look_where_they_say(pointing: str) -> None:
     apart = np.rad2deg(np.arccos(np.clip(boresight @ boresight[0], -1.0, 1.0)))
     field = paper_camera().fov_deg[0]
     assert apart.max() == pytest.approx(
-        {"stare": 0.0, "roll": 0.0, "raster": np.sqrt(2.0) * field, "scan": 2.4 * field}[pointing], rel=0.03, abs=1e-5
+        {"stare": 0.0, "roll": 0.0, "raster": np.sqrt(2.0) * field, "scan": 2.4 * field}[pointing],
+        rel=0.03,
+        abs=1e-5,
     )
 
 
 def test_a_simpler_model_is_biased_as_a_fit_of_it_is() -> None:
-    """Noise-free frames of a lens with k1 alone, fitted without: the estimate moves by what was foretold."""
+    """Noise-free frames of a lens with k1 alone, fitted without: the estimate moves by what was
+    foretold.
+    """
     camera = paper_camera().replace(distortion="k1", coefficients=(2.0e-9,))
     made = definition(camera=camera, sweep={"frames": (50,)}, observation={"min_stars": 10})
     bias = sc.study(made, workers=0).data.isel(cell=0)
@@ -237,14 +282,17 @@ def test_a_simpler_model_is_biased_as_a_fit_of_it_is() -> None:
         cal = sc.calibrate(obs, camera.replace(distortion="none", coefficients=()))
         fitted.append(np.sqrt(np.mean(cal.residuals_px**2)) / camera.focal_px * ARCSEC)
         shift.append((cal.theta[2] - camera.focal_px) / float(bias["sigma"].sel(parameter="f")))
-    assert float(bias["model_bias_arcsec"].sel(simpler="none")) == pytest.approx(np.mean(fitted), rel=0.15)
+    assert float(bias["model_bias_arcsec"].sel(simpler="none")) == pytest.approx(
+        np.mean(fitted), rel=0.15
+    )
     # In sigmas of the simpler model, which knows f better.
     stated = float(bias["model_bias_sigma"].sel(simpler="none", parameter="f"))
     ratio = float(bias["sigma"].sel(parameter="f") / bias["sigma_conditional"].sel(parameter="f"))
     assert stated == pytest.approx(np.mean(shift) * ratio, rel=0.2)
 
 
-# --- cameras ---------------------------------------------------------------------------------------------------------
+# --- cameras
+# --------------------------------------------------------------------------------------------------
 
 
 def test_other_pixels_are_the_same_optics() -> None:
@@ -256,21 +304,28 @@ def test_other_pixels_are_the_same_optics() -> None:
     np.testing.assert_allclose(sc.camera.project(half, b) - half.centre_px, 0.5 * place, rtol=1e-12)
     assert half.fov_deg == pytest.approx(base.fov_deg)
     coarse = camera_of(base, {"pixel_um": 24.0})
-    np.testing.assert_allclose(sc.camera.project(coarse, b) - coarse.centre_px, 0.5 * place, rtol=1e-12)
+    np.testing.assert_allclose(
+        sc.camera.project(coarse, b) - coarse.centre_px, 0.5 * place, rtol=1e-12
+    )
     assert coarse.width_px == base.width_px
 
 
 @pytest.mark.parametrize("model", ["k1", "brown", "brown3", "brown_tangential", "inverse"])
 @pytest.mark.parametrize("size", [-5.0, 8.0])
 def test_the_corner_moves_as_far_as_asked_for(model: str, size: float) -> None:
-    camera = camera_of(paper_camera().data_sheet(), {"distortion": model, "distortion_px": size, "fov_deg": 12.0})
+    camera = camera_of(
+        paper_camera().data_sheet(), {"distortion": model, "distortion_px": size, "fov_deg": 12.0}
+    )
     assert camera.fov_deg[0] == pytest.approx(12.0)
     corner = np.array([0.5 * camera.width_px, 0.5 * camera.height_px, camera.focal_px])
     moved = sc.camera.project(camera, corner[None])[0] - camera.centre_px
-    assert np.hypot(*moved) - np.hypot(*corner[:2]) == pytest.approx(size, rel=0.03 if model != "inverse" else 0.05)
+    assert np.hypot(*moved) - np.hypot(*corner[:2]) == pytest.approx(
+        size, rel=0.03 if model != "inverse" else 0.05
+    )
 
 
-# --- cells that have no numbers, cells that are there already ---------------------------------------------------------
+# --- cells that have no numbers, cells that are there already
+# ---------------------------------------------------------
 
 
 def test_what_cannot_be_is_said_of_its_cell_and_the_study_goes_on() -> None:
@@ -279,18 +334,25 @@ def test_what_cannot_be_is_said_of_its_cell_and_the_study_goes_on() -> None:
     status = found.data["status"].values
     assert list(found.ok) == [False, False, True, False]
     assert status[0].startswith("only 0 of 2")
-    assert "random attitudes show 10 stars to magnitude 6: raise max_mag, widen the field, or lower" in status[0]
+    assert (
+        "random attitudes show 10 stars to magnitude 6: raise max_mag, widen the field, or lower"
+        in status[0]
+    )
     assert status[3] == "the distortion folds over inside the field: make it smaller."
     assert sum(found.problems.values()) == 3
     assert np.isnan(found.data["sigma"].values[0]).all()
 
 
-def test_only_new_cells_are_computed_and_results_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_new_cells_are_computed_and_results_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls = counted(monkeypatch)
     first = sc.study(definition(), out=tmp_path, workers=0)
     assert len(calls) == 6
     wider = definition(
-        name="Another name", target_arcsec=0.1, sweep={"frames": (250, 1000, 500), "sigma_px": (0.05, 0.1, 0.2)}
+        name="Another name",
+        target_arcsec=0.1,
+        sweep={"frames": (250, 1000, 500), "sigma_px": (0.05, 0.1, 0.2)},
     )
     again = sc.study(wider, out=tmp_path, workers=0)
     assert len(calls) == 9
@@ -313,7 +375,9 @@ def same(found: Study, wanted: Study) -> bool:
 def test_a_forced_study_replaces_that_of_before_when_it_is_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At every moment; stopped, it goes on with the cells that it has, and each is computed once."""
+    """At every moment; stopped, it goes on with the cells that it has, and each is computed
+    once.
+    """
     monkeypatch.setattr("starcal_uq.studies.study._BATCH_S", 1e-9)
     folder = tmp_path / "work" / "out"
     old = sc.study(definition(sweep={"frames": (250, 500)}), out=folder, workers=0, more=page)
@@ -359,7 +423,10 @@ def results(folder: Path) -> list[bytes]:
 def test_a_full_disk_leaves_the_study_of_before(tmp_path: Path) -> None:
     old = sc.study(definition(sweep={"frames": (250, 500)}), out=tmp_path, workers=0)
     for largest in (3_000, 40_000):
-        with small_files(largest), pytest.raises(RunFolderError, match=r"cannot be written .*free space"):
+        with (
+            small_files(largest),
+            pytest.raises(RunFolderError, match=r"cannot be written .*free space"),
+        ):
             sc.study(definition(seed=2), out=tmp_path, workers=0, force=True)
         assert same(Study.load(tmp_path), old)
     assert sc.study(definition(seed=2), out=tmp_path, workers=0).complete
@@ -400,25 +467,35 @@ def test_an_interrupted_study_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
     assert found.data[same].equals(whole.data[same])
     damaged = next((tmp_path / "cells").glob("all-*"))
     damaged.write_bytes(damaged.read_bytes()[:500])
-    with pytest.raises(RunFolderError, match=r"all-.*is not a part of a study .*; delete it, and its cells"):
+    with pytest.raises(
+        RunFolderError, match=r"all-.*is not a part of a study .*; delete it, and its cells"
+    ):
         sc.study(definition(), out=tmp_path, workers=0)
 
 
-def test_cells_that_differ_in_noise_frames_or_prior_share_their_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_that_differ_in_noise_frames_or_prior_share_their_frames(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """What makes a cell of a grid cost a millisecond."""
     taken: list[int] = []
     stated: list[int] = []
     take, state = cells.take_frames, cells.statements
     monkeypatch.setattr(cells, "take_frames", lambda *given: taken.append(1) or take(*given))
     monkeypatch.setattr(cells, "statements", lambda *given: stated.append(1) or state(*given))
-    sweep = {"prior": ("flat", "ground"), "sigma_px": (0.05, 0.1), "fov_deg": (9.0, 12.0), "stars": (5, 8, 10)}
+    sweep = {
+        "prior": ("flat", "ground"),
+        "sigma_px": (0.05, 0.1),
+        "fov_deg": (9.0, 12.0),
+        "stars": (5, 8, 10),
+    }
     priors = {"ground": {"focal_fraction": 1e-5}}
     found = sc.study(definition(sweep=sweep, priors=priors, seeds=(0, 1), geometries=60), workers=0)
     assert found.n_cells == 48 and found.ok.all()
     assert (len(taken), len(stated)) == (2, 6)
 
 
-# --- definitions -----------------------------------------------------------------------------------------------------
+# --- definitions
+# --------------------------------------------------------------------------------------------------
 
 CAMERA = paper_camera().to_dict()
 
@@ -437,23 +514,44 @@ CAMERA = paper_camera().to_dict()
         ),
         ({"sweep": {"fov_deg": {"start": 5, "stop": 9}}}, "fov_deg: key n is missing"),
         ({"sweep": {"pointing": ["up"]}}, "pointing is 'up'; write one of random, stare"),
-        ({"sweep": {"prior": ["ground"]}}, r"prior 'ground' is not defined; add a section \[priors.ground\]"),
-        ({"sweep": {"method": ["efficient"]}}, "method makes no difference to Fisher information; set mode"),
+        (
+            {"sweep": {"prior": ["ground"]}},
+            r"prior 'ground' is not defined; add a section \[priors.ground\]",
+        ),
+        (
+            {"sweep": {"method": ["efficient"]}},
+            "method makes no difference to Fisher information; set mode",
+        ),
         ({"sweep": {"k3": [0.0]}}, "k3 is no coefficient of distortion 'brown'"),
-        ({"sweep": {"fov_deg": [5]}, "observation": {"focal_mm": 50.0}}, "fov_deg and focal_mm set the same thing"),
+        (
+            {"sweep": {"fov_deg": [5]}, "observation": {"focal_mm": 50.0}},
+            "fov_deg and focal_mm set the same thing",
+        ),
         ({"sweep": {}}, "nothing is varied"),
         ({"sweep": {"latin": {"n": 5}}}, r"section \[sweep.latin\]: write n, a number of points"),
         ({"sweep": {"latin": {"n": 5, "frames": 3}}}, "frames is 3; write a range of numbers"),
         ({"sweep": {"sigma_px": {"start": 1, "stop": 2, "n": 2000000}}}, "key n is 2000000"),
-        ({"study": {"mode": "guess"}}, r"section \[study\]: mode is 'guess'; write one of fisher, simulate"),
+        (
+            {"study": {"mode": "guess"}},
+            r"section \[study\]: mode is 'guess'; write one of fisher, simulate",
+        ),
         ({"study": {"colour": 1}}, "key colour is unknown"),
         ({"study": {"seeds": 0}}, "key seeds is 0; write a whole number from 1 to"),
         ({"study": {"target_sigma": {"k9": 1.0}}}, "target_sigma of k9"),
         ({"studies": {}}, r"section studies is unknown; did you mean study\?"),
-        ({"camera": {**CAMERA, "k1": -1e-5}}, r"section \[camera\]: the distortion folds over inside the field"),
+        (
+            {"camera": {**CAMERA, "k1": -1e-5}},
+            r"section \[camera\]: the distortion folds over inside the field",
+        ),
         ({"camera": {}}, r"section \[camera\]: camera: key width_px is missing"),
-        ({"priors": {"ground": {"focal": 1.0}}}, r"section \[priors.ground\]: key focal is unknown"),
-        ({"observation": {"sigma_px": "0.1"}}, r"section \[observation\]: sigma_px is '0.1'; write a number"),
+        (
+            {"priors": {"ground": {"focal": 1.0}}},
+            r"section \[priors.ground\]: key focal is unknown",
+        ),
+        (
+            {"observation": {"sigma_px": "0.1"}},
+            r"section \[observation\]: sigma_px is '0.1'; write a number",
+        ),
     ],
 )
 def test_a_bad_definition_is_one_sentence(tables: dict[str, object], words: str) -> None:
@@ -465,7 +563,10 @@ def test_a_bad_definition_is_one_sentence(tables: dict[str, object], words: str)
 
 
 def test_a_definition_made_in_python_is_checked_as_well() -> None:
-    for sweep, words in (({"fov": (1,)}, "did you mean fov_deg"), ({"pointing": ("up",)}, "pointing is 'up'")):
+    for sweep, words in (
+        ({"fov": (1,)}, "did you mean fov_deg"),
+        ({"pointing": ("up",)}, "pointing is 'up'"),
+    ):
         with pytest.raises(StudyError, match=words):
             sc.study(definition(sweep=sweep), workers=0)
 
@@ -475,7 +576,8 @@ def test_a_definition_comes_back_from_its_tables(tmp_path: Path) -> None:
     paper_camera().save(tmp_path / "sub" / "camera.toml")
     text = '[study]\ncamera = "sub/camera.toml"\nseeds = [3, 5]\n[sweep]\nframes = [10]\n'
     text += (
-        "[sweep.latin]\nn = 4\nsigma_px = {start = 0.02, stop = 0.3, spacing = 'log'}\nstars = {start = 4, stop = 9}\n"
+        "[sweep.latin]\nn = 4\nsigma_px = {start = 0.02, stop = 0.3, spacing = 'log'}\nstars = "
+        "{start = 4, stop = 9}\n"
     )
     (tmp_path / "study.toml").write_text(text, "utf-8")
     made = StudyDefinition.load(tmp_path / "study.toml")
@@ -504,7 +606,9 @@ def test_templates_are_definitions_with_a_question(name: str, tmp_path: Path) ->
 
 def test_a_hypercube_is_grouped_along_its_axes() -> None:
     span = {"start": 0.02, "stop": 0.3, "spacing": "log"}
-    found = sc.study(definition(sweep={}, latin={"sigma_px": span}, latin_n=60, geometries=100), workers=0)
+    found = sc.study(
+        definition(sweep={}, latin={"sigma_px": span}, latin_n=60, geometries=100), workers=0
+    )
     band = found.band("sigma", "sigma_px", parameter="f")
     assert len(band) == 6
     assert band["n"].sum() == 60

@@ -1,7 +1,9 @@
-"""One replicate of a validation: simulate, calibrate, sample, and ask where the truth lies among the draws.
+"""One replicate of a validation: simulate, calibrate, sample, and ask where the truth lies among
+the draws.
 
-Likelihood, target, Laplace approximation, moves and ensembles are those of `starcal_uq.sample`; what is left out is the
-number of ensembles, and diagnostics that a single run needs and a thousand replicates do not.
+Likelihood, target, Laplace approximation, moves and ensembles are those of `starcal_uq.sample`;
+what is left out is the number of ensembles, and diagnostics that a single run needs and a thousand
+replicates do not.
 """
 
 from __future__ import annotations
@@ -23,7 +25,12 @@ from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.inference.ensemble import EnsembleSettings, run_ensembles
 from starcal_uq.inference.named import NaivePairsWarning, find_source
-from starcal_uq.inference.target import Likelihood, LogLikelihood, laplace_approximation, start_target
+from starcal_uq.inference.target import (
+    Likelihood,
+    LogLikelihood,
+    laplace_approximation,
+    start_target,
+)
 from starcal_uq.maths.linear import symmetric_inverse
 from starcal_uq.simulation.frames import Campaign
 
@@ -52,20 +59,27 @@ class Replication:
     truth: Truth  # "fixed" or "prior": whether every replicate has one truth or a new one
     campaign: Campaign  # Data of one calibration; the noise may be drawn from the prior instead
     seed: int  # Replicate i depends on the seed and on i alone
-    assumed_sigma_px: float | None = None  # Noise that the sampler is told; None lets it sample the noise
-    likelihood: str | LikelihoodMaker = MARGINAL  # Name of a likelihood, or ``(obs, cal) -> Likelihood``
+    assumed_sigma_px: float | None = (
+        None  # Noise that the sampler is told; None lets it sample the noise
+    )
+    likelihood: str | LikelihoodMaker = (
+        MARGINAL  # Name of a likelihood, or ``(obs, cal) -> Likelihood``
+    )
     # ``() -> list of (emcee move, weight)`` to sample with instead of the usual ones.
     moves: Callable[[], list[tuple[Any, float]]] | None = None
     # `n_walkers`, `n_steps`, `n_burn`: one ensemble.
     n_walkers: int = 64
     n_steps: int = 200
     n_burn: int = 20
-    # Every `thin`-th step is ranked: walkers of one step are independent of each other, steps nearly so after ten.
+    # Every `thin`-th step is ranked: walkers of one step are independent of each other, steps
+    # nearly so after ten.
     thin: int = 10
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Names of what is ranked: parameters, noise if sampled, log likelihood, attitude errors."""
+        """Names of what is ranked: parameters, noise if sampled, log likelihood, attitude
+        errors.
+        """
         noise = self.priors.names[-1:] if self.assumed_sigma_px is None else ()
         return (*self.priors.names[:-1], *noise, LOG_LIKELIHOOD, *AXES)
 
@@ -73,11 +87,18 @@ class Replication:
     def units(self) -> tuple[str, ...]:
         """Their units."""
         noise = (sigma_parameter(False).unit,) if self.assumed_sigma_px is None else ()
-        return (*(p.unit for p in parameters(self.priors.distortion)), *noise, "nat", *("arcsec",) * 3)
+        return (
+            *(p.unit for p in parameters(self.priors.distortion)),
+            *noise,
+            "nat",
+            *("arcsec",) * 3,
+        )
 
     @property
     def n_ranked(self) -> int:
-        """Draws that the truth is ranked among; one is left out, so that the number of ranks has many divisors."""
+        """Draws that the truth is ranked among; one is left out, so that the number of ranks has
+        many divisors.
+        """
         return self.n_walkers * (self.n_steps // self.thin) - 1
 
 
@@ -92,13 +113,17 @@ class TrialOutcome(NamedTuple):
     error: FloatArray  # (Q,): mean of the draws minus truth
     sd: FloatArray  # (Q,): standard deviation of the draws
     nees: float  # Normalised squared error of the parameters with mean and covariance of the draws
-    nees_calibration: float  # Normalised squared error with the estimate and covariance of the calibration
+    nees_calibration: (
+        float  # Normalised squared error with the estimate and covariance of the calibration
+    )
     compression_error: float  # Compressed minus exact log likelihood at the truth, nat
     dof: int  # Degrees of freedom of the calibration
 
 
 def run_replicate(study: Replication, stars: StarCatalogue, index: int) -> TrialOutcome:
-    """Replicate number `index`; a calibration or posterior that fails is an outcome, a sky without stars an error."""
+    """Replicate number `index`; a calibration or posterior that fails is an outcome, a sky without
+    stars an error.
+    """
     truths, noise, sampler = np.random.SeedSequence(study.seed, spawn_key=(index,)).spawn(3)
     camera, sigma_px = _truth(study, np.random.default_rng(truths))
     truth = np.append(camera.theta, sigma_px)
@@ -117,8 +142,8 @@ def run_replicate(study: Replication, stars: StarCatalogue, index: int) -> Trial
 def _truth(study: Replication, rng: np.random.Generator) -> tuple[Camera, float]:
     """A camera and its noise; draws that are not cameras are drawn again.
 
-    The prior is then cut off where no camera is; so is the posterior in effect, because stars that were seen leave no
-    probability there.
+    The prior is then cut off where no camera is; so is the posterior in effect, because stars that
+    were seen leave no probability there.
     """
     if study.truth == "fixed":
         return study.camera, study.campaign.sigma_px
@@ -128,11 +153,18 @@ def _truth(study: Replication, rng: np.random.Generator) -> tuple[Camera, float]
         if not theta[2] > 0.0:
             continue
         camera = study.camera.with_theta(theta)
-        inside = -0.5 < theta[0] < camera.width_px - 0.5 and -0.5 < theta[1] < camera.height_px - 0.5
-        if inside and fold_radius_px(camera.distortion, theta, camera.corner_radius_px) > camera.corner_radius_px:
+        inside = (
+            -0.5 < theta[0] < camera.width_px - 0.5 and -0.5 < theta[1] < camera.height_px - 0.5
+        )
+        if (
+            inside
+            and fold_radius_px(camera.distortion, theta, camera.corner_radius_px)
+            > camera.corner_radius_px
+        ):
             return camera, sigma_px
     raise PriorError(
-        f"none of {_MAX_TRUTHS} draws of the prior is a camera whose principal point is on the detector and whose "
+        f"none of {_MAX_TRUTHS} draws of the prior is a camera whose principal point is on the "
+        "detector and whose "
         "distortion does not fold over: narrow the prior."
     )
 
@@ -152,7 +184,15 @@ def _sample(
     given = study.assumed_sigma_px
     sigma = source.sigma if given is None else given
     information = source.information * (source.sigma / sigma) ** 2
-    start = start_target(log_likelihood, study.priors, source.theta, information, sigma, source.dof, given is not None)
+    start = start_target(
+        log_likelihood,
+        study.priors,
+        source.theta,
+        information,
+        sigma,
+        source.dof,
+        given is not None,
+    )
     target, _ = laplace_approximation(start)
     chains = run_ensembles(
         target.log_density,
@@ -176,7 +216,9 @@ def _compare(
 ) -> TrialOutcome:
     p = len(truth) - 1
     flat = draws.reshape(-1, p + 1)
-    believed = truth if study.assumed_sigma_px is None else np.append(truth[:-1], study.assumed_sigma_px)
+    believed = (
+        truth if study.assumed_sigma_px is None else np.append(truth[:-1], study.assumed_sigma_px)
+    )
     points = np.vstack([flat, believed])
     level = log_likelihood(points[:, :-1], points[:, -1])
     noise = flat[:, -1:] - truth[-1] if study.assumed_sigma_px is None else np.empty((len(flat), 0))
@@ -185,10 +227,14 @@ def _compare(
     rotation = ARCSEC * shift @ cal.rotation_per_theta.T
     above = np.column_stack([shift, noise, level[:-1] - level[-1], rotation])
     low, high = np.quantile(above, [0.5 - 0.5 * INTERVAL, 0.5 + 0.5 * INTERVAL], axis=0)
-    ranked = above.reshape(study.n_steps, study.n_walkers, -1)[study.thin - 1 :: study.thin].reshape(-1, above.shape[1])
+    ranked = above.reshape(study.n_steps, study.n_walkers, -1)[
+        study.thin - 1 :: study.thin
+    ].reshape(-1, above.shape[1])
     exact = np.nan
     if study.likelihood == MARGINAL:
-        exact = MarginalLikelihood(obs, cal.camera.distortion).log_likelihood(believed[:-1], float(believed[-1]))
+        exact = MarginalLikelihood(obs, cal.camera.distortion).log_likelihood(
+            believed[:-1], float(believed[-1])
+        )
     return TrialOutcome(
         replicate=index,
         failure="",
@@ -207,7 +253,9 @@ def _compare(
 def _no_result(study: Replication, truth: FloatArray, index: int, reason: str) -> TrialOutcome:
     q = len(study.quantities)
     nothing, nowhere = np.full(q, np.nan), np.zeros(q, dtype=np.int64)
-    return TrialOutcome(index, reason, truth, nowhere, nowhere > 0, nothing, nothing, np.nan, np.nan, np.nan, 0)
+    return TrialOutcome(
+        index, reason, truth, nowhere, nowhere > 0, nothing, nothing, np.nan, np.nan, np.nan, 0
+    )
 
 
 def _nees(error: FloatArray, covariance: FloatArray) -> float:

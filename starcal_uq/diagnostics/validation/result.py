@@ -43,8 +43,9 @@ class Validation(Shown, Saved):
     Attributes
     ----------
     quantities, units : tuple of str
-        Camera parameters, noise (if sampled), ``log_likelihood`` (joint, of all data), and ``pitch``, ``yaw``,
-        ``roll``: the common rotation that the error of the parameters causes in every attitude, to first order.
+        Camera parameters, noise (if sampled), ``log_likelihood`` (joint, of all data), and
+        ``pitch``, ``yaw``, ``roll``: the common rotation that the error of the parameters causes in
+        every attitude, to first order.
     camera, nominal : Camera
         The truth (or what it was drawn around), and the start of every calibration.
     priors : Priors
@@ -104,7 +105,9 @@ class Validation(Shown, Saved):
     FILE = "a validation", "run `starcal-uq validate CAMERA` to write it"
     SHAPES: ClassVar[Shapes] = {
         **{"quantities": ("q",), "units": ("q",), "truth": ("n", "p+1")},
-        **dict.fromkeys(("replicate", "nees", "nees_calibration", "compression_error", "dof"), ("n",)),
+        **dict.fromkeys(
+            ("replicate", "nees", "nees_calibration", "compression_error", "dof"), ("n",)
+        ),
         **dict.fromkeys(("ranks", "covered", "error", "sd"), ("n", "q")),
     }
 
@@ -136,7 +139,9 @@ class Validation(Shown, Saved):
     @cached_property
     def coverage_interval(self) -> FloatArray:
         """95 % binomial interval (Q, 2) of the coverage (Clopper & Pearson)."""
-        return np.array([binomial_interval(int(k), self.n_replicates) for k in self.covered.sum(axis=0)])
+        return np.array(
+            [binomial_interval(int(k), self.n_replicates) for k in self.covered.sum(axis=0)]
+        )
 
     @cached_property
     def coverage_p_value(self) -> FloatArray:
@@ -148,7 +153,9 @@ class Validation(Shown, Saved):
 
     @cached_property
     def rank_p_value(self) -> FloatArray:
-        """p-values (Q,) of uniform ranks; below 0.05 where the curve leaves its band in the figure."""
+        """p-values (Q,) of uniform ranks; below 0.05 where the curve leaves its band in the
+        figure.
+        """
         return np.array([uniformity_p_value(ranks, self.n_ranked + 1) for ranks in self.ranks.T])
 
     @property
@@ -160,14 +167,17 @@ class Validation(Shown, Saved):
     def nees_ratio_se(self) -> float:
         """What chance alone moves `nees_ratio` by, one standard deviation.
 
-        With nu degrees of freedom for the noise, NEES is (nu - 2) / nu times p F(p, nu), and chi-square for many.
+        With nu degrees of freedom for the noise, NEES is (nu - 2) / nu times p F(p, nu), and
+        chi-square for many.
         """
         p, nu = self.n_parameters, np.maximum(self.dof, 5)
         return float(np.sqrt(np.mean(2.0 / p * (p + nu - 2.0) / (nu - 4.0)) / self.n_replicates))
 
     @property
     def nees_p_value(self) -> float:
-        """p-value of a mean NEES of p, from the gamma distribution with the mean and variance that it should have."""
+        """p-value of a mean NEES of p, from the gamma distribution with the mean and variance that
+        it should have.
+        """
         from scipy.stats import gamma
 
         variance = self.nees_ratio_se**2
@@ -178,25 +188,37 @@ class Validation(Shown, Saved):
     def findings(self) -> tuple[Finding, ...]:
         """All tests, smallest p-value first."""
         tests = [("camera parameters", "NEES", self.nees_p_value)]
-        tests += [(q, "ranks", float(p)) for q, p in zip(self.quantities, self.rank_p_value, strict=True)]
-        tests += [(q, "coverage", float(p)) for q, p in zip(self.quantities, self.coverage_p_value, strict=True)]
+        tests += [
+            (q, "ranks", float(p)) for q, p in zip(self.quantities, self.rank_p_value, strict=True)
+        ]
+        tests += [
+            (q, "coverage", float(p))
+            for q, p in zip(self.quantities, self.coverage_p_value, strict=True)
+        ]
         tests.sort(key=lambda test: test[2])
         corrected = holm([p for *_, p in tests])
-        return tuple(Finding(*test, bool(p <= FAMILY_LEVEL)) for test, p in zip(tests, corrected, strict=True))
+        return tuple(
+            Finding(*test, bool(p <= FAMILY_LEVEL))
+            for test, p in zip(tests, corrected, strict=True)
+        )
 
     @property
     def ok(self) -> bool:
         """No test objects, there were enough replicates, and at most one in a hundred failed."""
         few_failed = len(self.failures) <= 0.01 * (self.n_replicates + len(self.failures))
-        return few_failed and self.n_replicates >= ENOUGH_REPLICATES and not any(f.rejected for f in self.findings)
+        return (
+            few_failed
+            and self.n_replicates >= ENOUGH_REPLICATES
+            and not any(f.rejected for f in self.findings)
+        )
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per quantity.
 
-        Columns are ``quantity``, ``unit``, ``posterior_sd`` (median), ``rms_error`` (of the posterior mean),
-        ``bias_sd`` and ``rms_sd`` (mean and root mean square of the error in posterior standard deviations),
-        ``coverage_95`` with its binomial interval ``coverage_low`` and ``coverage_high``, ``coverage_p`` and
-        ``rank_p``.
+        Columns are ``quantity``, ``unit``, ``posterior_sd`` (median), ``rms_error`` (of the
+        posterior mean), ``bias_sd`` and ``rms_sd`` (mean and root mean square of the error in
+        posterior standard deviations), ``coverage_95`` with its binomial interval ``coverage_low``
+        and ``coverage_high``, ``coverage_p`` and ``rank_p``.
         """
         import pandas as pd
 

@@ -1,16 +1,18 @@
-"""Are the intervals right? Simulation-based calibration, coverage and squared errors for one's own sensor.
+"""Are the intervals right? Simulation-based calibration, coverage and squared errors for one's own
+sensor.
 
-Observations are simulated again and again as the sensor would make them, calibrated and sampled, and the truth is
-compared with its posterior. If the posterior is right, then
+Observations are simulated again and again as the sensor would make them, calibrated and sampled,
+and the truth is compared with its posterior. If the posterior is right, then
 
-- the rank of the truth among posterior draws is uniform, for every parameter and for any function of parameters and
-  data (Talts et al. 2018, arXiv:1804.06788; Modrak et al. 2023, arXiv:2211.02383, for the joint log likelihood);
+- the rank of the truth among posterior draws is uniform, for every parameter and for any function
+  of parameters and data (Talts et al. 2018, arXiv:1804.06788; Modrak et al. 2023, arXiv:2211.02383,
+  for the joint log likelihood);
 - a 95 % interval holds the truth 95 times in a hundred;
 - the normalised estimation error squared, e^T C^-1 e, is the number of parameters on average.
 
-With the truth drawn from the prior (``truth="prior"``) this holds exactly, for any prior. With one fixed truth it is
-the claim that a user makes in the end, that the intervals cover at *this* camera; it holds as far as the data, and not
-the prior, decide.
+With the truth drawn from the prior (``truth="prior"``) this holds exactly, for any prior. With one
+fixed truth it is the claim that a user makes in the end, that the intervals cover at *this* camera;
+it holds as far as the data, and not the prior, decide.
 """
 
 from __future__ import annotations
@@ -44,9 +46,11 @@ if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 TRUTHS = get_args(Truth)
-# Student t is for stars that are not where they should be; its sigma is not the noise that is simulated here.
+# Student t is for stars that are not where they should be; its sigma is not the noise that is
+# simulated here.
 LIKELIHOODS = (MARGINAL, "pairs", "pairs_naive")
-# What truth="prior" draws from by default: narrow enough that every draw is a camera that sees the same sky.
+# What truth="prior" draws from by default: narrow enough that every draw is a camera that sees the
+# same sky.
 _PRIOR_POINT_PX = 5.0
 _PRIOR_FOCAL = 1e-3
 _PRIOR_CORNER_PX = 1.0
@@ -73,41 +77,44 @@ def validate(
     likelihood: str | LikelihoodMaker = MARGINAL,
     keep: PathLike | None = None,
 ) -> Validation:
-    """Check intervals, ranks and errors of calibration and posterior for a sensor and its volume of data.
+    """Check intervals, ranks and errors of calibration and posterior for a sensor and its volume of
+    data.
 
     Parameters
     ----------
     camera : Camera
-        The sensor, with the optics and distortion that it is thought to have. Every calibration starts as from its
-        data sheet: principal point in the centre, no distortion.
+        The sensor, with the optics and distortion that it is thought to have. Every calibration
+        starts as from its data sheet: principal point in the centre, no distortion.
     n_replicates : int
         Data sets to simulate; 1000 know a coverage to 1.4 %.
     n_frames, min_stars, sigma_px, max_mag
-        Data of one calibration: frames, least stars in each, centroid noise in px per axis, and limiting magnitude.
+        Data of one calibration: frames, least stars in each, centroid noise in px per axis, and
+        limiting magnitude.
     seed : int
-        The same seed gives the same result, bit for bit, for any number of processes; the first replicates of a longer
-        validation are those of a shorter one.
+        The same seed gives the same result, bit for bit, for any number of processes; the first
+        replicates of a longer validation are those of a shorter one.
     workers : int, optional
-        Processes; as many as there are processors by default. With 0, everything happens in this process, where a BLAS
-        with several threads can change the last digits.
+        Processes; as many as there are processors by default. With 0, everything happens in this
+        process, where a BLAS with several threads can change the last digits.
     truth : {"fixed", "prior"}
-        ``fixed``: the truth is `camera` in every replicate, sampled with the default priors, which are nearly flat
-        there. ``prior``: the truth is drawn from the priors.
+        ``fixed``: the truth is `camera` in every replicate, sampled with the default priors, which
+        are nearly flat there. ``prior``: the truth is drawn from the priors.
     progress : callable, optional
         Called as ``progress(done, total)``.
     priors : Priors, optional
-        Instead of ``Priors.default`` of the data-sheet camera, or, with ``truth="prior"``, instead of narrow ones
-        around `camera` (`narrow_priors`).
+        Instead of ``Priors.default`` of the data-sheet camera, or, with ``truth="prior"``, instead
+        of narrow ones around `camera` (`narrow_priors`).
     stars : StarCatalogue, optional
         The sky, instead of the embedded catalogue to `max_mag`.
     assumed_sigma_px : float, optional
         Tell the sampler this noise instead of letting it sample the noise.
     likelihood : {"marginal", "pairs", "pairs_naive"} or callable
-        As in `sample`; or ``(obs, cal) -> object with log_likelihood(theta (n, p), sigma (n,)) -> (n,)``, to validate
-        one's own, which with several workers must be a function at the top level of a module.
+        As in `sample`; or ``(obs, cal) -> object with log_likelihood(theta (n, p), sigma (n,)) ->
+        (n,)``, to validate one's own, which with several workers must be a function at the top
+        level of a module.
     keep : path, optional
-        Folder in which replicates are kept as they are made; a later call goes on from them, with more replicates as
-        well. Not for a likelihood of one's own.
+        Folder in which replicates are kept as they are made; a later call goes on from them, with
+        more replicates as well. Not for a likelihood of one's own.
 
     Returns
     -------
@@ -129,22 +136,30 @@ def validate(
     if priors is None:
         priors = narrow_priors(camera, sigma_px) if truth == "prior" else Priors.default(nominal)
     campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
-    study = Replication(camera, nominal, priors, truth, campaign, seed, assumed_sigma_px, likelihood)
+    study = Replication(
+        camera, nominal, priors, truth, campaign, seed, assumed_sigma_px, likelihood
+    )
     _check(study, n_replicates, workers)
     settings: AnyDict = {
         "truth": truth,
         **campaign.settings(stars),
         "assumed_sigma_px": assumed_sigma_px,
-        "likelihood": likelihood if isinstance(likelihood, str) else getattr(likelihood, "__name__", repr(likelihood)),
+        "likelihood": likelihood
+        if isinstance(likelihood, str)
+        else getattr(likelihood, "__name__", repr(likelihood)),
     }
     sky = load_catalogue(max_mag=max_mag) if stars is None else stars
     kept = None
     if keep is not None:
         if not isinstance(likelihood, str):
-            raise SamplingError("replicates of a likelihood of your own cannot be kept: leave out `keep`.")
+            raise SamplingError(
+                "replicates of a likelihood of your own cannot be kept: leave out `keep`."
+            )
         identity = [camera, nominal, priors, seed, settings, sky.source]
         kept = Kept(keep, identity, (TrialOutcome,))
-    return validate_study(study, sky, n_replicates, workers=workers, progress=progress, settings=settings, kept=kept)
+    return validate_study(
+        study, sky, n_replicates, workers=workers, progress=progress, settings=settings, kept=kept
+    )
 
 
 def validate_study(
@@ -185,15 +200,18 @@ def validate_study(
         failures=failures,
         n_requested=n_replicates,
         interrupted=interrupted,
-        provenance=provenance(study.seed, {**(settings or {}), "n_replicates": n_replicates, **sampling}, None),
+        provenance=provenance(
+            study.seed, {**(settings or {}), "n_replicates": n_replicates, **sampling}, None
+        ),
     )
 
 
 def narrow_priors(camera: Camera, sigma_px: float) -> Priors:
     """Priors around a camera from which truths can be drawn.
 
-    Principal point within 5 px, focal length within 0.1 %, noise within 20 %, and each distortion term within what the
-    camera's largest one displaces at the corner, at least 1 px, around zero (one standard deviation each).
+    Principal point within 5 px, focal length within 0.1 %, noise within 20 %, and each distortion
+    term within what the camera's largest one displaces at the corner, at least 1 px, around zero
+    (one standard deviation each).
     """
     from starcal_uq.camera.distortion import get_model
 
@@ -213,23 +231,37 @@ def narrow_priors(camera: Camera, sigma_px: float) -> Priors:
 def _check(study: Replication, n_replicates: int, workers: int | None) -> None:
     assumed = study.assumed_sigma_px
     for good, text in (
-        (study.truth in TRUTHS, f"truth {study.truth!r} is unknown: use one of {', '.join(TRUTHS)}."),
-        (n_replicates >= 1, f"n_replicates is {n_replicates}: give at least 1, and at least 100 for a verdict."),
-        (workers is None or workers >= 0, f"workers is {workers}: give at least 1, or 0 for this process."),
-        (assumed is None or 0.0 < assumed < np.inf, f"assumed_sigma_px is {assumed}: give a noise above zero."),
+        (
+            study.truth in TRUTHS,
+            f"truth {study.truth!r} is unknown: use one of {', '.join(TRUTHS)}.",
+        ),
+        (
+            n_replicates >= 1,
+            f"n_replicates is {n_replicates}: give at least 1, and at least 100 for a verdict.",
+        ),
+        (
+            workers is None or workers >= 0,
+            f"workers is {workers}: give at least 1, or 0 for this process.",
+        ),
+        (
+            assumed is None or 0.0 < assumed < np.inf,
+            f"assumed_sigma_px is {assumed}: give a noise above zero.",
+        ),
     ):
         if not good:
             raise SamplingError(text)
     study.campaign.check(SamplingError)
     if isinstance(study.likelihood, str) and study.likelihood not in LIKELIHOODS:
         raise SamplingError(
-            f"the likelihood {study.likelihood!r} cannot be validated: use one of {', '.join(LIKELIHOODS)}, or give a "
+            f"the likelihood {study.likelihood!r} cannot be validated: use one of "
+            f"{', '.join(LIKELIHOODS)}, or give a "
             "function that makes one."
         )
     if study.priors.names != (*study.camera.parameter_names, "sigma"):
         raise PriorError(
             f"the priors are on {', '.join(study.priors.names)}, but the camera has "
-            f"{', '.join(study.camera.parameter_names)} and sigma: make them with Priors.default of this camera."
+            f"{', '.join(study.camera.parameter_names)} and sigma: make them with Priors.default "
+            "of this camera."
         )
 
 

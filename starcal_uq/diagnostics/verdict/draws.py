@@ -1,4 +1,6 @@
-"""Checks of what is done with draws; those of the draws themselves are in `Posterior.diagnostics`."""
+"""Checks of what is done with draws; those of the draws themselves are in
+`Posterior.diagnostics`.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.propagation.attitude_error import AttitudeError
 
-# What first order leaves out, and how many Monte Carlo errors of a sampled sigma are tolerated beyond it.
+# What first order leaves out, and how many Monte Carlo errors of a sampled sigma are tolerated
+# beyond it.
 PROPAGATION_SLACK, PROPAGATION_ERRORS = 0.03, 4.0
 
 
@@ -28,7 +31,15 @@ def same_data(post: Posterior, data_hash: str) -> Check:
     value = f"SHA-256 {str(post.provenance.get('data_sha256'))[:12]}…"
     bound = f"{data_hash[:12]}…"
     remedy = "" if good else "starcal-uq sample RUN --force or sc.sample(obs, cal)"
-    return Check("Data of the posterior", Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy)
+    return Check(
+        "Data of the posterior",
+        Question.CONVERGED,
+        pass_or_fail(good),
+        value,
+        bound,
+        sentence,
+        remedy,
+    )
 
 
 def propagation(error: AttitudeError) -> Check:
@@ -40,18 +51,33 @@ def propagation(error: AttitudeError) -> Check:
     sentence = (
         "Draws through QUEST and first-order propagation give the same attitude error."
         if good
-        else "Draws through QUEST and first-order propagation differ: prefer the draws, and raise their number."
+        else (
+            "Draws through QUEST and first-order propagation differ: prefer the draws, and raise "
+            "their number."
+        )
     )
     value = f"sigmas within {percent(largest)}"
     remedy = "" if good else f"starcal-uq propagate RUN --force --draws {4 * error.n_draws}"
     level = pass_or_warn(good)
-    return Check("Propagation to attitude", Question.TRUSTWORTHY, level, value, f"≤ {percent(bound)}", sentence, remedy)
+    return Check(
+        "Propagation to attitude",
+        Question.TRUSTWORTHY,
+        level,
+        value,
+        f"≤ {percent(bound)}",
+        sentence,
+        remedy,
+    )
 
 
 def propagation_difference(error: AttitudeError) -> float:
-    """Largest relative difference between sampled and first-order sigmas of the calibration's parts."""
+    """Largest relative difference between sampled and first-order sigmas of the calibration's
+    parts.
+    """
     sampled = np.concatenate([error.common_arcsec, error.rest_arcsec])
     first_order = np.concatenate([error.analytic_common_arcsec, error.analytic_rest_arcsec])
     # Parts without an effect worth the name (below a microarcsecond) have no ratio.
     real = np.maximum(sampled, first_order) > 1e-6
-    return float(np.max(np.abs(sampled[real] / np.maximum(first_order[real], 1e-12) - 1.0), initial=0.0))
+    return float(
+        np.max(np.abs(sampled[real] / np.maximum(first_order[real], 1e-12) - 1.0), initial=0.0)
+    )

@@ -1,7 +1,8 @@
-"""The verdict on a run: did it converge, can it be trusted, and what limits it; every check with its number and bound.
+"""The verdict on a run: did it converge, can it be trusted, and what limits it; every check with
+its number and bound.
 
-Pure functions of result objects. A check that fails means that the numbers must not be used; a warning means that they
-may be used by someone who has read it.
+Pure functions of result objects. A check that fails means that the numbers must not be used; a
+warning means that they may be used by someone who has read it.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class Verdict(Shown):
     commands : tuple of str
         What to try, in this order, each a command; at most three. Empty where no command helps.
     ended : str
-        That no model here explains the data, and which data would tell; empty where something is left to try.
+        That no model here explains the data, and which data would tell; empty where something is
+        left to try.
     """
 
     DOCUMENTED: ClassVar = ("level",)
@@ -61,7 +63,9 @@ class Verdict(Shown):
         return worst(self.checks)
 
     def to_dict(self) -> AnyDict:
-        """The verdict as ``verdict.json`` holds it; `VERSION` rises when a key goes or changes its meaning."""
+        """The verdict as ``verdict.json`` holds it; `VERSION` rises when a key goes or changes its
+        meaning.
+        """
         from starcal_uq.core.documents import document, part_of
 
         return document("verdict", VERSION, part_of(Verdict), self, self.level.exit_status)
@@ -72,7 +76,9 @@ class Verdict(Shown):
 
     @property
     def causes(self) -> dict[str, list[Check]]:
-        """The checks that did not pass by what they point to: the input, the lens, the noise, the computation."""
+        """The checks that did not pass by what they point to: the input, the lens, the noise, the
+        computation.
+        """
         return by_cause([check for check in self.checks if check.question is not Question.REQUIRED])
 
     @property
@@ -97,8 +103,8 @@ def judge(
 ) -> Verdict:
     """Check a run: everything that is known of it; `truth` is the camera of a simulation.
 
-    With its place, remedies are commands that name its files. The requirements of its budget are checks like the
-    others.
+    With its place, remedies are commands that name its files. The requirements of its budget are
+    checks like the others.
     """
     checks: list[Check | None] = [estimate.estimation(cal, post), estimate.determined(cal)]
     checks += [estimate.estimators_agree(cal)]
@@ -108,12 +114,23 @@ def judge(
         checks += [draws.same_data(post, cal.data_hash_of(obs)), *post.diagnostics.checks]
     used = weighed(obs, cal)
     asked = (None, None) if diagnosis is None else (diagnosis.air, diagnosis.times)
-    better = None if diagnosis is None or diagnosis.comparison is None else diagnosis.comparison.better
+    better = (
+        None if diagnosis is None or diagnosis.comparison is None else diagnosis.comparison.better
+    )
     unseen = None if diagnosis is None or diagnosis.times is not None else diagnosis.aberration
     rests = observed.rests_on_aberration(used, unseen)
     checks += [observed.directions(used, cal, *asked, rests)]
-    checks += [observed.residual_pattern(used, cal, better), observed.outliers(used, cal), observed.screening(obs)]
-    checks += [observed.noise(used, cal), observed.partitions(cal), observed.terms(cal), observed.coverage(used, cal)]
+    checks += [
+        observed.residual_pattern(used, cal, better),
+        observed.outliers(used, cal),
+        observed.screening(obs),
+    ]
+    checks += [
+        observed.noise(used, cal),
+        observed.partitions(cal),
+        observed.terms(cal),
+        observed.coverage(used, cal),
+    ]
     if diagnosis is not None:
         checks += estimate.model_checks(diagnosis, cal, post, attitude)
     if attitude is not None:
@@ -121,7 +138,9 @@ def judge(
     if truth is not None and truth.parameter_names == cal.parameter_names:
         checks += [estimate.against_truth(cal, truth, post)]
     checks += requirements
-    found = tuple(check if place is None else place.exact(check) for check in checks if check is not None)
+    found = tuple(
+        check if place is None else place.exact(check) for check in checks if check is not None
+    )
     commands, ended = _way_on(found, place)
     return Verdict(found, _headline(found, post is not None, rests), commands, ended)
 
@@ -137,14 +156,18 @@ def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[tuple[str, 
             break
     commands = _largest(every)[:MOST_COMMANDS]
     tried = () if place is None else place.tried
-    if worst(doubts) is not Level.FAIL or (commands and not (place is not None and place.exhausted(doubts))):
+    if worst(doubts) is not Level.FAIL or (
+        commands and not (place is not None and place.exhausted(doubts))
+    ):
         return commands, ""
     steps = f" (tried: {'; '.join(one.text for one in tried)})" if tried else ""
     return (), f"No model here explains this{steps}. What would tell: {telling(doubts)}."
 
 
 def _largest(commands: Sequence[str]) -> tuple[str, ...]:
-    """Commands without repeats; of those that differ in whole numbers alone, such as steps, that with the largest."""
+    """Commands without repeats; of those that differ in whole numbers alone, such as steps, that
+    with the largest.
+    """
     found: dict[str, str] = {}
     for command in commands:
         form = re.sub(r"(?<= )\d+(?= |$)", "N", command)
@@ -161,11 +184,15 @@ def _named(checks: Sequence[Check], level: Level) -> str:
     found = [check for check in checks if check.level is level]
     if len(found) <= _NAMED:
         return join_words([check.phrase for check in found])
-    return join_words([f"{plural(len(some), 'check')} of {cause}" for cause, some in by_cause(found).items()])
+    return join_words(
+        [f"{plural(len(some), 'check')} of {cause}" for cause, some in by_cause(found).items()]
+    )
 
 
 def _headline(checks: tuple[Check, ...], sampled: bool, rests: str) -> str:
-    """What becomes of the requirements, whether the numbers can be used, and what f then rests on."""
+    """What becomes of the requirements, whether the numbers can be used, and what f then rests
+    on.
+    """
     required = [check for check in checks if check.question is Question.REQUIRED]
     violated = [check.phrase for check in required if check.level is Level.FAIL]
     still_open = [check.phrase for check in required if check.level is Level.WARN]
@@ -182,8 +209,12 @@ def _usable(checks: Sequence[Check], sampled: bool) -> str:
     if failed:
         return f"Do not use these numbers: {_named(checks, Level.FAIL)} failed."
     if warned:
-        start = "Converged; usable once " + ("this warning is" if len(warned) == 1 else "these warnings are")
+        start = "Converged; usable once " + (
+            "this warning is" if len(warned) == 1 else "these warnings are"
+        )
         return f"{start} resolved or accepted: {_named(checks, Level.WARN)}."
     if not sampled:
-        return "The estimate converged and passed every check; the posterior has not been sampled yet."
+        return (
+            "The estimate converged and passed every check; the posterior has not been sampled yet."
+        )
     return "Converged, and every check passed: the stated uncertainties can be used."

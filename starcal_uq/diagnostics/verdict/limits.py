@@ -1,4 +1,6 @@
-"""What limits the result, in sentences: the largest term of the attitude error, the coupling, the systematics."""
+"""What limits the result, in sentences: the largest term of the attitude error, the coupling, the
+systematics.
+"""
 
 from __future__ import annotations
 
@@ -43,12 +45,19 @@ def _systematic(obs: Observations, cal: Calibration) -> str:
     if binned.p_value < PATTERN_P:
         arcsec = binned.pattern_px / cal.camera.focal_px * ARCSEC
         return (
-            f"The model: residuals keep a pattern of {significant(arcsec)} arcsec, which more frames will not remove."
+            f"The model: residuals keep a pattern of {significant(arcsec)} arcsec, which more "
+            "frames will not remove."
         )
     if obs.meta.get("directions") != "apparent":
-        return "Knowledge of the directions: until they are known to be apparent, f is conditional on that."
+        return (
+            "Knowledge of the directions: until they are known to be apparent, f is conditional "
+            "on that."
+        )
     if air(obs) == "unknown":
-        return "Refraction: until the site is stated, or that the camera was in space, f is conditional on it."
+        return (
+            "Refraction: until the site is stated, or that the camera was in space, f is "
+            "conditional on it."
+        )
     return ""
 
 
@@ -67,30 +76,44 @@ def _structure(cal: Calibration, diagnosis: Diagnosis) -> str:
 
 def _attitude(error: AttitudeError) -> str:
     """Compare the terms across the boresight, where missions state their requirement."""
-    names = ("centroid noise of a single frame", "the calibration's common rotation", "the calibration's rest")
+    names = (
+        "centroid noise of a single frame",
+        "the calibration's common rotation",
+        "the calibration's rest",
+    )
     values = error.headline_arcsec[:3, 3]
-    pairs = zip(error.with_misfit_found_arcsec[:3, 3], error.if_model_holds_arcsec[:3, 3], strict=True)
+    pairs = zip(
+        error.with_misfit_found_arcsec[:3, 3], error.if_model_holds_arcsec[:3, 3], strict=True
+    )
     noise, common, rest = (two_figures(*pair) for pair in pairs)
     largest = names[int(np.argmax(values))]
     if values[1] == max(values):
         return (
-            f"Attitude across the boresight: {largest}, one constant, exceeds centroid noise: {common} against "
-            f"{noise} per frame. Alignment calibration with these parameters, on {error.alignment}, absorbs it; what "
+            f"Attitude across the boresight: {largest}, one constant, exceeds centroid noise: "
+            f"{common} against "
+            f"{noise} per frame. Alignment calibration with these parameters, on "
+            f"{error.alignment}, absorbs it; what "
             f"remains is {rest}."
         )
     return (
-        f"Attitude across the boresight: {largest} dominates. Noise: {noise}; common rotation: {common}; rest: {rest}."
+        f"Attitude across the boresight: {largest} dominates. Noise: {noise}; common rotation: "
+        f"{common}; rest: {rest}."
     )
 
 
 def _coupled(coupling: Coupling) -> str:
     pairs = coupling.pairs(_STRONG)
     if not pairs:
-        return "Coupling: no two parameters are strongly coupled; every sigma falls as one over the root of the frames."
+        return (
+            "Coupling: no two parameters are strongly coupled; every sigma falls as one over the "
+            "root of the frames."
+        )
     first, second, value = pairs[0]
     ratio = coupling.sigma_marginal / coupling.sigma_conditional
     worst = int(np.argmax(ratio))
     return (
-        f"Coupling: {first} trades against {second} (correlation {value:.2f}); with the other parameters known, "
-        f"{coupling.parameter_names[worst]} would be {significant(float(ratio[worst]))} times better determined."
+        f"Coupling: {first} trades against {second} (correlation {value:.2f}); with the other "
+        "parameters known, "
+        f"{coupling.parameter_names[worst]} would be {significant(float(ratio[worst]))} times "
+        "better determined."
     ).replace("-", "−")

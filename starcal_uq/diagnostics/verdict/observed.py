@@ -9,7 +9,16 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import fixed, percent, plural, significant
-from starcal_uq.core.status import CALIBRATE, MORE, PLAN, Check, Level, Question, model_remedy, pass_or_warn
+from starcal_uq.core.status import (
+    CALIBRATE,
+    MORE,
+    PLAN,
+    Check,
+    Level,
+    Question,
+    model_remedy,
+    pass_or_warn,
+)
 from starcal_uq.core.times import TIMES_IN_NAMES
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
 from starcal_uq.diagnostics.verdict.effect import on_directions
@@ -41,11 +50,15 @@ _SMALL_SIGMA = 1.0
 SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
 _RICHEST = "brown_tangential"
 _NO_MODEL = (
-    "Count the pattern as an error of the directions, as the attitude error with the misfit found does: no distortion "
+    "Count the pattern as an error of the directions, as the attitude error with the misfit "
+    "found does: no distortion "
     "model here follows it."
 )
 FROM_IMAGES = "starcal-uq run IMAGES... CAMERA -o RUN --force"
-ROBUST, NOISE = f"{CALIBRATE} --robust", f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model')"
+ROBUST, NOISE = (
+    f"{CALIBRATE} --robust",
+    f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model')",
+)
 
 
 def directions(
@@ -55,33 +68,67 @@ def directions(
     times: TimeTest | None = None,
     rests: str = "",
 ) -> Check:
-    """Is annual aberration in the directions, and refraction where there is air? `rests` is what f rests on."""
+    """Is annual aberration in the directions, and refraction where there is air? `rests` is what f
+    rests on.
+    """
     declared = str(obs.meta.get("directions", "undeclared"))
     name, bound = "Catalogue directions", "apparent"
     seen = air(obs)
     wrong = [] if times is None else [_time_words(obs, times)]
     if found is not None and found.is_air:
-        order = "Give the directions of a catalogue, or apparent ones that hold refraction." if seen == "none" else ""
+        order = (
+            "Give the directions of a catalogue, or apparent ones that hold refraction."
+            if seen == "none"
+            else ""
+        )
         wrong.append(
-            (f"refraction, p = {significant(found.p_value)}", air_words(obs, found), _with_site(obs, found), order)
+            (
+                f"refraction, p = {significant(found.p_value)}",
+                air_words(obs, found),
+                _with_site(obs, found),
+                order,
+            )
         )
     if wrong:
         values, sentences, remedies, orders = zip(*wrong, strict=True)
         remedy, advice = next(filter(None, remedies), ""), " ".join(filter(None, orders))
         small = times is not None and len(wrong) == 1 and times.moves_sigma < _SMALL_SIGMA
         level = Level.WARN if small else Level.FAIL
-        return Check(name, Question.TRUSTWORTHY, level, "; ".join(values), bound, " ".join(sentences), remedy, advice)
+        return Check(
+            name,
+            Question.TRUSTWORTHY,
+            level,
+            "; ".join(values),
+            bound,
+            " ".join(sentences),
+            remedy,
+            advice,
+        )
     if declared == "apparent" and seen == "unknown":
-        words = ("Aberration is in the directions, refraction is not.", rests, _unsure(cal, found), REMEDY)
+        words = (
+            "Aberration is in the directions, refraction is not.",
+            rests,
+            _unsure(cal, found),
+            REMEDY,
+        )
         sentence = " ".join(filter(None, words))
-        return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, _about_air(obs))
+        return Check(
+            name,
+            Question.TRUSTWORTHY,
+            Level.WARN,
+            "without refraction",
+            bound,
+            sentence,
+            _about_air(obs),
+        )
     if declared == "apparent":
         sentence = "The directions are declared as apparent: aberration is in them."
         if obs.meta.get("observer") == "space":
             sentence = "Aberration is in the directions; the camera was in space."
         if seen == "corrected":
             sentence = (
-                f"Aberration and refraction at the site ({Site.from_dict(obs.meta['site'])}) are in the directions."
+                f"Aberration and refraction at the site ({Site.from_dict(obs.meta['site'])}) are "
+                "in the directions."
             )
         sentence = f"{sentence} {rests}".rstrip()
         return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, bound, sentence)
@@ -89,24 +136,33 @@ def directions(
     time = _time_of(obs) if _from_images(obs) else ""
     remedy = f"{_command(obs)}{time or ' --directions apparent'}"
     if seen == "unknown":
-        sentence, remedy = f"{sentence} {_unsure(cal, found)} {REMEDY}", f"{remedy} or {_about_air(obs)}"
+        sentence, remedy = (
+            f"{sentence} {_unsure(cal, found)} {REMEDY}",
+            f"{remedy} or {_about_air(obs)}",
+        )
     return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedy)
 
 
 def rests_on_aberration(obs: Observations, found: UnseenAberration | None) -> str:
-    """That f is conditional on aberration being in the directions once, where no residual can show that."""
+    """That f is conditional on aberration being in the directions once, where no residual can show
+    that.
+    """
     made = obs.meta.get("source") == "simulated" or obs.meta.get("observer") == "rendered"
     if found is None or made or obs.meta.get("directions") != "apparent":
         return ""
     size = f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)"
     return (
-        "The focal length f rests on annual aberration being in the directions, once: left out or applied twice, it "
-        f"would move f by {'' if found.dated else 'up to '}{size}, and the residuals of these frames would not show it."
+        "The focal length f rests on annual aberration being in the directions, once: left out "
+        "or applied twice, it "
+        f"would move f by {'' if found.dated else 'up to '}{size}, and the residuals of these "
+        "frames would not show it."
     )
 
 
 def air_words(obs: Observations, found: AirTest) -> str:
-    """That refraction is in the residuals, what it does to f, and where the camera would have stood."""
+    """That refraction is in the residuals, what it does to f, and where the camera would have
+    stood.
+    """
     first = (
         "The residuals hold refraction that the directions do not: f is too short by "
         f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)."
@@ -117,18 +173,25 @@ def air_words(obs: Observations, found: AirTest) -> str:
     place = Site(found.latitude_deg, found.longitude_deg)
     errors = (significant(error) for error in (found.latitude_std_deg, found.longitude_std_deg))
     ends = " and ".join(f"± {error}°" for error in errors)
-    seen = {"corrected": "Check site, pressure and times", "none": "They are declared to hold all there is: check that"}
+    seen = {
+        "corrected": "Check site, pressure and times",
+        "none": "They are declared to hold all there is: check that",
+    }
     asked = seen.get(air(obs), "State the site (--site)")
     return f"{first} {asked}; the residuals point to {place.words} ({ends})."
 
 
 def _unsure(cal: Calibration, found: AirTest | None) -> str:
-    """That f is conditional on refraction, and where the residuals leave open whether there is any."""
+    """That f is conditional on refraction, and where the residuals leave open whether there is
+    any.
+    """
     if found is None or not found.like_others:
         return conditional_words(cal)
     return (
-        f"{conditional_words(cal)} The residuals hold what refraction would leave if the zenith kept its place in the "
-        "camera, and so would axes of different scale, skewed axes or a drift of f: these cannot be told apart here."
+        f"{conditional_words(cal)} The residuals hold what refraction would leave if the zenith "
+        "kept its place in the "
+        "camera, and so would axes of different scale, skewed axes or a drift of f: these cannot "
+        "be told apart here."
     )
 
 
@@ -139,8 +202,16 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]
     later = f"{significant(abs(found.later))} ± {significant(found.later_std)} {unit}"
     later += " later" if found.later > 0.0 else " earlier"
     if found.cause == "epoch":
-        sentence = f"By proper motion the stars are those of an epoch {later} than that of the directions: {effect}."
-        return f"epoch {later}", sentence, "", "Correct the times, or give directions of the epoch of the images."
+        sentence = (
+            f"By proper motion the stars are those of an epoch {later} than that of the "
+            f"directions: {effect}."
+        )
+        return (
+            f"epoch {later}",
+            sentence,
+            "",
+            "Correct the times, or give directions of the epoch of the images.",
+        )
     if found.cause == "no aberration":
         sentence = f"The residuals hold annual aberration that the directions do not: {effect}."
         kind = "" if _from_images(obs) and obs.time_utc is None else " --directions catalogue"
@@ -151,13 +222,18 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]
     what, other = "Annual aberration", ""
     if found.cause == "hour":
         east = HOUR_DEG * found.later
-        what, other = "Refraction", f", or a site {significant(abs(east))}° further {'east' if east > 0.0 else 'west'}"
+        what, other = (
+            "Refraction",
+            f", or a site {significant(abs(east))}° further {'east' if east > 0.0 else 'west'}",
+        )
     sentence = f"{what} in the residuals is that of times {later} than stated{other}: {effect}."
     return f"times {later}", sentence, "", "Correct the times, which are UTC (column time_utc)."
 
 
 def wrong_time(obs: Observations, cal: Calibration) -> str | None:
-    """The wrong time that the residuals of a calibration show, with its remedy, as the end of a sentence."""
+    """The wrong time that the residuals of a calibration show, with its remedy, as the end of a
+    sentence.
+    """
     from starcal_uq.diagnostics.times import time_test
 
     try:
@@ -167,7 +243,9 @@ def wrong_time(obs: Observations, cal: Calibration) -> str | None:
     if found is None or not np.isfinite(found.moves_sigma):
         return None
     _, sentence, remedy, advice = _time_words(obs, found)
-    return sentence[0].lower() + " ".join(filter(None, (sentence[1:], advice, f"Use `{remedy}`." if remedy else "")))
+    return sentence[0].lower() + " ".join(
+        filter(None, (sentence[1:], advice, f"Use `{remedy}`." if remedy else ""))
+    )
 
 
 def _from_images(obs: Observations) -> bool:
@@ -180,14 +258,22 @@ def _time_of(obs: Observations) -> str:
 
 
 def _command(obs: Observations) -> str:
-    """The command that makes the directions of these stars: of images they are made while they are identified."""
+    """The command that makes the directions of these stars: of images they are made while they are
+    identified.
+    """
     return FROM_IMAGES if _from_images(obs) else CALIBRATE
 
 
 def _with_site(obs: Observations, found: AirTest | None = None) -> str:
-    """The command with a site: the one that the residuals point to, where they do, else one that is not known."""
+    """The command with a site: the one that the residuals point to, where they do, else one that is
+    not known.
+    """
     known = found is not None and bool(np.isfinite(found.latitude_deg))
-    near = f":{found.latitude_deg:.1f},{found.longitude_deg:.1f}" if found is not None and known else ""
+    near = (
+        f":{found.latitude_deg:.1f},{found.longitude_deg:.1f}"
+        if found is not None and known
+        else ""
+    )
     return f"{_command(obs)} --site SITE{near}{_time_of(obs)}"
 
 
@@ -206,7 +292,8 @@ def aberration_size(camera: Camera) -> str:
     diagonal_rad = 2.0 * np.arctan(camera.half_diagonal_px / camera.focal_px)
     angle = fixed(ABERRATION_RAD * diagonal_rad * ARCSEC, 1)
     return (
-        f"changes angles by up to {angle} arcsec from corner to corner of this field and can move f by up to "
+        f"changes angles by up to {angle} arcsec from corner to corner of this field and can "
+        "move f by up to "
         f"{significant(ABERRATION_RAD * camera.focal_px)} px"
     )
 
@@ -217,17 +304,23 @@ def residual_pattern(obs: Observations, cal: Calibration, better: str | None = N
     p_value, pattern = binned.p_value, binned.pattern_px
     cells = len(binned.counts)
     if p_value >= PATTERN_P:
-        level, sentence = Level.PASS, f"Mean residuals in {plural(cells, 'cell')} of the field are what noise gives."
+        level, sentence = (
+            Level.PASS,
+            f"Mean residuals in {plural(cells, 'cell')} of the field are what noise gives.",
+        )
     else:
         seen = 2.0 * float(binned.counts.sum()) * (pattern / _noise_px(obs, cal)) ** 2
         effect = on_directions(seen, len(cal.theta))
         level = effect.level
         arcsec = pattern / cal.camera.focal_px * ARCSEC
         sentence = (
-            f"The residuals show a pattern of {significant(pattern)} px per axis ({significant(arcsec)} arcsec) that "
+            f"The residuals show a pattern of {significant(pattern)} px per axis "
+            f"({significant(arcsec)} arcsec) that "
             f"the model does not explain; it is not in any interval of this report. {effect}"
         )
-    value = f"p = {significant(p_value)}" + (f", pattern {significant(pattern)} px" if pattern > 0.0 else "")
+    value = f"p = {significant(p_value)}" + (
+        f", pattern {significant(pattern)} px" if pattern > 0.0 else ""
+    )
     remedy, advice = ("", "") if level is Level.PASS else lens_remedy(cal.camera.distortion, better)
     name, bound = "Pattern in the residuals", f"p ≥ {PATTERN_P:g}"
     return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
@@ -236,7 +329,8 @@ def residual_pattern(obs: Observations, cal: Calibration, better: str | None = N
 def lens_remedy(fitted: str, better: str | None = None) -> tuple[str, str]:
     """Command and advice where the residuals hold a pattern of the field.
 
-    `better` is the model that a comparison prefers, empty if none; without a comparison, one with further terms.
+    `better` is the model that a comparison prefers, empty if none; without a comparison, one with
+    further terms.
     """
     has_all = {coefficient.name for coefficient in get_model(_RICHEST).coefficients}
     further = {coefficient.name for coefficient in get_model(fitted).coefficients} < has_all
@@ -253,7 +347,11 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
         frame = cal.partitions.largest_frame
     else:
         z = np.abs(normalised_residuals(cal, obs))
-        n_stars, found, largest = obs.n_stars, int(np.count_nonzero(np.any(z > OUTLIER_SIGMA, axis=1))), float(z.max())
+        n_stars, found, largest = (
+            obs.n_stars,
+            int(np.count_nonzero(np.any(z > OUTLIER_SIGMA, axis=1))),
+            float(z.max()),
+        )
         frame = int(obs.frame[int(np.argmax(z.max(axis=1)))])
     expected = n_stars * 2.0 * float(erfc(OUTLIER_SIGMA / np.sqrt(2.0)))
     # Probability of at least `found` where `expected` are expected (Poisson).
@@ -263,12 +361,17 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     sentence = (
         f"As many as Gaussian noise gives ({place})."
         if good
-        else f"More than Gaussian noise gives ({place}): look for wrong identifications and disturbed centroids."
+        else (
+            f"More than Gaussian noise gives ({place}): look for wrong identifications and "
+            "disturbed centroids."
+        )
     )
     value = f"{plural(found, 'star')} beyond {OUTLIER_SIGMA:g} sigma"
     bound = f"about {significant(expected)} expected"
     remedy = "" if good else SCREEN
-    return Check("Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy)
+    return Check(
+        "Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy
+    )
 
 
 def screening(obs: Observations) -> Check | None:
@@ -279,7 +382,9 @@ def screening(obs: Observations) -> Check | None:
     value = f"{plural(int(record['rejected']), 'star')} of {int(record['of'])} rejected"
     sentence, remedy = str(record["blame"]), f"{CALIBRATE} --noise model"
     sentence = sentence[0].upper() + sentence[1:]
-    return Check("Screening", Question.TRUSTWORTHY, Level.WARN, value, "wrong stars alone", sentence, remedy)
+    return Check(
+        "Screening", Question.TRUSTWORTHY, Level.WARN, value, "wrong stars alone", sentence, remedy
+    )
 
 
 def noise(obs: Observations, cal: Calibration) -> Check:
@@ -293,33 +398,49 @@ def noise(obs: Observations, cal: Calibration) -> Check:
     unit, remedy, advice = "" if scaled else " px", "", ""
     value = f"{significant(cal.sigma, 3)}{unit}"
     if good:
-        sentence = "The stated noise of the stars is confirmed." if scaled else "Usual for star centroids."
+        sentence = (
+            "The stated noise of the stars is confirmed." if scaled else "Usual for star centroids."
+        )
         if fitted is not None:
             sentence = f"The noise was fitted: {fitted}."
     elif cal.sigma > high:
         sentence = (
-            "Far more scatter than centroids have: identifications, camera file or distortion model may be wrong."
+            "Far more scatter than centroids have: identifications, camera file or distortion "
+            "model may be wrong."
         )
         remedy = SCREEN
     elif scaled:
         sentence, remedy = "Less scatter than is stated: the stated noise is too large.", NOISE
     else:
         sentence = "Less scatter than centroids have: the data are not measurements."
-        advice = "Give centroids as they were measured, not positions that were computed or smoothed."
+        advice = (
+            "Give centroids as they were measured, not positions that were computed or smoothed."
+        )
     if not good and scaled and fitted is None and (unlike := _stated_unit(obs, cal)):
         (sentence, advice), remedy = unlike, ""
-    name = f"Factor on the {'stated' if fitted is None else 'fitted'} noise" if scaled else "Centroid noise per axis"
+    name = (
+        f"Factor on the {'stated' if fitted is None else 'fitted'} noise"
+        if scaled
+        else "Centroid noise per axis"
+    )
     bound = f"{low:g} to {high:g}{unit}"
-    return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy, advice)
+    return Check(
+        name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy, advice
+    )
 
 
 def _stated_unit(obs: Observations, cal: Calibration) -> tuple[str, str] | None:
-    """What the column of stated noise holds, where it is not px, and what to do; None if that cannot be told."""
+    """What the column of stated noise holds, where it is not px, and what to do; None if that
+    cannot be told.
+    """
     stated, in_px = obs.sigma_px, "Give the noise in px, or leave the column out."
     if stated is None:
         return None
     if floor := obs.meta.get("noise_floor_px"):  # The column is not the user's.
-        less = f"Less scatter than the stars state: the {significant(floor)} px that were added to each are too many."
+        less = (
+            f"Less scatter than the stars state: the {significant(floor)} px that were added to "
+            "each are too many."
+        )
         return (less, "Accept it: the factor is in every interval.") if cal.sigma < 1.0 else None
     arcsec_per_px = ARCSEC / cal.camera.focal_px
     if obs.mag is not None and np.array_equal(stated, obs.mag):
@@ -329,7 +450,10 @@ def _stated_unit(obs: Observations, cal: Calibration) -> tuple[str, str] | None:
         return f"Column sigma_px ({ends}) looks like magnitudes.", in_px
     if 1.0 / _SAME_UNIT < cal.sigma * arcsec_per_px < _SAME_UNIT:
         per = significant(arcsec_per_px, 3)
-        return f"Column sigma_px looks like arcseconds, of which a pixel has {per}.", "Divide it by that."
+        return (
+            f"Column sigma_px looks like arcseconds, of which a pixel has {per}.",
+            "Divide it by that.",
+        )
     return None
 
 
@@ -348,15 +472,24 @@ def partitions(cal: Calibration) -> Check | None:
     p_value = min(1.0, len(z) * float(erfc(abs(z[worst]) / np.sqrt(2.0))))
     good = p_value >= PATTERN_P
     factor = float(np.sqrt(found.chi2[worst] / dof[worst])) / cal.sigma
-    place = f"file {worst + 1} of {len(z)}, by frame number, has {significant(factor, 3)} times the common noise"
+    place = (
+        f"file {worst + 1} of {len(z)}, by frame number, has {significant(factor, 3)} times the "
+        "common noise"
+    )
     sentence = (
         f"The files scatter as alike as noise of one size lets them ({place})."
         if good
         else f"The files scatter unequally ({place})."
     )
     value, bound, name = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}", "Noise of the files"
-    advice = "" if good else "Look for what changed in that file, or calibrate each by itself and compare the runs."
-    return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, advice=advice)
+    advice = (
+        ""
+        if good
+        else "Look for what changed in that file, or calibrate each by itself and compare the runs."
+    )
+    return Check(
+        name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, advice=advice
+    )
 
 
 def terms(cal: Calibration) -> Check | None:
@@ -371,13 +504,24 @@ def terms(cal: Calibration) -> Check | None:
     name, p_value = richer[best].model, min(1.0, len(single) * single[best])
     good = p_value >= PATTERN_P
     sentence = (
-        f"No richer distortion model fits all stars better than chance lets it ({name!r} comes nearest)."
+        (
+            f"No richer distortion model fits all stars better than chance lets it ({name!r} comes "
+            "nearest)."
+        )
         if good
         else f"All stars together ask for the terms of the distortion model {name!r}."
     )
     value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
     remedy = "" if good else f"{CALIBRATE} --model {name}"
-    return Check("Terms of the distortion", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy)
+    return Check(
+        "Terms of the distortion",
+        Question.TRUSTWORTHY,
+        pass_or_warn(good),
+        value,
+        bound,
+        sentence,
+        remedy,
+    )
 
 
 def coverage(obs: Observations, cal: Calibration) -> Check:
@@ -389,13 +533,24 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
     bound = f"≥ {percent(COVERED_SHARE)}, ≥ {MIN_FRAMES} frames"
     remedy, advice = PLAN, MORE
     if share < COVERED_SHARE:
-        level, sentence = Level.WARN, "Parts of the field hold no stars: the distortion is extrapolated there."
+        level, sentence = (
+            Level.WARN,
+            "Parts of the field hold no stars: the distortion is extrapolated there.",
+        )
     elif n_frames < MIN_FRAMES:
-        level, sentence = Level.WARN, "Few frames: errors common to a whole frame cannot be told from the camera."
+        level, sentence = (
+            Level.WARN,
+            "Few frames: errors common to a whole frame cannot be told from the camera.",
+        )
     else:
-        level, sentence = Level.PASS, "Stars covered the field, so that no part of it is extrapolated."
+        level, sentence = (
+            Level.PASS,
+            "Stars covered the field, so that no part of it is extrapolated.",
+        )
         remedy = advice = ""
-    return Check("Coverage of the field", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
+    return Check(
+        "Coverage of the field", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice
+    )
 
 
 def _noise_px(obs: Observations, cal: Calibration) -> float:
@@ -408,7 +563,8 @@ def _undeclared(obs: Observations) -> str:
         return "The directions come straight from a catalogue."
     if obs.time_utc is None:
         return (
-            "Neither time nor observer velocity was declared, so it is not known whether aberration is in the "
+            "Neither time nor observer velocity was declared, so it is not known whether "
+            "aberration is in the "
             "directions."
         )
     return "The table has times, but it was not declared whether aberration is in the directions."
@@ -435,13 +591,16 @@ def air(obs: Observations | PartitionedObservations) -> Air:
 
 
 def conditional_words(cal: Calibration) -> str:
-    """That f is conditional on refraction, with the size of the effect on this camera in standard air at sea level."""
+    """That f is conditional on refraction, with the size of the effect on this camera in standard
+    air at sea level.
+    """
     constants = refraction_constants(Site(latitude_deg=45.0, longitude_deg=0.0))
     focal, sigma = cal.camera.focal_px, float(cal.sigmas[2])
     sizes = [float(shrinking(altitude, constants)) * focal for altitude in (_HIGH_DEG, _MIDDLE_DEG)]
     high, middle = (f"{significant(size)} px ({significant(size / sigma)} sigma)" for size in sizes)
     return (
-        "The focal length f is conditional on refraction: if the stars were seen through air, f is too short by "
+        "The focal length f is conditional on refraction: if the stars were seen through air, f "
+        "is too short by "
         f"{high} at the zenith and by {middle} at 45° of altitude."
     )
 
@@ -454,16 +613,21 @@ def corrected_words(obs: Observations, cal: Calibration) -> str:
     assumed = " and ".join(site.assumed)
     source = f" ({assumed} of the standard atmosphere)" if assumed else ""
     low, high = (fixed(float(atmosphere[f"altitude_{end}_deg"]), 0) for end in ("min", "max"))
-    per_cent = f"each per cent of the air’s density (10 hPa, 3 °C) counts {significant(0.01 * size)} px"
+    per_cent = (
+        f"each per cent of the air’s density (10 hPa, 3 °C) counts {significant(0.01 * size)} px"
+    )
     weather = ""
     if site.assumed and _WEATHER * size > sigma:
         weather = (
-            f" The weather may differ from the standard atmosphere by {_WEATHER * 100:.0f} %, which is more than the "
+            f" The weather may differ from the standard atmosphere by {_WEATHER * 100:.0f} %, "
+            "which is more than the "
             "sigma of f: state pressure and temperature."
         )
     return (
         f"Site: {site}. Refraction in air of {fixed(site.air_pressure_hpa, 0)} hPa and "
-        f"{fixed(site.air_temperature_c, 0)} °C{source} is in the directions, at altitudes of {low}° to {high}°. "
-        f"Without it f would come out {significant(size)} px ({significant(size / sigma)} sigma) shorter; "
+        f"{fixed(site.air_temperature_c, 0)} °C{source} is in the directions, at altitudes of "
+        f"{low}° to {high}°. "
+        f"Without it f would come out {significant(size)} px ({significant(size / sigma)} sigma) "
+        "shorter; "
         f"{per_cent}.{weather}"
     )

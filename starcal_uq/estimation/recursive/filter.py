@@ -1,24 +1,29 @@
-"""Recursive estimation of a camera, frame by frame: the iterated extended Kalman filter behind the baselines.
+"""Recursive estimation of a camera, frame by frame: the iterated extended Kalman filter behind the
+baselines.
 
-A frame enters as its gradient ``a`` and information ``M`` (`innovations`), so that an update is algebra of p x p
-matrices. With prior estimate u and covariance P (in units of the noise variance), and the frame linearised at u0,
+A frame enters as its gradient ``a`` and information ``M`` (`innovations`), so that an update is
+algebra of p x p matrices. With prior estimate u and covariance P (in units of the noise variance),
+and the frame linearised at u0,
 
     P+ = (I + P M)^-1 P,    u+ = u + P+ (a - M (u - u0)),
 
-and P+ is then recomputed in Joseph's form ``F P F^T + P+ M P+``, ``F = I - P+ M``, which rounding cannot make
-indefinite. That the noise variance cancels lets the data give it: the whitened innovations
-``|d - J (u - u0)|^2 - (u+ - u)^T (a - M (u - u0))`` add up to the sum of squared residuals of the batch solution.
+and P+ is then recomputed in Joseph's form ``F P F^T + P+ M P+``, ``F = I - P+ M``, which rounding
+cannot make indefinite. That the noise variance cancels lets the data give it: the whitened
+innovations ``|d - J (u - u0)|^2 - (u+ - u)^T (a - M (u - u0))`` add up to the sum of squared
+residuals of the batch solution.
 
-**Where a frame is linearised.** At a point that frames share until the estimate has moved away from it; then the
-present frame is taken again from its prior at the new estimate, until that agrees with its point (the iterated filter,
-which is Gauss-Newton on the frame and its prior; Bell & Cathey 1993, IEEE Trans. Automatic Control 38(2), 294-297).
-Plain filters linearise every frame once, at the prior: from a start far off they keep the error of the first frames for
-ever. Sharing points changes estimates by less than a hundredth of a sigma and makes the linearisation of many frames at
+**Where a frame is linearised.** At a point that frames share until the estimate has moved away from
+it; then the present frame is taken again from its prior at the new estimate, until that agrees with
+its point (the iterated filter, which is Gauss-Newton on the frame and its prior; Bell & Cathey
+1993, IEEE Trans. Automatic Control 38(2), 294-297). Plain filters linearise every frame once, at
+the prior: from a start far off they keep the error of the first frames for ever. Sharing points
+changes estimates by less than a hundredth of a sigma and makes the linearisation of many frames at
 a time possible, which is most of the work.
 
-**The first frames.** A frame of a few stars leaves the estimate anywhere, and what it then says of its own information
-is wrong for ever, iterated or not. So the first frames are held, and taken together from the start each time another
-one comes, until together they determine every parameter. With a dozen stars in a frame that is the first frame.
+**The first frames.** A frame of a few stars leaves the estimate anywhere, and what it then says of
+its own information is wrong for ever, iterated or not. So the first frames are held, and taken
+together from the start each time another one comes, until together they determine every parameter.
+With a dozen stars in a frame that is the first frame.
 """
 
 from __future__ import annotations
@@ -40,15 +45,17 @@ _MAX_HISTORY = 16_384
 
 @dataclass
 class FrameSums:
-    """Sums over frames of their normal equations about one point, which say what the frames say together."""
+    """Sums over frames of their normal equations about one point, which say what the frames say
+    together.
+    """
 
     gram: FloatArray  # (1 + p, 1 + p): sum of `PairNormals.grams`: misfit of the pixels
-    # (s, s): sum of products of the frames' entries (gradient and information), from which the scatter of their
-    # scores follows for any estimate: the meat of the sandwich.
+    # (s, s): sum of products of the frames' entries (gradient and information), from which the
+    # scatter of their scores follows for any estimate: the meat of the sandwich.
     moments: FloatArray
     degrees: float = 0.0  # Sum of 2 m - 3
-    # `weight`, `squared_weight`: sums of the frames' weights, which are 1 where nothing is forgotten, and of their
-    # squares.
+    # `weight`, `squared_weight`: sums of the frames' weights, which are 1 where nothing is
+    # forgotten, and of their squares.
     weight: float = 0.0
     squared_weight: float = 0.0
 
@@ -58,7 +65,9 @@ class FrameSums:
         entries = entry_count(p) * (2 if diagonal else 1)
         return cls(np.zeros((1 + p, 1 + p)), np.zeros((entries, entries)))
 
-    def add(self, gram: FloatArray, entries: FloatArray, size: int, forgetting: float = 1.0) -> None:
+    def add(
+        self, gram: FloatArray, entries: FloatArray, size: int, forgetting: float = 1.0
+    ) -> None:
         """One frame of `size` stars; `entries` as from `frame_entries`."""
         if forgetting != 1.0:
             self.gram *= forgetting
@@ -84,9 +93,11 @@ def entry_count(p: int) -> int:
 
 
 def frame_entries(normals: PairNormals, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gram matrices (K, 1 + p, 1 + p) about another point, and the distinct entries of every frame (K, s).
+    """Gram matrices (K, 1 + p, 1 + p) about another point, and the distinct entries of every frame
+    (K, s).
 
-    `moved` (p,) is the point where the frames were linearised minus the new one, in the units of `normals`.
+    `moved` (p,) is the point where the frames were linearised minus the new one, in the units of
+    `normals`.
     """
     p = len(moved)
     transfer = np.eye(1 + p)
@@ -124,7 +135,10 @@ class History:
 
     def to_dict(self) -> AnyDict:
         """The lists as arrays, for a file."""
-        return {name: value if name == "every" else np.array(value) for name, value in vars(self).items()}
+        return {
+            name: value if name == "every" else np.array(value)
+            for name, value in vars(self).items()
+        }
 
     @classmethod
     def from_dict(cls, values: AnyDict) -> History:
@@ -133,9 +147,10 @@ class History:
         return cls(values["every"], list(estimates), list(sigmas), costs.tolist())
 
 
-# A linearisation serves while the estimate is within so many of its sigmas of it. The error that this leaves in a
-# frame's innovation is of second order: a sigma of a single frame is some pixels in thousands. Where pairs are taken as
-# independent these sigmas are a third of the spread, and the same reach is three times as many of them.
+# A linearisation serves while the estimate is within so many of its sigmas of it. The error that
+# this leaves in a frame's innovation is of second order: a sigma of a single frame is some pixels
+# in thousands. Where pairs are taken as independent these sigmas are a third of the spread, and the
+# same reach is three times as many of them.
 REACH_SIGMAS = {"full": 2.0, "diagonal": 6.0}
 # Data without noise leave no sigma; this far, in px, every model is linear to rounding.
 _REACH_PX = 1e-6
@@ -143,12 +158,13 @@ _REACH_PX = 1e-6
 _WINDOW = 256
 # Halvings of a step that makes matters worse.
 _HALVINGS = 8
-# Linearisations of the held frames each time another one comes: they go on where the last ones stopped.
+# Linearisations of the held frames each time another one comes: they go on where the last ones
+# stopped.
 _HELD_ITERATIONS = 4
 # Degrees of freedom from which on the noise is estimated rather than taken as stated.
 _ENOUGH_DOF = 30.0
-# A parameter counts as determined when its sigma is this share of the start's; until all are, frames are held and
-# taken together, but no more than so many.
+# A parameter counts as determined when its sigma is this share of the start's; until all are,
+# frames are held and taken together, but no more than so many.
 _DETERMINED = 0.005
 _MAX_HELD = 64
 
@@ -169,12 +185,17 @@ class Recursion:
     covariance: FloatArray  # (q, q): covariance of the estimate, per noise variance
     start_covariance: FloatArray  # (q, q): covariance at the start, per noise variance
     reference_px: float  # Stated noise: px, or 1 where the stars state their own
-    pair_covariance: PairCovariance  # "full" or "diagonal": covariance of the interstar angles that is assumed
-    process: FloatArray | None  # (q,): variance of each parameter's step from frame to frame, per noise variance
+    pair_covariance: (
+        PairCovariance  # "full" or "diagonal": covariance of the interstar angles that is assumed
+    )
+    process: (
+        FloatArray | None
+    )  # (q,): variance of each parameter's step from frame to frame, per noise variance
     forgetting: float  # Weight of the frames before against the next
     iterations: int  # Most linearisations of a frame
     sums: FrameSums  # About the origin
-    # `response`, `noise`, (3, p) and (3, 3): sums over frames of `PairNormals.response` and `PairNormals.noise`.
+    # `response`, `noise`, (3, p) and (3, 3): sums over frames of `PairNormals.response` and
+    # `PairNormals.noise`.
     response: FloatArray
     noise: FloatArray
     reach_sigmas: float  # How far from its point, in sigmas, a linearisation serves
@@ -204,12 +225,16 @@ class Recursion:
     def sigma(self) -> float:
         """Noise: from the innovations once there are enough, the stated one before."""
         dof = self.numbers - len(self.offset)
-        return float(np.sqrt(max(self.chi2, 0.0) / dof)) if dof >= _ENOUGH_DOF else self.reference_px
+        return (
+            float(np.sqrt(max(self.chi2, 0.0) / dof)) if dof >= _ENOUGH_DOF else self.reference_px
+        )
 
     def advance(self, frames: StarFrames) -> None:
         """Take frames in, one after the other."""
         if not self.history.costs:
-            self.history.add(0, self.offset, self.reference_px * np.sqrt(np.diag(self.covariance)), 0.0)
+            self.history.add(
+                0, self.offset, self.reference_px * np.sqrt(np.diag(self.covariance)), 0.0
+            )
         first, window = 0, 1
         while first < frames.n_frames:
             if self.starting:
@@ -233,14 +258,18 @@ class Recursion:
         self.response, self.noise = np.zeros_like(self.response), np.zeros_like(self.noise)
         self.chi2, self.numbers, self.n_frames, self.n_stars = 0.0, 0.0, 0, 0
         first = self.held.n_frames == 1
-        self._advance_iterated(self.held, self.iterations if first else min(self.iterations, _HELD_ITERATIONS))
+        self._advance_iterated(
+            self.held, self.iterations if first else min(self.iterations, _HELD_ITERATIONS)
+        )
         sigmas = self.sigma / self.reference_px * np.sqrt(self.covariance.diagonal())
         determined = np.all(sigmas < _DETERMINED * np.sqrt(self.start_covariance.diagonal()))
         if determined or self.held.n_frames >= _MAX_HELD:
             self.held, self.starting = None, False
 
     def _linearise(self, frames: StarFrames, point: FloatArray) -> PairNormals:
-        return frame_normals(frames, self.model_name, self.full(point), self.scale, self.pair_covariance)
+        return frame_normals(
+            frames, self.model_name, self.full(point), self.scale, self.pair_covariance
+        )
 
     def _about_origin(self, normals: PairNormals) -> tuple[FloatArray, FloatArray]:
         moved = np.zeros(len(self.origin))
@@ -261,7 +290,9 @@ class Recursion:
         return frames.n_frames
 
     def _advance_iterated(self, frames: StarFrames, iterations: int) -> None:
-        """Frames taken as one, linearised until their estimate agrees with the point of its linearisation."""
+        """Frames taken as one, linearised until their estimate agrees with the point of its
+        linearisation.
+        """
         normals, step = self._attempt(frames, self.point)
         accepted = self._misfit(normals, self.point)
         for _ in range(iterations - 1):
@@ -280,12 +311,15 @@ class Recursion:
             self.point, normals, step, accepted = target, trial, trial_step, misfit
         if step is None:
             raise CalibrationError(
-                f"frame number {self.n_frames + 1} of the stream has no finite interstar angles at the estimate: "
+                f"frame number {self.n_frames + 1} of the stream has no finite interstar angles "
+                "at the estimate: "
                 f"{Status.NOT_FINITE.remedy}.",
                 Status.NOT_FINITE,
             )
         grams, entries = self._about_origin(normals)
-        self._accept(step, float(self._weights(len(normals.pairs)) @ normals.pairs), frames.n_frames)
+        self._accept(
+            step, float(self._weights(len(normals.pairs)) @ normals.pairs), frames.n_frames
+        )
         for i, size in enumerate(frames.sizes.tolist()):
             self._add(grams[i], entries[i], normals, i, size)
         self._remember()
@@ -310,7 +344,9 @@ class Recursion:
         if len(normals.pairs) == 1:
             one: FloatArray = normals.weighted[0]
             return one
-        total: FloatArray = np.sum(self._weights(len(normals.pairs))[:, None, None] * normals.weighted, axis=0)
+        total: FloatArray = np.sum(
+            self._weights(len(normals.pairs))[:, None, None] * normals.weighted, axis=0
+        )
         return total
 
     def _misfit(self, normals: PairNormals, point: FloatArray) -> float:
@@ -355,7 +391,9 @@ class Recursion:
         self.chi2 = self.forgetting**n * self.chi2 + step.innovation
         self.numbers = self.forgetting**n * self.numbers + numbers
 
-    def _add(self, gram: FloatArray, entries: FloatArray, normals: PairNormals, index: int, size: int) -> None:
+    def _add(
+        self, gram: FloatArray, entries: FloatArray, normals: PairNormals, index: int, size: int
+    ) -> None:
         """Count a frame."""
         self.sums.add(gram, entries, size, self.forgetting)
         self.response += normals.response[index]
@@ -364,12 +402,16 @@ class Recursion:
         self.n_stars += size
 
     def _remember(self) -> None:
-        self.history.add(self.n_frames, self.offset, self.sigma * np.sqrt(self.covariance.diagonal()), self.chi2)
+        self.history.add(
+            self.n_frames, self.offset, self.sigma * np.sqrt(self.covariance.diagonal()), self.chi2
+        )
 
 
 @dataclass(frozen=True)
 class _Step:
-    """An update that may be taken: estimate, prior, information of the frame, covariance, innovation, within reach."""
+    """An update that may be taken: estimate, prior, information of the frame, covariance,
+    innovation, within reach.
+    """
 
     offset: FloatArray
     prior: FloatArray

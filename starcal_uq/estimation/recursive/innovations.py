@@ -1,20 +1,23 @@
-"""What the interstar angles of single frames say about the camera: normal equations of many frames at once.
+"""What the interstar angles of single frames say about the camera: normal equations of many frames
+at once.
 
-A frame of m stars has the innovations ``z_ij = r_i . r_j - b_i . b_j`` over its pairs. To first order
-``z = H dtheta - G e`` with e the centroid errors of the 2 m coordinates, ``H`` the derivative of the cosines with
-respect to the parameters and ``G`` that with respect to the pixels. The covariance of the pairs, ``sigma^2 G G^T``, has
-rank 2 m - 3 only, because turning the frame changes no angle, and cannot be inverted. The smallest centroid errors that
-explain z,
+A frame of m stars has the innovations ``z_ij = r_i . r_j - b_i . b_j`` over its pairs. To first
+order ``z = H dtheta - G e`` with e the centroid errors of the 2 m coordinates, ``H`` the derivative
+of the cosines with respect to the parameters and ``G`` that with respect to the pixels. The
+covariance of the pairs, ``sigma^2 G G^T``, has rank 2 m - 3 only, because turning the frame changes
+no angle, and cannot be inverted. The smallest centroid errors that explain z,
 
     d = G^+ z,    G^+ = (G^T G + c A A^T)^-1 G^T,
 
-can: A spans the pixel displacements of the frame's three rotations, the null space of G, and any c > 0 will do. Then
-``d = J dtheta - (noise of covariance sigma^2 (I - projector on A))`` with ``J = G^+ H``, the derivative of the pixels
-themselves after the best rotation is taken out, and least squares on d is generalised least squares over the pairs with
-their full covariance. `G` and `H` have m (m - 1) / 2 rows and are never formed: all that is needed of them are products
-with G^T, which follow from the matrix ``z_ij`` and the 3 x 3 matrix ``sum_j b_j b_j^T``.
+can: A spans the pixel displacements of the frame's three rotations, the null space of G, and any c
+> 0 will do. Then ``d = J dtheta - (noise of covariance sigma^2 (I - projector on A))`` with ``J =
+G^+ H``, the derivative of the pixels themselves after the best rotation is taken out, and least
+squares on d is generalised least squares over the pairs with their full covariance. `G` and `H`
+have m (m - 1) / 2 rows and are never formed: all that is needed of them are products with G^T,
+which follow from the matrix ``z_ij`` and the 3 x 3 matrix ``sum_j b_j b_j^T``.
 
-The historical filters took pairs as independent, with the diagonal of ``sigma^2 G G^T`` for covariance.
+The historical filters took pairs as independent, with the diagonal of ``sigma^2 G G^T`` for
+covariance.
 """
 
 from __future__ import annotations
@@ -32,8 +35,9 @@ from starcal_uq.observations.frames import StarFrames
 
 PAIR_COVARIANCES: tuple[PairCovariance, ...] = get_args(PairCovariance)
 
-# Share of the mean eigenvalue that is added to all: displacements that no angle sees to first order, such as that of
-# the middle one of three stars in line, then count for nothing instead of raising an error.
+# Share of the mean eigenvalue that is added to all: displacements that no angle sees to first
+# order, such as that of the middle one of three stars in line, then count for nothing instead of
+# raising an error.
 _RIDGE = 1e-13
 # Up to so many stars a frame's system is solved as it is.
 _DENSE_STARS = 200
@@ -43,27 +47,33 @@ _DENSE_STARS = 200
 class PairNormals:
     """Normal equations of K frames at one point, for p parameters."""
 
-    # (K, 1 + p, 1 + p): ``[d, J]^T [d, J]`` of every frame: sum of squares, gradient and information at unit noise
-    # (whitened by the stated noise where there is one).
+    # (K, 1 + p, 1 + p): ``[d, J]^T [d, J]`` of every frame: sum of squares, gradient and
+    # information at unit noise (whitened by the stated noise where there is one).
     grams: FloatArray
-    # (K, 1 + p, 1 + p): sums under the covariance that the filter assumes: `grams` itself for ``full``; for
-    # ``diagonal`` the sums over pairs, each divided by its variance.
+    # (K, 1 + p, 1 + p): sums under the covariance that the filter assumes: `grams` itself for
+    # ``full``; for ``diagonal`` the sums over pairs, each divided by its variance.
     weighted: FloatArray
-    # (K,): number of independent numbers that the filter counts in a frame: 2 m - 3, or m (m - 1) / 2 for
-    # ``diagonal``.
+    # (K,): number of independent numbers that the filter counts in a frame: 2 m - 3, or m (m - 1) /
+    # 2 for ``diagonal``.
     pairs: FloatArray
-    response: FloatArray  # (K, 3, p): rotation of the frame that makes up for a change of the parameters, rad
+    # (K, 3, p): rotation of the frame that makes up for a change of the parameters, rad
+    response: FloatArray
     noise: FloatArray  # (K, 3, 3): covariance of the frame's attitude at unit noise, rad^2
 
 
 def frame_normals(
-    frames: StarFrames, model_name: str, theta: FloatArray, scale: FloatArray, covariance: PairCovariance = "full"
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    scale: FloatArray,
+    covariance: PairCovariance = "full",
 ) -> PairNormals:
     """Linearise the interstar angles of every frame at theta (p,), px units.
 
-    Frames of equal size are treated together; the numbers of a frame do not depend on the others, to the last bit.
-    `scale` (p,) are the units of the parameters in the result; those of the principal point must be 1 px. The numbers
-    are not finite where the model is not defined at theta, such as at a focal length that is not positive.
+    Frames of equal size are treated together; the numbers of a frame do not depend on the others,
+    to the last bit. `scale` (p,) are the units of the parameters in the result; those of the
+    principal point must be 1 px. The numbers are not finite where the model is not defined at
+    theta, such as at a focal length that is not positive.
     """
     try:
         if theta[2] > 0.0:
@@ -74,17 +84,24 @@ def frame_normals(
         pass
     k, p = frames.n_frames, len(theta)
     grams = np.full((k, 1 + p, 1 + p), np.nan)
-    return PairNormals(grams, grams, np.full(k, np.nan), np.full((k, 3, p), np.nan), np.full((k, 3, 3), np.nan))
+    return PairNormals(
+        grams, grams, np.full(k, np.nan), np.full((k, 3, p), np.nan), np.full((k, 3, 3), np.nan)
+    )
 
 
 def _frame_normals(
-    frames: StarFrames, model_name: str, theta: FloatArray, scale: FloatArray, covariance: PairCovariance
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    scale: FloatArray,
+    covariance: PairCovariance,
 ) -> PairNormals:
     """As `frame_normals`, at a positive focal length."""
     k, p = frames.n_frames, len(theta)
     root = backward_root(model_name, theta, frames.pixel)
     b, db = backward_kernel(model_name, True)(frames.n_stars, theta, frames.pixel, root)
-    # A pixel moves b as the principal point does, the other way round; over its weight, a unit of its noise.
+    # A pixel moves b as the principal point does, the other way round; over its weight, a unit of
+    # its noise.
     by_pixel = -db[:2] if frames.weight is None else -db[:2] / frames.weight
     db *= scale[:, None, None]
     displaced = _left_inverse(by_pixel)
@@ -110,22 +127,32 @@ def _frame_normals(
 def _left_inverse(by_pixel: FloatArray) -> FloatArray:
     """Pixels per direction (2, 3, N) for directions per pixel of the same shape."""
     first, second = by_pixel
-    a, b, c = (np.sum(u * v, axis=0) for u, v in ((first, first), (first, second), (second, second)))
-    inverse: FloatArray = np.stack([c * first - b * second, a * second - b * first]) / (a * c - b * b)
+    a, b, c = (
+        np.sum(u * v, axis=0) for u, v in ((first, first), (first, second), (second, second))
+    )
+    inverse: FloatArray = np.stack([c * first - b * second, a * second - b * first]) / (
+        a * c - b * b
+    )
     return inverse
 
 
 def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
     """Cross products (3, N)."""
-    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    return np.stack(
+        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+    )
 
 
 def _attitudes(
     frames: StarFrames, displaced: FloatArray, rotated: FloatArray, db: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Response and noise of the attitudes, as in `PairNormals`, from pixels per direction and per rotation."""
+    """Response and noise of the attitudes, as in `PairNormals`, from pixels per direction and per
+    rotation.
+    """
     slopes = np.sum(displaced[:, None] * db, axis=2)
-    information = frames.sum(np.sum(rotated[:, :, None] * rotated[:, None], axis=0)).transpose(2, 0, 1)
+    information = frames.sum(np.sum(rotated[:, :, None] * rotated[:, None], axis=0)).transpose(
+        2, 0, 1
+    )
     shifts = frames.sum(np.sum(rotated[:, :, None] * slopes[:, None], axis=0)).transpose(2, 0, 1)
     if not np.isfinite(information).all():
         return np.full(shifts.shape, np.nan), np.full(information.shape, np.nan)
@@ -136,13 +163,15 @@ def _attitudes(
 class _Group:
     """n frames of m stars each, from a table (n, m, 18 + 3 p).
 
-    It holds of every star: measured and catalogue direction, directions per pixel (x, then y), pixels per rotation (x,
-    then y), and derivatives of the direction with respect to the parameters.
+    It holds of every star: measured and catalogue direction, directions per pixel (x, then y),
+    pixels per rotation (x, then y), and derivatives of the direction with respect to the
+    parameters.
     """
 
     def __init__(self, table: FloatArray, p: int) -> None:
         n, m = table.shape[:2]
-        # Copies: products of strided views take another path for one frame than for many, and end in other bits.
+        # Copies: products of strided views take another path for one frame than for many, and end
+        # in other bits.
         self.b, r = table[..., :3].copy(), table[..., 3:6].copy()
         self.by_pixel = table[..., 6:12].reshape(n, m, 2, 3)
         self.rotated = table[..., 12:18].reshape(n, 2 * m, 3)
@@ -158,7 +187,9 @@ class _Group:
     def by_pair(self) -> FloatArray:
         """Of star i, axis a: change of its cosine with star j, (n, m, 2, m)."""
         n, m = self.b.shape[:2]
-        return np.asarray((self.by_pixel.reshape(n, 2 * m, 3) @ self.transposed).reshape(n, m, 2, m))
+        return np.asarray(
+            (self.by_pixel.reshape(n, 2 * m, 3) @ self.transposed).reshape(n, m, 2, m)
+        )
 
     def full(self) -> FloatArray:
         """Gram matrices (n, 1 + p, 1 + p) of d and J."""
@@ -173,18 +204,26 @@ class _Group:
         else:
             rows = [slice(i, i + _DENSE_STARS) for i in range(0, m, _DENSE_STARS)]
             r_transposed = self.r.transpose(0, 2, 1)
-            chunks = [(self.r[:, at] @ r_transposed - b[:, at] @ self.transposed) @ b for at in rows]
+            chunks = [
+                (self.r[:, at] @ r_transposed - b[:, at] @ self.transposed) @ b for at in rows
+            ]
             first = np.concatenate(chunks, axis=1)
-        columns = np.concatenate([first[:, :, None], db @ moment + turned.reshape(n, m, p, 3)], axis=2)
+        columns = np.concatenate(
+            [first[:, :, None], db @ moment + turned.reshape(n, m, p, 3)], axis=2
+        )
         right = (by_pixel @ columns.transpose(0, 1, 3, 2)).reshape(n, 2 * m, 1 + p)
         # G^T G: star i with itself through all its partners.
         own = by_pixel @ moment @ by_pixel.transpose(0, 1, 3, 2)
-        solved = self._solved(own, right) if m <= _DENSE_STARS else self._solved_by_parts(own, right)
+        solved = (
+            self._solved(own, right) if m <= _DENSE_STARS else self._solved_by_parts(own, right)
+        )
         gram: FloatArray = solved.transpose(0, 2, 1) @ solved
         return gram
 
     def _solved(self, own: FloatArray, right: FloatArray) -> FloatArray:
-        """(G^T G + c A A^T)^-1 of columns (n, 2 m, q), from the blocks (n, m, 2, 2) of single stars."""
+        """(G^T G + c A A^T)^-1 of columns (n, 2 m, q), from the blocks (n, m, 2, 2) of single
+        stars.
+        """
         n, m = own.shape[:2]
         stars, every, rotated = np.arange(m), np.arange(2 * m), self.rotated
         # Star i with star j through their one pair.
@@ -201,8 +240,9 @@ class _Group:
     def _solved_by_parts(self, own: FloatArray, right: FloatArray) -> FloatArray:
         """As `_solved`, in a time proportional to the stars.
 
-        What stars have in common through their pairs is of rank nine: with directions per pixel P and u = P b^T, entry
-        (i, j) is the sum over x and y of u_i,xy u_j,yx. The rest is a 2 x 2 block for every star (Woodbury's formula).
+        What stars have in common through their pairs is of rank nine: with directions per pixel P
+        and u = P b^T, entry (i, j) is the sum over x and y of u_i,xy u_j,yx. The rest is a 2 x 2
+        block for every star (Woodbury's formula).
         """
         n, m = own.shape[:2]
         rotated = self.rotated
@@ -218,13 +258,19 @@ class _Group:
             return np.asarray((blocks @ columns.reshape(n, m, 2, -1)).reshape(columns.shape))
 
         alone, spread = apart(right), apart(common)
-        joint = np.linalg.solve(core + common.transpose(0, 2, 1) @ spread, common.transpose(0, 2, 1) @ alone)
+        joint = np.linalg.solve(
+            core + common.transpose(0, 2, 1) @ spread, common.transpose(0, 2, 1) @ alone
+        )
         return np.asarray(alone - spread @ joint)
 
     def diagonal(self) -> FloatArray:
         """Gram matrices (n, 1 + p, 1 + p) of z and H over pairs taken as independent."""
         n, m, p = self.db.shape[:3]
-        one_sided = (self.db.reshape(n, m * p, 3) @ self.transposed).reshape(n, m, p, m).transpose(0, 2, 1, 3)
+        one_sided = (
+            (self.db.reshape(n, m * p, 3) @ self.transposed)
+            .reshape(n, m, p, m)
+            .transpose(0, 2, 1, 3)
+        )
         slopes = one_sided + one_sided.transpose(0, 1, 3, 2)
         first, second = np.triu_indices(m, 1)
         columns = np.concatenate([self.innovations[:, None], slopes], axis=1)[:, :, first, second]

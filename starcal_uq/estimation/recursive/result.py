@@ -1,4 +1,6 @@
-"""What a recursion has found: estimate and covariance of all parameters, and a `Calibration` without the frames."""
+"""What a recursion has found: estimate and covariance of all parameters, and a `Calibration`
+without the frames.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,8 @@ from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.maths.linear import correlation_of
 
-# The scatter of fewer frames than this per parameter says less about the covariance than the model does: less is needed
-# where the distortion is ignored, because the model is then known to be wrong.
+# The scatter of fewer frames than this per parameter says less about the covariance than the model
+# does: less is needed where the distortion is ignored, because the model is then known to be wrong.
 _FRAMES_PER_PARAMETER = 30
 _FRAMES_PER_PARAMETER_IGNORING = 10
 # A parameter whose sigma is still this share of the start's has not been measured.
@@ -40,15 +42,17 @@ class JointEstimate:
 
 
 def joint_estimate(recursion: Recursion, sums: FrameSums | None = None) -> JointEstimate:
-    """Optics from the filter, distortion by linear least squares at them, and the covariance of both.
+    """Optics from the filter, distortion by linear least squares at them, and the covariance of
+    both.
 
-    With g the frames' scores of the optics (gradient of their innovations at the estimate) and h those of the
-    distortion, the estimates move by ``P g`` and ``N^-1 (h - E P g)``: N is the information on the distortion at fixed
-    optics, E its derivative with respect to them, attitudes eliminated throughout. The sum over frames of the outer
-    products of these influences is the sandwich covariance. It is the spread that the method really has, also where the
-    distortion is ignored or pairs are taken as independent; the filter's own claim, which presumes its model, is
-    in the sigmas of the stage. With few frames, or with process noise, the model's covariance is given. `sums` are
-    those of a second pass at the final optics, where there was one.
+    With g the frames' scores of the optics (gradient of their innovations at the estimate) and h
+    those of the distortion, the estimates move by ``P g`` and ``N^-1 (h - E P g)``: N is the
+    information on the distortion at fixed optics, E its derivative with respect to them, attitudes
+    eliminated throughout. The sum over frames of the outer products of these influences is the
+    sandwich covariance. It is the spread that the method really has, also where the distortion is
+    ignored or pairs are taken as independent; the filter's own claim, which presumes its model, is
+    in the sigmas of the stage. With few frames, or with process noise, the model's covariance is
+    given. `sums` are those of a second pass at the final optics, where there was one.
     """
     sums = recursion.sums if sums is None else sums
     q, p = len(recursion.offset), len(recursion.origin)
@@ -60,7 +64,10 @@ def joint_estimate(recursion: Recursion, sums: FrameSums | None = None) -> Joint
     if p > q:
         if is_singular(matrix[q:, q:]):
             raise CalibrationError(
-                f"the distortion cannot be estimated ({Status.SINGULAR.name}): {Status.SINGULAR.remedy}.",
+                (
+                    f"the distortion cannot be estimated ({Status.SINGULAR.name}): "
+                    f"{Status.SINGULAR.remedy}."
+                ),
                 Status.SINGULAR,
             )
         inverse = np.linalg.inv(matrix[q:, q:])
@@ -79,7 +86,9 @@ def joint_estimate(recursion: Recursion, sums: FrameSums | None = None) -> Joint
         meat = scores @ sums.moments @ scores.T
         covariance = frames / (frames - q) * (influence @ meat @ influence.T)
     else:
-        covariance = recursion.sigma**2 * _model_covariance(influence, matrix, q, recursion.process is not None)
+        covariance = recursion.sigma**2 * _model_covariance(
+            influence, matrix, q, recursion.process is not None
+        )
     scale = recursion.scale
     return JointEstimate(
         theta=recursion.origin + scale * offset,
@@ -88,15 +97,20 @@ def joint_estimate(recursion: Recursion, sums: FrameSums | None = None) -> Joint
     )
 
 
-def _model_covariance(influence: FloatArray, matrix: FloatArray, q: int, drifting: bool) -> FloatArray:
-    """Covariance per noise variance if the model holds: optics as the filter claims, distortion given them."""
+def _model_covariance(
+    influence: FloatArray, matrix: FloatArray, q: int, drifting: bool
+) -> FloatArray:
+    """Covariance per noise variance if the model holds: optics as the filter claims, distortion
+    given them.
+    """
     covariance = influence.copy()
     optics, inverse = influence[:q, :q], influence[q:, q:]
     if len(inverse):
         slope = inverse @ matrix[q:, :q]
         carried = slope @ optics @ slope.T
-        # Scores of the distortion and errors of the optics come from the same centroids: what they share cancels. With
-        # process noise the optics' error is another, and the sum is on the safe side.
+        # Scores of the distortion and errors of the optics come from the same centroids: what they
+        # share cancels. With process noise the optics' error is another, and the sum is on the safe
+        # side.
         covariance[q:, q:] = inverse + carried if drifting else inverse - carried
         covariance[q:, :q] = -slope @ optics if drifting else 0.0
         covariance[:q, q:] = covariance[q:, :q].T
@@ -104,14 +118,20 @@ def _model_covariance(influence: FloatArray, matrix: FloatArray, q: int, driftin
 
 
 def _score_map(offset: FloatArray, q: int, full: bool) -> FloatArray:
-    """Matrix (p, s) that takes a frame's entries to its score at an offset: gradient minus information times it."""
+    """Matrix (p, s) that takes a frame's entries to its score at an offset: gradient minus
+    information times it.
+    """
     p = len(offset)
     rows, columns = np.triu_indices(1 + p)
-    place = {(int(i), int(j)): index for index, (i, j) in enumerate(zip(rows[1:], columns[1:], strict=True))}
+    place = {
+        (int(i), int(j)): index
+        for index, (i, j) in enumerate(zip(rows[1:], columns[1:], strict=True))
+    }
     count = entry_count(p)
     scores = np.zeros((p, count if full else 2 * count))
     for i in range(p):
-        # The optics know no distortion; their equations are the filter's, those of the distortion the pixels'.
+        # The optics know no distortion; their equations are the filter's, those of the distortion
+        # the pixels'.
         base, known = (0 if full else count, q) if i < q else (0, p)
         scores[i, base + place[0, 1 + i]] = 1.0
         for j in range(known):
@@ -126,14 +146,17 @@ def sums_at_estimate(recursion: Recursion, parts: Any) -> FrameSums:
     moved[: len(recursion.offset)] = recursion.offset
     frames = 0
     for part in parts:
-        normals = frame_normals(part, recursion.model_name, recursion.theta, recursion.scale, recursion.pair_covariance)
+        normals = frame_normals(
+            part, recursion.model_name, recursion.theta, recursion.scale, recursion.pair_covariance
+        )
         grams, entries = frame_entries(normals, moved)
         for gram, entry, size in zip(grams, entries, part.sizes.tolist(), strict=True):
             sums.add(gram, entry, size)
         frames += part.n_frames
     if frames != recursion.n_frames:
         raise CalibrationError(
-            f"the source gave {recursion.n_frames} frames at first and {frames} when it was read again: "
+            f"the source gave {recursion.n_frames} frames at first and {frames} when it was read "
+            "again: "
             "pass a source that repeats itself, or an iterator, which is read once."
         )
     return sums
@@ -149,20 +172,28 @@ def filter_stage(recursion: Recursion, seconds: float) -> Stage:
     if n and not np.array_equal(trajectory[-1], recursion.theta):
         # A thinned history may have left out the last frame.
         trajectory[-1] = recursion.theta
-        sigmas[-1, :q] = recursion.sigma * np.sqrt(np.diag(recursion.covariance)) * recursion.scale[:q]
+        sigmas[-1, :q] = (
+            recursion.sigma * np.sqrt(np.diag(recursion.covariance)) * recursion.scale[:q]
+        )
     cost = np.array(history.costs)
-    return Stage("filter", trajectory, cost, filter_status(recursion), recursion.n_frames, seconds, sigmas)
+    return Stage(
+        "filter", trajectory, cost, filter_status(recursion), recursion.n_frames, seconds, sigmas
+    )
 
 
 def filter_status(recursion: Recursion) -> Status:
-    """Whether the frames determined every parameter, and the last estimate agrees with its linearisation."""
+    """Whether the frames determined every parameter, and the last estimate agrees with its
+    linearisation.
+    """
     prior = np.sqrt(np.diag(recursion.start_covariance))
     if np.any(np.sqrt(np.diag(recursion.covariance)) > _UNMEASURED * prior):
         return Status.SINGULAR
     return Status.CONVERGED if recursion.settled else Status.MAX_ITERATIONS
 
 
-def distortion_after(recursion: Recursion, estimate: JointEstimate, sums: FrameSums | None) -> Stage:
+def distortion_after(
+    recursion: Recursion, estimate: JointEstimate, sums: FrameSums | None
+) -> Stage:
     """The linear step from no distortion to the estimated one, as a stage."""
     gram = (recursion.sums if sums is None else sums).gram
     ends = np.stack([recursion.theta, estimate.theta])
@@ -183,10 +214,11 @@ def stream_calibration(
     per_star: bool,
     estimate: JointEstimate,
 ) -> Calibration:
-    """A `Calibration` from what the recursion has summed; the arrays over frames and stars are empty.
+    """A `Calibration` from what the recursion has summed; the arrays over frames and stars are
+    empty.
 
-    `Calibration.information` and `Calibration.compressed` are those of the frames where they were linearised: for
-    ``samaan`` without distortion.
+    `Calibration.information` and `Calibration.compressed` are those of the frames where they were
+    linearised: for ``samaan`` without distortion.
     """
     theta, scale = estimate.theta, recursion.scale
     p, sums = len(theta), recursion.sums
@@ -197,7 +229,8 @@ def stream_calibration(
     dof = round(sums.degrees) - p
     if dof <= 0 or is_singular(matrix):
         raise CalibrationError(
-            f"{recursion.n_stars} stars in {recursion.n_frames} frames do not determine {p} parameters and the noise: "
+            f"{recursion.n_stars} stars in {recursion.n_frames} frames do not determine {p} "
+            "parameters and the noise: "
             f"{Status.SINGULAR.remedy}.",
             Status.SINGULAR,
         )
@@ -232,9 +265,16 @@ def stream_calibration(
 
 
 def _quadratic(
-    recursion: Recursion, theta: FloatArray, chi2: float, gradient: FloatArray, sigma: float, degrees: int
+    recursion: Recursion,
+    theta: FloatArray,
+    chi2: float,
+    gradient: FloatArray,
+    sigma: float,
+    degrees: int,
 ) -> CompressedLikelihood:
-    """The likelihood of the linearised frames; the slope of the attitudes' volume, 0.01 sigma, is left out."""
+    """The likelihood of the linearised frames; the slope of the attitudes' volume, 0.01 sigma, is
+    left out.
+    """
     p, matrix = len(theta), recursion.sums.gram[1:, 1:]
     reduced, unit = correlation_of(matrix)
     whitening = np.linalg.cholesky(np.linalg.inv(reduced)) / unit[:, None] * sigma

@@ -18,7 +18,8 @@ from starcal_uq.estimation.recursive.innovations import PAIR_COVARIANCES
 from starcal_uq.estimation.stages import Stage, optics_stage
 from starcal_uq.observations.frames import StarFrames
 
-# What is believed of a start before the first star: next to nothing. A hundred frames outweigh it a million times.
+# What is believed of a start before the first star: next to nothing. A hundred frames outweigh it a
+# million times.
 _PRINCIPAL_POINT_WIDTHS = 1.0
 _FOCAL_FRACTION = 0.3
 _DISTORTION_WIDTHS = 0.08
@@ -31,10 +32,13 @@ _START_ITERATIONS = 200
 class StartPrior:
     """What a recursion believes before its first frame."""
 
-    # (p,): units of the parameters: 1 px for the optics, 1 px of displacement in the corner for a coefficient.
+    # (p,): units of the parameters: 1 px for the optics, 1 px of displacement in the corner for a
+    # coefficient.
     scale: FloatArray
     deviation: FloatArray  # (q,): standard deviations of the q estimated parameters, in those units
-    reference_px: float  # Noise that weighs them: as stated, px, or 1 where the stars state their own
+    reference_px: (
+        float  # Noise that weighs them: as stated, px, or 1 where the stars state their own
+    )
 
 
 def prior_of(camera: Camera, options: RecursionOptions, per_star: bool) -> StartPrior:
@@ -56,9 +60,9 @@ def begin(
 ) -> tuple[Recursion, Stage | None]:
     """The recursion before its first frame, and the least-squares start of ``samaan``.
 
-    ``samaan`` starts where least squares on the first of `frames` ends. It takes only the point from there, and filters
-    these frames as the others, so that none counts twice. The coefficients start from zero. CalibrationError when the
-    least-squares start fails.
+    ``samaan`` starts where least squares on the first of `frames` ends. It takes only the point
+    from there, and filters these frames as the others, so that none counts twice. The coefficients
+    start from zero. CalibrationError when the least-squares start fails.
     """
     p, q, reference = len(camera.theta), len(prior.deviation), prior.reference_px
     origin, stage = np.concatenate([camera.theta[:3], np.zeros(p - 3)]), None
@@ -68,7 +72,8 @@ def begin(
         if stage.status in (Status.NOT_FINITE, Status.SINGULAR):
             raise CalibrationError(
                 f"the least-squares start on {first.n_frames} frames failed ({stage.status.name}): "
-                "raise start_frames, or use method='griffith', which starts from the nominal camera.",
+                "raise start_frames, or use method='griffith', which starts from the nominal "
+                "camera.",
                 stage.status,
             )
         origin = stage.theta.copy()
@@ -109,23 +114,25 @@ class RecursionOptions:
     Attributes
     ----------
     pair_covariance : {"full", "diagonal"}
-        Covariance of the interstar angles of a frame: with the correlations of pairs that share a star, or, as in the
-        historical filters, as if pairs were independent.
+        Covariance of the interstar angles of a frame: with the correlations of pairs that share a
+        star, or, as in the historical filters, as if pairs were independent.
     parameters : {"optics", "all"}
-        Parameters to estimate: x0, y0 and f as in its source, or the distortion as well (``griffith`` only).
+        Parameters to estimate: x0, y0 and f as in its source, or the distortion as well
+        (``griffith`` only).
     process_noise : float or tuple of float, optional
-        ``samaan`` only: standard deviation of each parameter's random walk from frame to frame, px; needs a stated
-        noise. One number stands for all three.
+        ``samaan`` only: standard deviation of each parameter's random walk from frame to frame, px;
+        needs a stated noise. One number stands for all three.
     forgetting : float
-        ``griffith`` only: weight of all earlier frames against the next, in (0, 1]; 1 forgets nothing. It remembers
-        about ``1 / (1 - forgetting)`` frames.
+        ``griffith`` only: weight of all earlier frames against the next, in (0, 1]; 1 forgets
+        nothing. It remembers about ``1 / (1 - forgetting)`` frames.
     start_frames : int
         ``samaan`` only: frames whose least-squares solution starts the filter.
     sigma_px : float, optional
         Stated centroid noise per axis, px, where the stars do not state their own.
     iterations : int
-        Most linearisations of a frame; 1 is the plain filter, which takes each frame once, linearised where the frame
-        before has ended. From a start far off it keeps the error of its first frames.
+        Most linearisations of a frame; 1 is the plain filter, which takes each frame once,
+        linearised where the frame before has ended. From a start far off it keeps the error of its
+        first frames.
     """
 
     pair_covariance: PairCovariance = "full"
@@ -140,12 +147,17 @@ class RecursionOptions:
         """Refuse what makes no sense, by a `CalibrationError` with the remedy."""
         if self.pair_covariance not in PAIR_COVARIANCES:
             raise CalibrationError(
-                f"pair_covariance {self.pair_covariance!r} is unknown: use one of {', '.join(PAIR_COVARIANCES)}."
+                f"pair_covariance {self.pair_covariance!r} is unknown: use one of "
+                f"{', '.join(PAIR_COVARIANCES)}."
             )
         if self.parameters not in ("optics", "all"):
-            raise CalibrationError(f"parameters {self.parameters!r} is unknown: use one of optics, all.")
+            raise CalibrationError(
+                f"parameters {self.parameters!r} is unknown: use one of optics, all."
+            )
         if not 0.0 < self.forgetting <= 1.0:
-            raise CalibrationError(f"forgetting is {self.forgetting}: use a number above 0 and up to 1.")
+            raise CalibrationError(
+                f"forgetting is {self.forgetting}: use a number above 0 and up to 1."
+            )
         if self.sigma_px is not None and not 0.0 < self.sigma_px < np.inf:
             raise CalibrationError(f"sigma_px is {self.sigma_px}: use a positive number of pixels.")
         for name in ("start_frames", "iterations"):
@@ -153,15 +165,22 @@ class RecursionOptions:
                 raise CalibrationError(f"{name} is {getattr(self, name)}: use 1 or more.")
         if self.process_noise is not None:
             noise = np.atleast_1d(np.asarray(self.process_noise, dtype=np.float64))
-            if noise.shape not in ((1,), (3,)) or not (np.isfinite(noise).all() and (noise >= 0.0).all()):
+            if noise.shape not in ((1,), (3,)) or not (
+                np.isfinite(noise).all() and (noise >= 0.0).all()
+            ):
                 raise CalibrationError(
-                    f"process_noise is {self.process_noise}: use one number of pixels per frame that is not negative, "
+                    f"process_noise is {self.process_noise}: use one number of pixels per frame "
+                    "that is not negative, "
                     "or three, for x0, y0 and f."
                 )
         if method == "samaan":
             if self.parameters == "all":
-                raise CalibrationError("samaan filters the optics only: use griffith for parameters='all'.")
+                raise CalibrationError(
+                    "samaan filters the optics only: use griffith for parameters='all'."
+                )
             if self.forgetting != 1.0:
-                raise CalibrationError("samaan forgets by process_noise: leave forgetting out, or use griffith.")
+                raise CalibrationError(
+                    "samaan forgets by process_noise: leave forgetting out, or use griffith."
+                )
         elif self.process_noise is not None:
             raise CalibrationError("griffith has no process noise: use forgetting, or samaan.")

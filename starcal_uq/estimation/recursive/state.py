@@ -1,4 +1,6 @@
-"""The state of a recursive calibration as a file: arrays to the last bit, all else as JSON, in one ``.npz``."""
+"""The state of a recursive calibration as a file: arrays to the last bit, all else as JSON, in one
+``.npz``.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ _VERSION = 2
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Everything that a recursive calibration knows; the fields are those of `RecursiveCalibration`."""
+    """Everything that a recursive calibration knows; the fields are those of
+    `RecursiveCalibration`.
+    """
 
     method: str
     options: RecursionOptions
@@ -49,14 +53,18 @@ def write_state(state: State, path: str | os.PathLike[str]) -> None:
 
 
 def read_state(path: str | os.PathLike[str]) -> State:
-    """Inverse of `write_state`; `RunFolderError` for a file that is missing, truncated, or no such state."""
+    """Inverse of `write_state`; `RunFolderError` for a file that is missing, truncated, or no such
+    state.
+    """
     with reading(path, WHAT, REMEDY):
         arrays = read_arrays(path)
         header = json.loads(str(arrays.pop("header")))
         kind, version = header.pop("kind"), header.pop("version")
         if kind != _KIND or version not in (1, _VERSION):
             raise ValueError("another kind or version")
-        return from_plain(State, header if version == _VERSION else _upgraded(header, arrays), arrays)
+        return from_plain(
+            State, header if version == _VERSION else _upgraded(header, arrays), arrays
+        )
 
 
 def _upgraded(header: AnyDict, arrays: Arrays) -> AnyDict:
@@ -68,6 +76,11 @@ def _upgraded(header: AnyDict, arrays: Arrays) -> AnyDict:
     recursion = header.get("recursion")
     if recursion is not None:
         history = {"every": recursion.pop("every")}
-        recursion = {"process": None, **recursion, "history": history, "held": frames("recursion_held")}
+        recursion = {
+            "process": None,
+            **recursion,
+            "history": history,
+            "held": frames("recursion_held"),
+        }
     held = {name: frames(name) for name in ("waiting", "richest")}
     return {"stage": None, **header, **held, "recursion": recursion}

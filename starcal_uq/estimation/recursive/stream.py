@@ -1,4 +1,6 @@
-"""Calibration of a stream of frames: each is used once and forgotten, and the state can be saved in between."""
+"""Calibration of a stream of frames: each is used once and forgotten, and the state can be saved in
+between.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,12 @@ from starcal_uq.estimation.recursive.result import (
     joint_estimate,
     stream_calibration,
 )
-from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions, begin, prior_of
+from starcal_uq.estimation.recursive.start import (
+    RECURSIVE_METHODS,
+    RecursionOptions,
+    begin,
+    prior_of,
+)
 from starcal_uq.estimation.recursive.state import REMEDY, WHAT, State, read_state, write_state
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.frames import StarFrames
@@ -47,9 +54,11 @@ class FilterStep:
     theta : (q,) array
         Estimate, px units.
     covariance : (q, q) array
-        The covariance that the filter claims, px units: right if its model of the camera and of the pairs is.
+        The covariance that the filter claims, px units: right if its model of the camera and of the
+        pairs is.
     sigma : float
-        Noise, px or a factor on the stated noise: from the innovations so far, or as stated while there are few.
+        Noise, px or a factor on the stated noise: from the innovations so far, or as stated while
+        there are few.
     chi2 : float
         Sum of whitened innovations so far, px^2 or in units of the stated noise.
     dof : float
@@ -81,9 +90,10 @@ class RecursiveCalibration:
     camera : Camera
         Start values; its `distortion` names the model. The coefficients start from zero.
     method : {"griffith", "samaan"}
-        ``griffith`` (Griffith & Junkins): recursive least squares from the start values. ``samaan`` (Samaan et al.
-        2001): a Kalman filter from the least-squares solution of the first frames, which wait until there are
-        ``options.start_frames`` of them; the distortion follows at the end by linear least squares.
+        ``griffith`` (Griffith & Junkins): recursive least squares from the start values. ``samaan``
+        (Samaan et al. 2001): a Kalman filter from the least-squares solution of the first frames,
+        which wait until there are ``options.start_frames`` of them; the distortion follows at the
+        end by linear least squares.
     options : RecursionOptions, optional
         The defaults otherwise.
 
@@ -93,14 +103,20 @@ class RecursiveCalibration:
         For an unknown method, or options that the method does not have.
     """
 
-    def __init__(self, camera: Camera, method: str = "griffith", options: RecursionOptions | None = None) -> None:
+    def __init__(
+        self, camera: Camera, method: str = "griffith", options: RecursionOptions | None = None
+    ) -> None:
         if method not in RECURSIVE_METHODS:
-            raise CalibrationError(f"method {method!r} is not recursive: use one of {', '.join(RECURSIVE_METHODS)}.")
+            raise CalibrationError(
+                f"method {method!r} is not recursive: use one of {', '.join(RECURSIVE_METHODS)}."
+            )
         self.options = options or RecursionOptions()
         self.options.check(method)
         self.method = method
         keeps_distortion = method == "samaan" or self.options.parameters == "all"
-        self.nominal = camera if keeps_distortion else camera.replace(distortion="none", coefficients=())
+        self.nominal = (
+            camera if keeps_distortion else camera.replace(distortion="none", coefficients=())
+        )
         self._given_distortion = camera.distortion
         self._recursion: Recursion | None = None
         self._start_stage: Stage | None = None
@@ -118,7 +134,9 @@ class RecursiveCalibration:
 
     @property
     def camera(self) -> Camera:
-        """The estimate so far; for ``samaan`` with the distortion that follows from the sums so far."""
+        """The estimate so far; for ``samaan`` with the distortion that follows from the sums so
+        far.
+        """
         if self._recursion is None:
             return self.nominal
         try:
@@ -132,7 +150,11 @@ class RecursiveCalibration:
         recursion = self._recursion
         if recursion is None:
             prior = prior_of(self.nominal, self.options, bool(self._per_star))
-            q, scale, sigma = len(prior.deviation), prior.scale[: len(prior.deviation)], prior.reference_px
+            q, scale, sigma = (
+                len(prior.deviation),
+                prior.scale[: len(prior.deviation)],
+                prior.reference_px,
+            )
             theta = self.nominal.theta[:q]
             covariance, chi2, dof, stars = np.diag((scale * prior.deviation) ** 2), 0.0, 0.0, 0
         else:
@@ -152,8 +174,8 @@ class RecursiveCalibration:
         Parameters
         ----------
         frame : Observations
-            Stars of the next frame or frames. What is kept are sums, and the one frame with the most stars, which
-            guards against mirrored axes.
+            Stars of the next frame or frames. What is kept are sums, and the one frame with the
+            most stars, which guards against mirrored axes.
 
         Returns
         -------
@@ -163,7 +185,8 @@ class RecursiveCalibration:
         Raises
         ------
         CalibrationError
-            When stars state their own noise in some frames only, or process noise has no stated noise to go with.
+            When stars state their own noise in some frames only, or process noise has no stated
+            noise to go with.
         """
         self.take(StarFrames.from_observations(frame), fingerprint=True)
         return self.step
@@ -176,7 +199,9 @@ class RecursiveCalibration:
         if fingerprint:
             self._hash(frames)
         if self._recursion is None:
-            waiting = frames if self._waiting is None else StarFrames.joined([self._waiting, frames])
+            waiting = (
+                frames if self._waiting is None else StarFrames.joined([self._waiting, frames])
+            )
             if self.method == "samaan" and waiting.n_frames < self.options.start_frames:
                 self._waiting = waiting
                 self._seconds += perf_counter() - began
@@ -189,33 +214,49 @@ class RecursiveCalibration:
         self._waiting = None
         if self._recursion is None:
             start = prior_of(self.nominal, self.options, bool(self._per_star))
-            self._recursion, self._start_stage = begin(self.method, self.nominal, self.options, start, frames)
+            self._recursion, self._start_stage = begin(
+                self.method, self.nominal, self.options, start, frames
+            )
         self._recursion.advance(frames)
 
     def _keep_richest(self, frames: StarFrames) -> None:
-        """Remember the frame with the most stars: interstar angles do not see a mirror, its positions do."""
+        """Remember the frame with the most stars: interstar angles do not see a mirror, its
+        positions do.
+        """
         index = int(np.argmax(frames.sizes))
         if self._richest is None or frames.sizes[index] > self._richest.n_stars:
             # A copy, because a part would keep all the frames in memory that came with it.
-            self._richest = frames.select(np.repeat(np.arange(frames.n_frames) == index, frames.sizes))
+            self._richest = frames.select(
+                np.repeat(np.arange(frames.n_frames) == index, frames.sizes)
+            )
 
     def _check_noise(self, frames: StarFrames) -> None:
         per_star = frames.weight is not None
         if self._per_star is None:
             self._per_star = per_star
             if per_star and self.options.sigma_px is not None:
-                raise CalibrationError("the stars state their own noise (column sigma_px): leave sigma_px out.")
-            if self.options.process_noise is not None and not per_star and self.options.sigma_px is None:
                 raise CalibrationError(
-                    "process noise needs a stated noise to be weighed against: give sigma_px, or a column sigma_px."
+                    "the stars state their own noise (column sigma_px): leave sigma_px out."
+                )
+            if (
+                self.options.process_noise is not None
+                and not per_star
+                and self.options.sigma_px is None
+            ):
+                raise CalibrationError(
+                    "process noise needs a stated noise to be weighed against: give sigma_px, or "
+                    "a column sigma_px."
                 )
         if per_star is not self._per_star:
             raise CalibrationError(
-                "some frames state the noise of their stars and others do not: give the column sigma_px in all or none."
+                "some frames state the noise of their stars and others do not: give the column "
+                "sigma_px in all or none."
             )
 
     def _hash(self, frames: StarFrames) -> None:
-        """A chain of hashes, frame by frame: the same however the frames are grouped into updates."""
+        """A chain of hashes, frame by frame: the same however the frames are grouped into
+        updates.
+        """
         for start, stop in zip(frames.starts[:-1], frames.starts[1:], strict=True):
             digest = hashlib.sha256(self._digest.encode())
             for values in (frames.pixel, frames.r, frames.weight):
@@ -228,7 +269,9 @@ class RecursiveCalibration:
         if self._waiting is not None:
             self._filter(self._waiting)
         if self._recursion is None:
-            raise CalibrationError("there is no frame yet: give frames to update() first.", Status.SINGULAR)
+            raise CalibrationError(
+                "there is no frame yet: give frames to update() first.", Status.SINGULAR
+            )
         stage = filter_stage(self._recursion, self._seconds)
         stages = [stage] if self._start_stage is None else [self._start_stage, stage]
         return self._recursion, stages, self._plausible(stage.status)
@@ -237,7 +280,9 @@ class RecursiveCalibration:
         recursion, limit = self._recursion, IMPLAUSIBLE_NOISE * self.nominal.width_px
         if recursion is None or self._richest is None:
             return status
-        positions = noise_px(MarginalLikelihood(self._richest, recursion.model_name), recursion.theta)
+        positions = noise_px(
+            MarginalLikelihood(self._richest, recursion.model_name), recursion.theta
+        )
         wrong = positions > limit or (not self._per_star and recursion.sigma > limit)
         return Status.INCONSISTENT if wrong else status
 
@@ -263,7 +308,8 @@ class RecursiveCalibration:
         throw : bool
             Raise when the estimate is not good; otherwise `Calibration.status` says so.
         sums : FrameSums, optional
-            Sums of a second pass over the frames (``samaan``); the sums of the first pass otherwise.
+            Sums of a second pass over the frames (``samaan``); the sums of the first pass
+            otherwise.
 
         Returns
         -------
@@ -295,7 +341,8 @@ class RecursiveCalibration:
         return calibration
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the state to a file (``.npz``), atomically; `load` goes on from it as if nothing had happened.
+        """Write the state to a file (``.npz``), atomically; `load` goes on from it as if nothing
+        had happened.
 
         Raises
         ------
@@ -336,7 +383,9 @@ class RecursiveCalibration:
         return loaded
 
 
-def raise_unless_good(status: Status, remedy: str = "", calibration: Calibration | None = None) -> None:
+def raise_unless_good(
+    status: Status, remedy: str = "", calibration: Calibration | None = None
+) -> None:
     """Raise the `CalibrationError` of a status that is not CONVERGED."""
     if not status.ok:
         message = f"the calibration did not end well ({status.name}): {remedy or status.remedy}."

@@ -1,9 +1,10 @@
 """Stars of a frame that agree on one attitude, found without trusting any of them.
 
-Two stars fix an attitude, and the other stars of the frame vote on it (random sample consensus, Fischler & Bolles 1981,
-Comm. ACM 24(6), 381-395, scored by the truncated sum of squares of Torr & Zisserman 2000, MSAC). Before any calibration
-the focal length may be several per cent off, which bends every attitude; it is the same for all frames, so that it is
-found first, as the mode of the ratios of catalogue angle to measured angle over pairs of all frames.
+Two stars fix an attitude, and the other stars of the frame vote on it (random sample consensus,
+Fischler & Bolles 1981, Comm. ACM 24(6), 381-395, scored by the truncated sum of squares of Torr &
+Zisserman 2000, MSAC). Before any calibration the focal length may be several per cent off, which
+bends every attitude; it is the same for all frames, so that it is found first, as the mode of the
+ratios of catalogue angle to measured angle over pairs of all frames.
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.observations.frames import StarFrames
 
-# Pairs tried per frame; with a third of all stars wrong, none of 32 pairs is right in one frame of a hundred million.
+# Pairs tried per frame; with a third of all stars wrong, none of 32 pairs is right in one frame of
+# a hundred million.
 _TRIALS = 32
 _SEED = 20170925
 MIN_STARS = 3
-# First tolerance of the pre-screen as a fraction of the detector: distortion and a wrong principal point stay below.
+# First tolerance of the pre-screen as a fraction of the detector: distortion and a wrong principal
+# point stay below.
 _WIDE_FRACTION = 0.02
 _NARROWEST_PX = 2.0
 _NARROW_MADS = 6.0
@@ -32,18 +35,22 @@ _NARROW_MADS = 6.0
 class Consensus:
     """What the stars of each frame agree on."""
 
-    # (N,): stars within the tolerance of their frame's best attitude; all false in a frame without three such stars.
+    # (N,): stars within the tolerance of their frame's best attitude; all false in a frame without
+    # three such stars.
     agree: BoolArray
-    # (N,): angle between measurement and catalogue direction at that attitude, approximately; NaN without an
-    # attitude.
+    # (N,): angle between measurement and catalogue direction at that attitude, approximately; NaN
+    # without an attitude.
     offset_rad: FloatArray
 
 
-def consensus(b: FloatArray, r: FloatArray, starts: IntArray, tolerance_rad: FloatArray | float) -> Consensus:
+def consensus(
+    b: FloatArray, r: FloatArray, starts: IntArray, tolerance_rad: FloatArray | float
+) -> Consensus:
     """Find the largest set of stars in each frame that one attitude explains.
 
-    `b` are measured and `r` catalogue unit vectors (3, N); frame k holds the stars ``starts[k]:starts[k + 1]``. A star
-    with NaN never agrees, the others do within the tolerance (one, or (N,)).
+    `b` are measured and `r` catalogue unit vectors (3, N); frame k holds the stars
+    ``starts[k]:starts[k + 1]``. A star with NaN never agrees, the others do within the tolerance
+    (one, or (N,)).
     """
     sizes = np.diff(starts)
     tolerance = np.broadcast_to(np.asarray(tolerance_rad, dtype=np.float64), b.shape[1:])
@@ -66,7 +73,8 @@ def consensus(b: FloatArray, r: FloatArray, starts: IntArray, tolerance_rad: Flo
 
 
 def pair_trials(starts: IntArray) -> list[tuple[IntArray, IntArray]]:
-    """Pairs of stars to try, one per frame and trial, as two arrays (K,) of rows; the same on every call.
+    """Pairs of stars to try, one per frame and trial, as two arrays (K,) of rows; the same on every
+    call.
 
     Frames with few stars have all their pairs tried. A frame with a single star is given it twice.
     """
@@ -85,16 +93,24 @@ def pair_trials(starts: IntArray) -> list[tuple[IntArray, IntArray]]:
 
 
 def _triad(u: FloatArray, v: FloatArray) -> FloatArray:
-    """Orthonormal axes (K, 3, 3) of two directions each, as columns: their middle, their normal and the third."""
+    """Orthonormal axes (K, 3, 3) of two directions each, as columns: their middle, their normal and
+    the third.
+    """
     middle, normal = u + v, np.cross(u, v, axis=0)
     middle = middle / np.linalg.norm(middle, axis=0)
     normal = normal / np.linalg.norm(normal, axis=0)
     return np.stack([middle, normal, np.cross(middle, normal, axis=0)], axis=-1).transpose(1, 0, 2)
 
 
-def _two_star_attitude(b: FloatArray, r: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
-    """Rotations (K, 3, 3) that take two catalogue directions to two measured ones, the misfit shared equally."""
-    rotation: FloatArray = _triad(b[:, first], b[:, second]) @ _triad(r[:, first], r[:, second]).transpose(0, 2, 1)
+def _two_star_attitude(
+    b: FloatArray, r: FloatArray, first: IntArray, second: IntArray
+) -> FloatArray:
+    """Rotations (K, 3, 3) that take two catalogue directions to two measured ones, the misfit
+    shared equally.
+    """
+    rotation: FloatArray = _triad(b[:, first], b[:, second]) @ _triad(
+        r[:, first], r[:, second]
+    ).transpose(0, 2, 1)
     return rotation
 
 
@@ -117,7 +133,9 @@ def _agreeing(
     return agree & np.repeat(enough, sizes), 2.0 * np.arcsin(np.minimum(offset / 2.0, 1.0))
 
 
-def _refined(b: FloatArray, r: FloatArray, agree: BoolArray, starts: IntArray, rotations: FloatArray) -> FloatArray:
+def _refined(
+    b: FloatArray, r: FloatArray, agree: BoolArray, starts: IntArray, rotations: FloatArray
+) -> FloatArray:
     """QUEST on the stars that agree; the given rotations where there are none."""
     counts = np.add.reduceat(agree.astype(np.int64), starts[:-1])
     some = counts > 0
@@ -136,17 +154,20 @@ def measured_directions(camera: Camera, frames: StarFrames) -> FloatArray:
 
 
 def focal_ratio(camera: Camera, frames: StarFrames) -> float:
-    """Focal length that the interstar angles ask for over that of the camera, wrong identifications or not.
+    """Focal length that the interstar angles ask for over that of the camera, wrong identifications
+    or not.
 
-    The mode over pairs of the ratio of measured to catalogue angle: at least a quarter of the pairs must be right, so
-    that half of the stars may be wrong.
+    The mode over pairs of the ratio of measured to catalogue angle: at least a quarter of the pairs
+    must be right, so that half of the stars may be wrong.
     """
     first, second = np.array(pair_trials(frames.starts)).transpose(1, 0, 2).reshape(2, 1, -1)
     catalogue = _angle(frames.r, first, second)
     ratio = 1.0
     for _ in range(3):
         scaled = camera.replace(focal_px=camera.focal_px * ratio)
-        ratio *= float(_factors(_angle(measured_directions(scaled, frames), first, second), catalogue)[0])
+        ratio *= float(
+            _factors(_angle(measured_directions(scaled, frames), first, second), catalogue)[0]
+        )
     return ratio
 
 
@@ -179,7 +200,9 @@ def _factors(measured: FloatArray, catalogue: FloatArray) -> FloatArray:
 
 
 def _modes(values: FloatArray, usable: BoolArray) -> FloatArray:
-    """In each row, the median of what lies around the shortest interval that holds a quarter of its usable values."""
+    """In each row, the median of what lies around the shortest interval that holds a quarter of its
+    usable values.
+    """
     ordered = np.sort(np.where(usable, values, np.inf), axis=1)
     place, count = np.arange(values.shape[1]), np.count_nonzero(usable, axis=1)[:, None]
     end = place + np.maximum(count // 4, 1)
@@ -194,17 +217,21 @@ def _modes(values: FloatArray, usable: BoolArray) -> FloatArray:
 
 
 def _middle(ordered: FloatArray, first: IntArray, n: IntArray) -> FloatArray:
-    """Median of n values from the first on, of sorted rows; what stands first where there are none."""
+    """Median of n values from the first on, of sorted rows; what stands first where there are
+    none.
+    """
     row, before, after = np.arange(len(ordered)), first + np.maximum(n - 1, 0) // 2, first + n // 2
     middle: FloatArray = (ordered[row, before] + ordered[row, after]) / 2.0
     return middle
 
 
 def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
-    """Stars that can be calibrated on, found with a camera that has not been calibrated, and that camera refocused.
+    """Stars that can be calibrated on, found with a camera that has not been calibrated, and that
+    camera refocused.
 
-    The stars (N,) agree on their frame's attitude within what the uncalibrated camera allows. The nominal focal length
-    may be tens of per cent off; the camera that comes back has that of `focal_ratio`.
+    The stars (N,) agree on their frame's attitude within what the uncalibrated camera allows. The
+    nominal focal length may be tens of per cent off; the camera that comes back has that of
+    `focal_ratio`.
     """
     if not np.isfinite(measured_directions(camera, frames)).all():
         camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))
@@ -215,7 +242,9 @@ def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
     if not wide.agree.any():
         return wide.agree, camera
     spread = 1.4826 * float(np.median(wide.offset_rad[wide.agree]))
-    narrow_rad = np.clip(_NARROW_MADS * spread, min(_NARROWEST_PX / camera.focal_px, wide_rad), wide_rad)
+    narrow_rad = np.clip(
+        _NARROW_MADS * spread, min(_NARROWEST_PX / camera.focal_px, wide_rad), wide_rad
+    )
     stated = 0.0 if frames.weight is None else 10.0 / frames.weight / camera.focal_px
     narrow = consensus(b, frames.r, frames.starts, np.maximum(narrow_rad, stated))
     # A frame that falls apart within the narrow tolerance is judged after the calibration.

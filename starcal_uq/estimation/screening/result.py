@@ -1,4 +1,6 @@
-"""What a screening found: the rows left out, each with its reason, in tables for people and for files."""
+"""What a screening found: the rows left out, each with its reason, in tables for people and for
+files.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ COLUMNS = (
 )  # fmt: skip
 _MANY_REJECTED = 0.25
 _PATTERN_P, _PATTERN_ROWS = 1e-3, 5
-# Wrong identifications are rarely this near: statistics below this many thresholds are noise with heavy tails.
+# Wrong identifications are rarely this near: statistics below this many thresholds are noise with
+# heavy tails.
 MARGINAL = 4.0
 
 
@@ -61,12 +64,13 @@ class Screening(Shown):
     observations : Observations
         Rows that were kept; ``meta["screening"]`` says what they were taken from.
     rejected : DataFrame
-        The other rows, one line each: ``row`` (from 0, in the observations given), ``frame``, ``star_id``, ``x_px``,
-        ``y_px``, ``residual_px`` (measurement minus prediction of the other stars, length), ``offset_deg`` (the same as
-        an angle), ``statistic``, ``threshold`` and ``reason`` (a key of `REASONS`). The statistic is the squared
-        distance over its variance (chi-square with 2 degrees of freedom where the noise is known well), TASTE of the
-        frame for the reasons ``taste`` and ``frame_disturbed``, and NaN in other frames that were dropped, of which
-        the residual is the distance from what most of their stars agree on.
+        The other rows, one line each: ``row`` (from 0, in the observations given), ``frame``,
+        ``star_id``, ``x_px``, ``y_px``, ``residual_px`` (measurement minus prediction of the other
+        stars, length), ``offset_deg`` (the same as an angle), ``statistic``, ``threshold`` and
+        ``reason`` (a key of `REASONS`). The statistic is the squared distance over its variance
+        (chi-square with 2 degrees of freedom where the noise is known well), TASTE of the frame for
+        the reasons ``taste`` and ``frame_disturbed``, and NaN in other frames that were dropped, of
+        which the residual is the distance from what most of their stars agree on.
     rounds : tuple of ScreeningRound
         How it went.
     calibration : Calibration
@@ -86,19 +90,22 @@ class Screening(Shown):
     frame_count : (K,) array of int
         Stars kept in each; 0 for a frame that was dropped.
     taste, taste_p_value : (K,) arrays
-        Chi-square of the kept stars with ``2 * frame_count - 3`` degrees of freedom, and its p-value; NaN and 1 for a
-        frame that was dropped.
+        Chi-square of the kept stars with ``2 * frame_count - 3`` degrees of freedom, and its
+        p-value; NaN and 1 for a frame that was dropped.
     focal_ratio : float
-        Focal length that the interstar angles asked for before the calibration, over the nominal one.
+        Focal length that the interstar angles asked for before the calibration, over the nominal
+        one.
     n_pre_screened : int
-        Rows that were set aside before the first calibration (later rounds may have taken some back).
+        Rows that were set aside before the first calibration (later rounds may have taken some
+        back).
     stable : bool
         Whether the last round changed nothing.
     warnings : tuple of str
         Sentences on what a user should look at.
     model_is_wrong : bool
-        Whether more was to be rejected than noise and wrong stars explain, or the rounds did not settle: then only
-        stars beyond the tails of all others are rejected, and tails that are not Gaussian are fitted as Student's.
+        Whether more was to be rejected than noise and wrong stars explain, or the rounds did not
+        settle: then only stars beyond the tails of all others are rejected, and tails that are not
+        Gaussian are fitted as Student's.
     """
 
     kept: BoolArray
@@ -157,7 +164,10 @@ class Screening(Shown):
 
     def __repr__(self) -> str:
         reasons = ", ".join(f"{number} {reason}" for reason, number in self.counts.items())
-        return f"Screening({self.n_rejected} of {len(self.kept)} stars rejected{': ' if reasons else ''}{reasons})"
+        return (
+            f"Screening({self.n_rejected} of {len(self.kept)} stars "
+            f"rejected{': ' if reasons else ''}{reasons})"
+        )
 
 
 def rejected_table(
@@ -182,7 +192,9 @@ def rejected_table(
     taste, limit = _taste_with(residuals, rows, frame, frame_p_value, shrinkage)
     statistic[by_frame], threshold[by_frame] = taste[by_frame], limit[by_frame]
     dropped = residuals.frame_count[frame] == 0
-    reason[dropped] = np.where(sizes[frame[dropped]] < MIN_STARS, "frame_too_small", "frame_dropped")
+    reason[dropped] = np.where(
+        sizes[frame[dropped]] < MIN_STARS, "frame_too_small", "frame_dropped"
+    )
     statistic[dropped] = threshold[dropped] = np.nan
     data: AnyDict = {
         "row": rows,
@@ -207,10 +219,11 @@ def add_dropped_frames(
     disturbed: FloatArray,
     frame_p_value: float,
 ) -> None:
-    """Fill in rows of dropped frames: the distance from what most of the frame's stars agree on, and TASTE.
+    """Fill in rows of dropped frames: the distance from what most of the frame's stars agree on,
+    and TASTE.
 
-    `vote_rad` (N,) is the angle from that agreement; `disturbed` (K,) is TASTE of frames dropped for it (without stars
-    that are far off), NaN for others. The table is changed in place.
+    `vote_rad` (N,) is the angle from that agreement; `disturbed` (K,) is TASTE of frames dropped
+    for it (without stars that are far off), NaN for others. The table is changed in place.
     """
     from scipy.special import chdtri
 
@@ -222,11 +235,17 @@ def add_dropped_frames(
     blamed = lost & ~np.isnan(disturbed[frame])
     table.loc[blamed, "reason"] = "frame_disturbed"
     table.loc[blamed, "statistic"] = disturbed[frame[blamed]]
-    table.loc[blamed, "threshold"] = chdtri(2 * obs.stars_per_frame[frame[blamed]] - 3, frame_p_value)
+    table.loc[blamed, "threshold"] = chdtri(
+        2 * obs.stars_per_frame[frame[blamed]] - 3, frame_p_value
+    )
 
 
 def _taste_with(
-    residuals: StarResiduals, rows: IntArray, frame: IntArray, frame_p_value: float, shrinkage: float
+    residuals: StarResiduals,
+    rows: IntArray,
+    frame: IntArray,
+    frame_p_value: float,
+    shrinkage: float,
 ) -> tuple[FloatArray, FloatArray]:
     """TASTE of the rows' frames with the star put back, and its limit."""
     from scipy.special import chdtri
@@ -236,13 +255,16 @@ def _taste_with(
     return taste, np.asarray(limit, dtype=np.float64)
 
 
-def warnings_about(obs: Observations, camera: Camera, kept: BoolArray, rejected: pd.DataFrame) -> tuple[str, ...]:
+def warnings_about(
+    obs: Observations, camera: Camera, kept: BoolArray, rejected: pd.DataFrame
+) -> tuple[str, ...]:
     """What the pattern of the rejections says against the model or the data."""
     warnings = []
     share = 1.0 - np.count_nonzero(kept) / len(kept)
     if share > _MANY_REJECTED:
         warnings.append(
-            f"{percent(share)} of the stars were rejected: look for a cause other than single wrong identifications."
+            f"{percent(share)} of the stars were rejected: look for a cause other than single "
+            "wrong identifications."
         )
     displaced = rejected[rejected["reason"] == "displaced"]
     if len(displaced) < _PATTERN_ROWS:
@@ -250,14 +272,18 @@ def warnings_about(obs: Observations, camera: Camera, kept: BoolArray, rejected:
     radius = np.hypot(*(obs.xy - camera.theta[:2]).T)
     if _farther_p_value(radius[displaced["row"].to_numpy()], radius[kept]) < _PATTERN_P:
         warnings.append(
-            "the displaced stars lie farther from the principal point than the others: the distortion model may be "
-            "too poor, so that right stars are rejected; compare models before trusting the screening."
+            "the displaced stars lie farther from the principal point than the others: the "
+            "distortion model may be "
+            "too poor, so that right stars are rejected; compare models before trusting the "
+            "screening."
         )
     return tuple(warnings)
 
 
 def _farther_p_value(sample: FloatArray, others: FloatArray) -> float:
-    """Rank test (Mann-Whitney, normal approximation, one-sided) that `sample` tends to be larger."""
+    """Rank test (Mann-Whitney, normal approximation, one-sided) that `sample` tends to be
+    larger.
+    """
     from scipy.special import ndtr
 
     n, m = len(sample), len(others)

@@ -1,16 +1,18 @@
 """Screening of observations for wrong identifications: which rows are left out, and why.
 
-Before any calibration the stars of a frame vote on its attitude (`consensus`). Then, in rounds: calibrate on the stars
-in use, vote again with the calibrated camera and the noise it shows, reject the worst star of each frame while it is
-farther from the prediction of the others than chance explains (`outliers`) or while the frame's TASTE fails, and take
-back stars that pass. The rounds end when they no longer change anything.
+Before any calibration the stars of a frame vote on its attitude (`consensus`). Then, in rounds:
+calibrate on the stars in use, vote again with the calibrated camera and the noise it shows, reject
+the worst star of each frame while it is farther from the prediction of the others than chance
+explains (`outliers`) or while the frame's TASTE fails, and take back stars that pass. The rounds
+end when they no longer change anything.
 
-Where more stars are rejected just beyond the limit than noise and wrong stars let expect, or the rounds do not settle,
-the model is wrong and not the stars (`tails`): what hangs together with the others is kept, with a Student t where the
-tails ask for it.
+Where more stars are rejected just beyond the limit than noise and wrong stars let expect, or the
+rounds do not settle, the model is wrong and not the stars (`tails`): what hangs together with the
+others is kept, with a Student t where the tails ask for it.
 
-Every right star and every right frame takes the same risk of being rejected: with N stars and K frames and an expected
-number E of false rejections, a star is rejected at p < E / (2N) and a frame at p < E / (2K) (Bonferroni's bound).
+Every right star and every right frame takes the same risk of being rejected: with N stars and K
+frames and an expected number E of false rejections, a star is rejected at p < E / (2N) and a frame
+at p < E / (2K) (Bonferroni's bound).
 """
 
 from __future__ import annotations
@@ -27,7 +29,12 @@ from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.plausibility import explained
-from starcal_uq.estimation.screening.consensus import MIN_STARS, consensus, measured_directions, pre_screen
+from starcal_uq.estimation.screening.consensus import (
+    MIN_STARS,
+    consensus,
+    measured_directions,
+    pre_screen,
+)
 from starcal_uq.estimation.screening.outliers import (
     StarResiduals,
     star_residuals,
@@ -58,7 +65,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 CONTROLS = ("table", "star")
-# A vote with the calibrated camera: wide enough for the noise of attitudes from two stars, which the tests see to.
+# A vote with the calibrated camera: wide enough for the noise of attitudes from two stars, which
+# the tests see to.
 _VOTE_SIGMAS = 10.0
 # The tests of one round remove one star per frame at a time.
 _MAX_PASSES = 60
@@ -69,7 +77,9 @@ _NEAR_FRACTION = 0.25
 
 @dataclass(frozen=True)
 class _Rates:
-    """p-values below which a star and a frame are rejected, and the shrinkage of the variance that follows."""
+    """p-values below which a star and a frame are rejected, and the shrinkage of the variance that
+    follows.
+    """
 
     star: float
     frame: float
@@ -97,31 +107,33 @@ def screen(
     obs : Observations
         Identified stars, some of them wrongly. Stated noise per star (`sigma_px`) is respected.
     camera : Camera
-        Nominal camera: the focal length may be tens of per cent off, the principal point tens of pixels, the distortion
-        unknown.
+        Nominal camera: the focal length may be tens of per cent off, the principal point tens of
+        pixels, the distortion unknown.
     significance : float
-        With ``control="table"``, the probability that anything at all is rejected from a table without wrong
-        identifications; with ``control="star"``, the fraction of right stars that is rejected (at most 0.05). Both are
-        bounds: tests that overlap reject less.
+        With ``control="table"``, the probability that anything at all is rejected from a table
+        without wrong identifications; with ``control="star"``, the fraction of right stars that is
+        rejected (at most 0.05). Both are bounds: tests that overlap reject less.
     control : {"table", "star"}
-        Meaning of `significance`. Only ``"star"`` shortens the tails of the noise so that it shows in the estimated
-        sigma (`Screening.sigma_shrinkage`).
+        Meaning of `significance`. Only ``"star"`` shortens the tails of the noise so that it shows
+        in the estimated sigma (`Screening.sigma_shrinkage`).
     max_rounds : int
         Limit on the rounds of calibrating and testing.
     throw : bool
         Whether to raise an error where the calibration does not converge.
     noise : {"common", "model"}
-        As for `calibrate`. With ``model``, stars are screened a second time, with the noise that the model fitted to
-        those kept at first gives each of them.
+        As for `calibrate`. With ``model``, stars are screened a second time, with the noise that
+        the model fitted to those kept at first gives each of them.
     duplicates : {"refuse", "drop", "keep"}
-        As for `calibrate`; asked once, of the rows that are kept. With ``drop``, the result is of the other frames.
+        As for `calibrate`; asked once, of the rows that are kept. With ``drop``, the result is of
+        the other frames.
     **options
         Passed on to `calibrate`, such as ``solver``.
 
     Returns
     -------
     Screening
-        Rows that are kept, every rejected row with its reason, and the calibration of the kept rows.
+        Rows that are kept, every rejected row with its reason, and the calibration of the kept
+        rows.
 
     Raises
     ------
@@ -133,7 +145,12 @@ def screen(
     check_duplicates(duplicates)
     options["duplicates"] = "keep"
     if noise != "common":
-        settings = {"significance": significance, "control": control, "max_rounds": max_rounds, "throw": throw}
+        settings = {
+            "significance": significance,
+            "control": control,
+            "max_rounds": max_rounds,
+            "throw": throw,
+        }
         settings["duplicates"] = duplicates
         return _with_noise_model(obs.unweighted, camera, settings, options | {"noise": noise})
     frames = StarFrames.from_observations(obs)
@@ -141,7 +158,8 @@ def screen(
     use, start = pre_screen(camera, frames)
     if not use.any():
         raise CalibrationError(
-            "no three stars of any frame agree with their catalogue directions: check the star identifications, "
+            "no three stars of any frame agree with their catalogue directions: check the star "
+            "identifications, "
             "the parity of the axes and the nominal camera.",
             Status.INCONSISTENT,
         )
@@ -149,14 +167,24 @@ def screen(
     rounds: list[ScreeningRound] = []
     states: list[tuple[BoolArray, Calibration, _Tested]] = []
     n_changed = -1
-    while n_changed and len(rounds) < max_rounds and not any(np.array_equal(use, seen) for seen, _, _ in states):
+    while (
+        n_changed
+        and len(rounds) < max_rounds
+        and not any(np.array_equal(use, seen) for seen, _, _ in states)
+    ):
         calibration, tested = _round(obs, frames, camera, use, rates, options)
         n_changed = int(np.count_nonzero(tested.in_use != use))
-        rounds.append(ScreeningRound(int(np.count_nonzero(use)), n_changed, calibration.sigma, calibration.theta))
+        rounds.append(
+            ScreeningRound(
+                int(np.count_nonzero(use)), n_changed, calibration.sigma, calibration.theta
+            )
+        )
         states.append((use, calibration, tested))
         use = tested.in_use
     # Rounds that go in circles have no natural end: the state that fits best is gone on from.
-    use, calibration, tested = states[-1] if n_changed == 0 else min(states, key=lambda state: state[1].sigma)
+    use, calibration, tested = (
+        states[-1] if n_changed == 0 else min(states, key=lambda state: state[1].sigma)
+    )
     stable, tails, blame = n_changed == 0, None, ""
     found = star_residuals(frames, calibration.camera.distortion, calibration.theta, use)
     statistic, dof = found.studentised(rates.shrinkage)
@@ -170,7 +198,8 @@ def screen(
         calibration = calibrate(obs.select(use), camera, throw=False, **last)
         follows = follows_place(obs.select(use).xy, calibration)
         if follows and last is not options:
-            # Tails would take what the lens does at some places for noise, and believe the others all the more.
+            # Tails would take what the lens does at some places for noise, and believe the others
+            # all the more.
             last = options
             calibration = calibrate(obs.select(use), camera, throw=False, **last)
         blame = blame_words(near, allowed, len(rounds), stable, calibration, follows)
@@ -180,11 +209,19 @@ def screen(
         calibration = calibrate(kept, camera, **last)
     repeating = repeating_frames(calibration, duplicates)
     if len(repeating):
-        again = {"significance": significance, "control": control, "max_rounds": max_rounds, "throw": throw, **options}
+        again = {
+            "significance": significance,
+            "control": control,
+            "max_rounds": max_rounds,
+            "throw": throw,
+            **options,
+        }
         return screen(obs.select_frames(np.setdiff1d(obs.frame_ids, repeating)), camera, **again)
     residuals = star_residuals(frames, calibration.camera.distortion, calibration.theta, use)
     table = rejected_table(obs, residuals, rates.star, rates.frame, rates.shrinkage)
-    add_dropped_frames(table, obs, calibration.camera, tested.vote_rad, tested.disturbed, rates.frame)
+    add_dropped_frames(
+        table, obs, calibration.camera, tested.vote_rad, tested.disturbed, rates.frame
+    )
     if tails is not None:
         mark_beyond(table, residuals, tails, rates.star)
     n_rejected = int(np.count_nonzero(~use))
@@ -192,7 +229,12 @@ def screen(
     return Screening(
         kept=use,
         observations=kept.with_meta(
-            screening={"rejected": n_rejected, "of": obs.n_stars, "significance": significance, "control": control}
+            screening={
+                "rejected": n_rejected,
+                "of": obs.n_stars,
+                "significance": significance,
+                "control": control,
+            }
             | ({"blame": blame} if blame else {})
         ),
         rejected=table,
@@ -220,13 +262,23 @@ def screen(
 def _all_that_hangs_together(
     frames: StarFrames, calibration: Calibration, use: BoolArray, rates: _Rates
 ) -> tuple[BoolArray, Tails]:
-    """Stars (N,) that lie within the tails of the others, those of frames that were dropped among them."""
+    """Stars (N,) that lie within the tails of the others, those of frames that were dropped among
+    them.
+    """
     model, theta = calibration.camera.distortion, calibration.theta
     found = star_residuals(frames, model, theta, use)
     # Frames without stars in use get an attitude from those that agree, however roughly.
-    tolerance = np.sqrt(MARGINAL * -2.0 * np.log(rates.star) * found.robust_variance()) / calibration.camera.focal_px
+    tolerance = (
+        np.sqrt(MARGINAL * -2.0 * np.log(rates.star) * found.robust_variance())
+        / calibration.camera.focal_px
+    )
     weight = 1.0 if frames.weight is None else frames.weight
-    vote = consensus(measured_directions(calibration.camera, frames), frames.r, frames.starts, 4.0 * tolerance / weight)
+    vote = consensus(
+        measured_directions(calibration.camera, frames),
+        frames.r,
+        frames.starts,
+        4.0 * tolerance / weight,
+    )
     lost = np.repeat(found.frame_count == 0, frames.sizes)
     found = star_residuals(frames, model, theta, np.where(lost, vote.agree, use))
     t = np.where(np.isnan(found.t), np.inf, found.t)
@@ -235,14 +287,20 @@ def _all_that_hangs_together(
 
 
 def _with_tails(options: AnyDict, tails: Tails) -> AnyDict:
-    """Options of the last calibration: Student's tails where the stars have them and nothing else was asked for."""
+    """Options of the last calibration: Student's tails where the stars have them and nothing else
+    was asked for.
+    """
     free = options.get("likelihood") is None and not options.get("star_errors")
     suits = free and options.get("method", "efficient") == "efficient"
     return options | {"likelihood": "student_t"} if suits and tails.heavy else options
 
 
-def _with_noise_model(obs: Observations, camera: Camera, settings: AnyDict, options: AnyDict) -> Screening:
-    """Screen with one noise, fit how it varies, screen with that; what is kept gets a model of its own."""
+def _with_noise_model(
+    obs: Observations, camera: Camera, settings: AnyDict, options: AnyDict
+) -> Screening:
+    """Screen with one noise, fit how it varies, screen with that; what is kept gets a model of its
+    own.
+    """
     # The noise model is what explains tails.
     plain = {name: value for name, value in options.items() if name not in ("noise", "duplicates")}
     plain |= {"likelihood": "marginal"}
@@ -256,7 +314,12 @@ def _with_noise_model(obs: Observations, camera: Camera, settings: AnyDict, opti
 
 
 def _round(
-    obs: Observations, frames: StarFrames, camera: Camera, use: BoolArray, rates: _Rates, options: AnyDict
+    obs: Observations,
+    frames: StarFrames,
+    camera: Camera,
+    use: BoolArray,
+    rates: _Rates,
+    options: AnyDict,
 ) -> tuple[Calibration, _Tested]:
     """Calibrate on the stars in use, and test all stars."""
     try:
@@ -267,7 +330,8 @@ def _round(
         if n_agree > 0.5 * obs.n_stars:
             raise
         raise CalibrationError(
-            f"only {n_agree} of {obs.n_stars} stars agree on attitudes, and no calibration fits them: "
+            f"only {n_agree} of {obs.n_stars} stars agree on attitudes, and no calibration fits "
+            "them: "
             f"{Status.INCONSISTENT.remedy}.",
             Status.INCONSISTENT,
         ) from error
@@ -278,7 +342,9 @@ def _rates(frames: StarFrames, significance: float, control: str, max_rounds: in
         raise ValueError(f"control={control!r} is unknown: use one of {', '.join(CONTROLS)}.")
     highest = 1.0 if control == "table" else _MAX_STAR_RATE
     if not 0.0 < significance <= highest:
-        raise ValueError(f"significance={significance}: give a number above 0 and up to {highest:g}.")
+        raise ValueError(
+            f"significance={significance}: give a number above 0 and up to {highest:g}."
+        )
     if max_rounds < 1:
         raise ValueError(f"max_rounds={max_rounds}: at least one round is needed.")
     expected = significance * (frames.n_stars if control == "star" else 1.0)
@@ -290,7 +356,8 @@ def _rates(frames: StarFrames, significance: float, control: str, max_rounds: in
 
 @dataclass(frozen=True)
 class _Tested:
-    """Stars in use after a round (N,); angle of every star from its frame's vote (N,); TASTE of disturbed frames (K,).
+    """Stars in use after a round (N,); angle of every star from its frame's vote (N,); TASTE of
+    disturbed frames (K,).
 
     TASTE is NaN for frames that were not dropped for it.
     """
@@ -301,7 +368,9 @@ class _Tested:
 
 
 def _tested(frames: StarFrames, calibration: Calibration, use: BoolArray, rates: _Rates) -> _Tested:
-    """One round at a fixed camera: vote, remove with the robust noise, then remove and take back with the final one."""
+    """One round at a fixed camera: vote, remove with the robust noise, then remove and take back
+    with the final one.
+    """
     model, theta, camera = calibration.camera.distortion, calibration.theta, calibration.camera
     robust = star_residuals(frames, model, theta, use).robust_variance()
     weight = 1.0 if frames.weight is None else frames.weight
@@ -328,9 +397,9 @@ def _settled(
 ) -> tuple[BoolArray, FloatArray]:
     """Remove and take back stars, at most one of a frame at a time, until nothing changes.
 
-    A frame may lose its worst stars, but not one after the other until the rest happens to fit: where more than a
-    quarter of its stars are out without any being far off, the frame is dropped. Returns the stars in use, and TASTE of
-    frames dropped so (NaN for others).
+    A frame may lose its worst stars, but not one after the other until the rest happens to fit:
+    where more than a quarter of its stars are out without any being far off, the frame is dropped.
+    Returns the stars in use, and TASTE of frames dropped so (NaN for others).
     """
     barred = np.zeros(frames.n_stars, dtype=bool)
     disturbed = np.full(frames.n_frames, np.nan)
@@ -362,8 +431,12 @@ def _settled(
     return found.in_use, disturbed
 
 
-def _passing(frames: StarFrames, residuals: StarResiduals, candidates: BoolArray, rates: _Rates) -> BoolArray:
-    """Stars not in use, in frames that are, which pass and with which their frame passes as well."""
+def _passing(
+    frames: StarFrames, residuals: StarResiduals, candidates: BoolArray, rates: _Rates
+) -> BoolArray:
+    """Stars not in use, in frames that are, which pass and with which their frame passes as
+    well.
+    """
     from scipy.special import chdtrc
 
     candidates = candidates & ~residuals.in_use & np.isfinite(residuals.t)

@@ -1,9 +1,10 @@
 """Attitude errors of the field experiment, and what they consist of.
 
-The error of a frame is the rotation from the true attitude to that of QUEST, about the camera's axes x (pitch), y (yaw)
-and z (roll). It has three parts. *Noise* is what changes when the centroids are put where the stars truly are. What
-is left then is the camera's: its mean over the frames is the *common rotation*, which a calibration of the alignment
-takes out, and the *rest* differs from frame to frame with the places of the stars.
+The error of a frame is the rotation from the true attitude to that of QUEST, about the camera's
+axes x (pitch), y (yaw) and z (roll). It has three parts. *Noise* is what changes when the centroids
+are put where the stars truly are. What is left then is the camera's: its mean over the frames is
+the *common rotation*, which a calibration of the alignment takes out, and the *rest* differs from
+frame to frame with the places of the stars.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ _CHUNK = 4
 class FieldStars:
     """Identified stars of frames, ready for QUEST; m stars in k frames.
 
-    Places measured and true (m, 2), catalogue directions (m, 3), stated noise (m,) px per axis, the first star of each
-    frame and their number (k + 1,), and true attitudes (k, 4).
+    Places measured and true (m, 2), catalogue directions (m, 3), stated noise (m,) px per axis, the
+    first star of each frame and their number (k + 1,), and true attitudes (k, 4).
     """
 
     xy_px: FloatArray
@@ -84,10 +85,11 @@ class FieldStars:
 class AttitudeErrors:
     """Attitude errors of frames with one camera, arcsec; columns pitch, yaw, roll.
 
-    `total` (k, 3) is against the true attitude, and `rms` (3,) its size; `aligned` its scatter about the mean, which is
-    left when the alignment was calibrated with the same camera. The parts are `noise`, what centroid noise does;
-    `common`, the rotation common to all frames without noise, with its sign; and the `rest`, what the camera does
-    differently from frame to frame; all (3,).
+    `total` (k, 3) is against the true attitude, and `rms` (3,) its size; `aligned` its scatter
+    about the mean, which is left when the alignment was calibrated with the same camera. The parts
+    are `noise`, what centroid noise does; `common`, the rotation common to all frames without
+    noise, with its sign; and the `rest`, what the camera does differently from frame to frame; all
+    (3,).
     """
 
     total: FloatArray
@@ -99,7 +101,9 @@ class AttitudeErrors:
 
     @property
     def sum_of_squares(self) -> FloatArray:
-        """Root of the sum of the squared parts, (3,); `rms` up to the chance correlation of noise with the others."""
+        """Root of the sum of the squared parts, (3,); `rms` up to the chance correlation of noise
+        with the others.
+        """
         total: FloatArray = np.sqrt(self.common**2 + self.rest**2 + self.noise**2)
         return total
 
@@ -142,7 +146,9 @@ def attitude_errors(stars: FieldStars, camera: Camera) -> AttitudeErrors:
 
 
 def single_faults(truth: Camera, camera: Camera) -> dict[str, Camera]:
-    """Cameras that have one of another camera's faults each, and are right otherwise; keys are `SOURCES`."""
+    """Cameras that have one of another camera's faults each, and are right otherwise; keys are
+    `SOURCES`.
+    """
     return {
         "principal point": truth.replace(x0_px=camera.x0_px, y0_px=camera.y0_px),
         "focal length": truth.replace(focal_mm=camera.focal_mm),
@@ -159,13 +165,16 @@ def _rms(error: FloatArray) -> FloatArray:
 class FieldReplicates:
     """Errors (n, 3) over repetitions by camera and part, arcsec, columns pitch, yaw, roll.
 
-    The common rotation has its sign. A repetition in which a method failed is missing from its arrays.
+    The common rotation has its sign. A repetition in which a method failed is missing from its
+    arrays.
     """
 
     draws: Mapping[str, Mapping[str, FloatArray]]
 
     def interval(self, camera: str, part: str) -> tuple[FloatArray, FloatArray]:
-        """Ends (3,), (3,) of the range that 95 of 100 repetitions stay in; NaN without repetitions."""
+        """Ends (3,), (3,) of the range that 95 of 100 repetitions stay in; NaN without
+        repetitions.
+        """
         values = np.abs(self.draws[camera][part])
         if len(values) < 2:
             return np.full(3, np.nan), np.full(3, np.nan)
@@ -175,10 +184,12 @@ class FieldReplicates:
 
 @dataclass(frozen=True, eq=False)
 class Repetition:
-    """Calibration and test again with other noise, by number: {camera: {part: (3,)}}, without methods that failed.
+    """Calibration and test again with other noise, by number: {camera: {part: (3,)}}, without
+    methods that failed.
 
-    `campaign_px` (m, 2) is where the stars of the campaign truly are, `scale` its noise over what is stated, `tests`
-    are the stars that each camera identified; those of the paper's methods are calibrated anew from `nominal`.
+    `campaign_px` (m, 2) is where the stars of the campaign truly are, `scale` its noise over what
+    is stated, `tests` are the stars that each camera identified; those of the paper's methods are
+    calibrated anew from `nominal`.
     """
 
     campaign: Observations
@@ -191,8 +202,15 @@ class Repetition:
 
     def __call__(self, number: int) -> dict[str, dict[str, FloatArray]]:
         rng = np.random.default_rng([self.seed, 2, number])
-        sigma = np.ones(len(self.campaign_px)) if self.campaign.sigma_px is None else self.campaign.sigma_px
-        xy = self.campaign_px + rng.standard_normal(self.campaign_px.shape) * (self.scale * sigma)[:, None]
+        sigma = (
+            np.ones(len(self.campaign_px))
+            if self.campaign.sigma_px is None
+            else self.campaign.sigma_px
+        )
+        xy = (
+            self.campaign_px
+            + rng.standard_normal(self.campaign_px.shape) * (self.scale * sigma)[:, None]
+        )
         obs = replace(self.campaign, x_px=xy[:, 0], y_px=xy[:, 1])
         found = {}
         for index, (name, stars) in enumerate(self.tests.items()):
@@ -218,11 +236,16 @@ def replicate_field(
     kept: Kept | None = None,
 ) -> FieldReplicates:
     """Every repetition; `FieldReplicates`."""
-    results = run_or_stop(repetition, n_replicates, chunk=_CHUNK, workers=workers, progress=progress, kept=kept)
+    results = run_or_stop(
+        repetition, n_replicates, chunk=_CHUNK, workers=workers, progress=progress, kept=kept
+    )
     empty = np.empty((0, 3))
     return FieldReplicates(
         {
-            name: {part: np.array([one[name][part] for one in results if name in one] or empty) for part in PARTS}
+            name: {
+                part: np.array([one[name][part] for one in results if name in one] or empty)
+                for part in PARTS
+            }
             for name in repetition.tests
         }
     )

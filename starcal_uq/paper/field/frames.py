@@ -1,8 +1,10 @@
-"""Frames of the field experiment: rendered, searched for stars, chosen by the paper's rule, and identified.
+"""Frames of the field experiment: rendered, searched for stars, chosen by the paper's rule, and
+identified.
 
-A star tracker in flight holds its camera for right: each frame is identified for itself with tolerances that are the
-same whatever the camera. Tolerances of a number of pixels mean that the camera may misplace a star in the corner of
-the field by so much, by its focal length or by its distortion, and the principal point by so much.
+A star tracker in flight holds its camera for right: each frame is identified for itself with
+tolerances that are the same whatever the camera. Tolerances of a number of pixels mean that the
+camera may misplace a star in the corner of the field by so much, by its focal length or by its
+distortion, and the principal point by so much.
 """
 
 from __future__ import annotations
@@ -36,11 +38,12 @@ if TYPE_CHECKING:
 
 # Stars this much fainter than the limit still shine.
 _FAINTER_MAG = 2.0
-# Attitudes that show too few stars down to so much beyond the limit are not rendered: noise would have to lift several
-# stars by this much.
+# Attitudes that show too few stars down to so much beyond the limit are not rendered: noise would
+# have to lift several stars by this much.
 _DOUBTFUL_MAG = 0.5
 _BATCH = 256
-# Candidates for each frame wanted, and some more; a second helping is drawn where they do not suffice.
+# Candidates for each frame wanted, and some more; a second helping is drawn where they do not
+# suffice.
 _CANDIDATES, _MORE_CANDIDATES = 1.9, 8
 _MAX_BATCHES = 400
 _CHUNK = 8
@@ -50,7 +53,8 @@ WRONG_PX = 3.0
 
 @dataclass(frozen=True, eq=False)
 class FieldFrames:
-    """Centroids of frames 0 .. n - 1 with more than six stars, true R_cam_icrs (n, 3, 3), and how rare such frames are.
+    """Centroids of frames 0 .. n - 1 with more than six stars, true R_cam_icrs (n, 3, 3), and how
+    rare such frames are.
 
     `share` is the part of random attitudes that gave one.
     """
@@ -62,7 +66,9 @@ class FieldFrames:
     def part(self, first: int, last: int) -> FieldFrames:
         """Frames first .. last - 1, numbered from 0."""
         part = self.centroids.select_frames(np.arange(first, last))
-        part = replace(part, frame=part.frame - first, frame_ids=np.arange(last - first), messages=())
+        part = replace(
+            part, frame=part.frame - first, frame_ids=np.arange(last - first), messages=()
+        )
         return FieldFrames(part, self.rotations[first:last], self.share)
 
 
@@ -90,7 +96,9 @@ def take_frames(
     progress: Progress | None,
     keep: PathLike | None = None,
 ) -> FieldFrames:
-    """Render random attitudes until `n_frames` of them show more than six stars; a folder keeps what is done."""
+    """Render random attitudes until `n_frames` of them show more than six stars; a folder keeps
+    what is done.
+    """
     stars, camera = load_catalogue(max_mag=reading.limit_mag + _FAINTER_MAG), reading.truth
     scene = Scene(stars, camera, reading.sensor)
     attitudes = _Attitudes(reading, np.random.default_rng([seed, 0]))
@@ -110,7 +118,9 @@ def take_frames(
         # A candidate depends on the seed and its own number.
         identity = ["field frames", reading.name, seed, done, stars.source]
         kept = None if keep is None else Kept(keep, identity, (Centroids,))
-        tables = run_or_stop(task, len(some), chunk=_CHUNK, workers=workers, progress=move, kept=kept)
+        tables = run_or_stop(
+            task, len(some), chunk=_CHUNK, workers=workers, progress=move, kept=kept
+        )
         done += len(some)
         for table, rotation, number in zip(tables, some, ranks, strict=True):
             if len(chosen) < n_frames and len(table.frame) > MORE_THAN_STARS:
@@ -142,7 +152,9 @@ class _Attitudes:
                     self.ranks.append(self.drawn + number)
             self.drawn += _BATCH
         else:
-            raise CalibrationError("the field experiment: next to no attitude shows more than six stars.")
+            raise CalibrationError(
+                "the field experiment: next to no attitude shows more than six stars."
+            )
         rotations, ranks = np.array(self.rotations[:n]), self.ranks[:n]
         del self.rotations[:n], self.ranks[:n]
         return rotations, ranks
@@ -150,9 +162,13 @@ class _Attitudes:
 
 def _joined(tables: list[Centroids]) -> Centroids:
     """One table of many single frames, numbered anew."""
-    columns: AnyDict = {name: np.concatenate([getattr(t, name) for t in tables]) for name in COLUMNS}
+    columns: AnyDict = {
+        name: np.concatenate([getattr(t, name) for t in tables]) for name in COLUMNS
+    }
     columns["frame"] = np.repeat(np.arange(len(tables)), [len(t.frame) for t in tables])
-    frames: AnyDict = {name: np.concatenate([getattr(t, name) for t in tables]) for name in FRAME_COLUMNS}
+    frames: AnyDict = {
+        name: np.concatenate([getattr(t, name) for t in tables]) for name in FRAME_COLUMNS
+    }
     frames["frame_ids"] = np.arange(len(tables))
     messages = dict.fromkeys(message for table in tables for message in table.messages)
     meta = {key: value for key, value in tables[0].meta.items() if key != "images_sha256"}
@@ -163,8 +179,9 @@ def _joined(tables: list[Centroids]) -> Centroids:
 class FieldIdentification:
     """Every frame identified with one camera and one tolerance.
 
-    Of each of m stars that were named there is its frame, its row in the table of centroids and in the catalogue;
-    `correct` and `wrong` (n,) mark frames with an attitude and no wrong star, and with one.
+    Of each of m stars that were named there is its frame, its row in the table of centroids and in
+    the catalogue; `correct` and `wrong` (n,) mark frames with an attitude and no wrong star, and
+    with one.
     """
 
     camera: Camera
@@ -199,17 +216,22 @@ class _IdentifyTask:
     def __call__(self, number: int) -> FieldIdentification:
         camera, tolerance_px = self.jobs[number]
         field = FrameTable(self.frames.centroids, camera)
-        # `identify` would try failed frames again with wider tolerances and refine the camera over all frames.
+        # `identify` would try failed frames again with wider tolerances and refine the camera over
+        # all frames.
         search = Search(camera, self.stars, corner_tolerance(camera, tolerance_px), self.proposer)
         n = len(field.ids)
         matches = [search.frame(field, k).match for k in range(n)]
         solved = [(k, match) for k, match in enumerate(matches) if match is not None]
         empty = [np.empty(0, dtype=np.int64)]
-        frame = np.repeat([k for k, _ in solved], [len(match) for _, match in solved]).astype(np.int64)
+        frame = np.repeat([k for k, _ in solved], [len(match) for _, match in solved]).astype(
+            np.int64
+        )
         row = np.concatenate([field.rows[k][match.centroid] for k, match in solved] or empty)
         star = np.concatenate([match.star for _, match in solved] or empty)
         table = self.frames.centroids
-        place = true_pixels(self.truth, self.frames.rotations[frame], self.stars.directions_icrs[star])
+        place = true_pixels(
+            self.truth, self.frames.rotations[frame], self.stars.directions_icrs[star]
+        )
         # Nowhere near is also wrong.
         bad = ~(np.hypot(table.x_px[row] - place[:, 0], table.y_px[row] - place[:, 1]) <= WRONG_PX)
         wrong = np.bincount(frame[bad], minlength=n) > 0
@@ -218,7 +240,9 @@ class _IdentifyTask:
 
 
 def true_pixels(truth: Camera, rotations: FloatArray, directions: FloatArray) -> FloatArray:
-    """Where stars (m, 3) truly are under attitudes (m, 3, 3): (m, 2), NaN for those behind the camera."""
+    """Where stars (m, 3) truly are under attitudes (m, 3, 3): (m, 2), NaN for those behind the
+    camera.
+    """
     b = np.einsum("nij,nj->ni", rotations, directions)
     place = np.full((len(b), 2), np.nan)
     ahead = b[:, 2] > 0.5

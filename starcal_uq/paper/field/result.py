@@ -1,4 +1,6 @@
-"""The result of the field experiment: cameras, identifications and attitude errors beside the paper's Table 3."""
+"""The result of the field experiment: cameras, identifications and attitude errors beside the
+paper's Table 3.
+"""
 
 from __future__ import annotations
 
@@ -27,18 +29,24 @@ from starcal_uq.paper.field.frames import FieldFrames, FieldIdentification
 from starcal_uq.paper.field.published import AXES, FIELD_METHODS, RATE, FieldReading, printed_field
 
 FIELD_REPORT = "field.html"
-AS_IT_STANDS, ALIGNED, BOTH, NEITHER = "against the true attitude", "after alignment", "either way", "no"
+AS_IT_STANDS, ALIGNED, BOTH, NEITHER = (
+    "against the true attitude",
+    "after alignment",
+    "either way",
+    "no",
+)
 
 
 @dataclass(frozen=True, eq=False)
 class FieldExperiment(Shown):
     """The paper's field experiment, simulated; the report is in the folder `path`.
 
-    Cameras go by their names: ``uncalibrated``, the three methods, ``truth``. `sweep` has the identifications by camera
-    and tolerance in px, of which `tolerance_px` is that of the main table; `stars` and `errors` are those of the main
-    table, for cameras that identified a frame. `data_sheets` has identification and, if there is any, attitude errors
-    of a camera with another nominal focal length (mm). `campaign_counts` says how many frames of the calibration
-    there are, are ``identified``, and the ``stars`` of these, of which so many are ``wrong``.
+    Cameras go by their names: ``uncalibrated``, the three methods, ``truth``. `sweep` has the
+    identifications by camera and tolerance in px, of which `tolerance_px` is that of the main
+    table; `stars` and `errors` are those of the main table, for cameras that identified a frame.
+    `data_sheets` has identification and, if there is any, attitude errors of a camera with another
+    nominal focal length (mm). `campaign_counts` says how many frames of the calibration there are,
+    are ``identified``, and the ``stars`` of these, of which so many are ``wrong``.
     """
 
     path: Path
@@ -72,12 +80,15 @@ class FieldExperiment(Shown):
     def table_3(self) -> pd.DataFrame:
         """The paper's Table 3 beside ours: one row for each printed number.
 
-        Columns: method, quantity, printed; ours, low, high: identification rate with its Wilson interval, or error
-        against the true attitude with the range of 95 % of repetitions; aligned, aligned_low, aligned_high: the same
-        about the mean over the frames; common (with its sign), rest, noise: the parts; agrees: whether the printed
-        number is in the range, and in which one. Errors are root mean squares in arcsec.
+        Columns: method, quantity, printed; ours, low, high: identification rate with its Wilson
+        interval, or error against the true attitude with the range of 95 % of repetitions; aligned,
+        aligned_low, aligned_high: the same about the mean over the frames; common (with its sign),
+        rest, noise: the parts; agrees: whether the printed number is in the range, and in which
+        one. Errors are root mean squares in arcsec.
         """
-        return pd.DataFrame([self._row(method, name) for method in FIELD_METHODS for name in (RATE, *AXES)])
+        return pd.DataFrame(
+            [self._row(method, name) for method in FIELD_METHODS for name in (RATE, *AXES)]
+        )
 
     def _row(self, method: str, quantity: str) -> AnyDict:
         number = printed_field(method, quantity)
@@ -99,10 +110,18 @@ class FieldExperiment(Shown):
             row[part] = float(getattr(errors, part)[axis])
         stands = row["low"] <= number.value <= row["high"]
         aligned = row["aligned_low"] <= number.value <= row["aligned_high"]
-        return row | {"agrees": (BOTH if aligned else AS_IT_STANDS) if stands else ALIGNED if aligned else NEITHER}
+        return row | {
+            "agrees": (BOTH if aligned else AS_IT_STANDS)
+            if stands
+            else ALIGNED
+            if aligned
+            else NEITHER
+        }
 
     def rates(self) -> pd.DataFrame:
-        """Identification against tolerance: camera, tolerance_px, n_frames, correct, wrong, rate, low, high."""
+        """Identification against tolerance: camera, tolerance_px, n_frames, correct, wrong, rate,
+        low, high.
+        """
         return pd.DataFrame(
             [
                 {"camera": camera, "tolerance_px": tolerance, **_counts(found)}
@@ -113,8 +132,9 @@ class FieldExperiment(Shown):
     def parts(self) -> pd.DataFrame:
         """What the errors consist of: a row for each camera and axis, arcsec.
 
-        Columns: camera, axis, rms, sum_of_squares (root of the squares of the three parts), aligned, common, rest,
-        noise, and for each of the parts the range over repetitions in ``_low`` and ``_high``.
+        Columns: camera, axis, rms, sum_of_squares (root of the squares of the three parts),
+        aligned, common, rest, noise, and for each of the parts the range over repetitions in
+        ``_low`` and ``_high``.
         """
         rows = []
         for camera, errors in self.errors.items():
@@ -129,22 +149,28 @@ class FieldExperiment(Shown):
         return pd.DataFrame(rows)
 
     def sources(self) -> pd.DataFrame:
-        """Each fault of each camera by itself, without noise: camera, source, axis, common, rest (arcsec).
+        """Each fault of each camera by itself, without noise: camera, source, axis, common, rest
+        (arcsec).
 
-        The faults of an estimated camera make up for each other, so that together they do less than each alone.
+        The faults of an estimated camera make up for each other, so that together they do less than
+        each alone.
         """
         rows = []
         for camera, stars in self.stars.items():
             faults = single_faults(self.reading.truth, self.cameras[camera])
             for source in SOURCES:
                 errors = attitude_errors(stars, faults[source])
-                for axis, common, rest in zip(AXES, errors.common.tolist(), errors.rest.tolist(), strict=True):
+                for axis, common, rest in zip(
+                    AXES, errors.common.tolist(), errors.rest.tolist(), strict=True
+                ):
                     row = {"camera": camera, "source": source, "axis": axis.removesuffix("_arcsec")}
                     rows.append(row | {"common": common, "rest": rest})
         return pd.DataFrame(rows)
 
     def other_data_sheets(self) -> pd.DataFrame:
-        """Other nominal focal lengths: focal_mm, identification as in `rates`, errors after alignment (arcsec)."""
+        """Other nominal focal lengths: focal_mm, identification as in `rates`, errors after
+        alignment (arcsec).
+        """
         rows = []
         for focal_mm, (found, errors) in self.data_sheets.items():
             aligned = np.full(3, np.nan) if errors is None else errors.aligned
@@ -153,20 +179,32 @@ class FieldExperiment(Shown):
         return pd.DataFrame(rows)
 
     def camera_table(self) -> pd.DataFrame:
-        """The cameras: camera, parameter, value, sigma (claimed; empty where none is), truth; px units."""
+        """The cameras: camera, parameter, value, sigma (claimed; empty where none is), truth; px
+        units.
+        """
         truth = self.reading.truth
         true = dict(zip(truth.parameter_names, truth.theta.tolist(), strict=True))
         rows = []
         for name, camera in self.cameras.items():
             known = self.calibrations.get(name)
             sigmas = [np.nan] * len(camera.theta) if known is None else known.sigmas.tolist()
-            for parameter, value, sigma in zip(camera.parameter_names, camera.theta.tolist(), sigmas, strict=True):
-                row = {"camera": name, "parameter": parameter, "value": value, "sigma": sigma, "truth": true[parameter]}
+            for parameter, value, sigma in zip(
+                camera.parameter_names, camera.theta.tolist(), sigmas, strict=True
+            ):
+                row = {
+                    "camera": name,
+                    "parameter": parameter,
+                    "value": value,
+                    "sigma": sigma,
+                    "truth": true[parameter],
+                }
                 rows.append(row)
         return pd.DataFrame(rows)
 
     def frame_table(self) -> pd.DataFrame:
-        """Every test frame with every camera: camera, frame, n_stars, correct, wrong, pitch, yaw, roll (arcsec)."""
+        """Every test frame with every camera: camera, frame, n_stars, correct, wrong, pitch, yaw,
+        roll (arcsec).
+        """
         tables = []
         for camera in self.cameras:
             found = self.identified(camera)
@@ -193,7 +231,10 @@ class FieldExperiment(Shown):
         }
 
     def __repr__(self) -> str:
-        return f"FieldExperiment({self.reading.name}, {len(self.frames.rotations)} frames; report {str(self.report)!r})"
+        return (
+            f"FieldExperiment({self.reading.name}, {len(self.frames.rotations)} frames; report "
+            f"{str(self.report)!r})"
+        )
 
 
 def _counts(found: FieldIdentification) -> AnyDict:

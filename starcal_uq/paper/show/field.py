@@ -40,8 +40,10 @@ def headline(found: FieldExperiment) -> str:
     table = found.table_3()
     rates, agree = table["quantity"] == RATE, table["agrees"] != NEITHER
     return (
-        f"Of the {len(table)} numbers of Table 3, {int(agree.sum())} come out: {int((agree & rates).sum())} of the "
-        f"{int(rates.sum())} rates at a tolerance of {found.tolerance_px:g} px, and {int((agree & ~rates).sum())} of "
+        f"Of the {len(table)} numbers of Table 3, {int(agree.sum())} come out: "
+        f"{int((agree & rates).sum())} of the "
+        f"{int(rates.sum())} rates at a tolerance of {found.tolerance_px:g} px, and "
+        f"{int((agree & ~rates).sum())} of "
         f"the {int((~rates).sum())} errors, either against the true attitude or after alignment."
     )
 
@@ -59,7 +61,8 @@ def table_3(found: FieldExperiment) -> TextTable:
     return TextTable(
         ("Camera", "", "Printed", "Ours (95 % range)", "After alignment", "Agrees"),
         tuple(rows),
-        f"Rates at a tolerance of {found.tolerance_px:g} px with Wilson intervals; errors against the true attitude, "
+        f"Rates at a tolerance of {found.tolerance_px:g} px with Wilson intervals; errors "
+        "against the true attitude, "
         "and about the mean of all frames, with the range of 95 % of repetitions with other noise.",
         "llrrrl",
         tuple(marks),
@@ -89,7 +92,11 @@ def sources(found: FieldExperiment) -> TextTable:
     return TextTable(
         ("Camera", "Wrong", "Common", "Rest"),
         tuple(rows),
-        f"One fault of each camera in an otherwise true one, without noise ({_ANGLES}); together they do less.",
+        (
+            f"One fault of each camera in an otherwise true one, without noise ({_ANGLES}); "
+            "together "
+            "they do less."
+        ),
         "llrr",
     )
 
@@ -104,7 +111,10 @@ def rates(found: FieldExperiment) -> TextTable:
     return TextTable(
         ("Camera", "Printed", *(f"{tolerance:g} px" for tolerance in found.tolerances)),
         tuple(rows),
-        "Frames identified without a wrong star, in per cent, by what a star in the corner may be misplaced by.",
+        (
+            "Frames identified without a wrong star, in per cent, by what a star in the corner may "
+            "be misplaced by."
+        ),
     )
 
 
@@ -131,14 +141,18 @@ def cameras(found: FieldExperiment) -> TextTable:
         cells = dict.fromkeys(shown, "–")
         for row in group.to_dict("records"):
             factor, decimals = shown[row["parameter"]]
-            sigma = f" ± {fixed(row['sigma'] * factor, decimals)}" if np.isfinite(row["sigma"]) else ""
+            sigma = (
+                f" ± {fixed(row['sigma'] * factor, decimals)}" if np.isfinite(row["sigma"]) else ""
+            )
             cells[row["parameter"]] = fixed(row["value"] * factor, decimals) + sigma
         rows.append((CAMERA_NAMES[name], *cells.values()))
     offset = found.reading.offset_px
     return TextTable(
         ("Camera", "x₀ [px]", "y₀ [px]", "f [mm]", "k₁ [10⁻⁹ px⁻²]", "k₂ [10⁻¹⁶ px⁻⁴]"),
         tuple(rows),
-        f"With claimed standard deviations; the paper counts pixels {offset} higher." if offset else "",
+        f"With claimed standard deviations; the paper counts pixels {offset} higher."
+        if offset
+        else "",
     )
 
 
@@ -146,7 +160,10 @@ def sensor(found: FieldExperiment) -> TextTable:
     """What is printed of the sensor, and what the reading makes of it."""
     return TextTable(
         ("Printed", "", "Kept", "How"),
-        tuple((name, text, "yes" if kept else "no", how) for name, text, kept, how in printed_sensor(found.reading)),
+        tuple(
+            (name, text, "yes" if kept else "no", how)
+            for name, text, kept, how in printed_sensor(found.reading)
+        ),
         found.reading.words,
         "llll",
     )

@@ -1,4 +1,6 @@
-"""Figures of the paper's experiments: their Figs. 3 to 6 and printed numbers, the field, replicates, and the study."""
+"""Figures of the paper's experiments: their Figs. 3 to 6 and printed numbers, the field,
+replicates, and the study.
+"""
 
 from __future__ import annotations
 
@@ -48,14 +50,18 @@ _ORDER = {"f": ("mm", 1e-3), "x0": ("px", 0.1), "y0": ("px", 0.1)}
 
 
 def plot_trajectories(found: Reproduction) -> Figure:
-    """The optics on their way to the estimate (the paper's Fig. 3): batch methods by iteration, filters by frame.
+    """The optics on their way to the estimate (the paper's Fig. 3): batch methods by iteration,
+    filters by frame.
 
-    Distances from the truth, on axes that are linear near it and logarithmic beyond: the start is far away, and the end
-    is what matters. Filters have the band of one claimed standard deviation; marks at the right edge are printed.
+    Distances from the truth, on axes that are linear near it and logarithmic beyond: the start is
+    far away, and the end is what matters. Filters have the band of one claimed standard deviation;
+    marks at the right edge are printed.
     """
     run, truth = found.run, found.run.truth
     calibrations = {run.label(method): run.of(method) for method in PAPER_METHODS}
-    filters = [name for name, cal in calibrations.items() if any(s.name == "filter" for s in cal.stages)]
+    filters = [
+        name for name, cal in calibrations.items() if any(s.name == "filter" for s in cal.stages)
+    ]
     colours = dict(zip(calibrations, _PALETTE, strict=False))
     names = [p.name for p in parameters("none")]
     figure = style.new_figure(10.0, 8.6)
@@ -69,10 +75,18 @@ def plot_trajectories(found: Reproduction) -> Figure:
             if label in filters:
                 _by_frame(by_frame, cal, index, true, to_unit, colour)
             else:
-                path = (np.concatenate([s.trajectory[:, index] for s in cal.stages]) - true) * to_unit
-                # First stages of several methods coincide: the shorter path is drawn as rings around the longer.
+                path = (
+                    np.concatenate([s.trajectory[:, index] for s in cal.stages]) - true
+                ) * to_unit
+                # First stages of several methods coincide: the shorter path is drawn as rings
+                # around the longer.
                 short = len(cal.stages) == 1
-                rings: AnyDict = {"markersize": 7.5, "markerfacecolor": "none", "linewidth": 2.6, "alpha": 0.75}
+                rings: AnyDict = {
+                    "markersize": 7.5,
+                    "markerfacecolor": "none",
+                    "linewidth": 2.6,
+                    "alpha": 0.75,
+                }
                 dots: AnyDict = {"markersize": 3.6, "linewidth": 1.3}
                 by_iteration.plot(path, color=colour, marker="o", **(rings if short else dots))
             value = printed(method, QUANTITIES[name]).value - true * to_unit
@@ -90,11 +104,15 @@ def plot_trajectories(found: Reproduction) -> Figure:
     handles = [style.key(label, colour, linewidth=1.6) for label, colour in colours.items()]
     handles.append(style.key("truth", style.INK, linewidth=1.0, dashes=(4, 2)))
     handles.append(_printed_key("<"))
-    style.legend_above(figure, handles, fontsize=style.LABEL_SIZE, columnspacing=1.4, handlelength=1.8)
+    style.legend_above(
+        figure, handles, fontsize=style.LABEL_SIZE, columnspacing=1.4, handlelength=1.8
+    )
     return figure
 
 
-def _by_frame(ax: Axes, cal: Calibration, index: int, true: float, to_unit: float, colour: str) -> None:
+def _by_frame(
+    ax: Axes, cal: Calibration, index: int, true: float, to_unit: float, colour: str
+) -> None:
     """A filter's estimate and claimed band after each frame."""
     stage = next(s for s in cal.stages if s.name == "filter")
     values = (stage.trajectory[:, index] - true) * to_unit
@@ -103,27 +121,47 @@ def _by_frame(ax: Axes, cal: Calibration, index: int, true: float, to_unit: floa
     ax.plot(frames, values[1:], color=colour, linewidth=1.3)
     if stage.sigmas is not None:
         sigma = stage.sigmas[1:, index] * to_unit
-        ax.fill_between(frames, values[1:] - sigma, values[1:] + sigma, color=colour, alpha=0.18, linewidth=0)
+        ax.fill_between(
+            frames, values[1:] - sigma, values[1:] + sigma, color=colour, alpha=0.18, linewidth=0
+        )
 
 
 def _mark(ax: Axes, x: float, y: float, colour: str, *, edge: bool = False) -> None:
     """A printed value: at a place, or at the right edge for x = 1."""
-    options: AnyDict = {"marker": ">", "markersize": 7.0, "markeredgecolor": style.INK, "markeredgewidth": 0.6}
+    options: AnyDict = {
+        "marker": ">",
+        "markersize": 7.0,
+        "markeredgecolor": style.INK,
+        "markeredgewidth": 0.6,
+    }
     if edge:
-        options |= {"marker": "<", "transform": ax.get_yaxis_transform(), "clip_on": False, "zorder": 5}
+        options |= {
+            "marker": "<",
+            "transform": ax.get_yaxis_transform(),
+            "clip_on": False,
+            "zorder": 5,
+        }
     ax.plot(x, y, color=colour, linestyle="none", **options)
 
 
-def _printed_key(marker: str, colour: str = style.GREY, text: str = "printed in the paper") -> Line2D:
-    return style.key(text, colour, marker=marker, markersize=7.0, markeredgecolor=style.INK, linestyle="")
+def _printed_key(
+    marker: str, colour: str = style.GREY, text: str = "printed in the paper"
+) -> Line2D:
+    return style.key(
+        text, colour, marker=marker, markersize=7.0, markeredgecolor=style.INK, linestyle=""
+    )
 
 
 def _distance_axis(axes: Sequence[Axes], threshold: float) -> None:
-    """Linear within the threshold, logarithmic beyond, and reaching the start; the axis is shared."""
+    """Linear within the threshold, logarithmic beyond, and reaching the start; the axis is
+    shared.
+    """
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     ax = axes[0]
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for one in axes for line in one.lines])
+    values = np.concatenate(
+        [np.asarray(line.get_ydata(), dtype=np.float64) for one in axes for line in one.lines]
+    )
     low, high = float(values.min()), float(values.max())
     reach = max(-low, high)
     powers = threshold * 10.0 ** np.arange(int(np.ceil(np.log10(max(reach / threshold, 10.0)))) + 1)
@@ -136,14 +174,19 @@ def _distance_axis(axes: Sequence[Axes], threshold: float) -> None:
 
 
 def plot_error_fields(found: Reproduction) -> Figure:
-    """Errors over the detector without noise (the paper's Figs. 4 to 6): size as colour, direction as arrows."""
+    """Errors over the detector without noise (the paper's Figs. 4 to 6): size as colour, direction
+    as arrows.
+    """
     from matplotlib.colors import LogNorm
 
     truth, names = found.run.truth, (*PAPER_METHODS, "efficient")
     xy, _ = detector_grid(truth, _MAP_POINTS)
     cameras = {name: found.run.of(name).camera for name in names}
     fields = {
-        name: (reprojection_error_px(truth, camera, xy).error_px, map_error(truth, camera, xy).error_px)
+        name: (
+            reprojection_error_px(truth, camera, xy).error_px,
+            map_error(truth, camera, xy).error_px,
+        )
         for name, camera in cameras.items()
     }
     figure = style.new_figure(3.55 * len(fields) + 0.9, 8.2)
@@ -155,9 +198,18 @@ def plot_error_fields(found: Reproduction) -> Figure:
     for column, (name, parts) in enumerate(fields.items()):
         for row, (kind, error) in enumerate(zip(kinds, parts, strict=True)):
             image = _error_panel(panels[row, column], xy, error, norm)
-            note = f" (printed: {printed(name, 'max_residual_px').text})" if name in PAPER_METHODS else ""
-            title = f"{found.run.label(name)}, {kind}\nlargest {significant(float(np.hypot(*error.T).max()))} px{note}"
-            style.label(panels[row, column], title, "x [px]" if row else "", "y [px]" if column == 0 else "")
+            note = (
+                f" (printed: {printed(name, 'max_residual_px').text})"
+                if name in PAPER_METHODS
+                else ""
+            )
+            title = (
+                f"{found.run.label(name)}, {kind}\nlargest "
+                f"{significant(float(np.hypot(*error.T).max()))} px{note}"
+            )
+            style.label(
+                panels[row, column], title, "x [px]" if row else "", "y [px]" if column == 0 else ""
+            )
     bar = figure.colorbar(image, ax=panels, fraction=0.03, pad=0.015, extend="min")
     style.dress_bar(bar, "size of the error [px]")
     return figure
@@ -169,13 +221,16 @@ def _error_panel(ax: Axes, xy: FloatArray, error: FloatArray, norm: LogNorm) -> 
     x, y = xy[:n, 0], xy[::n, 1]
     size = np.hypot(*error.T).reshape(n, n)
     low = float(norm.vmin or 0.0)
-    image = ax.pcolormesh(x, y, np.maximum(size, low), norm=norm, cmap="cividis", shading="gouraud", rasterized=True)
+    image = ax.pcolormesh(
+        x, y, np.maximum(size, low), norm=norm, cmap="cividis", shading="gouraud", rasterized=True
+    )
     some = np.unique(np.linspace(0, n - 1, _ARROWS + 2).round().astype(int)[1:-1])
     grid = np.ix_(some, some)
     along = [part.reshape(n, n)[grid] for part in (*xy.T, *error.T)]
     longest = float(np.hypot(*error.T).max())
     if longest > 0.0:
-        # Arrows tell the direction; their length, the root of the size over the panel's largest, keeps small ones seen.
+        # Arrows tell the direction; their length, the root of the size over the panel's largest,
+        # keeps small ones seen.
         length = np.sqrt(np.hypot(*along[2:]) * longest)
         along[2:] = [part / np.maximum(length, 1e-300) for part in along[2:]]
         scale = 1.0 / (0.95 * (x[some[1]] - x[some[0]]))
@@ -188,7 +243,8 @@ def _error_panel(ax: Axes, xy: FloatArray, error: FloatArray, norm: LogNorm) -> 
 
 
 def plot_printed_numbers(found: Reproduction) -> Figure:
-    """Every printed number as a distance from our draws: under the main reading, and under the closest one.
+    """Every printed number as a distance from our draws: under the main reading, and under the
+    closest one.
 
     The axis is to scale within three standard deviations and logarithmic beyond.
     """
@@ -231,31 +287,47 @@ _COLOURS = {
     "three_stage": style.BLUE,
     "truth": style.GREEN,
 }
-_PARTS = {"common": (style.GREY, "common rotation"), "rest": (style.ORANGE, "rest"), "noise": (style.SKY, "noise")}
+_PARTS = {
+    "common": (style.GREY, "common rotation"),
+    "rest": (style.ORANGE, "rest"),
+    "noise": (style.SKY, "noise"),
+}
 # Cameras of one tolerance stand side by side, so that their bars can be told apart.
 _SPREAD = 1.035
 
 
 def plot_rates(found: FieldExperiment) -> Figure:
-    """Identification rate against tolerance, with Wilson intervals; the paper's rates at the right edge."""
+    """Identification rate against tolerance, with Wilson intervals; the paper's rates at the right
+    edge.
+    """
     rates, main_px = found.rates(), found.tolerance_px
     figure = style.new_figure(8.6, 4.6)
     ax = style.dress(figure.add_subplot(), grid=True)
     ax.axvline(main_px, color=style.GREY, linewidth=1.0, dashes=(4, 3))
-    small: AnyDict = {"textcoords": "offset points", "fontsize": style.TICK_SIZE, "color": style.GREY}
+    small: AnyDict = {
+        "textcoords": "offset points",
+        "fontsize": style.TICK_SIZE,
+        "color": style.GREY,
+    }
     ax.annotate("main table", (main_px, 0.0), xytext=(4, 3), **small)
     for number, (name, colour) in enumerate(_COLOURS.items()):
         rows = rates[rates["camera"] == name].sort_values("tolerance_px")
         x = rows["tolerance_px"].to_numpy() * _SPREAD ** (number - 2)
         y = 100.0 * rows["rate"].to_numpy()
         error = 100.0 * np.stack([rows["rate"] - rows["low"], rows["high"] - rows["rate"]])
-        ax.errorbar(x, y, error, color=colour, marker="o", markersize=4.0, linewidth=1.4, elinewidth=1.0)
+        ax.errorbar(
+            x, y, error, color=colour, marker="o", markersize=4.0, linewidth=1.4, elinewidth=1.0
+        )
         if name in FIELD_METHODS:
             _mark(ax, 1.0, printed_field(name, RATE).value, colour, edge=True)
     ax.set_xscale("log")
     plain_ticks(ax, sorted(set(rates["tolerance_px"])))
     ax.set_ylim(0.0, 102.0)
-    style.label(ax, x="tolerance: displacement in the corner that the camera may be wrong by [px]", y="identified [%]")
+    style.label(
+        ax,
+        x="tolerance: displacement in the corner that the camera may be wrong by [px]",
+        y="identified [%]",
+    )
     line: AnyDict = {"marker": "o", "markersize": 4.0, "linewidth": 1.4}
     keys = [style.key(CAMERA_NAMES[name], colour, **line) for name, colour in _COLOURS.items()]
     style.legend_above(figure, [*keys, _printed_key("<")])
@@ -263,7 +335,9 @@ def plot_rates(found: FieldExperiment) -> Figure:
 
 
 def plot_errors(found: FieldExperiment) -> Figure:
-    """Attitude errors about each axis: total, what alignment leaves, the three parts, and the printed number."""
+    """Attitude errors about each axis: total, what alignment leaves, the three parts, and the
+    printed number.
+    """
     parts = found.parts()
     figure = style.new_figure(10.4, 4.6)
     panels = figure.subplots(1, 3, sharey=True)
@@ -274,11 +348,18 @@ def plot_errors(found: FieldExperiment) -> Figure:
             row = parts[(parts["camera"] == camera) & (parts["axis"] == axis)].iloc[0]
             _camera_column(ax, place, row)
             if camera in FIELD_METHODS:
-                _mark(ax, place - 0.36, printed_field(camera, f"{axis}_arcsec").value, style.VERMILLION)
+                _mark(
+                    ax,
+                    place - 0.36,
+                    printed_field(camera, f"{axis}_arcsec").value,
+                    style.VERMILLION,
+                )
         ax.set_yscale("log")
         ax.set_ylim(0.03, 9000.0)
         ax.set_xlim(-0.6, len(cameras) - 0.4)
-        ax.set_xticks(range(len(cameras)), [CAMERA_NAMES[name].replace(" ", "\n") for name in cameras])
+        ax.set_xticks(
+            range(len(cameras)), [CAMERA_NAMES[name].replace(" ", "\n") for name in cameras]
+        )
         ax.tick_params(axis="x", labelsize=style.TICK_SIZE - 0.7)
         style.label(ax, axis.capitalize())
     style.label(panels[0], y="error, root mean square [arcsec]")
@@ -296,12 +377,34 @@ def plot_errors(found: FieldExperiment) -> Figure:
 
 def _camera_column(ax: Axes, place: int, row: pd.Series) -> None:
     """One camera in one panel."""
-    for part, x, colour, marker in (("rms", -0.17, style.INK, "s"), ("aligned", 0.03, style.BLUE, "o")):
+    for part, x, colour, marker in (
+        ("rms", -0.17, style.INK, "s"),
+        ("aligned", 0.03, style.BLUE, "o"),
+    ):
         value = float(row[part])
-        error = [[max(value - float(row[f"{part}_low"]), 0.0)], [max(float(row[f"{part}_high"]) - value, 0.0)]]
-        ax.errorbar(place + x, value, error, color=colour, marker=marker, markersize=5.5, linestyle="", elinewidth=1.2)
+        error = [
+            [max(value - float(row[f"{part}_low"]), 0.0)],
+            [max(float(row[f"{part}_high"]) - value, 0.0)],
+        ]
+        ax.errorbar(
+            place + x,
+            value,
+            error,
+            color=colour,
+            marker=marker,
+            markersize=5.5,
+            linestyle="",
+            elinewidth=1.2,
+        )
     for part, (colour, _) in _PARTS.items():
-        ax.plot(place + 0.22, abs(float(row[part])), marker="_", markersize=9.0, markeredgewidth=2.4, color=colour)
+        ax.plot(
+            place + 0.22,
+            abs(float(row[part])),
+            marker="_",
+            markersize=9.0,
+            markeredgewidth=2.4,
+            color=colour,
+        )
 
 
 # Errors up to this many bounds are drawn to scale, larger ones on a logarithmic axis.
@@ -310,13 +413,15 @@ _RIGHT, _WRONG = style.BLUE, style.VERMILLION
 
 
 def plot_replicates(found: Replicates) -> Figure:
-    """Errors and widths of every method, one column of panels for each parameter, in units of the Cramer-Rao bound.
+    """Errors and widths of every method, one column of panels for each parameter, in units of the
+    Cramer-Rao bound.
 
-    Above, the mean error (dot) with the spread of the estimates (thick bar) and the claimed standard deviation (thin
-    bar with caps); the grey band is the bound around the truth. The axis is to scale near the truth and logarithmic
-    beyond, where the mean error is also given as a number. Below, the widths alone: spread with its 95 % interval
-    (dot), claim (diamond) and, where there is one, the claim by the formula of the textbooks (cross). Claims that the
-    tests reject are red.
+    Above, the mean error (dot) with the spread of the estimates (thick bar) and the claimed
+    standard deviation (thin bar with caps); the grey band is the bound around the truth. The axis
+    is to scale near the truth and logarithmic beyond, where the mean error is also given as a
+    number. Below, the widths alone: spread with its 95 % interval (dot), claim (diamond) and, where
+    there is one, the claim by the formula of the textbooks (cross). Claims that the tests reject
+    are red.
     """
     columns = parameters(found.truth.distortion)
     rows = found.table().to_dict("records")
@@ -333,7 +438,9 @@ def plot_replicates(found: Replicates) -> Figure:
             ax.set_yticks(range(len(labels)), labels[::-1])
             ax.tick_params(axis="y", length=0.0)
     middle = len(columns) // 2
-    style.label(panels[0, middle], x="error / Cramer-Rao bound (to scale up to ±4, logarithmic beyond)")
+    style.label(
+        panels[0, middle], x="error / Cramer-Rao bound (to scale up to ±4, logarithmic beyond)"
+    )
     style.label(panels[1, middle], x="standard deviation / Cramer-Rao bound")
     _legend(figure, found)
     return figure
@@ -349,14 +456,25 @@ def _errors(ax: Axes, rows: list[AnyDict], places: list[int], parameter: Paramet
         colour = _WRONG if row["claim_wrong"] else _RIGHT
         ends = [bias - spread, bias + spread]
         ax.plot(ends, [place + 0.12] * 2, color=style.SKY, linewidth=4.0, solid_capstyle="butt")
-        ax.errorbar(bias, place - 0.18, xerr=claimed, color=colour, linewidth=1.1, capsize=2.5, fmt="none")
+        ax.errorbar(
+            bias, place - 0.18, xerr=claimed, color=colour, linewidth=1.1, capsize=2.5, fmt="none"
+        )
         ax.plot(bias, place + 0.12, "o", color=style.INK, markersize=3.5)
         if abs(bias) > _LINEAR:
             # The logarithmic part has few ticks.
             side = -1.0 if bias > 0.0 else 1.0
-            small: AnyDict = {"textcoords": "offset points", "fontsize": style.TICK_SIZE - 1.0, "color": style.GREY}
-            end, anchor = (bias + side * max(spread, claimed), place), "right" if side < 0.0 else "left"
-            ax.annotate(fixed(bias, 0), end, xytext=(side * 5.0, 0.0), ha=anchor, va="center", **small)
+            small: AnyDict = {
+                "textcoords": "offset points",
+                "fontsize": style.TICK_SIZE - 1.0,
+                "color": style.GREY,
+            }
+            end, anchor = (
+                (bias + side * max(spread, claimed), place),
+                "right" if side < 0.0 else "left",
+            )
+            ax.annotate(
+                fixed(bias, 0), end, xytext=(side * 5.0, 0.0), ha=anchor, va="center", **small
+            )
         reach = max(reach, abs(bias) + max(spread, claimed))
     _signed_axis(ax, reach)
     style.label(ax, symbol(parameter.name))
@@ -389,7 +507,9 @@ def _widths(ax: Axes, rows: list[AnyDict], places: list[int]) -> None:
     ax.axvline(1.0, color=style.GREY, linewidth=0.9)
     smallest, largest = 1.0, 1.0
     for row, place in zip(rows, places, strict=True):
-        spread, claimed, classical = (row[name] / row["crlb"] for name in ("spread", "claimed", "claimed_classical"))
+        spread, claimed, classical = (
+            row[name] / row["crlb"] for name in ("spread", "claimed", "claimed_classical")
+        )
         colour = _WRONG if row["claim_wrong"] else _RIGHT
         ends = [1.0 / np.sqrt(row[f"efficiency_{end}"]) for end in ("high", "low")]
         ax.plot(ends, [place + 0.12] * 2, color=style.SKY, linewidth=4.0, solid_capstyle="butt")
@@ -397,13 +517,21 @@ def _widths(ax: Axes, rows: list[AnyDict], places: list[int]) -> None:
         ax.plot(claimed, place - 0.18, "D", color=colour, markersize=4.0)
         shown = [*ends, claimed]
         if np.isfinite(classical):
-            ax.plot(classical, place - 0.18, "x", color=_WRONG if row["classical_wrong"] else _RIGHT, markersize=4.5)
+            ax.plot(
+                classical,
+                place - 0.18,
+                "x",
+                color=_WRONG if row["classical_wrong"] else _RIGHT,
+                markersize=4.5,
+            )
             shown.append(classical)
         smallest, largest = min(smallest, *shown), max(largest, *shown)
     ax.set_xscale("log")
     low, high = 0.8 * smallest, 1.25 * largest
     ax.set_xlim(low, high)
-    ticks = [tick for tick in (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0) if low <= tick <= high]
+    ticks = [
+        tick for tick in (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0) if low <= tick <= high
+    ]
     plain_ticks(ax, ticks)
 
 
@@ -414,7 +542,9 @@ def _legend(figure: Figure, found: Replicates) -> None:
         style.key("mean error; spread", style.INK, marker="o", linestyle="", markersize=4),
         style.key("± spread; its 95 % interval", style.SKY, linewidth=4),
         style.key("claimed", _RIGHT, marker="D", markersize=4),
-        style.key("claimed by the textbook's formula", _RIGHT, marker="x", linestyle="", markersize=5),
+        style.key(
+            "claimed by the textbook's formula", _RIGHT, marker="x", linestyle="", markersize=5
+        ),
         style.key("claims that the tests reject", _WRONG, linewidth=1.5),
         Patch(color=style.LIGHT, label="Cramer-Rao bound"),
     ]
@@ -437,7 +567,8 @@ _METHOD_COLOURS = {
     "efficient": style.GREEN,
 }
 _MARKERS = {"least squares": "o", "samaan": "s", "three stages": "^", "efficient": "D"}
-# Biases this far below the smallest spread are rounding; they are counted in words rather than drawn.
+# Biases this far below the smallest spread are rounding; they are counted in words rather than
+# drawn.
 _FLOOR = 0.2
 # Spread over noise from which on both are drawn.
 _APART = 1.3
@@ -446,10 +577,11 @@ _APART = 1.3
 def plot_interaction(study: InteractionStudy) -> Figure:
     """Size of the bias and spread of x0, y0 and f for every method, along the four axes.
 
-    Solid lines are the bias (from data without noise), dashed ones the spread (with noise). Where the bias depends on
-    where the stars are, the spread holds more than the noise, which is then dotted. Where a solid line is above the
-    noise of its colour, the interaction costs more than noise. Biases far below every spread are not drawn: the methods
-    that have them are named in the first panel.
+    Solid lines are the bias (from data without noise), dashed ones the spread (with noise). Where
+    the bias depends on where the stars are, the spread holds more than the noise, which is then
+    dotted. Where a solid line is above the noise of its colour, the interaction costs more than
+    noise. Biases far below every spread are not drawn: the methods that have them are named in the
+    first panel.
     """
     table = study.table
     optics = [p for p in parameters("none") if p.name in set(table["parameter"])]
@@ -476,7 +608,9 @@ def plot_interaction(study: InteractionStudy) -> Figure:
     return figure
 
 
-def _panel(ax: Axes, rows: pd.DataFrame, column: str, methods: list[str], low: float, named: bool) -> None:
+def _panel(
+    ax: Axes, rows: pd.DataFrame, column: str, methods: list[str], low: float, named: bool
+) -> None:
     unseen = []
     for method in methods:
         curve = rows[rows["method"] == method]
@@ -493,14 +627,24 @@ def _panel(ax: Axes, rows: pd.DataFrame, column: str, methods: list[str], low: f
             continue
         marker = _MARKERS.get(method, "o")
         # A bias of zero has no place on the axis; the line then starts from below it.
-        ax.plot(at, np.maximum(bias, 1e-3 * low), "-", color=colour, linewidth=1.4, marker=marker, markersize=3.5)
+        ax.plot(
+            at,
+            np.maximum(bias, 1e-3 * low),
+            "-",
+            color=colour,
+            linewidth=1.4,
+            marker=marker,
+            markersize=3.5,
+        )
     if unseen and named:
         words, small = f"bias too small to show: {', '.join(unseen)}", style.TICK_SIZE - 1.0
         ax.text(0.03, 0.03, words, transform=ax.transAxes, fontsize=small, color=style.GREY)
 
 
 def _scale(ax: Axes, at: FloatArray) -> None:
-    """Logarithmic, with a place for zero where the axis starts there; ticks that say plain numbers."""
+    """Logarithmic, with a place for zero where the axis starts there; ticks that say plain
+    numbers.
+    """
     if len(at) == 0:
         return
     positive = np.unique(at[at > 0.0])
@@ -519,13 +663,16 @@ def _ticks(values: FloatArray) -> FloatArray:
     steps = (1.0,) if high - low > 2.2 else (1.0, 3.0) if high - low > 1.5 else (1.0, 2.0, 5.0)
     decades = 10.0 ** np.arange(np.floor(low) - 1.0, np.ceil(high) + 1.0)
     candidates: FloatArray = np.sort(np.outer(decades, steps).ravel())
-    chosen: FloatArray = candidates[(candidates > 0.95 * values[0]) & (candidates < 1.05 * values[-1])]
+    chosen: FloatArray = candidates[
+        (candidates > 0.95 * values[0]) & (candidates < 1.05 * values[-1])
+    ]
     return chosen
 
 
 def _interaction_legend(figure: Figure, methods: list[str]) -> None:
     handles = [
-        style.key(m, _METHOD_COLOURS.get(m, style.GREY), marker=_MARKERS.get(m, "o"), markersize=4) for m in methods
+        style.key(m, _METHOD_COLOURS.get(m, style.GREY), marker=_MARKERS.get(m, "o"), markersize=4)
+        for m in methods
     ]
     lines = {"-": "bias", "--": "spread", ":": "noise alone, where it differs from the spread"}
     handles += [style.key(text, style.INK, linestyle=line) for line, text in lines.items()]

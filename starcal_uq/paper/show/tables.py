@@ -41,9 +41,17 @@ NAMES = {
     **{"x0_px": "x₀", "y0_px": "y₀", "f_mm": "f", "y0_error_px": "error of y₀"},
     **{"reprojection_px": "reprojection error", "max_residual_px": "largest residual"},
 }
-METHOD_NAMES = {LEAST_SQUARES: "least squares", SAMAAN: "Samaan’s method", PROPOSED: "the proposed method"}
+METHOD_NAMES = {
+    LEAST_SQUARES: "least squares",
+    SAMAAN: "Samaan’s method",
+    PROPOSED: "the proposed method",
+}
 _AGREE = (Outcome.REPRODUCED, Outcome.WITHIN_NOISE)
-_MARKS = {Outcome.AGAINST_TEXT: "warning", Outcome.BY_CHOICE: "warning", Outcome.NOT_REPRODUCED: "fail"}
+_MARKS = {
+    Outcome.AGAINST_TEXT: "warning",
+    Outcome.BY_CHOICE: "warning",
+    Outcome.NOT_REPRODUCED: "fail",
+}
 # Coefficients are tiny, and are shown in powers of ten.
 _COEFFICIENTS = {p.name: p for p in parameters("brown")[3:]}
 
@@ -51,7 +59,9 @@ _COEFFICIENTS = {p.name: p for p in parameters("brown")[3:]}
 def _unit(quantity: str) -> tuple[float, str]:
     """Scale and unit in which a printed quantity is shown."""
     p = _COEFFICIENTS.get(quantity)
-    return (1.0, quantity.rpartition("_")[2]) if p is None else (p.scale, pretty_unit(p.scaled_unit))
+    return (
+        (1.0, quantity.rpartition("_")[2]) if p is None else (p.scale, pretty_unit(p.scaled_unit))
+    )
 
 
 def _named(quantity: str) -> str:
@@ -89,7 +99,9 @@ def headline(found: Reproduction) -> str:
     if n[Outcome.AGAINST_TEXT]:
         parts.append(f"{n[Outcome.AGAINST_TEXT]} only if the text is not followed")
     if n[Outcome.BY_CHOICE]:
-        parts.append(f"{n[Outcome.BY_CHOICE]} only under some reading that would fit almost any number")
+        parts.append(
+            f"{n[Outcome.BY_CHOICE]} only under some reading that would fit almost any number"
+        )
     parts.append(f"{n[Outcome.NOT_REPRODUCED]} under none of the readings tried")
     return f"Of {len(found.judged)} printed numbers, {join_words(parts)}."
 
@@ -100,7 +112,9 @@ def reproduction_text(found: Reproduction) -> str:
     for method in (PROPOSED, LEAST_SQUARES, SAMAAN):
         mine = [one.outcome in _AGREE for one in found.judged if one.printed.method == method]
         name = METHOD_NAMES[method]
-        parts.append(f"{name[0].upper() if not parts else name[0]}{name[1:]}: {sum(mine)} of {len(mine)}")
+        parts.append(
+            f"{name[0].upper() if not parts else name[0]}{name[1:]}: {sum(mine)} of {len(mine)}"
+        )
     return f"{headline(found)} {'; '.join(parts)}."
 
 
@@ -114,15 +128,36 @@ def printed_numbers(judged: Sequence[Judged]) -> TextTable:
     rows = []
     for one in judged:
         number, main, best = one.printed, one.main, one.best
-        what = (f"{number.place}: {METHOD_NAMES[number.method]}", _named(number.quantity), _minus(number.text))
-        ours, other = ((_spread(t.mean, t.spread, number.quantity), signed(t.z)) for t in (main, best))
+        what = (
+            f"{number.place}: {METHOD_NAMES[number.method]}",
+            _named(number.quantity),
+            _minus(number.text),
+        )
+        ours, other = (
+            (_spread(t.mean, t.spread, number.quantity), signed(t.z)) for t in (main, best)
+        )
         better = ("", "", "") if best is main else (*other, reading_words(best))
         chance = "" if np.isnan(one.by_chance) else percent(one.by_chance)
         rows.append((*what, str(one.noise_digits), *ours, *better, chance, one.outcome.value))
     return TextTable(
-        ("Place", "Number", "Printed", "Noise digits", "Ours", "z", "Best", "z", "Reading", "Fits anything", "Outcome"),
+        (
+            "Place",
+            "Number",
+            "Printed",
+            "Noise digits",
+            "Ours",
+            "z",
+            "Best",
+            "z",
+            "Reading",
+            "Fits anything",
+            "Outcome",
+        ),
         tuple(rows),
-        "Mean ± spread over seeds under the main reading and, where that one does not agree, under the best of all.",
+        (
+            "Mean ± spread over seeds under the main reading and, where that one does not agree, "
+            "under the best of all."
+        ),
         "llrrrrrrlrl",
         tuple(_MARKS.get(one.outcome, "") for one in judged),
     )
@@ -135,13 +170,27 @@ def table_2(found: Reproduction) -> TextTable:
         scale, _ = _unit(row["quantity"])
         ours, spread = row["ours"] / scale, row["spread"] / scale
         one_run = with_sigma(ours, spread) if np.isfinite(spread) else significant(ours)
-        what = (row["method"], _named(row["quantity"]), f"{row['truth'] / scale:g}".replace("-", MINUS))
+        what = (
+            row["method"],
+            _named(row["quantity"]),
+            f"{row['truth'] / scale:g}".replace("-", MINUS),
+        )
         sigmas = (_known(row[name] / scale) for name in ("sigma_claimed", "sigma_crlb"))
         z = signed(row["z_printed"]) if row["printed"] else ""
         over_seeds = _spread(row["mean"], row["spread"], row["quantity"])
         rows.append((*what, one_run, over_seeds, *sigmas, _minus(row["printed"]), z))
     return TextTable(
-        ("Method", "", "Truth", "This run", "Over seeds", "Claimed σ", "Cramér–Rao bound", "Printed", "z"),
+        (
+            "Method",
+            "",
+            "Truth",
+            "This run",
+            "Over seeds",
+            "Claimed σ",
+            "Cramér–Rao bound",
+            "Printed",
+            "z",
+        ),
         tuple(rows),
         "One run, mean ± spread over seeds, and what the paper prints.",
         "llrrrrrrr",
@@ -167,10 +216,15 @@ def row_tests(found: Reproduction) -> TextTable:
 
 
 def error_readings(found: Reproduction, quantity: str) -> TextTable:
-    """The paper's three methods under every reading of one error size: is there one that fits all three?"""
+    """The paper's three methods under every reading of one error size: is there one that fits all
+    three?
+    """
     rows, marks = [], []
     for reading in REPROJECTION if quantity == "reprojection_px" else MAXIMUM:
-        cells, fits = [reading.words if reading.faithful else f"{reading.words} (against the text)"], []
+        cells, fits = (
+            [reading.words if reading.faithful else f"{reading.words} (against the text)"],
+            [],
+        )
         for method in PAPER_METHODS:
             draws = found.readings.of(AS_PRINTED, method, quantity, reading.key)
             if len(draws) < 2:
@@ -181,11 +235,16 @@ def error_readings(found: Reproduction, quantity: str) -> TextTable:
             fits.append(one.accepted)
         rows.append(tuple(cells))
         marks.append("pass" if len(fits) == len(PAPER_METHODS) and all(fits) else "")
-    heads = [(f"{METHOD_NAMES[m]}, printed {printed(m, quantity).text}", "z") for m in PAPER_METHODS]
+    heads = [
+        (f"{METHOD_NAMES[m]}, printed {printed(m, quantity).text}", "z") for m in PAPER_METHODS
+    ]
     return TextTable(
         ("Reading", *(text for pair in heads for text in pair)),
         tuple(rows),
-        f"The {NAMES[quantity]} as printed, in px, under each reading; one that fits all three methods is green.",
+        (
+            f"The {NAMES[quantity]} as printed, in px, under each reading; one that fits all three "
+            "methods is green."
+        ),
         marks=tuple(marks),
     )
 
@@ -194,7 +253,9 @@ def checks(found: Reproduction) -> TextTable:
     """The paper against itself."""
     return TextTable(
         ("Statement", "Place", "Printed", "What follows from its other numbers", "Agrees"),
-        tuple((one.statement, one.place, one.text, one.follows, one.agrees) for one in found.checks),
+        tuple(
+            (one.statement, one.place, one.text, one.follows, one.agrees) for one in found.checks
+        ),
         "Printed parameters put into the paper’s own formulas.",
         "llrll",
         tuple("fail" if one.agrees == NO else "" for one in found.checks),
@@ -204,15 +265,27 @@ def checks(found: Reproduction) -> TextTable:
 def errors(found: Reproduction) -> TextTable:
     """Errors of the one run, in px and arcsec."""
     heads = {
-        **{"method": "Method", "eq16_px": "Eq. 16 [px]", "eq16_max_px": "largest", "eq16_noisy_px": "with noise"},
-        **{"residual_px": "Residuals [px]", "map_px": "Directions [px]", "map_max_px": "largest [px]"},
+        **{
+            "method": "Method",
+            "eq16_px": "Eq. 16 [px]",
+            "eq16_max_px": "largest",
+            "eq16_noisy_px": "with noise",
+        },
+        **{
+            "residual_px": "Residuals [px]",
+            "map_px": "Directions [px]",
+            "map_max_px": "largest [px]",
+        },
         **{"map_arcsec": "Directions [arcsec]", "map_max_arcsec": "largest [arcsec]"},
         **{"across": "Rotation across [arcsec]", "roll_arcsec": "roll [arcsec]"},
     }
     frame = found.errors()
     frame["across"] = np.hypot(frame["pitch_arcsec"], frame["yaw_arcsec"])
     frame = frame.rename(columns=heads)[list(heads.values())]
-    title = "Errors without noise, unless it is named; directions over the detector, best rotation removed."
+    title = (
+        "Errors without noise, unless it is named; directions over the detector, best rotation "
+        "removed."
+    )
     return TextTable.of(frame, title)
 
 
@@ -234,11 +307,21 @@ def replicates_text(found: Replicates) -> str:
         named = {what: list(dict.fromkeys(table["method"][rows])) for what, rows in groups.items()}
         guilty = {label for labels in named.values() for label in labels}
         named = {"honest": [label for label in found.labels if label not in guilty], **named}
-        text += "; ".join(f"{what}: {join_words(labels)}" for what, labels in named.items() if labels) + "."
-    failed = [f"{label} in {count(found.n_failed(label))}" for label in found.labels if found.n_failed(label)]
+        text += (
+            "; ".join(f"{what}: {join_words(labels)}" for what, labels in named.items() if labels)
+            + "."
+        )
+    failed = [
+        f"{label} in {count(found.n_failed(label))}"
+        for label in found.labels
+        if found.n_failed(label)
+    ]
     text += f" No result from {join_words(failed)}." if failed else ""
     if found.interrupted:
-        text += f" The run was interrupted after {count(found.n_replicates)} of {count(found.n_requested)}."
+        text += (
+            f" The run was interrupted after {count(found.n_replicates)} of "
+            f"{count(found.n_requested)}."
+        )
     return text
 
 
@@ -248,22 +331,42 @@ def replicates(found: Replicates) -> TextTable:
     rows = []
     for row in found.table().to_dict("records"):
         p = by_name[row["parameter"]]
-        bias, bias_se, spread, bound = (row[name] / p.scale for name in ("bias", "bias_se", "spread", "crlb"))
-        claimed, low, high = (fixed(row[f"claimed_over_spread{end}"], 2) for end in ("", "_low", "_high"))
+        bias, bias_se, spread, bound = (
+            row[name] / p.scale for name in ("bias", "bias_se", "spread", "crlb")
+        )
+        claimed, low, high = (
+            fixed(row[f"claimed_over_spread{end}"], 2) for end in ("", "_low", "_high")
+        )
         textbook = row["claimed_classical_over_spread"]
         what = (row["method"], f"{NAMES[p.name]} [{pretty_unit(p.scaled_unit)}]", count(row["n"]))
         sizes = (significant(size) for size in (spread, bound, row["rmse_over_crlb"]))
         efficiency = "–" if row["biased"] else fixed(row["efficiency"], 2)
-        claims = (f"{claimed} ({low} to {high})", fixed(textbook, 2) if np.isfinite(textbook) else "–")
+        claims = (
+            f"{claimed} ({low} to {high})",
+            fixed(textbook, 2) if np.isfinite(textbook) else "–",
+        )
         mean = plus_minus(bias, bias_se)
-        rows.append((*what, mean, *sizes, efficiency, *claims, percent(row["coverage95"], 3), row["verdict"]))
+        rows.append(
+            (
+                *what,
+                mean,
+                *sizes,
+                efficiency,
+                *claims,
+                percent(row["coverage95"], 3),
+                row["verdict"],
+            )
+        )
     return TextTable(
         (
             *("Method", "", "n", "Bias", "Spread", "Bound", "RMSE / bound", "Efficiency"),
             *("Claimed / spread", "Textbook / spread", "Coverage", "Verdict"),
         ),
         tuple(rows),
-        "What every method does over seeds, against its own standard deviation and that of the textbooks.",
+        (
+            "What every method does over seeds, against its own standard deviation and that of the "
+            "textbooks."
+        ),
         "llrrrrrrrrrl",
     )
 
@@ -275,17 +378,28 @@ def study_text(study: InteractionStudy) -> str:
         if one.kind == "bias":
             sides.setdefault(one.method, set()).add(one.side)
     nowhere = [method for method, found in sides.items() if found == {"never"}]
-    biased = [f"{method}, which {HANDLING[method]} the distortion" for method in sides if method not in nowhere]
+    biased = [
+        f"{method}, which {HANDLING[method]} the distortion"
+        for method in sides
+        if method not in nowhere
+    ]
     parts = [f"for {'; '.join(biased)}"] if biased else []
     if nowhere:
         parts.append(f"nowhere for {join_words(nowhere)}")
     text = f"The bias of the optics exceeds one standard deviation of the noise {'; '.join(parts)}."
-    return text + (" The study was interrupted: later replicates are missing." if study.interrupted else "")
+    return text + (
+        " The study was interrupted: later replicates are missing." if study.interrupted else ""
+    )
 
 
 def thresholds(study: InteractionStudy) -> TextTable:
     """Where the bias of each method passes one standard deviation of its noise."""
-    units = {"distortion": "px at the corner", "field": "deg", "frames": "frames", "stars": "stars in a frame"}
+    units = {
+        "distortion": "px at the corner",
+        "field": "deg",
+        "frames": "frames",
+        "stars": "stars in a frame",
+    }
     found = {(t.method, t.parameter, t.axis): t for t in study.thresholds if t.kind == "bias"}
     rows = [
         (method, NAMES[parameter], *(_side(found.get((method, parameter, axis))) for axis in AXES))
@@ -316,8 +430,16 @@ def provenance_table(record: AnyDict) -> TextTable:
     rows = (
         ("Data, SHA-256", str(record["data_sha256"])),
         ("Seed", str(record["seed"])),
-        ("Settings", ", ".join(f"{k} = {v if isinstance(v, str) else json.dumps(v)}" for k, v in settings)),
+        (
+            "Settings",
+            ", ".join(f"{k} = {v if isinstance(v, str) else json.dumps(v)}" for k, v in settings),
+        ),
         ("Time", str(record["created_utc"])),
-        ("Versions", ", ".join(f"{name} {version}" for name, version in record["versions"].items() if version)),
+        (
+            "Versions",
+            ", ".join(
+                f"{name} {version}" for name, version in record["versions"].items() if version
+            ),
+        ),
     )
     return TextTable(("What", "Value"), rows, align="ll")

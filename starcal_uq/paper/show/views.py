@@ -16,7 +16,10 @@ from starcal_uq.presentation.tables import TextTable
 
 
 def _view(
-    title: str, text: Callable[[Any], str], table: Callable[[Any], TextTable], **drawn: Callable[..., Any]
+    title: str,
+    text: Callable[[Any], str],
+    table: Callable[[Any], TextTable],
+    **drawn: Callable[..., Any],
 ) -> View:
     return View(text, lambda result: card(title, text(result), table(result)), drawn)
 
@@ -30,7 +33,9 @@ VIEWS: Mapping[type, View] = {
         error_fields=figures.plot_error_fields,
         printed_numbers=figures.plot_printed_numbers,
     ),
-    Replicates: _view("Replicates", tables.replicates_text, tables.replicates, spread=figures.plot_replicates),
+    Replicates: _view(
+        "Replicates", tables.replicates_text, tables.replicates, spread=figures.plot_replicates
+    ),
     InteractionStudy: _view(
         "Interaction of optics and distortion",
         tables.study_text,

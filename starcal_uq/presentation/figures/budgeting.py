@@ -21,16 +21,21 @@ if TYPE_CHECKING:
 
     from starcal_uq.budgeting.result import Budget
 
-_PANELS = ((CROSS_BORESIGHT, "Across the boresight, X and Y together"), ("roll", "About the boresight, Z"))
+_PANELS = (
+    (CROSS_BORESIGHT, "Across the boresight, X and Y together"),
+    ("roll", "About the boresight, Z"),
+)
 _COLOURS = {"posterior": style.SKY, "file": style.ORANGE}
 _TALL = 0.31
 
 
 def plot_budget(budget: Budget) -> Figure:
-    """What each contributor reaches at the budget's confidence, and the totals (mixed interpretation), in two panels.
+    """What each contributor reaches at the budget's confidence, and the totals (mixed
+    interpretation), in two panels.
 
-    Contributors that nobody assessed are counted below, for nothing drawn would read as zero. Limits are drawn of
-    requirements that the totals may be held against: at the budget's confidence, and mixed.
+    Contributors that nobody assessed are counted below, for nothing drawn would read as zero.
+    Limits are drawn of requirements that the totals may be held against: at the budget's
+    confidence, and mixed.
     """
     names = list(dict.fromkeys(row.name for row in budget.rows if row.assessed))
     without = len({row.name for row in budget.rows} - set(names))
@@ -39,7 +44,9 @@ def plot_budget(budget: Budget) -> Figure:
     panels = figure.subplots(1, 2, sharey=True)
     for ax, (axis, title) in zip(panels, _PANELS, strict=True):
         _panel(ax, budget, names, axis)
-        style.label(ax, title, f"|mean| + n sigma at {confidence_text(budget.confidence)} [arcsec]{missing}")
+        style.label(
+            ax, title, f"|mean| + n sigma at {confidence_text(budget.confidence)} [arcsec]{missing}"
+        )
     style.legend_above(figure, _handles(budget), columnspacing=1.2, handlelength=1.6)
     return figure
 
@@ -51,7 +58,9 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
     reaches = {name: _reach(rows, axis, budget.confidence) for name, rows in by_name.items()}
     sums = [budget.total(axis, scope) for scope in SCOPES]
     limits = [outcome for outcome in budget.comparable if outcome.requirement.axis == axis]
-    shown = [value for value in reaches.values() if value] + [s.rule_arcsec for s in sums if s.rule_arcsec > 0.0]
+    shown = [value for value in reaches.values() if value] + [
+        s.rule_arcsec for s in sums if s.rule_arcsec > 0.0
+    ]
     shown += [outcome.requirement.limit_arcsec for outcome in limits]
     low, high = (min(shown), max(shown)) if shown else (0.1, 1.0)
     left = 10.0 ** np.floor(np.log10(low * 0.7))
@@ -72,7 +81,15 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
             continue
         hatch = "///" if row.absorbed_by_alignment == "yes" else ""
         source = next((r.source for r in by_name[name] if r.assessed), "file")
-        ax.barh(place, value - left, left=left, height=0.66, color=_COLOURS[source], hatch=hatch, edgecolor="white")
+        ax.barh(
+            place,
+            value - left,
+            left=left,
+            height=0.66,
+            color=_COLOURS[source],
+            hatch=hatch,
+            edgecolor="white",
+        )
         _write(ax, value, place, f"{significant(value)}″", style.INK)
     for offset, entry in enumerate(sums):
         at = len(names) + 0.7 + offset
@@ -80,11 +97,19 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
             _write(ax, left, at, "not assessed", style.VERMILLION, italic=True)
             continue
         ax.plot(entry.rule_arcsec, at, "o", color=style.INK, markersize=7)
-        ax.plot(entry.sampled_arcsec, at, "D", color="white", markeredgecolor=style.INK, markersize=4.2)
+        ax.plot(
+            entry.sampled_arcsec, at, "D", color="white", markeredgecolor=style.INK, markersize=4.2
+        )
         least = "≥ " if entry.at_least else ""
-        mine = [outcome.requirement.limit_arcsec for outcome in limits if outcome.total.scope == entry.scope]
+        mine = [
+            outcome.requirement.limit_arcsec
+            for outcome in limits
+            if outcome.total.scope == entry.scope
+        ]
         larger = entry.rule_arcsec if entry.unresolved else entry.larger_arcsec
-        _write(ax, max(larger, *mine, 0.0), at, f"{least}{significant(larger, 3)}″", style.INK, shift=8)
+        _write(
+            ax, max(larger, *mine, 0.0), at, f"{least}{significant(larger, 3)}″", style.INK, shift=8
+        )
     for outcome in limits:
         at = len(names) + 0.7 + SCOPES.index(outcome.requirement.scope)
         colour = style.VERMILLION if outcome.verdict == "violated" else style.GREEN
@@ -93,7 +118,9 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
     ax.axhline(len(names) - 0.15, color=style.GREY, linewidth=0.7)
     ax.set_ylim(len(names) + 2.4, -0.7)
     places = [*range(len(names)), *(len(names) + 0.7 + i for i in range(2))]
-    ax.set_yticks(places, [*names, *(f"total {scope}" for scope in SCOPES)], fontsize=style.TICK_SIZE)
+    ax.set_yticks(
+        places, [*names, *(f"total {scope}" for scope in SCOPES)], fontsize=style.TICK_SIZE
+    )
     ax.tick_params(axis="y", length=0)
 
 
@@ -116,7 +143,9 @@ def _reach(rows: list[Contributor], axis: str, confidence: float) -> float | Non
     return mean + one_axis_factor(confidence) * chosen[0].sigma_arcsec
 
 
-def _write(ax: Axes, x: float, y: float, text: str, colour: str, *, italic: bool = False, shift: int = 4) -> None:
+def _write(
+    ax: Axes, x: float, y: float, text: str, colour: str, *, italic: bool = False, shift: int = 4
+) -> None:
     ax.annotate(
         text,
         (x, y),
@@ -136,11 +165,21 @@ def _handles(budget: Budget) -> list[object]:
 
     tested = any(row.with_misfit_found_arcsec >= 0.0 for row in budget.rows)
     handles: list[object] = [
-        Patch(facecolor=style.SKY, label=f"from the posterior, {WITH_MISFIT_FOUND if tested else IF_MODEL_HOLDS}"),
+        Patch(
+            facecolor=style.SKY,
+            label=f"from the posterior, {WITH_MISFIT_FOUND if tested else IF_MODEL_HOLDS}",
+        ),
         Patch(facecolor=style.ORANGE, label="from the budget file"),
         Patch(facecolor=style.GREY, hatch="///", edgecolor="white", label="absorbed by alignment"),
         style.key("total by the rule", style.INK, marker="o", linestyle="", markersize=7),
-        style.key("total by sampling", "white", marker="D", linestyle="", markeredgecolor=style.INK, markersize=4.2),
+        style.key(
+            "total by sampling",
+            "white",
+            marker="D",
+            linestyle="",
+            markeredgecolor=style.INK,
+            markersize=4.2,
+        ),
     ]
     if budget.comparable:
         handles.append(style.key("limit", style.GREEN, linewidth=2.4))

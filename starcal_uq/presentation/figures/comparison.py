@@ -27,10 +27,11 @@ _TIMES = (1.0, 2.0, 3.0)
 
 
 def plot_camera_comparison(comparison: CameraComparison) -> Figure:
-    """Arrows and size of the difference, and beside it the size that the joint uncertainty gives, in the same colours.
+    """Arrows and size of the difference, and beside it the size that the joint uncertainty gives,
+    in the same colours.
 
-    White lines in the left panel are where the difference is one, two and three times the joint standard deviation of
-    its length. Without a covariance there is the left panel alone.
+    White lines in the left panel are where the difference is one, two and three times the joint
+    standard deviation of its length. Without a covariance there is the left panel alone.
     """
     tall = 1.0 + 4.05 * float(np.ptp(comparison.y_px) / np.ptp(comparison.x_px))
     figure = style.new_figure(11.0 if comparison.tested else 6.6, tall)
@@ -47,7 +48,12 @@ def plot_camera_comparison(comparison: CameraComparison) -> Figure:
     if comparison.tested:
         _multiples(panels[0], comparison)
         _filled(
-            panels[1], comparison, comparison.sigma_arcsec, levels, norm, "Expected from both uncertainties (1 sigma)"
+            panels[1],
+            comparison,
+            comparison.sigma_arcsec,
+            levels,
+            norm,
+            "Expected from both uncertainties (1 sigma)",
         )
     _arrows(panels[0], comparison)
     bar = figure.colorbar(image, ax=list(panels), fraction=0.046, pad=0.02)
@@ -57,11 +63,18 @@ def plot_camera_comparison(comparison: CameraComparison) -> Figure:
 
 
 def _filled(
-    ax: Axes, comparison: CameraComparison, values: FloatArray, levels: FloatArray, norm: Normalize | None, title: str
+    ax: Axes,
+    comparison: CameraComparison,
+    values: FloatArray,
+    levels: FloatArray,
+    norm: Normalize | None,
+    title: str,
 ) -> Any:
     style.dress(ax)
     x, y = comparison.x_px, comparison.y_px
-    image = ax.contourf(x, y, np.maximum(values, levels[0]), levels=levels, norm=norm, cmap="cividis")
+    image = ax.contourf(
+        x, y, np.maximum(values, levels[0]), levels=levels, norm=norm, cmap="cividis"
+    )
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[-1], y[0])
     ax.set_aspect("equal")
@@ -72,7 +85,12 @@ def _filled(
 def _multiples(ax: Axes, comparison: CameraComparison) -> None:
     """Contours of the difference in its standard deviations."""
     lines = ax.contour(
-        comparison.x_px, comparison.y_px, comparison.ratio, levels=_TIMES, colors="white", linewidths=(0.9, 1.3, 1.8)
+        comparison.x_px,
+        comparison.y_px,
+        comparison.ratio,
+        levels=_TIMES,
+        colors="white",
+        linewidths=(0.9, 1.3, 1.8),
     )
     ax.clabel(lines, fmt=lambda v: f"{v:g}σ", fontsize=style.TICK_SIZE, colors="white")
 

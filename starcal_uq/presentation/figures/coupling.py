@@ -36,7 +36,11 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
     if ax is None:
         side = 1.4 + 0.62 * len(names)
         ax = style.new_axes(side + 0.8, side)
-    image = _extended(ax, coupling) if extended else _heat_map(ax, np.asarray(coupling.correlation), names)
+    image = (
+        _extended(ax, coupling)
+        if extended
+        else _heat_map(ax, np.asarray(coupling.correlation), names)
+    )
     style.label(ax, "With the boresight" if extended else "Camera parameters", pad=24)
     style.colour_bar(ax, image, "correlation")
     return ax
@@ -130,7 +134,11 @@ def correlation_text(value: float, diagonal: bool = False) -> str:
     if diagonal:
         return "1"
     if abs(value) >= 0.99:
-        text = f"{np.sign(value) * min(abs(value), 0.9999):.4f}" if abs(value) >= 0.999 else f"{value:.3f}"
+        text = (
+            f"{np.sign(value) * min(abs(value), 0.9999):.4f}"
+            if abs(value) >= 0.999
+            else f"{value:.3f}"
+        )
     else:
         text = f"{value:.2f}"
     return text.replace("-", "−") if float(text) != 0.0 else "0.00"

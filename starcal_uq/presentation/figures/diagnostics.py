@@ -1,4 +1,6 @@
-"""What questions the model, in pictures: p-values of the tests, residuals against everything, jackknife, models."""
+"""What questions the model, in pictures: p-values of the tests, residuals against everything,
+jackknife, models.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,10 @@ def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = ALPHA)
     tests = misfit.tests[::-1]
     p = np.maximum([test.p_holm for test in tests], SMALLEST_P)
     rows = np.arange(len(tests))
-    for chosen, colour, marker in ((p >= alpha, style.BLUE, "o"), (p < alpha, style.VERMILLION, "D")):
+    for chosen, colour, marker in (
+        (p >= alpha, style.BLUE, "o"),
+        (p < alpha, style.VERMILLION, "D"),
+    ):
         ax.scatter(p[chosen], rows[chosen], color=colour, marker=marker, s=30, zorder=3)
     ax.axvline(alpha, color=style.INK, linewidth=1.0, dashes=(4, 2))
     style.log_scale(ax.xaxis)
@@ -51,22 +56,34 @@ def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = ALPHA)
 
 
 def plot_jackknife(jackknife: Jackknife, ax: Axes | None = None) -> Axes:
-    """Cluster-robust and jackknife over formal sigma of every parameter, with the range that chance gives."""
+    """Cluster-robust and jackknife over formal sigma of every parameter, with the range that chance
+    gives.
+    """
     if ax is None:
         ax = style.new_axes(4.2, 3.2)
     style.dress(ax, grid=True)
     rows = np.arange(len(jackknife.ratio))
     low, high = jackknife.expected()
     ax.bar(rows, high - low, bottom=low, width=0.62, color=style.LIGHT, label="chance (95 %)")
-    ax.scatter(rows - 0.08, jackknife.ratio, color=style.BLUE, s=32, zorder=3, label="cluster-robust")
     ax.scatter(
-        rows + 0.08, jackknife.jackknife_ratio, color=style.ORANGE, marker="s", s=26, zorder=3, label="jackknife"
+        rows - 0.08, jackknife.ratio, color=style.BLUE, s=32, zorder=3, label="cluster-robust"
+    )
+    ax.scatter(
+        rows + 0.08,
+        jackknife.jackknife_ratio,
+        color=style.ORANGE,
+        marker="s",
+        s=26,
+        zorder=3,
+        label="jackknife",
     )
     ax.axhline(1.0, color=style.INK, linewidth=0.9)
     ax.set_xticks(rows, jackknife.parameter_names)
     top = max(float(np.max([high, jackknife.ratio, jackknife.jackknife_ratio])), 1.2)
     ax.set_ylim(min(0.5, float(low.min()) - 0.05), 1.0 + 1.8 * (top - 1.0))
-    style.legend(ax, loc="upper left", ncols=2, columnspacing=0.7, handletextpad=0.2, handlelength=1.0)
+    style.legend(
+        ax, loc="upper left", ncols=2, columnspacing=0.7, handletextpad=0.2, handlelength=1.0
+    )
     style.label(ax, "Frames against formal errors", "", "ratio to formal sigma")
     return ax
 
@@ -81,7 +98,15 @@ def plot_comparison(models: ModelComparison, ax: Axes | None = None) -> Axes:
     for row, score in zip(rows, scores, strict=True):
         colour = style.VERMILLION if score.rejected else style.BLUE
         spread = 2.0 * score.difference_se
-        ax.errorbar(-score.difference, row, xerr=spread, color=colour, marker="o", markersize=5, elinewidth=1.4)
+        ax.errorbar(
+            -score.difference,
+            row,
+            xerr=spread,
+            color=colour,
+            marker="o",
+            markersize=5,
+            elinewidth=1.4,
+        )
     names = [f"{s.model} (fitted)" if s.model == models.fitted else s.model for s in scores]
     ax.set_yticks(rows, names, fontsize=style.TICK_SIZE)
     ax.set_ylim(-0.6, len(scores) - 0.4)
@@ -99,7 +124,9 @@ def plot_diagnosis(diagnosis: Diagnosis) -> Figure:
     width, height, bottom = 11.0, 5.4, 0.5
     figure = style.new_figure(width, height)
     names = 0.2 + _LETTER_IN * max((len(test.name) for test in diagnosis.misfit.tests), default=0)
-    plot_misfit(diagnosis.misfit, style.place(figure, names, bottom, 5.7 - names, height - bottom - 0.12))
+    plot_misfit(
+        diagnosis.misfit, style.place(figure, names, bottom, 5.7 - names, height - bottom - 0.12)
+    )
     each = 0.5 * (height - bottom - 0.36 - 0.76)
     if diagnosis.jackknife is not None:
         upper = style.place(figure, 7.3, bottom + each + 0.76, width - 7.42, each)
@@ -112,7 +139,9 @@ def plot_diagnosis(diagnosis: Diagnosis) -> Figure:
 
 
 def plot_residual_profiles(cal: Calibration, obs: Observations) -> Figure:
-    """Mean residuals against azimuth, pixel phase, magnitude, time or order of frames, and temperature."""
+    """Mean residuals against azimuth, pixel phase, magnitude, time or order of frames, and
+    temperature.
+    """
     profiles = residual_profiles(cal, obs)
     columns = 3
     rows = -(-len(profiles) // columns)
@@ -127,9 +156,13 @@ def _plot_profile(ax: Axes, profile: Profile1D) -> None:
     style.dress(ax, grid=True)
     shift = 0.006 * np.ptp(profile.centres)
     looks = ((style.BLUE, "o", -shift), (style.ORANGE, "s", shift))
-    for name, means, (colour, marker, aside) in zip(profile.names, profile.means, looks, strict=True):
+    for name, means, (colour, marker, aside) in zip(
+        profile.names, profile.means, looks, strict=True
+    ):
         at = profile.centres + aside
-        ax.errorbar(at, means, profile.errors, color=colour, marker=marker, label=name, **style.BARS)
+        ax.errorbar(
+            at, means, profile.errors, color=colour, marker=marker, label=name, **style.BARS
+        )
     style.about_zero(ax)
     style.label(ax, profile.title, profile.label, "mean residual [px]")
     style.label_distance(ax, x_in=0.25, y_in=0.67)
@@ -141,11 +174,12 @@ _NEES_BINS = 30
 
 
 def plot_validation(validation: Validation) -> Figure:
-    """Rank curves of every quantity with their simultaneous 95 % bands, coverage, and NEES against chi-square.
+    """Rank curves of every quantity with their simultaneous 95 % bands, coverage, and NEES against
+    chi-square.
 
-    A rank curve is the empirical distribution of the truth's rank minus the uniform one. High on the left and low on
-    the right means that intervals are too narrow, the reverse that they are too wide; a curve to one side, that
-    estimates are too high (above zero) or too low.
+    A rank curve is the empirical distribution of the truth's rank minus the uniform one. High on
+    the left and low on the right means that intervals are too narrow, the reverse that they are too
+    wide; a curve to one side, that estimates are too high (above zero) or too low.
     """
     n_panels = len(validation.quantities) + 2
     rows = -(-n_panels // _COLUMNS)
@@ -164,7 +198,10 @@ def plot_validation(validation: Validation) -> Figure:
 
 
 def _symbols(validation: Validation) -> list[str]:
-    known = {p.name: symbol(p.name) for p in (*parameters(validation.camera.distortion), sigma_parameter(False))}
+    known = {
+        p.name: symbol(p.name)
+        for p in (*parameters(validation.camera.distortion), sigma_parameter(False))
+    }
     return [known.get(q, q.replace("_", " ")) for q in validation.quantities]
 
 
@@ -213,15 +250,24 @@ def _nees_panel(ax: Axes, validation: Validation) -> None:
     counts, _ = np.histogram(np.minimum(validation.nees, end * (1.0 - 1e-9)), edges)
     width = edges[1]
     ax.bar(
-        edges[:-1], counts / (validation.n_replicates * width), width, align="edge", color=style.SKY, edgecolor="white"
+        edges[:-1],
+        counts / (validation.n_replicates * width),
+        width,
+        align="edge",
+        color=style.SKY,
+        edgecolor="white",
     )
     grid = np.linspace(0.0, end, 200)
-    ax.plot(grid, chi2.pdf(grid, p), color=style.INK, linewidth=1.2, label=f"chi-square, {p} d.o.f.")
+    ax.plot(
+        grid, chi2.pdf(grid, p), color=style.INK, linewidth=1.2, label=f"chi-square, {p} d.o.f."
+    )
     ax.set_xlim(0.0, end)
     ax.set_yticks([])
     style.legend(ax, loc="upper right")
     ratio = fixed(validation.nees_ratio, 3 if validation.nees_ratio < 2.0 else 1)
-    style.label(ax, f"NEES/{p} = {ratio}:  p {_p(validation.nees_p_value)}", "normalised squared error")
+    style.label(
+        ax, f"NEES/{p} = {ratio}:  p {_p(validation.nees_p_value)}", "normalised squared error"
+    )
 
 
 def _p(value: float) -> str:

@@ -28,12 +28,17 @@ _BANDS = ("#eef3f7", "#ffffff")
 def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
     """Every parameter against the iteration, stage by stage (Ye & Yang 2017, Fig. 3).
 
-    Above: the value. Below: its distance from the truth if that is known, else from the final estimate, in units of the
-    final standard deviation on an axis that is linear between -1 and 1 and logarithmic outside.
+    Above: the value. Below: its distance from the truth if that is known, else from the final
+    estimate, in units of the final standard deviation on an axis that is linear between -1 and 1
+    and logarithmic outside.
     """
     parameters = camera_parameters(cal.camera.distortion)
     values, starts = _joined(cal)
-    reference = np.asarray(truth.theta) if _comparable(truth, cal) and truth is not None else np.asarray(cal.theta)
+    reference = (
+        np.asarray(truth.theta)
+        if _comparable(truth, cal) and truth is not None
+        else np.asarray(cal.theta)
+    )
     figure = style.new_figure(1.2 + 2.0 * len(parameters), 5.1)
     grid = style.panels(figure, 2, len(parameters), (0.9, 0.12, 0.5, 0.72), (0.56, 0.18))
     axes = grid.subplots(sharex=True, squeeze=False)
@@ -46,9 +51,22 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
             factor, unit = pixel_um / 1000.0, "mm"
         for ax in (upper, lower):
             _mark_stages(ax, starts, len(values))
-        upper.plot(iteration, values[:, i] * factor, color=style.BLUE, marker="o", markersize=3.2, linewidth=1.2)
+        upper.plot(
+            iteration,
+            values[:, i] * factor,
+            color=style.BLUE,
+            marker="o",
+            markersize=3.2,
+            linewidth=1.2,
+        )
         upper.axhline(reference[i] * factor, color=style.VERMILLION, linewidth=1.0, dashes=(4, 2))
-        upper.set_title(f"{symbol(parameter.name)} [{unit}]", fontsize=style.TITLE_SIZE, color=style.INK, pad=16, y=1.0)
+        upper.set_title(
+            f"{symbol(parameter.name)} [{unit}]",
+            fontsize=style.TITLE_SIZE,
+            color=style.INK,
+            pad=16,
+            y=1.0,
+        )
         upper.ticklabel_format(axis="y", useOffset=False, style="plain")
         error = (values[:, i] - reference[i]) / cal.sigmas[i]
         lower.axhspan(-1.0, 1.0, color=style.GREEN, alpha=0.2, linewidth=0)
@@ -59,7 +77,9 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
         style.label_distance(lower, x_in=0.23)
     what = "truth" if _comparable(truth, cal) else "final estimate"
     axes[0, 0].set_ylabel("value", fontsize=style.LABEL_SIZE, color=style.INK)
-    axes[1, 0].set_ylabel(f"distance from {what}\n[final sigma]", fontsize=style.LABEL_SIZE, color=style.INK)
+    axes[1, 0].set_ylabel(
+        f"distance from {what}\n[final sigma]", fontsize=style.LABEL_SIZE, color=style.INK
+    )
     for ax in axes[:, 0]:
         style.label_distance(ax, y_in=0.46)
     _key(figure, cal, what)
@@ -76,7 +96,12 @@ def _key(figure: Figure, cal: Calibration, what: str) -> None:
         Patch(facecolor=style.GREEN, alpha=0.2, label="within 1 sigma"),
         style.key(f"Stages: {stages}", style.INK, linestyle="none"),
     ]
-    options = {"loc": "upper left", "fontsize": style.LABEL_SIZE, "columnspacing": 1.6, "handlelength": 1.8}
+    options = {
+        "loc": "upper left",
+        "fontsize": style.LABEL_SIZE,
+        "columnspacing": 1.6,
+        "handlelength": 1.8,
+    }
     style.legend_above(figure, handles, **options)
 
 
@@ -126,7 +151,8 @@ _CHI2_2_99 = 9.21
 
 
 def plot_residuals(cal: Calibration, obs: Observations) -> Figure:
-    """Mean residual vectors over the field, residual against radius, and the histogram against a Gaussian.
+    """Mean residual vectors over the field, residual against radius, and the histogram against a
+    Gaussian.
 
     Raises
     ------
@@ -135,10 +161,13 @@ def plot_residuals(cal: Calibration, obs: Observations) -> Figure:
     """
     if len(cal.residuals_px) == 0:
         raise CalibrationError(
-            "this calibration comes from a stream of frames and kept no residuals: calibrate loaded observations."
+            "this calibration comes from a stream of frames and kept no residuals: calibrate "
+            "loaded observations."
         )
     figure = style.new_figure(11.0, 4.1)
-    grid = style.panels(figure, 1, 3, (0.62, 0.1, 0.72, 0.36), (0.8, 0.0), width_ratios=(1.12, 1.0, 0.95))
+    grid = style.panels(
+        figure, 1, 3, (0.62, 0.1, 0.72, 0.36), (0.8, 0.0), width_ratios=(1.12, 1.0, 0.95)
+    )
     left, middle, right = (figure.add_subplot(grid[0, column]) for column in range(3))
     plot_residual_map(cal, obs, left)
     plot_residual_radius(cal, obs, middle)
@@ -170,15 +199,27 @@ def plot_residual_map(cal: Calibration, obs: Observations, ax: Axes | None = Non
         linewidths=0,
         rasterized=True,
     )
-    ax.plot([cal.camera.x0_px], [cal.camera.y0_px], marker="+", color=style.INK, markersize=10, markeredgewidth=1.2)
+    ax.plot(
+        [cal.camera.x0_px],
+        [cal.camera.y0_px],
+        marker="+",
+        color=style.INK,
+        markersize=10,
+        markeredgewidth=1.2,
+    )
     if len(binned.counts) == 0:
-        ax.text(0.5, 0.5, "too few stars per cell", transform=ax.transAxes, ha="center", color=style.INK)
+        ax.text(
+            0.5, 0.5, "too few stars per cell", transform=ax.transAxes, ha="center", color=style.INK
+        )
         return ax
     key = float(np.sqrt(2.0 * np.mean(binned.noise_px**2)))
     longest = max(float(np.sqrt((binned.means**2).sum(1)).max()), key)
     scale = longest / (0.95 * binned.cell_px)
     strong = binned.chi2 > _CHI2_2_99
-    for chosen, colour, thick in ((~strong, style.BLUE, 0.0045), (strong, style.VERMILLION, 0.0085)):
+    for chosen, colour, thick in (
+        (~strong, style.BLUE, 0.0045),
+        (strong, style.VERMILLION, 0.0085),
+    ):
         if np.any(chosen):
             arrows = ax.quiver(
                 *binned.centres[chosen].T,
@@ -202,7 +243,10 @@ def plot_residual_map(cal: Calibration, obs: Observations, ax: Axes | None = Non
         fontproperties={"size": style.TICK_SIZE},
     )
     ax.set_xlabel(
-        f"x [px]\n{np.count_nonzero(strong)} of {strong.size} arrows bold: beyond 99 % of pure noise",
+        (
+            f"x [px]\n{np.count_nonzero(strong)} of {strong.size} arrows bold: beyond 99 % of pure "
+            "noise"
+        ),
         fontsize=style.LABEL_SIZE,
         color=style.INK,
     )
@@ -210,7 +254,9 @@ def plot_residual_map(cal: Calibration, obs: Observations, ax: Axes | None = Non
 
 
 def plot_residual_radius(cal: Calibration, obs: Observations, ax: Axes | None = None) -> Axes:
-    """Radial and tangential residual against the distance from the principal point, with one standard error."""
+    """Radial and tangential residual against the distance from the principal point, with one
+    standard error.
+    """
     if ax is None:
         ax = style.new_axes(4.4, 3.8)
     style.dress(ax, grid=True)
@@ -218,7 +264,10 @@ def plot_residual_radius(cal: Calibration, obs: Observations, ax: Axes | None = 
     radius = np.hypot(*offset.T)
     unit = offset / np.maximum(radius, 1e-9)[:, None]
     residuals = np.asarray(cal.residuals_px)
-    parts = (np.sum(residuals * unit, axis=1), unit[:, 0] * residuals[:, 1] - unit[:, 1] * residuals[:, 0])
+    parts = (
+        np.sum(residuals * unit, axis=1),
+        unit[:, 0] * residuals[:, 1] - unit[:, 1] * residuals[:, 0],
+    )
     n_bins = int(np.clip(obs.n_stars // 60, 4, 14))
     # Bins of equal number, so that all error bars mean the same.
     edges = np.quantile(radius, np.linspace(0.0, 1.0, n_bins + 1))
@@ -237,7 +286,9 @@ def plot_residual_radius(cal: Calibration, obs: Observations, ax: Axes | None = 
 
 
 def plot_residual_histogram(cal: Calibration, obs: Observations, ax: Axes | None = None) -> Axes:
-    """Residuals in units of their expected standard deviation, against the standard normal, on a log axis."""
+    """Residuals in units of their expected standard deviation, against the standard normal, on a
+    log axis.
+    """
     if ax is None:
         ax = style.new_axes(4.2, 3.8)
     style.dress(ax)

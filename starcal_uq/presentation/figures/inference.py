@@ -21,11 +21,14 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.inference.priors import Priors
 
-# Probability inside the 1- and 2-sigma ellipses of a two-dimensional normal distribution: 1 - exp(-n^2 / 2).
+# Probability inside the 1- and 2-sigma ellipses of a two-dimensional normal distribution: 1 -
+# exp(-n^2 / 2).
 CONTOUR_MASSES = (0.3935, 0.8647)
 
 
-def plot_corner(post: Posterior, cal: Calibration | None = None, truth: Camera | None = None) -> Figure:
+def plot_corner(
+    post: Posterior, cal: Calibration | None = None, truth: Camera | None = None
+) -> Figure:
     """Corner plot: one- and two-dimensional marginals of all sampled parameters.
 
     Parameters
@@ -33,15 +36,16 @@ def plot_corner(post: Posterior, cal: Calibration | None = None, truth: Camera |
     post
         The posterior; parameters are plotted as value minus the printed mean.
     cal
-        If given, the Gaussian approximation of the calibration is drawn over the draws (dashed), so that a departure
-        from it is seen.
+        If given, the Gaussian approximation of the calibration is drawn over the draws (dashed), so
+        that a departure from it is seen.
     truth
         If given, the camera of a simulation, drawn as a line and a cross.
 
     Returns
     -------
     Figure
-        Contours hold 39 % and 86 % of the probability, as the 1- and 2-sigma ellipses of a normal distribution do.
+        Contours hold 39 % and 86 % of the probability, as the 1- and 2-sigma ellipses of a normal
+        distribution do.
     """
     names = sampled_names(post)
     scales, columns = scaled_draws(post)
@@ -57,7 +61,9 @@ def plot_corner(post: Posterior, cal: Calibration | None = None, truth: Camera |
             ax = style.dress(figure.add_subplot(grid[row, column]))
             if row == column:
                 histogram(ax, columns[row], ends[row], gaussian, row, marks[row])
-                ax.set_title(scales[row].title, fontsize=style.TICK_SIZE, color=style.INK, pad=5, y=1.0)
+                ax.set_title(
+                    scales[row].title, fontsize=style.TICK_SIZE, color=style.INK, pad=5, y=1.0
+                )
             else:
                 _density(ax, columns[column], columns[row])
                 if gaussian is not None:
@@ -68,8 +74,12 @@ def plot_corner(post: Posterior, cal: Calibration | None = None, truth: Camera |
     return figure
 
 
-def _gaussian(cal: Calibration, scales: list[AxisScale], size: int) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of the Gaussian approximation, in plotted units; sigma is independent of the rest."""
+def _gaussian(
+    cal: Calibration, scales: list[AxisScale], size: int
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of the Gaussian approximation, in plotted units; sigma is independent of
+    the rest.
+    """
     mean, covariance = np.zeros(size), np.zeros((size, size))
     p = len(cal.theta)
     factors = np.array([s.factor for s in scales])
@@ -81,7 +91,9 @@ def _gaussian(cal: Calibration, scales: list[AxisScale], size: int) -> tuple[Flo
 
 
 def _density(ax: Axes, x: FloatArray, y: FloatArray) -> None:
-    """Filled contours; binned along the principal axes of the cloud, so that smoothing does not fatten a narrow one."""
+    """Filled contours; binned along the principal axes of the cloud, so that smoothing does not
+    fatten a narrow one.
+    """
     mean = np.array([x.mean(), y.mean()])
     values, vectors = np.linalg.eigh(np.cov(x, y))
     axes = vectors * np.sqrt(np.maximum(values, 1e-300))
@@ -95,8 +107,13 @@ def _density(ax: Axes, x: FloatArray, y: FloatArray) -> None:
     if not np.all(np.diff(levels) > 0):
         return
     centre = reach * ((2.0 * np.arange(BINS) + 1.0) / BINS - 1.0)
-    grid = np.einsum("ij,jab->iab", axes, np.stack(np.meshgrid(centre, centre, indexing="ij"))) + mean[:, None, None]
-    filled = ax.contourf(grid[0], grid[1], smooth, levels=[*levels, smooth.max() * 1.001], colors=_FILLS)
+    grid = (
+        np.einsum("ij,jab->iab", axes, np.stack(np.meshgrid(centre, centre, indexing="ij")))
+        + mean[:, None, None]
+    )
+    filled = ax.contourf(
+        grid[0], grid[1], smooth, levels=[*levels, smooth.max() * 1.001], colors=_FILLS
+    )
     # Edges of the fill are the contours.
     filled.set(edgecolor=style.BLUE, linewidth=0.9)
 
@@ -105,7 +122,9 @@ def mass_levels(density: FloatArray, masses: tuple[float, ...]) -> list[float]:
     """Density levels whose super-level sets hold these probabilities, in rising order of level."""
     ordered = np.sort(density, axis=None)[::-1]
     mass = np.cumsum(ordered) / ordered.sum()
-    return sorted(float(ordered[min(int(np.searchsorted(mass, m)), ordered.size - 1)]) for m in masses)
+    return sorted(
+        float(ordered[min(int(np.searchsorted(mass, m)), ordered.size - 1)]) for m in masses
+    )
 
 
 def _smooth(counts: FloatArray) -> FloatArray:
@@ -122,18 +141,39 @@ def _ellipses(ax: Axes, gaussian: tuple[FloatArray, FloatArray], i: int, j: int)
     block = covariance[np.ix_((i, j), (i, j))]
     values, vectors = np.linalg.eigh(block)
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
-    ring = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * np.stack([np.cos(angle), np.sin(angle)]))
+    ring = vectors @ (
+        np.sqrt(np.maximum(values, 0.0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
+    )
     for n_sigma in (1.0, 2.0):
-        ax.plot(mean[i] + n_sigma * ring[0], mean[j] + n_sigma * ring[1], color=style.INK, linewidth=0.9, dashes=(4, 2))
+        ax.plot(
+            mean[i] + n_sigma * ring[0],
+            mean[j] + n_sigma * ring[1],
+            color=style.INK,
+            linewidth=0.9,
+            dashes=(4, 2),
+        )
 
 
 def _mark(ax: Axes, x: float | None, y: float | None) -> None:
     if x is not None and y is not None:
-        ax.plot([x], [y], marker="+", markersize=9, markeredgewidth=1.8, color=style.VERMILLION, linestyle="none")
+        ax.plot(
+            [x],
+            [y],
+            marker="+",
+            markersize=9,
+            markeredgewidth=1.8,
+            color=style.VERMILLION,
+            linestyle="none",
+        )
 
 
 def _ticks(
-    ax: Axes, row: int, column: int, size: int, scales: list[AxisScale], ends: list[tuple[float, float]]
+    ax: Axes,
+    row: int,
+    column: int,
+    size: int,
+    scales: list[AxisScale],
+    ends: list[tuple[float, float]],
 ) -> None:
     ax.set_xlim(*ends[column])
     if row != column:
@@ -161,7 +201,11 @@ def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> No
     if gaussian:
         handles.append(style.key("Gaussian approximation", style.INK, dashes=(4, 2), linewidth=1.0))
     if truth:
-        handles.append(style.key("truth of the simulation", style.VERMILLION, marker="+", markersize=9, linewidth=1.3))
+        handles.append(
+            style.key(
+                "truth of the simulation", style.VERMILLION, marker="+", markersize=9, linewidth=1.3
+            )
+        )
     figure.legend(
         handles=handles,
         loc="upper right",
@@ -175,9 +219,11 @@ def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> No
 
 
 def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure:
-    """Prior and posterior of every parameter: on the scale of the prior (above) and of the posterior (below).
+    """Prior and posterior of every parameter: on the scale of the prior (above) and of the
+    posterior (below).
 
-    The upper row shows how much the data said, the lower row that the prior is flat where the posterior lives.
+    The upper row shows how much the data said, the lower row that the prior is flat where the
+    posterior lives.
     """
     names = sampled_names(post)
     scales, columns = scaled_draws(post)
@@ -189,7 +235,9 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
         upper = style.dress(figure.add_subplot(grid[0, i]))
         wide = _prior_grid(post.priors, name, columns[i], scales[i])
         density = _relative_prior(post.priors, name, wide)
-        upper.plot(wide / parameter.scale, density, color=style.GREEN, linewidth=1.5, dashes=(4, 1.5))
+        upper.plot(
+            wide / parameter.scale, density, color=style.GREEN, linewidth=1.5, dashes=(4, 1.5)
+        )
         upper.axvline(
             float(np.mean(columns[i]) * scales[i].factor + scales[i].reference) / parameter.scale,
             color=style.BLUE,
@@ -218,7 +266,9 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
 
 
 def _relative_prior(priors: Priors, name: str, values: FloatArray) -> FloatArray:
-    """Prior density relative to its largest value on the grid; flat where it underflows all over."""
+    """Prior density relative to its largest value on the grid; flat where it underflows all
+    over.
+    """
     density = priors.marginal_density(name, values)
     return density / density.max() if density.max() > 0.0 else np.ones_like(density)
 
@@ -229,7 +279,11 @@ def _prior_grid(priors: Priors, name: str, column: FloatArray, scale: AxisScale)
         top = max(1.4 * centre, priors.sigma_median * np.exp(1.2 * priors.sigma_log_sd))
         return np.asarray(np.linspace(top / 400, top, 400))
     mean, sd = float(priors.mean((name,))[0]), float(priors.sd((name,))[0])
-    return np.asarray(np.linspace(min(mean - 3 * sd, centre - 0.3 * sd), max(mean + 3 * sd, centre + 0.3 * sd), 300))
+    return np.asarray(
+        np.linspace(
+            min(mean - 3 * sd, centre - 0.3 * sd), max(mean + 3 * sd, centre + 0.3 * sd), 300
+        )
+    )
 
 
 def _prior_key(figure: Figure, truth: bool) -> None:
@@ -250,7 +304,8 @@ BINS = 44
 HALF_WIDTH_SD = 3.6
 # Share of an axis at either end without ticks: about half a label.
 _MARGIN = 0.12
-# Bins on either side over which counts are blurred, and the colours within two sigma and within one.
+# Bins on either side over which counts are blurred, and the colours within two sigma and within
+# one.
 _BLUR = 3
 _FILLS = ("#cfe3f1", "#6fb0d9")
 
@@ -260,7 +315,9 @@ def scaled_draws(post: Posterior) -> tuple[list[AxisScale], list[FloatArray]]:
     draws = post.draws[:, list(post.sampled)]
     spreads, means = draws.std(axis=0, ddof=1), draws.mean(axis=0)
     entries = [post.parameters[i] for i in post.sampled]
-    scales = [axis_scale(p, float(m), float(s)) for p, m, s in zip(entries, means, spreads, strict=True)]
+    scales = [
+        axis_scale(p, float(m), float(s)) for p, m, s in zip(entries, means, spreads, strict=True)
+    ]
     return scales, [scale(draws[:, i]) for i, scale in enumerate(scales)]
 
 
@@ -273,15 +330,21 @@ def limits(column: FloatArray) -> tuple[float, float]:
     """Ends of the axis of one parameter."""
     centre, spread = float(np.median(column)), float(np.std(column))
     low, high = np.quantile(column, (0.0005, 0.9995))
-    return min(centre - HALF_WIDTH_SD * spread, float(low)), max(centre + HALF_WIDTH_SD * spread, float(high))
+    return min(centre - HALF_WIDTH_SD * spread, float(low)), max(
+        centre + HALF_WIDTH_SD * spread, float(high)
+    )
 
 
-def truth_marks(truth: Camera | None, names: tuple[str, ...], scales: list[AxisScale]) -> list[float | None]:
+def truth_marks(
+    truth: Camera | None, names: tuple[str, ...], scales: list[AxisScale]
+) -> list[float | None]:
     """The truth in plotted numbers; None where it is not known."""
     if truth is None:
         return [None] * len(names)
     values = dict(zip(truth.parameter_names, truth.theta, strict=True))
-    return [float(scales[i](values[name])) if name in values else None for i, name in enumerate(names)]
+    return [
+        float(scales[i](values[name])) if name in values else None for i, name in enumerate(names)
+    ]
 
 
 def histogram(
@@ -292,7 +355,9 @@ def histogram(
     index: int,
     mark: float | None,
 ) -> None:
-    """Histogram of one parameter, with the normal curve of entry `index` of `gaussian` (mean, covariance)."""
+    """Histogram of one parameter, with the normal curve of entry `index` of `gaussian` (mean,
+    covariance).
+    """
     counts, edges = np.histogram(column, bins=BINS, range=limits)
     peak = counts.max()
     ax.stairs(counts / peak, edges, fill=True, color=style.SKY, alpha=0.45)
@@ -301,7 +366,13 @@ def histogram(
         mean, sd = gaussian[0][index], np.sqrt(gaussian[1][index, index])
         x = np.linspace(*limits, 200)
         height = column.size * (edges[1] - edges[0]) / (sd * np.sqrt(2 * np.pi)) / peak
-        ax.plot(x, height * np.exp(-0.5 * ((x - mean) / sd) ** 2), color=style.INK, linewidth=1.0, dashes=(4, 2))
+        ax.plot(
+            x,
+            height * np.exp(-0.5 * ((x - mean) / sd) ** 2),
+            color=style.INK,
+            linewidth=1.0,
+            dashes=(4, 2),
+        )
     if mark is not None:
         ax.axvline(mark, color=style.VERMILLION, linewidth=1.3)
     ax.set_ylim(0.0, 1.12)
@@ -320,7 +391,9 @@ def sparse(ax: Axes, *, y: bool) -> None:
 
 
 def inner_ticks(low: float, high: float) -> FloatArray:
-    """Round values, two to five, so far from both ends that their labels do not touch those of the next panel."""
+    """Round values, two to five, so far from both ends that their labels do not touch those of the
+    next panel.
+    """
     from matplotlib.ticker import MaxNLocator
 
     margin = _MARGIN * (high - low)

@@ -1,4 +1,6 @@
-"""Figures of plans: errors against number of frames, what changes them, chosen frames, and the check of a forecast."""
+"""Figures of plans: errors against number of frames, what changes them, chosen frames, and the
+check of a forecast.
+"""
 
 from __future__ import annotations
 
@@ -46,11 +48,12 @@ _CHECKED = (
 
 
 def plot_forecast(plan: Plan) -> Figure:
-    """Attitude errors across and about the boresight, the two-axis error with the target, and the parameters.
+    """Attitude errors across and about the boresight, the two-axis error with the target, and the
+    parameters.
 
-    All against number of frames, on logarithmic axes. The band of the two-axis error holds 90 % of the campaigns, the
-    grey one its range over the distortion that the sheet leaves open; where
-    the target needs more frames than were forecast, the curve is continued with dots.
+    All against number of frames, on logarithmic axes. The band of the two-axis error holds 90 % of
+    the campaigns, the grey one its range over the distortion that the sheet leaves open; where the
+    target needs more frames than were forecast, the curve is continued with dots.
     """
     figure = style.new_figure(11.0, 7.6)
     panels = figure.subplots(2, 2)
@@ -75,8 +78,18 @@ def _attitude_panel(ax: Axes, table: pd.DataFrame, n: FloatArray, axes: tuple[st
         ("common", "calibration, common rotation", style.ORANGE, "o"),
         ("rest", "calibration, rest", style.GREEN, "s"),
     ):
-        squares = sum(np.asarray(table[f"{part}_{axis}_arcsec"], dtype=np.float64) ** 2 for axis in axes)
-        ax.plot(n, np.sqrt(squares / len(axes)), color=colour, marker=marker, markersize=4, linewidth=1.5, label=words)
+        squares = sum(
+            np.asarray(table[f"{part}_{axis}_arcsec"], dtype=np.float64) ** 2 for axis in axes
+        )
+        ax.plot(
+            n,
+            np.sqrt(squares / len(axes)),
+            color=colour,
+            marker=marker,
+            markersize=4,
+            linewidth=1.5,
+            label=words,
+        )
     _plain_ticks(ax)
 
 
@@ -85,8 +98,12 @@ def _radius_panel(ax: Axes, plan: Plan, n: FloatArray) -> None:
     found = plan.forecast
     if plan.distortion is not None:
         radii = plan.distortion.radius_arcsec
-        ax.fill_between(n, radii.min(axis=0), radii.max(axis=0), color=style.LIGHT, linewidth=0, zorder=0)
-    ax.fill_between(n, found.radius_low, found.radius_high, color=style.BLUE, alpha=0.2, linewidth=0)
+        ax.fill_between(
+            n, radii.min(axis=0), radii.max(axis=0), color=style.LIGHT, linewidth=0, zorder=0
+        )
+    ax.fill_between(
+        n, found.radius_low, found.radius_high, color=style.BLUE, alpha=0.2, linewidth=0
+    )
     ax.plot(n, found.radius, color=style.BLUE, marker="o", markersize=4, linewidth=1.5)
     if plan.target_arcsec is not None:
         ax.axhline(plan.target_arcsec, color=style.VERMILLION, linewidth=1.2, dashes=(5, 2))
@@ -96,7 +113,13 @@ def _radius_panel(ax: Axes, plan: Plan, n: FloatArray) -> None:
             words += f": {need_words(plan.need, plan.need.frames)}"
             _continued(ax, plan, n, needed)
             ax.plot(
-                needed, plan.target_arcsec, linestyle="", marker="D", color=style.VERMILLION, markersize=6, zorder=4
+                needed,
+                plan.target_arcsec,
+                linestyle="",
+                marker="D",
+                color=style.VERMILLION,
+                markersize=6,
+                zorder=4,
             )
         ax.annotate(
             words,
@@ -117,7 +140,10 @@ def _continued(ax: Axes, plan: Plan, n: FloatArray, needed: int) -> None:
     if n[0] <= needed <= n[-1]:
         return
     place = 0 if needed < n[0] else -1
-    ends = (n[place], plan.forecast.radius[place]), (float(needed), float(plan.target_arcsec or np.nan))
+    ends = (
+        (n[place], plan.forecast.radius[place]),
+        (float(needed), float(plan.target_arcsec or np.nan)),
+    )
     ax.plot(*np.transpose(ends), color=style.BLUE, linewidth=1.3, linestyle=":")
 
 
@@ -129,7 +155,9 @@ def _parameter_panel(ax: Axes, plan: Plan, table: pd.DataFrame, n: FloatArray) -
         (table["f_px"], "focal length", style.ORANGE, "D"),
     ]
     if "distortion_corner_px" in table:
-        shown.append((table["distortion_corner_px"], "distortion, at the farthest corner", style.PURPLE, "^"))
+        shown.append(
+            (table["distortion_corner_px"], "distortion, at the farthest corner", style.PURPLE, "^")
+        )
     for values, words, colour, marker in shown:
         ax.plot(n, values, color=colour, marker=marker, markersize=4, linewidth=1.5, label=words)
     _plain_ticks(ax)
@@ -156,14 +184,17 @@ def _plain_axis(axis: Axis, limits: tuple[float, float]) -> None:
 
     narrow = limits[1] < 150.0 * limits[0]
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,), numticks=20))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: count(int(value)) if value >= 1.0 else f"{value:.6g}"))
+    axis.set_major_formatter(
+        FuncFormatter(lambda value, _: count(int(value)) if value >= 1.0 else f"{value:.6g}")
+    )
 
 
 def plot_plan_sweeps(plan: Plan) -> Figure:
     """Frames that the target needs, with one thing changed at a time; the diamond is the plan.
 
-    Triangles at the upper edge mark what takes more than ten million frames. Without a target, or with one that the
-    plan itself cannot keep, the two-axis error after 1000 frames is drawn instead.
+    Triangles at the upper edge mark what takes more than ten million frames. Without a target, or
+    with one that the plan itself cannot keep, the two-axis error after 1000 frames is drawn
+    instead.
     """
     if plan.sweeps is None:
         raise ValueError("this plan was made without sweeps: call plan with sweeps=True.")
@@ -187,19 +218,36 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
         good = np.isfinite(y)
         ax.plot(x[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5)
         edge = ax.get_xaxis_transform()
-        ax.plot(x[~good], np.full((~good).sum(), 0.97), "^", color=style.GREY, markersize=6, transform=edge)
+        ax.plot(
+            x[~good],
+            np.full((~good).sum(), 0.97),
+            "^",
+            color=style.GREY,
+            markersize=6,
+            transform=edge,
+        )
         present = good & np.isclose(x, here[name], rtol=1e-6)
-        ax.plot(x[present], y[present], marker="D", color=style.VERMILLION, markersize=7, linestyle="")
+        ax.plot(
+            x[present], y[present], marker="D", color=style.VERMILLION, markersize=7, linestyle=""
+        )
         if plan.target_arcsec is not None and not of_frames:
             ax.axhline(plan.target_arcsec, color=style.VERMILLION, linewidth=1.2, dashes=(5, 2))
         style.label(ax, "", words)
     if of_frames:
         style.label(panels[0], "", "", "frames")
-        title = f"Frames for {plan.target_arcsec:g} arcsec at {level(plan.confidence)}, {_SCOPES[plan.scope]}"
+        title = (
+            f"Frames for {plan.target_arcsec:g} arcsec at {level(plan.confidence)}, "
+            f"{_SCOPES[plan.scope]}"
+        )
     else:
         style.label(panels[0], "", "", f"error at {level(plan.confidence)} [arcsec]")
-        title = f"Two-axis error after {count(int(plan.sweeps['n_frames'].iloc[0]))} frames, {_SCOPES[plan.scope]}"
-        title += "" if plan.target_arcsec is None else f"; line: target {plan.target_arcsec:g} arcsec"
+        title = (
+            f"Two-axis error after {count(int(plan.sweeps['n_frames'].iloc[0]))} frames, "
+            f"{_SCOPES[plan.scope]}"
+        )
+        title += (
+            "" if plan.target_arcsec is None else f"; line: target {plan.target_arcsec:g} arcsec"
+        )
     style.label(panels[0], title)
     _plain_axis(panels[0].yaxis, panels[0].get_ylim())
     return figure
@@ -213,7 +261,9 @@ def _distortion_panel(ax: Axes, plan: Plan, of_frames: bool) -> None:
     ax.set_yscale("log")
     ax.minorticks_off()
     good = np.isfinite(y)
-    ax.plot(found.percent[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5)
+    ax.plot(
+        found.percent[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5
+    )
     ax.plot(
         *(found.percent[~good], np.full((~good).sum(), 0.97), "^"),
         color=style.GREY,
@@ -222,7 +272,14 @@ def _distortion_panel(ax: Axes, plan: Plan, of_frames: bool) -> None:
     )
     own = int(np.argmin(np.abs(found.percent - found.own_percent)))
     if good[own]:
-        ax.plot(found.percent[own], y[own], marker="D", color=style.VERMILLION, markersize=7, linestyle="")
+        ax.plot(
+            found.percent[own],
+            y[own],
+            marker="D",
+            color=style.VERMILLION,
+            markersize=7,
+            linestyle="",
+        )
     style.label(ax, "", "distortion at the corner [%]")
 
 
@@ -233,20 +290,32 @@ def plot_frame_choice(choice: FrameChoice) -> Figure:
     table = choice.to_dataframe()
     style.dress(left, grid=True)
     size = 12.0 + 60.0 * np.clip(30.0 / len(table), 0.1, 1.0)
-    image = left.scatter(table["ra_deg"], table["dec_deg"], c=table["n_stars"], s=size, cmap="cividis", linewidths=0)
+    image = left.scatter(
+        table["ra_deg"], table["dec_deg"], c=table["n_stars"], s=size, cmap="cividis", linewidths=0
+    )
     left.set_xlim(360.0, 0.0)
     left.set_ylim(-90.0, 90.0)
     left.set_xticks(range(0, 361, 60))
     left.set_yticks(range(-90, 91, 30))
     style.colour_bar(left, image, "stars in the frame")
-    style.label(left, "Boresights of the chosen frames", "right ascension [deg]", "declination [deg]")
+    style.label(
+        left, "Boresights of the chosen frames", "right ascension [deg]", "declination [deg]"
+    )
 
     _logarithmic(right)
     n = np.arange(1, len(table) + 1)
     # The first frames alone hardly determine the parameters.
     first = min(3, len(n) - 1)
-    right.plot(n[first:], choice.random_path[first:], color=style.GREY, linewidth=1.5, label="random frames, mean")
-    right.plot(n[first:], choice.score_path[first:], color=style.BLUE, linewidth=1.8, label="chosen frames")
+    right.plot(
+        n[first:],
+        choice.random_path[first:],
+        color=style.GREY,
+        linewidth=1.5,
+        label="random frames, mean",
+    )
+    right.plot(
+        n[first:], choice.score_path[first:], color=style.BLUE, linewidth=1.8, label="chosen frames"
+    )
     _plain_ticks(right)
     style.legend(right, loc="upper right")
     if choice.criterion == "D":
@@ -257,9 +326,11 @@ def plot_frame_choice(choice: FrameChoice) -> Figure:
 
 
 def plot_forecast_check(check: ForecastCheck) -> Figure:
-    """Stated sigmas over forecast sigmas with the 5 % band, and squared errors over their expectation.
+    """Stated sigmas over forecast sigmas with the 5 % band, and squared errors over their
+    expectation.
 
-    Bars hold 95 % of chance: of the mean over the campaigns on the left, of the pooled squared errors on the right.
+    Bars hold 95 % of chance: of the mean over the campaigns on the left, of the pooled squared
+    errors on the right.
     """
     figure = style.new_figure(11.0, 3.9)
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
@@ -274,12 +345,21 @@ def plot_forecast_check(check: ForecastCheck) -> Figure:
         at = n * 1.045 ** (i - 0.5 * (len(shown) - 1))
         bar = 1.96 * check.ratio_se[:, j]
         left.errorbar(
-            at, check.ratio[:, j], yerr=bar, color=colour, marker=marker, markersize=4, linestyle="", label=words
+            at,
+            check.ratio[:, j],
+            yerr=bar,
+            color=colour,
+            marker=marker,
+            markersize=4,
+            linestyle="",
+            label=words,
         )
     reach = max(0.075, 1.1 * float(np.max(np.abs(check.ratio - 1.0) + 1.96 * check.ratio_se)))
     left.set_ylim(1.0 - reach, 1.0 + 1.9 * reach)
     style.legend(left, loc="upper right", ncols=3)
-    style.label(left, f"Sigmas of {check.n_campaigns} campaigns each", "frames", "stated / forecast")
+    style.label(
+        left, f"Sigmas of {check.n_campaigns} campaigns each", "frames", "stated / forecast"
+    )
 
     style.dress(right, grid=True)
     right.set_xscale("log")

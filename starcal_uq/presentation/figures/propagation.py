@@ -27,9 +27,11 @@ if TYPE_CHECKING:
 
 
 def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
-    """Bars of the three contributions to the attitude error per axis, 1 sigma, arcsec, on a log axis.
+    """Bars of the three contributions to the attitude error per axis, 1 sigma, arcsec, on a log
+    axis.
 
-    Bars and their numbers are with the misfit found, lines across them if the model holds; open bars are not assessed.
+    Bars and their numbers are with the misfit found, lines across them if the model holds; open
+    bars are not assessed.
     """
     if ax is None:
         ax = style.new_axes(7.2, 3.4, (0.66, 0.1, 0.72, 0.36))
@@ -40,7 +42,9 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
         ("calibration, common", style.ORANGE, "//"),
         ("calibration, rest", style.GREEN, ".."),
     )
-    held, values = (np.asarray(v)[:3, :3] for v in (error.if_model_holds_arcsec, error.headline_arcsec))
+    held, values = (
+        np.asarray(v)[:3, :3] for v in (error.if_model_holds_arcsec, error.headline_arcsec)
+    )
     tested = error.misfit is not None
     positive = np.concatenate([values[values > 0], held[held > 0]])
     floor = 10.0 ** np.floor(np.log10(positive.min() * 0.7)) if positive.size else 1e-3
@@ -53,7 +57,9 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
         ax.bar(at, np.maximum(values[i], floor), width=0.25, hatch=hatch, label=name, **look)
         for x, value, first in zip(at, values[i], held[i], strict=True):
             if tested:
-                ax.plot([x - 0.125, x + 0.125], [max(first, floor)] * 2, color=style.INK, linewidth=1.6)
+                ax.plot(
+                    [x - 0.125, x + 0.125], [max(first, floor)] * 2, color=style.INK, linewidth=1.6
+                )
             ax.annotate(
                 f"{significant(float(value))}″",
                 (x, max(value, floor)),
@@ -68,7 +74,14 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
     ax.set_xticks(place, error.axes, fontsize=style.LABEL_SIZE)
     ax.tick_params(axis="x", length=0)
     ax.grid(False, axis="x")
-    style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, columnspacing=1.4)
+    style.legend(
+        ax,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.2,
+        ncols=3,
+        columnspacing=1.4,
+    )
     which = f"bars: {WITH_MISFIT_FOUND}; lines: {IF_MODEL_HOLDS}"
     if not tested:
         which = f"{IF_MODEL_HOLDS}; {WITH_MISFIT_FOUND}: {NOT_ASSESSED}"
@@ -82,45 +95,72 @@ def _interaction_words(error: AttitudeError) -> str:
     values = np.asarray(getattr(error, "interaction_arcsec", np.nan))
     if not np.isfinite(values).all():
         return ""
-    return f"interaction of calibration and noise: at most {significant(float(values.max()))}″ on any axis (not drawn)"
+    return (
+        f"interaction of calibration and noise: at most {significant(float(values.max()))}″ on "
+        "any axis (not drawn)"
+    )
 
 
 _STARS_SHOWN = 600
-# Ellipses along each side (about), and the share of the space between them that the largest semi-axis takes.
+# Ellipses along each side (about), and the share of the space between them that the largest
+# semi-axis takes.
 _ELLIPSES = 6
 _FILL = 0.46
 
 
 def plot_field_map(field: FieldMap) -> Figure:
-    """Direction uncertainty over the detector: absolute, and after the best constant rotation is removed.
+    """Direction uncertainty over the detector: absolute, and after the best constant rotation is
+    removed.
 
-    Colours are the 1-sigma error per axis, root mean square of the two; ellipses are the 1-sigma ellipses, enlarged
-    from panel to panel by the factor that the key shows. A map of an earlier version has no ellipses.
+    Colours are the 1-sigma error per axis, root mean square of the two; ellipses are the 1-sigma
+    ellipses, enlarged from panel to panel by the factor that the key shows. A map of an earlier
+    version has no ellipses.
     """
     across = 3.76
     down = across * float(np.ptp(field.y_px) / np.ptp(field.x_px))
     figure = style.new_figure(11.0, 0.88 + down)
     maps = (
         (field.sigma_absolute_arcsec, field.covariance_absolute_arcsec2, "Absolute"),
-        (field.sigma_compensated_arcsec, field.covariance_compensated_arcsec2, "Best constant rotation removed"),
+        (
+            field.sigma_compensated_arcsec,
+            field.covariance_compensated_arcsec2,
+            "Best constant rotation removed",
+        ),
     )
     for column, (sigma, covariance, title) in enumerate(maps):
         left = 0.64 + 5.5 * column
-        ax, bar = (style.place(figure, left + x, 0.5, wide, down) for x, wide in ((0.0, across), (across + 0.14, 0.18)))
+        ax, bar = (
+            style.place(figure, left + x, 0.5, wide, down)
+            for x, wide in ((0.0, across), (across + 0.14, 0.18))
+        )
         _panel(ax, bar, field, sigma, covariance, title)
         style.label_distance(ax, x_in=0.27, y_in=0.42)
     return figure
 
 
-def plot_glance(error: AttitudeError, cal: Calibration, obs: Observations, field: FieldMap) -> Figure:
-    """A run at a glance: attitude error, mean residuals, and what of a direction no rotation takes away."""
+def plot_glance(
+    error: AttitudeError, cal: Calibration, obs: Observations, field: FieldMap
+) -> Figure:
+    """A run at a glance: attitude error, mean residuals, and what of a direction no rotation takes
+    away.
+    """
     figure = style.new_figure(11.0, 3.3)
     shape = cal.camera.height_px / cal.camera.width_px
     wide, tall = min(2.15, 2.15 / shape), min(2.15, 2.15 * shape)
     bars = plot_attitude(error, style.place(figure, 0.66, 0.75, 4.0, 2.15))
-    style.legend(bars, loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, columnspacing=0.8, handlelength=1.2)
+    style.legend(
+        bars,
+        loc="lower left",
+        bbox_to_anchor=(-0.02, 1.0),
+        ncols=3,
+        columnspacing=0.8,
+        handlelength=1.2,
+    )
     stars = plot_residual_map(cal, obs, style.place(figure, 5.3, 0.75, wide, tall))
-    ax, bar = style.place(figure, 8.15, 0.75, wide, tall), style.place(figure, 8.25 + wide, 0.75, 0.14, tall)
+    ax, bar = (
+        style.place(figure, 8.15, 0.75, wide, tall),
+        style.place(figure, 8.25 + wide, 0.75, 0.14, tall),
+    )
     _panel(ax, bar, field, field.sigma_compensated_arcsec, None, "Rest of directions [arcsec]")
     bar.set_ylabel("")
     # The page says what else there is to say.
@@ -131,7 +171,14 @@ def plot_glance(error: AttitudeError, cal: Calibration, obs: Observations, field
     return figure
 
 
-def _panel(ax: Axes, own: Axes, field: FieldMap, values: FloatArray, covariance: FloatArray | None, title: str) -> None:
+def _panel(
+    ax: Axes,
+    own: Axes,
+    field: FieldMap,
+    values: FloatArray,
+    covariance: FloatArray | None,
+    title: str,
+) -> None:
     style.dress(ax)
     x, y = np.asarray(field.x_px), np.asarray(field.y_px)
     levels, norm = round_levels(values)
@@ -139,7 +186,9 @@ def _panel(ax: Axes, own: Axes, field: FieldMap, values: FloatArray, covariance:
     ax.contour(x, y, values, levels=levels[1:-1], colors="white", linewidths=0.5)
     # A sample is enough to show where stars were, and evenly spaced rows are a sample.
     some = slice(None, None, max(1, len(field.star_x_px) // _STARS_SHOWN))
-    ax.scatter(field.star_x_px[some], field.star_y_px[some], s=2.0, color="white", alpha=0.45, linewidths=0)
+    ax.scatter(
+        field.star_x_px[some], field.star_y_px[some], s=2.0, color="white", alpha=0.45, linewidths=0
+    )
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[-1], y[0])
     ax.set_aspect("equal")
@@ -151,7 +200,9 @@ def _panel(ax: Axes, own: Axes, field: FieldMap, values: FloatArray, covariance:
 
 
 def _ellipses(ax: Axes, x: FloatArray, y: FloatArray, covariance: FloatArray) -> None:
-    """1-sigma ellipses in the middle of equal cells, drawn at one scale, and a key that says which."""
+    """1-sigma ellipses in the middle of equal cells, drawn at one scale, and a key that says
+    which.
+    """
     from matplotlib.collections import EllipseCollection
 
     columns, rows = (_middles(axis) for axis in (x, y))
@@ -161,7 +212,10 @@ def _ellipses(ax: Axes, x: FloatArray, y: FloatArray, covariance: FloatArray) ->
     semi = np.sqrt(np.maximum(values, 0.0))
     if not semi.max() > 0.0:
         return
-    spacing = min(abs(float(axis[1] - axis[0])) * (lines[1] - lines[0]) for axis, lines in ((x, columns), (y, rows)))
+    spacing = min(
+        abs(float(axis[1] - axis[0])) * (lines[1] - lines[0])
+        for axis, lines in ((x, columns), (y, rows))
+    )
     scale = _FILL * spacing / float(semi.max())
     angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
     for colour, width in (("white", 2.6), (style.INK, 1.1)):
@@ -192,9 +246,18 @@ def _middles(axis: FloatArray) -> list[int]:
 def _key(ax: Axes, scale: float, largest: float) -> None:
     """A bar of a round length above the panel's right end, with its value."""
     exponent = np.floor(np.log10(largest))
-    length = max(step * 10.0**exponent for step in (1.0, 2.0, 5.0) if step * 10.0**exponent <= largest)
+    length = max(
+        step * 10.0**exponent for step in (1.0, 2.0, 5.0) if step * 10.0**exponent <= largest
+    )
     share = length * scale / float(np.ptp(ax.get_xlim()))
-    ax.plot([1.0 - share, 1.0], [1.022, 1.022], color=style.INK, linewidth=1.6, transform=ax.transAxes, clip_on=False)
+    ax.plot(
+        [1.0 - share, 1.0],
+        [1.022, 1.022],
+        color=style.INK,
+        linewidth=1.6,
+        transform=ax.transAxes,
+        clip_on=False,
+    )
     ax.annotate(
         f"semi-axis {significant(length, 1)}″",
         (1.0 - share, 1.022),
@@ -217,7 +280,9 @@ _DECADES = 9.0
 
 
 def plot_spectrum(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
-    """Power spectral density of the frame-dependent part per axis, over the white floor of centroid noise."""
+    """Power spectral density of the frame-dependent part per axis, over the white floor of centroid
+    noise.
+    """
     if ax is None:
         ax = style.new_axes(7.2, 4.2)
     style.dress(ax, grid=True)
@@ -246,13 +311,22 @@ def plot_spectrum(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
     style.log_scale(ax.yaxis)
     ax.set_xlim(f[0], f[-1])
     ax.set_ylim(max(bottom * 0.5, top * 10.0**-_DECADES), top * 8.0)
-    style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, columnspacing=1.4)
+    style.legend(
+        ax,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.2,
+        ncols=3,
+        columnspacing=1.4,
+    )
     style.label(ax, "", "frequency [Hz]", "power spectral density [arcsec²/Hz]")
     return ax
 
 
 def plot_error_series(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
-    """Standard deviation of the frame-dependent part over the posterior, at every instant, on a log axis."""
+    """Standard deviation of the frame-dependent part over the posterior, at every instant, on a log
+    axis.
+    """
     if ax is None:
         ax = style.new_axes(7.2, 3.2)
     style.dress(ax, grid=True)
@@ -306,16 +380,29 @@ def plot_distortion_curve(curve: DistortionCurve) -> Figure:
     azimuths = curve.azimuth_deg if len(curve.azimuth_deg) > 1 else [np.nan]
     for row, azimuth in enumerate(azimuths):
         colour = _BAND_COLOURS[row % len(_BAND_COLOURS)]
-        left.plot(curve.radius_px, curve.mean_px[row], color=colour, linewidth=1.6, label=f"{azimuth:g}°")
+        left.plot(
+            curve.radius_px, curve.mean_px[row], color=colour, linewidth=1.6, label=f"{azimuth:g}°"
+        )
     left.axhline(0.0, color=style.INK, linewidth=0.8)
     if len(curve.azimuth_deg) > 1:
         # Azimuths differ little in the width of the band; the widest stands for all.
         style.legend(left, title="azimuth", title_fontsize=style.TICK_SIZE, ncols=2)
     widest = int(np.argmax(curve.sd_px.max(axis=1)))
     _bands(right, curve, widest)
-    where = "" if len(curve.azimuth_deg) == 1 else f", azimuth {curve.azimuth_deg[widest]:g}° (the widest)"
-    style.label(left, "Distortion", "distance from the principal point [px]", "radial displacement [px]")
-    style.label(right, f"Its uncertainty{where}", "distance from the principal point [px]", "minus the mean [px]")
+    where = (
+        ""
+        if len(curve.azimuth_deg) == 1
+        else f", azimuth {curve.azimuth_deg[widest]:g}° (the widest)"
+    )
+    style.label(
+        left, "Distortion", "distance from the principal point [px]", "radial displacement [px]"
+    )
+    style.label(
+        right,
+        f"Its uncertainty{where}",
+        "distance from the principal point [px]",
+        "minus the mean [px]",
+    )
     style.label_distance(left, x_in=0.27, y_in=0.5)
     style.label_distance(right, x_in=0.27, y_in=0.66)
     return figure
@@ -324,21 +411,39 @@ def plot_distortion_curve(curve: DistortionCurve) -> Figure:
 def _bands(ax: Axes, curve: DistortionCurve, row: int) -> None:
     share = percent(curve.level)
     mean = curve.mean_px[row]
-    simultaneous = (curve.lower_simultaneous_px[row] - mean, curve.upper_simultaneous_px[row] - mean)
+    simultaneous = (
+        curve.lower_simultaneous_px[row] - mean,
+        curve.upper_simultaneous_px[row] - mean,
+    )
     pointwise = (curve.lower_px[row] - mean, curve.upper_px[row] - mean)
     ax.fill_between(
-        curve.radius_px, *simultaneous, color=style.SKY, alpha=0.35, linewidth=0, label=f"{share}, whole curves"
+        curve.radius_px,
+        *simultaneous,
+        color=style.SKY,
+        alpha=0.35,
+        linewidth=0,
+        label=f"{share}, whole curves",
     )
     ax.fill_between(
-        curve.radius_px, *pointwise, color=style.BLUE, alpha=0.45, linewidth=0, label=f"{share} at each radius"
+        curve.radius_px,
+        *pointwise,
+        color=style.BLUE,
+        alpha=0.45,
+        linewidth=0,
+        label=f"{share} at each radius",
     )
     ax.axhline(0.0, color=style.INK, linewidth=0.8)
     style.legend(ax, loc="upper left")
-    # The scale of angles changes by a per cent over the field; one right-hand axis would lie by as much.
+    # The scale of angles changes by a per cent over the field; one right-hand axis would lie by as
+    # much.
     middle = float(curve.arcsec_per_px[0])
     second = ax.secondary_yaxis("right", functions=(_times(middle), _times(1.0 / middle)))
-    second.set_ylabel("arcsec, at the scale of the centre", fontsize=style.LABEL_SIZE, color=style.INK)
-    second.tick_params(labelsize=style.TICK_SIZE, colors=style.INK, color=style.GREY, length=3.0, width=0.7)
+    second.set_ylabel(
+        "arcsec, at the scale of the centre", fontsize=style.LABEL_SIZE, color=style.INK
+    )
+    second.tick_params(
+        labelsize=style.TICK_SIZE, colors=style.INK, color=style.GREY, length=3.0, width=0.7
+    )
     second.spines["right"].set_visible(False)
 
 
@@ -349,4 +454,11 @@ def _times(factor: float) -> Callable[[Any], Any]:
 def _beyond_stars(ax: Axes, curve: DistortionCurve) -> None:
     """Grey where no star was."""
     if np.isfinite(curve.star_radius_px) and curve.star_radius_px < curve.radius_px[-1]:
-        ax.axvspan(curve.star_radius_px, curve.radius_px[-1], color=style.LIGHT, alpha=0.8, linewidth=0, zorder=0)
+        ax.axvspan(
+            curve.star_radius_px,
+            curve.radius_px[-1],
+            color=style.LIGHT,
+            alpha=0.8,
+            linewidth=0,
+            zorder=0,
+        )

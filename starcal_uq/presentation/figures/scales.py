@@ -1,4 +1,6 @@
-"""How a parameter is put on an axis: value minus a printed reference, in a unit that keeps tick labels short."""
+"""How a parameter is put on an axis: value minus a printed reference, in a unit that keeps tick
+labels short.
+"""
 
 from __future__ import annotations
 
@@ -61,12 +63,16 @@ def symbol(name: str) -> str:
 
 
 def axis_scale(parameter: Parameter, estimate: float, sigma: float) -> AxisScale:
-    """Choose the reference and the unit from the estimate and its standard deviation (computation units)."""
+    """Choose the reference and the unit from the estimate and its standard deviation (computation
+    units).
+    """
     value, spread = estimate / parameter.scale, sigma / parameter.scale
     decimals = decimals_for(spread)
     text = fixed(value, decimals)
     rounded = round(value, decimals)
-    title = f"{symbol(parameter.name)} = {_with_unit(f'{text} ± {fixed(spread, decimals)}', parameter)}"
+    title = (
+        f"{symbol(parameter.name)} = {_with_unit(f'{text} ± {fixed(spread, decimals)}', parameter)}"
+    )
     exponent = 3 * round(math.log10(spread) / 3.0) if 0.0 < spread < 0.01 else 0
     power = 10.0**exponent
     unit = pretty_unit(parameter.scaled_unit)
@@ -85,7 +91,9 @@ def _with_unit(text: str, parameter: Parameter) -> str:
 
 
 def round_levels(values: FloatArray) -> tuple[FloatArray, Normalize | None]:
-    """Round levels; in equal ratios where the map spans more than a factor of five, else a few would hold it all."""
+    """Round levels; in equal ratios where the map spans more than a factor of five, else a few
+    would hold it all.
+    """
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import MaxNLocator
 
@@ -105,7 +113,9 @@ def round_levels(values: FloatArray) -> tuple[FloatArray, Normalize | None]:
 
 
 def ticks_at_levels(bar: Any, levels: FloatArray) -> None:
-    """Ticks of a colour bar at its levels, all of them or every second, third..., in plain numbers."""
+    """Ticks of a colour bar at its levels, all of them or every second, third..., in plain
+    numbers.
+    """
     from matplotlib.ticker import FuncFormatter
 
     bar.set_ticks(levels[:: -(-len(levels) // _LEVELS_NAMED)])

@@ -74,8 +74,8 @@ def numbers_of(
 ) -> tuple[FloatArray, str]:
     """A number of every cell as it is drawn (C,), and its label with the unit.
 
-    Errors of attitude are per axis across the boresight; sigmas stand in the units in which parameters are printed; the
-    inflation is that of the sigma, the root of the variance's.
+    Errors of attitude are per axis across the boresight; sigmas stand in the units in which
+    parameters are printed; the inflation is that of the sigma, the root of the variance's.
 
     Raises
     ------
@@ -107,18 +107,19 @@ def plot_study_correlation(
     by: str | None = None,
     at: Mapping[str, Any] | None = None,
 ) -> Figure:
-    """Size of the correlation of pairs against a swept axis, a line for every value of a second one.
+    """Size of the correlation of pairs against a swept axis, a line for every value of a second
+    one.
 
-    The band is the range over seeds; in a simulated study, bars are the posterior's correlation, median and range over
-    seeds. The scale grows towards one as the price in sigma does.
+    The band is the range over seeds; in a simulated study, bars are the posterior's correlation,
+    median and range over seeds. The scale grows towards one as the price in sigma does.
 
     Parameters
     ----------
     study : Study
         Result of `starcal_uq.study`.
     pairs : sequence of (str, str), optional
-        Names of parameters, or of a parameter and pitch, yaw or roll of the common rotation; those that are coupled
-        most by default.
+        Names of parameters, or of a parameter and pitch, yaw or roll of the common rotation; those
+        that are coupled most by default.
     along, by : str, optional
         Axes; the first two that were swept by default.
     at : dict, optional
@@ -140,7 +141,11 @@ def plot_study_correlation(
             draw_bars(ax, _sizes(sweep.lines(sampled, along, by, at)))
         known = np.abs(np.stack([lines.median, lines.low, lines.high]))
         top = max(top, float(np.nanmax(known, initial=0.0)))
-        style.label(ax, f"{symbol(first)} and {symbol(second)}{_sign_words(lines.median)}", axis_label(along))
+        style.label(
+            ax,
+            f"{symbol(first)} and {symbol(second)}{_sign_words(lines.median)}",
+            axis_label(along),
+        )
     style.label(panels[0], "", "", "size of the correlation")
     _correlation_axis(panels[0], top)
     legend(figure, lines, sampled="posterior_correlation" in study.data)
@@ -148,31 +153,46 @@ def plot_study_correlation(
 
 
 def _correlation(study: Study, first: str, second: str) -> FloatArray:
-    """Correlation of two parameters, or of a parameter and an axis of the common rotation, of every cell."""
+    """Correlation of two parameters, or of a parameter and an axis of the common rotation, of every
+    cell.
+    """
     names = study.parameter_names
     if first not in names or second not in (*names, *AXES):
-        raise ValueError(f"no pair {first}, {second}: name two of {', '.join((*names, *AXES))}, a parameter first.")
+        raise ValueError(
+            f"no pair {first}, {second}: name two of {', '.join((*names, *AXES))}, a parameter "
+            "first."
+        )
     if second in AXES:
         return study.values("attitude_correlation", parameter=first, axis=second)
     return study.values("correlation", parameter=first, parameter_2=second)
 
 
 def _main_pairs(sweep: Sweep) -> list[tuple[str, str]]:
-    """The pairs to show where none was named: those that are coupled in most of the sweep, or the strongest."""
+    """The pairs to show where none was named: those that are coupled in most of the sweep, or the
+    strongest.
+    """
     shown = sorted(sweep.coupled or sweep.pairs[:_MOST_PANELS], key=lambda pair: -pair.mean_size)
     return [pair.names for pair in shown[:_MOST_PANELS]]
 
 
 def _sign_words(r: FloatArray) -> str:
     signs = np.sign(r[np.abs(np.nan_to_num(r)) > 0.05])
-    return " (opposite)" if len(signs) and np.all(signs < 0) else " (alike)" if len(signs) and np.all(signs > 0) else ""
+    return (
+        " (opposite)"
+        if len(signs) and np.all(signs < 0)
+        else " (alike)"
+        if len(signs) and np.all(signs > 0)
+        else ""
+    )
 
 
 def _sizes(lines: Lines) -> Lines:
     """Absolute values, the range over seeds with them."""
     ends = np.sort(np.abs(np.stack([lines.low, lines.high])), axis=0)
     crosses = lines.low * lines.high < 0.0
-    return replace(lines, median=np.abs(lines.median), low=np.where(crosses, 0.0, ends[0]), high=ends[1])
+    return replace(
+        lines, median=np.abs(lines.median), low=np.where(crosses, 0.0, ends[0]), high=ends[1]
+    )
 
 
 def _correlation_axis(ax: Axes, top: float) -> None:
@@ -181,7 +201,11 @@ def _correlation_axis(ax: Axes, top: float) -> None:
     limit = float(np.tanh(np.arctanh(top) * 1.06 + 0.05))
     ax.set_yscale("function", functions=(_to_z, np.tanh))
     ax.set_ylim(0.0, limit)
-    ticks = [tick for tick in _CORRELATION_TICKS if tick < limit] if limit > 0.6 else [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    ticks = (
+        [tick for tick in _CORRELATION_TICKS if tick < limit]
+        if limit > 0.6
+        else [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    )
     ax.set_yticks([tick for tick in ticks if tick < limit])
     ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.minorticks_off()
@@ -202,15 +226,17 @@ def plot_study_map(
     at: Mapping[str, Any] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """A number over two axes, median over seeds: cells with their numbers, or contours where they are many.
+    """A number over two axes, median over seeds: cells with their numbers, or contours where they
+    are many.
 
     Parameters
     ----------
     study : Study
         Result of `starcal_uq.study`.
     variable : str
-        A variable of the study's data: ``sigma``, ``correlation``, ``variance_inflation``, ``condition_number``,
-        ``frame_error_arcsec``, ``common_rotation_arcsec``, ``nea_arcsec``, ``frames_needed``, ``mean_stars``.
+        A variable of the study's data: ``sigma``, ``correlation``, ``variance_inflation``,
+        ``condition_number``, ``frame_error_arcsec``, ``common_rotation_arcsec``, ``nea_arcsec``,
+        ``frames_needed``, ``mean_stars``.
     parameter, parameter_2 : str, optional
         For variables of a parameter or of a pair.
     x, y : str, optional
@@ -269,7 +295,9 @@ def _cells(ax: Axes, lines: Lines, variable: str) -> None:
         if np.isnan(value):
             text, colour = "–", style.GREY
         else:
-            text = correlation_text(float(value)) if variable == "correlation" else short(float(value))
+            text = (
+                correlation_text(float(value)) if variable == "correlation" else short(float(value))
+            )
             colour = "white" if np.isfinite(value) and dark(value) else style.INK
         ax.text(column, row, text, ha="center", va="center", fontsize=size, color=colour)
 
@@ -282,7 +310,9 @@ def _contours(ax: Axes, lines: Lines, variable: str) -> None:
     scale(ax.yaxis, lines.by_values)
     colours, norm, _ = _colours(lines.median, variable)
     levels, _ = round_levels(z.compressed())
-    image = ax.pcolormesh(x, y, z, cmap=colours, norm=norm, shading="nearest" if z.mask.any() else "gouraud")
+    image = ax.pcolormesh(
+        x, y, z, cmap=colours, norm=norm, shading="nearest" if z.mask.any() else "gouraud"
+    )
     bar = style.colour_bar(ax, image, "")
     low, high = float(z.min()), float(z.max())
     if variable == "correlation":
@@ -294,8 +324,18 @@ def _contours(ax: Axes, lines: Lines, variable: str) -> None:
         # Contours of little relief would be those of chance.
         shown = levels[1:-1][:: max(1, len(levels) // 6)] if high > 1.3 * low else levels[:0]
     if not len(shown):
-        words = " to ".join(correlation_text(v) if variable == "correlation" else short(v) for v in (low, high))
-        ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", color="white", fontsize=style.LABEL_SIZE)
+        words = " to ".join(
+            correlation_text(v) if variable == "correlation" else short(v) for v in (low, high)
+        )
+        ax.text(
+            0.5,
+            0.5,
+            words,
+            transform=ax.transAxes,
+            ha="center",
+            color="white",
+            fontsize=style.LABEL_SIZE,
+        )
         return
     from matplotlib.patheffects import withStroke
 
@@ -321,17 +361,26 @@ def _colours(z: FloatArray, variable: str) -> tuple[str, Any, Any]:
 
 
 def plot_study_maps(study: Study, x: str | None = None, y: str | None = None) -> Figure:
-    """Four maps over two axes: the coupling that changes most, the largest inflation, and both attitude errors."""
+    """Four maps over two axes: the coupling that changes most, the largest inflation, and both
+    attitude errors.
+    """
     sweep = study.sweep
     x, y = two_axes(sweep, x, y, lines=False)
     if y is None:
         raise ValueError("maps need two swept axes.")
-    changing = max(sweep.coupled or sweep.pairs[:1], key=lambda pair: max((c.change for c in pair.costs), default=0.0))
+    changing = max(
+        sweep.coupled or sweep.pairs[:1],
+        key=lambda pair: max((c.change for c in pair.costs), default=0.0),
+    )
     first, second = changing.names
     figure = style.new_figure(11.0, 2.2 + 0.72 * max(5, min(10, len(sweep.values[y]))))
     panels = figure.subplots(2, 2).ravel()
-    plot_study_map(study, "correlation", parameter=first, parameter_2=second, x=x, y=y, ax=panels[0])
-    plot_study_map(study, "variance_inflation", parameter=_most_inflated(study), x=x, y=y, ax=panels[1])
+    plot_study_map(
+        study, "correlation", parameter=first, parameter_2=second, x=x, y=y, ax=panels[0]
+    )
+    plot_study_map(
+        study, "variance_inflation", parameter=_most_inflated(study), x=x, y=y, ax=panels[1]
+    )
     plot_study_map(study, "frame_error_arcsec", x=x, y=y, ax=panels[2])
     plot_study_map(study, "common_rotation_arcsec", x=x, y=y, ax=panels[3])
     held_title(figure, sweep.held(x, y))
@@ -345,12 +394,17 @@ def _most_inflated(study: Study) -> str:
 
 
 def plot_weakest(
-    study: Study, *, along: str | None = None, by: str | None = None, at: Mapping[str, Any] | None = None
+    study: Study,
+    *,
+    along: str | None = None,
+    by: str | None = None,
+    at: Mapping[str, Any] | None = None,
 ) -> Figure:
     """What the weakest direction is made of along an axis, for up to three values of a second one.
 
-    The direction is the combination of parameters, each in its own sigma, that the data determine worst; shares are the
-    squares of its entries, and the numbers above the bars its variance over that of uncoupled parameters.
+    The direction is the combination of parameters, each in its own sigma, that the data determine
+    worst; shares are the squares of its entries, and the numbers above the bars its variance over
+    that of uncoupled parameters.
 
     Parameters
     ----------
@@ -369,18 +423,36 @@ def plot_weakest(
     figure = style.new_figure(2.2 + 2.9 * len(rows), 3.8)
     panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
     places = np.arange(len(variance.values))
-    stack = {name: sweep.lines(shares[:, i], along, by, at).median for i, name in enumerate(study.parameter_names)}
+    stack = {
+        name: sweep.lines(shares[:, i], along, by, at).median
+        for i, name in enumerate(study.parameter_names)
+    }
     total = np.nansum(list(stack.values()), axis=0)
     for ax, row in zip(panels, rows, strict=True):
         style.dress(ax)
         below = np.zeros(len(places))
         for name, share in stack.items():
             height = np.nan_to_num(share[row] / np.where(total[row] > 0.0, total[row], np.nan))
-            ax.bar(places, height, 0.78, bottom=below, color=colour_of(name), edgecolor="white", linewidth=0.8)
+            ax.bar(
+                places,
+                height,
+                0.78,
+                bottom=below,
+                color=colour_of(name),
+                edgecolor="white",
+                linewidth=0.8,
+            )
             below = below + height
         for at_x, value in zip(places, variance.median[row], strict=True):
             words = "–" if np.isnan(value) else f"×{significant(float(value))}"
-            ax.annotate(words, (at_x, 1.02), ha="center", va="bottom", fontsize=style.TICK_SIZE - 0.5, color=style.INK)
+            ax.annotate(
+                words,
+                (at_x, 1.02),
+                ha="center",
+                va="bottom",
+                fontsize=style.TICK_SIZE - 0.5,
+                color=style.INK,
+            )
         ax.set_ylim(0.0, 1.12)
         ax.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "25 %", "50 %", "75 %", "100 %"])
         ticks(ax.xaxis, variance.values, places)
@@ -393,7 +465,11 @@ def plot_weakest(
 
 
 def plot_matrices(
-    study: Study, *, along: str | None = None, by: str | None = None, at: Mapping[str, Any] | None = None
+    study: Study,
+    *,
+    along: str | None = None,
+    by: str | None = None,
+    at: Mapping[str, Any] | None = None,
 ) -> Figure:
     """The correlation matrix along an axis, and down a second one, median over seeds.
 
@@ -421,9 +497,17 @@ def plot_matrices(
             ax = figure.add_subplot(panels[row, column])
             image = _matrix(ax, grid[:, :, at_row, at_column], names, row == 0, column == 0)
             if column == 0 and by is not None:
-                ax.set_ylabel(value_words(lines[0][0].by_values[at_row]), fontsize=style.LABEL_SIZE, color=style.INK)
+                ax.set_ylabel(
+                    value_words(lines[0][0].by_values[at_row]),
+                    fontsize=style.LABEL_SIZE,
+                    color=style.INK,
+                )
             if row == len(rows) - 1:
-                ax.set_xlabel(value_words(lines[0][0].values[at_column]), fontsize=style.LABEL_SIZE, color=style.INK)
+                ax.set_xlabel(
+                    value_words(lines[0][0].values[at_column]),
+                    fontsize=style.LABEL_SIZE,
+                    color=style.INK,
+                )
     figure.supxlabel(axis_label(along), fontsize=style.LABEL_SIZE, color=style.INK, y=0.01)
     if by is not None:
         figure.supylabel(axis_label(by), fontsize=style.LABEL_SIZE, color=style.INK, x=0.005)
@@ -441,7 +525,9 @@ def _matrix(ax: Axes, matrix: FloatArray, names: Sequence[str], top: bool, left:
     words = [symbol(name) for name in names]
     ax.set_xticks(ticks, words if top else [], fontsize=style.TICK_SIZE)
     ax.set_yticks(ticks, words if left else [], fontsize=style.TICK_SIZE)
-    ax.tick_params(length=0.0, top=False, labeltop=top, bottom=False, labelbottom=False, colors=style.INK)
+    ax.tick_params(
+        length=0.0, top=False, labeltop=top, bottom=False, labelbottom=False, colors=style.INK
+    )
     ax.set_xticks(ticks[1:] - 0.5, minor=True)
     ax.set_yticks(ticks[1:] - 0.5, minor=True)
     ax.tick_params(which="minor", length=0.0)
@@ -452,7 +538,15 @@ def _matrix(ax: Axes, matrix: FloatArray, names: Sequence[str], top: bool, left:
         for (i, j), value in np.ndenumerate(matrix):
             if np.isfinite(value):
                 colour = "white" if abs(value) > 0.62 else style.INK
-                ax.text(j, i, correlation_text(float(value)), ha="center", va="center", fontsize=6.5, color=colour)
+                ax.text(
+                    j,
+                    i,
+                    correlation_text(float(value)),
+                    ha="center",
+                    va="center",
+                    fontsize=6.5,
+                    color=colour,
+                )
     return image
 
 
@@ -464,7 +558,8 @@ def plot_needed(
     target_arcsec: float | None = None,
     at: Mapping[str, Any] | None = None,
 ) -> Figure:
-    """Frame-dependent attitude error along an axis with its target, and the frames that the target takes.
+    """Frame-dependent attitude error along an axis with its target, and the frames that the target
+    takes.
 
     Parameters
     ----------
@@ -491,7 +586,12 @@ def plot_needed(
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(min(low, float(target) / 1.5), max(high, float(target) * 1.5))
         plain(panels[0].yaxis)
-    style.label(panels[0], "Error that differs from frame to frame", axis_label(along), "1 sigma per axis [arcsec]")
+    style.label(
+        panels[0],
+        "Error that differs from frame to frame",
+        axis_label(along),
+        "1 sigma per axis [arcsec]",
+    )
     if target is not None:
         target_line(panels[0], float(target), f"target {target:g} arcsec")
         needed = sweep.lines(study.frames_for(float(target)), along, by, at)
@@ -504,9 +604,14 @@ def plot_needed(
 
 
 def plot_inflation(
-    study: Study, *, along: str | None = None, by: str | None = None, at: Mapping[str, Any] | None = None
+    study: Study,
+    *,
+    along: str | None = None,
+    by: str | None = None,
+    at: Mapping[str, Any] | None = None,
 ) -> Figure:
-    """Sigma of every parameter along an axis, with all others unknown and, dashed, with all others known.
+    """Sigma of every parameter along an axis, with all others unknown and, dashed, with all others
+    known.
 
     The gap between both is the price of coupling.
 
@@ -543,9 +648,14 @@ def plot_inflation(
 
 
 def plot_simpler(
-    study: Study, *, along: str | None = None, by: str | None = None, at: Mapping[str, Any] | None = None
+    study: Study,
+    *,
+    along: str | None = None,
+    by: str | None = None,
+    at: Mapping[str, Any] | None = None,
 ) -> Figure:
-    """Attitude error that a simpler distortion model would leave, beside the error of the calibration itself.
+    """Attitude error that a simpler distortion model would leave, beside the error of the
+    calibration itself.
 
     Where a model's line lies below the grey one, that model is rich enough.
 
@@ -563,8 +673,14 @@ def plot_simpler(
     ValueError
         For a study in which no simpler model was tried.
     """
-    models = [str(model) for model in study.data["simpler"].values] if "simpler" in study.data else []
-    bias = np.stack([model_bias(study, model) for model in models], axis=1) if models else np.empty((0, 0))
+    models = (
+        [str(model) for model in study.data["simpler"].values] if "simpler" in study.data else []
+    )
+    bias = (
+        np.stack([model_bias(study, model) for model in models], axis=1)
+        if models
+        else np.empty((0, 0))
+    )
     # A model that leaves out zeros alone was not tried.
     shown = [i for i in range(len(models)) if np.any(np.nan_to_num(bias[:, i]) > 0.0)]
     if not shown:
@@ -579,24 +695,39 @@ def plot_simpler(
     x = positions(error.values)
     for ax, row in zip(panels, rows, strict=True):
         style.dress(ax, grid=True)
-        ax.fill_between(x, error.low[row], error.high[row], color=style.GREY, alpha=0.25, linewidth=0)
+        ax.fill_between(
+            x, error.low[row], error.high[row], color=style.GREY, alpha=0.25, linewidth=0
+        )
         ax.plot(x, error.median[row], color=style.GREY, linewidth=2.2)
         for number, curve in enumerate(curves):
-            ax.plot(x, curve.median[row], color=NAMED[number % 5], marker=MARKERS[number % 5], markersize=4.5)
+            ax.plot(
+                x,
+                curve.median[row],
+                color=NAMED[number % 5],
+                marker=MARKERS[number % 5],
+                markersize=4.5,
+            )
         scale(ax.xaxis, error.values)
-        style.label(ax, capital(said(by, error.by_values[row])) if by is not None else "", axis_label(along))
+        style.label(
+            ax, capital(said(by, error.by_values[row])) if by is not None else "", axis_label(along)
+        )
     logarithmic(panels[0], error, *curves)
     style.label(panels[0], "", "", "arcsec")
     keys = [
-        style.key(f"left by the model {models[i]}", NAMED[n % 5], marker=MARKERS[n % 5], markersize=4.5)
+        style.key(
+            f"left by the model {models[i]}", NAMED[n % 5], marker=MARKERS[n % 5], markersize=4.5
+        )
         for n, i in enumerate(shown)
     ]
-    style.legend_above(figure, [style.key("error of the calibration", style.GREY, linewidth=2.2), *keys])
+    style.legend_above(
+        figure, [style.key("error of the calibration", style.GREY, linewidth=2.2), *keys]
+    )
     return figure
 
 
 def plot_coverage(study: Study, *, along: str | None = None) -> Figure:
-    """Part of the simulated cells whose 95 % interval holds the truth, with exact 95 % bounds of that part.
+    """Part of the simulated cells whose 95 % interval holds the truth, with exact 95 % bounds of
+    that part.
 
     Parameters
     ----------
@@ -637,6 +768,9 @@ def plot_coverage(study: Study, *, along: str | None = None) -> Figure:
     style.label(ax, "", axis_label(along), "95 % intervals that hold the truth")
     style.legend_above(
         figure,
-        [style.key(symbol(name), colour_of(name), marker="o", markersize=6) for name in study.parameter_names],
+        [
+            style.key(symbol(name), colour_of(name), marker="o", markersize=6)
+            for name in study.parameter_names
+        ],
     )
     return figure

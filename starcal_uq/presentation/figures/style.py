@@ -1,7 +1,8 @@
-"""One look for all figures: colours that colour-blind readers can tell apart, quiet axes, explicit sizes.
+"""One look for all figures: colours that colour-blind readers can tell apart, quiet axes, explicit
+sizes.
 
-Styles are set on each artist rather than through ``rcParams``: figures look the same wherever they are drawn, and the
-user's own settings stay untouched.
+Styles are set on each artist rather than through ``rcParams``: figures look the same wherever they
+are drawn, and the user's own settings stay untouched.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ BARS: dict[str, Any] = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.
 
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure that no window manager knows of and that shows itself in a notebook."""
-    return _notebook_figure()(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+    return _notebook_figure()(
+        figsize=(width_in, height_in), layout="constrained", facecolor="white"
+    )
 
 
 @cache
@@ -64,9 +67,11 @@ def panels(
     gaps_in: tuple[float, float],
     **ratios: Any,
 ) -> GridSpec:
-    """A grid of panels with margins (left, right, bottom, top) and gaps (across, down) in inches; equal by default.
+    """A grid of panels with margins (left, right, bottom, top) and gaps (across, down) in inches;
+    equal by default.
 
-    Many small panels of known labels are laid out at once: measuring every label takes longer than drawing all of them.
+    Many small panels of known labels are laid out at once: measuring every label takes longer than
+    drawing all of them.
     """
     figure.set_layout_engine("none")
     width, height = figure.get_size_inches()
@@ -85,15 +90,21 @@ def panels(
     )
 
 
-def place(figure: Figure, left_in: float, bottom_in: float, width_in: float, height_in: float) -> Axes:
+def place(
+    figure: Figure, left_in: float, bottom_in: float, width_in: float, height_in: float
+) -> Axes:
     """A panel of known place in inches, as `panels` are."""
     figure.set_layout_engine("none")
     width, height = figure.get_size_inches()
-    return figure.add_axes((left_in / width, bottom_in / height, width_in / width, height_in / height))
+    return figure.add_axes(
+        (left_in / width, bottom_in / height, width_in / width, height_in / height)
+    )
 
 
 def label_distance(ax: Axes, *, x_in: float | None = None, y_in: float | None = None) -> None:
-    """Begin the axis labels so many inches below and to the left of a panel whose place is fixed."""
+    """Begin the axis labels so many inches below and to the left of a panel whose place is
+    fixed.
+    """
     figure = figure_of(ax)
     # The shape of a panel of equal scales, which is smaller than its place.
     ax.apply_aspect()
@@ -104,16 +115,21 @@ def label_distance(ax: Axes, *, x_in: float | None = None, y_in: float | None = 
         ax.yaxis.set_label_coords(-y_in / width, 0.5)
 
 
-def new_axes(width_in: float, height_in: float, margins_in: tuple[float, float, float, float] | None = None) -> Axes:
-    """One dressed panel on a figure of its own, with margins (left, right, bottom, top) in inches where they are known.
+def new_axes(
+    width_in: float, height_in: float, margins_in: tuple[float, float, float, float] | None = None
+) -> Axes:
+    """One dressed panel on a figure of its own, with margins (left, right, bottom, top) in inches
+    where they are known.
 
-    In a notebook the figure is handed to pyplot, because only then does the notebook show it below the cell although
-    the caller holds the Axes; elsewhere pyplot is left alone.
+    In a notebook the figure is handed to pyplot, because only then does the notebook show it below
+    the cell although the caller holds the Axes; elsewhere pyplot is left alone.
     """
     if _in_notebook():
         from matplotlib import pyplot
 
-        figure = pyplot.figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+        figure = pyplot.figure(
+            figsize=(width_in, height_in), layout="constrained", facecolor="white"
+        )
     else:
         figure = new_figure(width_in, height_in)
     if margins_in is None:
@@ -126,7 +142,8 @@ def dress(ax: Axes, *, grid: bool = False) -> Axes:
     """Quiet spines, small ticks, and not many of them."""
     from matplotlib.ticker import AutoLocator
 
-    # A title whose height is given is not put above all tick labels, each of them measured, when the figure is drawn.
+    # A title whose height is given is not put above all tick labels, each of them measured, when
+    # the figure is drawn.
     ax.set_title("", y=1.0)
     for axis in (ax.xaxis, ax.yaxis):
         locator = axis.get_major_locator()
@@ -145,7 +162,9 @@ def dress(ax: Axes, *, grid: bool = False) -> Axes:
 
 
 def log_scale(axis: Axis, linear: float | None = None, **options: Any) -> None:
-    """A logarithmic axis with ticks at powers of ten; linear between -`linear` and `linear` where that is given."""
+    """A logarithmic axis with ticks at powers of ten; linear between -`linear` and `linear` where
+    that is given.
+    """
     from matplotlib.ticker import FuncFormatter, NullLocator
 
     ax = axis.axes
@@ -159,7 +178,9 @@ def log_scale(axis: Axis, linear: float | None = None, **options: Any) -> None:
 
 
 def power_text(value: float) -> str:
-    """A power of ten as a tick label, without the mathematical typesetting that takes as long as a panel."""
+    """A power of ten as a tick label, without the mathematical typesetting that takes as long as a
+    panel.
+    """
     if value == 0.0:
         return "0"
     exponent = round(float(np.log10(abs(value))))
@@ -179,7 +200,12 @@ def label(ax: Axes, title: str = "", x: str = "", y: str = "", *, pad: float = 7
 
 def legend(ax: Axes, **keywords: Any) -> None:
     """A legend with a faint white ground, so that data under it do not cross the words."""
-    options: dict[str, Any] = {"fontsize": TICK_SIZE, "framealpha": 0.9, "edgecolor": "none", "labelcolor": INK}
+    options: dict[str, Any] = {
+        "fontsize": TICK_SIZE,
+        "framealpha": 0.9,
+        "edgecolor": "none",
+        "labelcolor": INK,
+    }
     ax.legend(**{**options, **keywords})
 
 
@@ -200,13 +226,20 @@ def key(text: str, colour: str, **keywords: Any) -> Line2D:
 
 def legend_above(figure: Figure, handles: Any, **keywords: Any) -> None:
     """One legend for all panels, in a line above them."""
-    options: dict[str, Any] = {"ncols": len(handles), "fontsize": TICK_SIZE, "frameon": False, "labelcolor": INK}
+    options: dict[str, Any] = {
+        "ncols": len(handles),
+        "fontsize": TICK_SIZE,
+        "frameon": False,
+        "labelcolor": INK,
+    }
     figure.legend(handles=handles, **{"loc": "outside upper center", **options, **keywords})
 
 
 def colour_bar(ax: Axes, image: Any, text: str, own: Axes | None = None) -> Any:
     """A colour bar of one panel, on a panel of its own where there is one."""
-    where: dict[str, Any] = {"cax": own} if own is not None else {"ax": ax, "fraction": 0.046, "pad": 0.03}
+    where: dict[str, Any] = (
+        {"cax": own} if own is not None else {"ax": ax, "fraction": 0.046, "pad": 0.03}
+    )
     bar = ax.figure.colorbar(image, **where)
     dress_bar(bar, text)
     return bar
@@ -233,18 +266,22 @@ def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:
     from PIL import Image
 
     buffer = io.BytesIO()
-    # 256 colours are as many as flat grounds, letters and a colour bar need, in a quarter of the bytes.
-    picture = Image.fromarray(painted(figure, dpi)).quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    # 256 colours are as many as flat grounds, letters and a colour bar need, in a quarter of the
+    # bytes.
+    picture = Image.fromarray(painted(figure, dpi)).quantize(
+        256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+    )
     colours = np.array(picture.getpalette(), dtype=np.uint8).reshape(-1, 3)
-    # A colour of the palette is a mean, and that of the ground would be seen beside the page's white.
+    # A colour of the palette is a mean, and that of the ground would be seen beside the page's
+    # white.
     colours[colours.min(axis=1) >= _WHITE] = 255
     picture.putpalette(colours.tobytes())
     picture.save(buffer, format="png", dpi=(dpi, dpi))
     return buffer.getvalue()
 
 
-# What makes a vector figure half as large: hundredths of a point are finer than any screen or printer, letters stand at
-# their x, and nobody asks for the names of groups, glyphs apart.
+# What makes a vector figure half as large: hundredths of a point are finer than any screen or
+# printer, letters stand at their x, and nobody asks for the names of groups, glyphs apart.
 _SHORTER = tuple(
     (re.compile(pattern), short)
     for pattern, short in (
@@ -262,7 +299,9 @@ _SHORTER = tuple(
 
 
 def svg_bytes(figure: Figure) -> bytes:
-    """The figure as SVG with its letters as shapes: it looks the same everywhere, and gives the same bytes again."""
+    """The figure as SVG with its letters as shapes: it looks the same everywhere, and gives the
+    same bytes again.
+    """
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 

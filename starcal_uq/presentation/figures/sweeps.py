@@ -37,10 +37,11 @@ MARKERS = "osD^v"
 def two_axes(
     sweep: Sweep, along: str | None, by: str | None, *, names: bool = False, lines: bool = True
 ) -> tuple[str, str | None]:
-    """The axis to draw along, and the one that tells lines apart: as named, or the first that are left.
+    """The axis to draw along, and the one that tells lines apart: as named, or the first that are
+    left.
 
-    Lines run along numbers, and names tell them apart; with `names` it is the other way round. With `lines`, axes of a
-    Latin hypercube tell no lines apart.
+    Lines run along numbers, and names tell them apart; with `names` it is the other way round. With
+    `lines`, axes of a Latin hypercube tell no lines apart.
     """
     if not sweep.axes:
         raise ValueError("nothing was swept: give [sweep] an axis with more than one value.")
@@ -83,7 +84,11 @@ def _geometric(values: Sequence[Any]) -> bool:
 
 def positions(values: Sequence[Any]) -> FloatArray:
     """Where values stand on an axis: names side by side, numbers where they are."""
-    return np.asarray(values, dtype=np.float64) if numeric(values) else np.arange(len(values), dtype=np.float64)
+    return (
+        np.asarray(values, dtype=np.float64)
+        if numeric(values)
+        else np.arange(len(values), dtype=np.float64)
+    )
 
 
 def scale(axis: Any, values: Sequence[Any]) -> None:
@@ -101,7 +106,9 @@ def _no_ticks() -> Any:
 
 
 def ticks(axis: Any, values: Sequence[Any], places: NDArray[Any]) -> None:
-    """Ticks at the swept values, every second or third where they are many; long names stand aslant."""
+    """Ticks at the swept values, every second or third where they are many; long names stand
+    aslant.
+    """
     shown = some(len(values), 8)
     words = [value_words(values[i]) for i in shown]
     axis.set_ticks(np.asarray(places)[shown], words)
@@ -111,7 +118,9 @@ def ticks(axis: Any, values: Sequence[Any], places: NDArray[Any]) -> None:
 
 
 def _line_colours(lines: Lines) -> dict[int, Any]:
-    """The lines to draw, by their number, each with its colour: in order of the second axis' values."""
+    """The lines to draw, by their number, each with its colour: in order of the second axis'
+    values.
+    """
     rows = some(len(lines.median), _MOST_LINES)
     if lines.by is None:
         return {rows[0]: style.BLUE}
@@ -131,14 +140,30 @@ def draw_lines(ax: Axes, lines: Lines, *, dashed: bool = False) -> None:
         if dashed:
             ax.plot(x[good], lines.median[row][good], color=colour, linewidth=1.2, dashes=(4, 2))
             continue
-        ax.fill_between(x[good], lines.low[row][good], lines.high[row][good], color=colour, alpha=0.2, linewidth=0)
+        ax.fill_between(
+            x[good],
+            lines.low[row][good],
+            lines.high[row][good],
+            color=colour,
+            alpha=0.2,
+            linewidth=0,
+        )
         marker = MARKERS[number % len(MARKERS)]
-        ax.plot(x[good], lines.median[row][good], color=colour, marker=marker, markersize=4.5, linewidth=1.5)
+        ax.plot(
+            x[good],
+            lines.median[row][good],
+            color=colour,
+            marker=marker,
+            markersize=4.5,
+            linewidth=1.5,
+        )
     scale(ax.xaxis, lines.values)
 
 
 def draw_bars(ax: Axes, lines: Lines) -> None:
-    """What the posterior says beside the line: median and range over seeds, those of other lines a little aside."""
+    """What the posterior says beside the line: median and range over seeds, those of other lines a
+    little aside.
+    """
     from matplotlib.transforms import ScaledTranslation
 
     x = positions(lines.values)
@@ -147,7 +172,9 @@ def draw_bars(ax: Axes, lines: Lines) -> None:
         middle = lines.median[row]
         good = np.isfinite(middle)
         bars = np.stack([middle - lines.low[row], lines.high[row] - middle])[:, good]
-        aside = ScaledTranslation(0.09 * (number - 0.5 * (len(colours) - 1)), 0.0, style.figure_of(ax).dpi_scale_trans)
+        aside = ScaledTranslation(
+            0.09 * (number - 0.5 * (len(colours) - 1)), 0.0, style.figure_of(ax).dpi_scale_trans
+        )
         ax.errorbar(
             *(x[good], middle[good]),
             yerr=np.abs(bars),
@@ -170,9 +197,13 @@ def legend(figure: Figure, lines: Lines, *, sampled: bool = False, dashed: str =
                 if number
                 else capital(f"{axis_label(lines.by)}: {value_words(lines.by_values[row])}")
             )
-            keys.append(style.key(words, colour, marker=MARKERS[number % len(MARKERS)], markersize=4.5))
+            keys.append(
+                style.key(words, colour, marker=MARKERS[number % len(MARKERS)], markersize=4.5)
+            )
     if sampled:
-        keys.append(style.key("posterior, range over seeds", style.GREY, marker="x", linestyle="none"))
+        keys.append(
+            style.key("posterior, range over seeds", style.GREY, marker="x", linestyle="none")
+        )
     if dashed:
         keys.append(style.key(dashed, style.GREY, dashes=(4, 2)))
     if keys:
@@ -182,12 +213,16 @@ def legend(figure: Figure, lines: Lines, *, sampled: bool = False, dashed: str =
 
 def held_title(figure: Figure, held: Mapping[str, Any]) -> None:
     if held:
-        figure.suptitle(f"For {place(held)}", fontsize=style.LABEL_SIZE, color=style.GREY, x=0.01, ha="left")
+        figure.suptitle(
+            f"For {place(held)}", fontsize=style.LABEL_SIZE, color=style.GREY, x=0.01, ha="left"
+        )
 
 
 def logarithmic(ax: Axes, *lines: Lines) -> None:
     """A logarithmic axis in plain numbers over what is drawn, of at least a factor of two."""
-    values = np.concatenate([array.ravel() for entry in lines for array in (entry.median, entry.low, entry.high)])
+    values = np.concatenate(
+        [array.ravel() for entry in lines for array in (entry.median, entry.low, entry.high)]
+    )
     values = values[np.isfinite(values) & (values > 0.0)]
     if not len(values):
         nothing(ax)
@@ -205,9 +240,17 @@ def plain(axis: Any) -> None:
 
     low, high = axis.get_view_interval()
     span = high / low
-    subs = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0) if span < 6.0 else (1.0, 2.0, 5.0) if span < 150.0 else (1.0,)
+    subs = (
+        (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+        if span < 6.0
+        else (1.0, 2.0, 5.0)
+        if span < 150.0
+        else (1.0,)
+    )
     axis.set_major_locator(LogLocator(subs=subs, numticks=20))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: count(int(value)) if value >= 10.0 else f"{value:.6g}"))
+    axis.set_major_formatter(
+        FuncFormatter(lambda value, _: count(int(value)) if value >= 10.0 else f"{value:.6g}")
+    )
     axis.set_minor_locator(_no_ticks())
 
 
@@ -227,7 +270,13 @@ def target_line(ax: Axes, value: float, words: str) -> None:
 
 def nothing(ax: Axes) -> None:
     ax.text(
-        0.5, 0.5, "no cell has this", transform=ax.transAxes, ha="center", color=style.GREY, fontsize=style.LABEL_SIZE
+        0.5,
+        0.5,
+        "no cell has this",
+        transform=ax.transAxes,
+        ha="center",
+        color=style.GREY,
+        fontsize=style.LABEL_SIZE,
     )
 
 

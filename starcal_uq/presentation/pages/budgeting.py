@@ -19,7 +19,13 @@ from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import tex
-from starcal_uq.presentation.words.budgeting import NOT_RESOLVED, axis_label, headline, outcome_text, tables
+from starcal_uq.presentation.words.budgeting import (
+    NOT_RESOLVED,
+    axis_label,
+    headline,
+    outcome_text,
+    tables,
+)
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
@@ -74,7 +80,9 @@ def write_html(budget: Budget, path: str | os.PathLike[str]) -> None:
 
 
 def write_xlsx(budget: Budget, path: str | os.PathLike[str]) -> None:
-    """A workbook with the sheets Contributors, Totals, Requirements (if any) and Notes; numbers are numbers."""
+    """A workbook with the sheets Contributors, Totals, Requirements (if any) and Notes; numbers are
+    numbers.
+    """
     with extra("excel", "Excel workbooks", "write .csv or .html"):
         from openpyxl import Workbook
 
@@ -87,7 +95,13 @@ def write_xlsx(budget: Budget, path: str | os.PathLike[str]) -> None:
         _requirements(book.create_sheet("Requirements"), budget)
     notes = book.create_sheet("Notes")
     created = str(budget.provenance.get("created_utc", ""))
-    lines = [budget.title, created, headline(budget), *tables(budget)["explanations"], *budget.notes]
+    lines = [
+        budget.title,
+        created,
+        headline(budget),
+        *tables(budget)["explanations"],
+        *budget.notes,
+    ]
     _table(notes, ["Notes"], [[line] for line in lines if line], [110])
     with atomic_path(path) as temporary:
         book.save(temporary)
@@ -97,37 +111,70 @@ def _contributors(sheet: Worksheet, budget: Budget) -> None:
     header = [
         *("Contributor", "ECSS class", "Axis", "Mean [arcsec]", "Sigma [arcsec]"),
         *(f"{name[0].upper()}{name[1:]} [arcsec]" for name in (WITH_MISFIT_FOUND, IF_MODEL_HOLDS)),
-        *("Distribution", "99.7 % half-width [sigma]", "Random over", "Correlation group", "Combination"),
+        *(
+            "Distribution",
+            "99.7 % half-width [sigma]",
+            "Random over",
+            "Correlation group",
+            "Combination",
+        ),
         *("Absorbed by alignment", "Conditions", "Provenance", "Source"),
     ]
     rows, colours = [], []
     for row in budget.rows:
-        mean, sigma = (row.mean_arcsec, row.sigma_arcsec) if row.assessed else (NOT_ASSESSED, NOT_ASSESSED)
+        mean, sigma = (
+            (row.mean_arcsec, row.sigma_arcsec) if row.assessed else (NOT_ASSESSED, NOT_ASSESSED)
+        )
         gaussian = row.assessed and row.applies and row.distribution == "gaussian"
         rows.append(
             [
                 *(row.name, row.ecss_class, AXIS_LABELS[row.axis], mean, sigma),
                 *(_with_misfit(row), row.if_model_holds_arcsec),
-                *(row.distribution if row.applies else "does not apply", row.tail_997 if gaussian else None),
+                *(
+                    row.distribution if row.applies else "does not apply",
+                    row.tail_997 if gaussian else None,
+                ),
                 *(row.interpretation, row.correlation_group, row.combination),
                 *(row.absorbed_by_alignment, row.conditions, row.provenance, row.source),
             ]
         )
         colours.append("" if row.assessed and not row.inflated else _AMBER)
-    _table(sheet, header, rows, [34, 20, 11, 13, 13, 17, 17, 15, 16, 13, 16, 24, 15, 50, 40, 13], colours)
+    _table(
+        sheet,
+        header,
+        rows,
+        [34, 20, 11, 13, 13, 17, 17, 15, 16, 13, 16, 24, 15, 50, 40, 13],
+        colours,
+    )
 
 
 def _with_misfit(row: Contributor) -> float | str:
-    untested = not math.isnan(row.if_model_holds_arcsec) and math.isnan(row.with_misfit_found_arcsec)
+    untested = not math.isnan(row.if_model_holds_arcsec) and math.isnan(
+        row.with_misfit_found_arcsec
+    )
     return NOT_ASSESSED if untested else row.with_misfit_found_arcsec
 
 
 def _totals(sheet: Worksheet, budget: Budget) -> None:
     header = [
-        *("Scope", "Axis", "Random over", "Confidence", "Mean [arcsec]", "Sigma [arcsec]", "Factor n [sigma]"),
+        *(
+            "Scope",
+            "Axis",
+            "Random over",
+            "Confidence",
+            "Mean [arcsec]",
+            "Sigma [arcsec]",
+            "Factor n [sigma]",
+        ),
         *("Worst case added [arcsec]", "Bound by the rule [arcsec]", "Bound by sampling [arcsec]"),
         *("Rule at the least [arcsec]", "Sampling at the least [arcsec]"),
-        *("Standard error of sampling [arcsec]", "Reads", "Dominant", "Not assessed", "Rule against sampling"),
+        *(
+            "Standard error of sampling [arcsec]",
+            "Reads",
+            "Dominant",
+            "Not assessed",
+            "Rule against sampling",
+        ),
     ]
     rows = [
         [
@@ -135,13 +182,23 @@ def _totals(sheet: Worksheet, budget: Budget) -> None:
             *(_numbers(entry)[:2]),
             *(entry.factor, entry.worst_arcsec, *_numbers(entry)[2:]),
             *(entry.rule_least_arcsec, entry.sampled_least_arcsec, entry.sampled_se_arcsec),
-            *("at least" if entry.at_least else "total", entry.dominant, "; ".join(entry.not_assessed)),
+            *(
+                "at least" if entry.at_least else "total",
+                entry.dominant,
+                "; ".join(entry.not_assessed),
+            ),
             entry.explanation,
         ]
         for entry in budget.totals
     ]
     colours = [_AMBER if entry.at_least else "" for entry in budget.totals]
-    _table(sheet, header, rows, [17, 17, 13, 12, 13, 13, 11, 14, 14, 14, 14, 14, 16, 10, 30, 55, 60], colours)
+    _table(
+        sheet,
+        header,
+        rows,
+        [17, 17, 13, 12, 13, 13, 11, 14, 14, 14, 14, 14, 16, 10, 30, 55, 60],
+        colours,
+    )
 
 
 def _numbers(entry: Total) -> list[Any]:
@@ -152,7 +209,15 @@ def _numbers(entry: Total) -> list[Any]:
 
 def _requirements(sheet: Worksheet, budget: Budget) -> None:
     header = [
-        *("Requirement", "Axis", "Scope", "Random over", "Confidence", "Limit [arcsec]", "Bound by the rule [arcsec]"),
+        *(
+            "Requirement",
+            "Axis",
+            "Scope",
+            "Random over",
+            "Confidence",
+            "Limit [arcsec]",
+            "Bound by the rule [arcsec]",
+        ),
         *(
             "Bound by sampling [arcsec]",
             "Judged by",
@@ -167,13 +232,27 @@ def _requirements(sheet: Worksheet, budget: Budget) -> None:
         asked = outcome.requirement
         rows.append(
             [
-                *(asked.name, axis_label(asked), asked.scope, asked.interpretation, asked.confidence),
-                *(asked.limit_arcsec, *_numbers(outcome.total)[2:], asked.judged_by, outcome.least_arcsec),
+                *(
+                    asked.name,
+                    axis_label(asked),
+                    asked.scope,
+                    asked.interpretation,
+                    asked.confidence,
+                ),
+                *(
+                    asked.limit_arcsec,
+                    *_numbers(outcome.total)[2:],
+                    asked.judged_by,
+                    outcome.least_arcsec,
+                ),
                 outcome.margin_arcsec,
                 *(outcome.verdict, outcome_text(outcome)),
             ]
         )
-    colours = [{Level.FAIL: _RED, Level.WARN: _AMBER, Level.PASS: _GREEN}[outcome.level] for outcome in budget.outcomes]
+    colours = [
+        {Level.FAIL: _RED, Level.WARN: _AMBER, Level.PASS: _GREEN}[outcome.level]
+        for outcome in budget.outcomes
+    ]
     _table(sheet, header, rows, [34, 17, 17, 13, 12, 12, 14, 14, 12, 14, 12, 12, 70], colours)
 
 
@@ -190,7 +269,12 @@ def _table(
 
     sheet.append(list(header))
     for row in rows:
-        sheet.append([None if isinstance(value, float) and math.isnan(value) else _cell(value) for value in row])
+        sheet.append(
+            [
+                None if isinstance(value, float) and math.isnan(value) else _cell(value)
+                for value in row
+            ]
+        )
     line = Side(style="thin", color="FFB8C1CA")
     for cells in sheet.iter_rows():
         for cell in cells:
@@ -221,8 +305,13 @@ def _table(
 def _cell(value: Any) -> Any:
     from openpyxl.cell.cell import ILLEGAL_CHARACTERS_RE
 
-    # No workbook holds control characters; a name that begins like a formula is text, not a formula.
-    return cell_text(ILLEGAL_CHARACTERS_RE.sub("\N{REPLACEMENT CHARACTER}", value)) if isinstance(value, str) else value
+    # No workbook holds control characters; a name that begins like a formula is text, not a
+    # formula.
+    return (
+        cell_text(ILLEGAL_CHARACTERS_RE.sub("\N{REPLACEMENT CHARACTER}", value))
+        if isinstance(value, str)
+        else value
+    )
 
 
 def _share_format(value: float) -> str:
@@ -235,7 +324,15 @@ def _format(value: float) -> str:
     size = abs(value)
     if size == 0.0:
         return "0"
-    return "0.0" if size >= 100.0 else "0.00" if size >= 1.0 else "0.0000" if size >= 0.01 else "0.00E+00"
+    return (
+        "0.0"
+        if size >= 100.0
+        else "0.00"
+        if size >= 1.0
+        else "0.0000"
+        if size >= 0.01
+        else "0.00E+00"
+    )
 
 
 _WRITERS: dict[str, Callable[[Budget, str | os.PathLike[str]], None]] = {
@@ -250,8 +347,8 @@ FORMATS = tuple(_WRITERS)
 def write_budget(budget: Budget, path: str | os.PathLike[str]) -> Path:
     """Write the budget, atomically; overwritten. The ending names the format.
 
-    ``.csv`` holds everything to the last digit and is what `Budget.load` reads; the others are for people. BudgetError
-    for another ending.
+    ``.csv`` holds everything to the last digit and is what `Budget.load` reads; the others are for
+    people. BudgetError for another ending.
     """
     ending = Path(path).suffix.lower()
     if ending not in _WRITERS:
@@ -261,7 +358,9 @@ def write_budget(budget: Budget, path: str | os.PathLike[str]) -> Path:
 
 
 def budget_context(budget: Budget | None) -> dict[str, Any]:
-    """What ``budget_section.html.j2`` shows beside the figure, under the name ``budget``; None where there is none."""
+    """What ``budget_section.html.j2`` shows beside the figure, under the name ``budget``; None
+    where there is none.
+    """
     return {"budget": None if budget is None else tables(budget)}
 
 

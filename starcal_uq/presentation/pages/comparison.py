@@ -18,7 +18,12 @@ from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.comparison import headline, rotation_words
 
-_LEVELS = {"agree": "pass", "parameters differ": "warning", "maps differ": "fail", "not tested": "warning"}
+_LEVELS = {
+    "agree": "pass",
+    "parameters differ": "warning",
+    "maps differ": "fail",
+    "not tested": "warning",
+}
 _BADGES = {
     "agree": "✓ agree",
     "parameters differ": "! parameters differ",
@@ -31,7 +36,8 @@ _PAGE = "comparison.html"
 
 
 def write_comparison(comparison: CameraComparison, folder: str | os.PathLike[str]) -> Path:
-    """Write the page, the tables, the figure and a lossless file into a folder, in place of those of before.
+    """Write the page, the tables, the figure and a lossless file into a folder, in place of those
+    of before.
 
     Returns ``comparison.html``, which needs no network and no other file.
     """
@@ -67,7 +73,12 @@ def render_comparison(comparison: CameraComparison, image: bytes) -> str:
 def _map_table(found: CameraComparison) -> TextTable:
     expected = significant(found.expected_rms_arcsec) if found.tested else "not known"
     rows = (
-        ("Root mean square over the detector", significant(found.rms_arcsec), significant(found.rms_px), expected),
+        (
+            "Root mean square over the detector",
+            significant(found.rms_arcsec),
+            significant(found.rms_px),
+            expected,
+        ),
         ("Largest", significant(found.largest_arcsec), significant(found.largest_px), ""),
     )
     return TextTable(("Length of the difference", "arcsec", "px", "Expected [arcsec]"), rows)
@@ -81,7 +92,10 @@ def _test_table(found: CameraComparison) -> TextTable | None:
         (
             "Map",
             "Do the directions differ by more than they should, on average over the detector?",
-            f"{significant(found.rms_arcsec)} arcsec, {significant(found.expected_rms_arcsec)} expected",
+            (
+                f"{significant(found.rms_arcsec)} arcsec, {significant(found.expected_rms_arcsec)} "
+                "expected"
+            ),
             p_words(found.p_map),
         ),
         (
@@ -120,7 +134,9 @@ def _parameter_table(found: CameraComparison) -> TextTable:
                 pretty_unit(spec.scaled_unit),
             )
         )
-    return TextTable(("", *found.labels, "Difference", "In sigma", "Unit"), tuple(rows), align="lrrrrl")
+    return TextTable(
+        ("", *found.labels, "Difference", "In sigma", "Unit"), tuple(rows), align="lrrrrl"
+    )
 
 
 def _source_table(found: CameraComparison) -> TextTable:
@@ -129,7 +145,9 @@ def _source_table(found: CameraComparison) -> TextTable:
     for label, key in zip(found.labels, "ab", strict=True):
         provenance = found.provenance.get(key, {})
         settings = provenance.get("settings", {})
-        how = ", ".join(f"{name} {settings[name]}" for name in ("method", "likelihood") if name in settings)
+        how = ", ".join(
+            f"{name} {settings[name]}" for name in ("method", "likelihood") if name in settings
+        )
         created = str(provenance.get("created_utc", "")).replace("T", " ").replace("Z", " UTC")
         rows.append((label, created, how, str(provenance.get("data_sha256") or "")))
     return TextTable(("Calibration", "Made", "How", "Data (SHA-256)"), tuple(rows), align="llll")

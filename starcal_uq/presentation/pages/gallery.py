@@ -1,4 +1,6 @@
-"""Frames with their stars: the image as a small picture, and marks of lines over it that stay sharp and can be read."""
+"""Frames with their stars: the image as a small picture, and marks of lines over it that stay sharp
+and can be read.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,14 @@ from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.formatting import MINUS, count, fixed, plural, significant
 from starcal_uq.core.provenance import installed_version
-from starcal_uq.pipeline.inspection import FAINTER, IDENTIFIED, LEFT_OUT, NOT_MATCHED, Frames, InspectedFrame
+from starcal_uq.pipeline.inspection import (
+    FAINTER,
+    IDENTIFIED,
+    LEFT_OUT,
+    NOT_MATCHED,
+    Frames,
+    InspectedFrame,
+)
 from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.words.images import frames_text, next_step, outcome_words
 from starcal_uq.sky.names import short_name
@@ -46,13 +55,19 @@ _LEGEND = (
     ("i", IDENTIFIED, "identified: a star of the catalogue, calibrated"),
     ("l", LEFT_OUT, "rejected: has a star, but was left out of the calibration"),
     ("u", NOT_MATCHED, "rejected: detected, and not matched with a star"),
-    ("e", "expected", "expected: where the calibrated camera puts a star bright enough to be detected"),
+    (
+        "e",
+        "expected",
+        "expected: where the calibrated camera puts a star bright enough to be detected",
+    ),
     ("m", "missed", "missed: expected, and not detected"),
 )
 
 
 def gallery(frames: Frames) -> str:
-    """The frames as a piece of a page, with its legend and style; it needs no script and no other file."""
+    """The frames as a piece of a page, with its legend and style; it needs no script and no other
+    file.
+    """
     shown = list(frames)
     factor = _factor(frames)
     context = {
@@ -80,21 +95,26 @@ def write_frames(frames: Frames, to: str | os.PathLike[str]) -> Path:
     page = template_environment().get_template("frames.html.j2")
     atomic_write_text(
         to,
-        page.render(title=f"Frames of {Path(frames.run).name}", gallery=_markup(gallery(frames)), version=_version())
+        page.render(
+            title=f"Frames of {Path(frames.run).name}",
+            gallery=_markup(gallery(frames)),
+            version=_version(),
+        )
         + "\n",
     )
     return Path(to)
 
 
 def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> bytes:
-    """An image as astronomers look at it: limits by zscale, brightness by asinh, no wider than `width_px`.
+    """An image as astronomers look at it: limits by zscale, brightness by asinh, no wider than
+    `width_px`.
 
     JPEG, which a PDF holds as it is; any other format it would hold pixel by pixel.
 
     `width_px`: width of the picture, at most.
-    `camera`: its detector has the size that the image must have.
-    `flat`: whether the background is taken out, so that stars show; clouds and the Moon then do not.
-    ImageError if it cannot be read or is of another size.
+    `camera`: its detector has the size that the image must have. `flat`: whether the background is
+    taken out, so that stars show; clouds and the Moon then do not. ImageError if it cannot be read
+    or is of another size.
     """
     with extra("images", "pictures of frames"):
         from astropy.visualization import AsinhStretch, ZScaleInterval
@@ -113,7 +133,9 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
         sky[~known] = np.median(sky[known]) if known.any() else 0.0
     small = Image.fromarray(sky)
     if small.width > width_px:
-        small = small.resize((width_px, max(1, round(small.height * width_px / small.width))), Image.Resampling.BOX)
+        small = small.resize(
+            (width_px, max(1, round(small.height * width_px / small.width))), Image.Resampling.BOX
+        )
     # Stars are wider than pixels, and noise is not.
     sky = gaussian_filter(np.asarray(small), _BLUR_PX)
     sky -= np.median(sky)
@@ -122,13 +144,19 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
     floor, span = -_BLACK * low, max(_SPAN * (high - low), 1e-12)
     bright = AsinhStretch(_BEND)(np.clip((sky - floor) / span, 0.0, 1.0))
     out = io.BytesIO()
-    Image.fromarray((255.0 * bright).astype(np.uint8)).save(out, "JPEG", quality=_QUALITY, optimize=True)
+    Image.fromarray((255.0 * bright).astype(np.uint8)).save(
+        out, "JPEG", quality=_QUALITY, optimize=True
+    )
     return out.getvalue()
 
 
 def _card(frame: InspectedFrame, frames: Frames, factor: float) -> dict[str, Any]:
     row = frame.row
-    counts = [(key, _symbol(key), kind, frame.n(kind)) for key, kind, _ in _LEGEND] if frame.solved else []
+    counts = (
+        [(key, _symbol(key), kind, frame.n(kind)) for key, kind, _ in _LEGEND]
+        if frame.solved
+        else []
+    )
     return {
         "name": row.image,
         "number": row.frame,
@@ -139,7 +167,9 @@ def _card(frame: InspectedFrame, frames: Frames, factor: float) -> dict[str, Any
         "counts": counts,
         "reasons": _reasons(frame),
         "step": next_step(frame, frames),
-        "missing": "" if frame.path is not None else "The image is not where it was; its stars are drawn without it.",
+        "missing": ""
+        if frame.path is not None
+        else "The image is not where it was; its stars are drawn without it.",
     }
 
 
@@ -157,12 +187,17 @@ def _facts(frame: InspectedFrame) -> Iterable[tuple[str, str]]:
         yield "Limit", f"G {'≥ ' if frame.at_least else ''}{fixed(frame.limit_mag, 1)}"
     if np.isfinite(frame.seconds):
         yield "Identified in" if frame.solved else "Searched for", f"{significant(frame.seconds)} s"
-    yield "Time", f"{frame.row.time_utc.replace('T', ' ')[:19]} UTC" if frame.row.time_utc else "not known"
+    yield (
+        "Time",
+        f"{frame.row.time_utc.replace('T', ' ')[:19]} UTC" if frame.row.time_utc else "not known",
+    )
 
 
 def _reasons(frame: InspectedFrame) -> str:
     """Why detections were rejected, with their numbers."""
-    found = frame.detections.loc[frame.detections["reason"] != "", ["kind", "reason"]].value_counts()
+    found = frame.detections.loc[
+        frame.detections["reason"] != "", ["kind", "reason"]
+    ].value_counts()
     parts = [f"{count(int(n))} {str(reason).replace('_', ' ')}" for (_, reason), n in found.items()]
     return f"Rejected: {'; '.join(parts)}." if parts else ""
 
@@ -187,7 +222,10 @@ def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> str:
     r = _radius(frames)
     words = escape(f"{frame.row.image}: {outcome_words(frame)}, {_told(frame)}", quote=True)
     parts = [
-        f'<svg viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{words}" style="--u:{width / 100:g}px">',
+        (
+            f'<svg viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{words}" '
+            f'style="--u:{width / 100:g}px">'
+        ),
         f'<rect x="-0.5" y="-0.5" width="{width}" height="{height}" class="sky"/>',
     ]
     if frame.path is not None:
@@ -195,13 +233,19 @@ def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> str:
         try:
             data = base64.b64encode(picture(frame.path, widest, frames.camera, flat=frame.solved))
             parts.append(
-                f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" preserveAspectRatio="none" '
+                f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" '
+                'preserveAspectRatio="none" '
                 f'href="data:image/jpeg;base64,{data.decode("ascii")}"/>'
             )
         except (ImageError, MissingExtraError) as error:
-            parts.append(f'<text x="{width / 2:g}" y="{height / 2:g}" class="middle">{escape(str(error))}</text>')
+            parts.append(
+                f'<text x="{width / 2:g}" y="{height / 2:g}" '
+                f'class="middle">{escape(str(error))}</text>'
+            )
     detections, stars = frame.detections, frame.stars
-    by_kind: dict[str, Any] = {kind: detections[detections["kind"] == kind] for _, kind, _ in _LEGEND[:3]}
+    by_kind: dict[str, Any] = {
+        kind: detections[detections["kind"] == kind] for _, kind, _ in _LEGEND[:3]
+    }
     by_kind |= {"expected": stars, "missed": stars[stars["missed"]]}
     for key in ("e", "u", "l", "m", "i"):
         kind = next(kind for letter, kind, _ in _LEGEND if letter == key)
@@ -220,12 +264,20 @@ def _told(frame: InspectedFrame) -> str:
 
 
 def _shape(key: str, x: float, y: float, r: float) -> str:
-    """The path of a mark; each kind has a shape of its own, so that nothing rests on colour alone."""
+    """The path of a mark; each kind has a shape of its own, so that nothing rests on colour
+    alone.
+    """
     if key == "i":
-        return f"M{x - r:.1f} {y:.1f}a{r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0a{r:.1f} {r:.1f} 0 1 0 {-2 * r:.1f} 0"
+        return (
+            f"M{x - r:.1f} {y:.1f}a{r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0a{r:.1f} {r:.1f} 0 1 0 "
+            f"{-2 * r:.1f} 0"
+        )
     if key == "l":
         s = 0.8 * r
-        return f"M{x - s:.1f} {y - s:.1f}l{2 * s:.1f} {2 * s:.1f}m0 {-2 * s:.1f}l{-2 * s:.1f} {2 * s:.1f}"
+        return (
+            f"M{x - s:.1f} {y - s:.1f}l{2 * s:.1f} {2 * s:.1f}m0 {-2 * s:.1f}l{-2 * s:.1f} "
+            f"{2 * s:.1f}"
+        )
     if key == "u":
         s = 0.6 * r
         return f"M{x - s:.1f} {y - 0.6 * s:.1f}h{2 * s:.1f}l{-s:.1f} {1.7 * s:.1f}z"
@@ -233,7 +285,9 @@ def _shape(key: str, x: float, y: float, r: float) -> str:
         # Open in the middle, where the star is.
         gap, tick = 0.3 * r, 0.35 * r
         ends = ((1, 0), (-1, 0), (0, 1), (0, -1))
-        return "".join(f"M{x + gap * i:.1f} {y + gap * j:.1f}l{tick * i:.1f} {tick * j:.1f}" for i, j in ends)
+        return "".join(
+            f"M{x + gap * i:.1f} {y + gap * j:.1f}l{tick * i:.1f} {tick * j:.1f}" for i, j in ends
+        )
     return f"M{x - r:.1f} {y - r:.1f}h{2 * r:.1f}v{2 * r:.1f}h{-2 * r:.1f}z"
 
 
@@ -243,10 +297,16 @@ def _symbol(key: str) -> Markup:
 
 
 def _marks(key: str, table: Any, r: float) -> str:
-    """All marks of a kind; those that can be few have their words, which browsers show beside the pointer."""
+    """All marks of a kind; those that can be few have their words, which browsers show beside the
+    pointer.
+    """
     # Stars that nobody has searched for do not need to catch the eye.
-    size = np.where(table["reason"] == FAINTER, 0.6 * r, r) if key == "u" else np.full(len(table), r)
-    paths = [_shape(key, x, y, s) for x, y, s in zip(table["x_px"], table["y_px"], size, strict=True)]
+    size = (
+        np.where(table["reason"] == FAINTER, 0.6 * r, r) if key == "u" else np.full(len(table), r)
+    )
+    paths = [
+        _shape(key, x, y, s) for x, y, s in zip(table["x_px"], table["y_px"], size, strict=True)
+    ]
     if not paths:
         return ""
     if key in "eu" or len(paths) > _TOLD:
@@ -272,7 +332,9 @@ def _arrows(table: Any, factor: float) -> str:
         dx, dy = factor * row.dx_px, factor * row.dy_px
         tip = f"M{row.x_px + dx:.1f} {row.y_px + dy:.1f}"
         # The barbs point back, 20 degrees to either side.
-        barbs = ((-0.23 * dx + side * 0.085 * dy, -0.23 * dy - side * 0.085 * dx) for side in (1.0, -1.0))
+        barbs = (
+            (-0.23 * dx + side * 0.085 * dy, -0.23 * dy - side * 0.085 * dx) for side in (1.0, -1.0)
+        )
         head = "".join(f"{tip}l{bx:.1f} {by:.1f}" for bx, by in barbs)
         lines.append(f"M{row.x_px:.1f} {row.y_px:.1f}l{dx:.1f} {dy:.1f}{head}")
     return f'<path class="r" d="{"".join(lines)}"/>' if lines else ""
@@ -282,9 +344,14 @@ def _names(table: Any, r: float, width: int) -> str:
     """The brightest stars by name."""
     texts = []
     for row in table.nsmallest(_NAMED, "mag").itertuples() if len(table) else ():
-        side, anchor = (-1.3 * r, ' text-anchor="end"') if row.x_px > 0.75 * width else (1.3 * r, "")
+        side, anchor = (
+            (-1.3 * r, ' text-anchor="end"') if row.x_px > 0.75 * width else (1.3 * r, "")
+        )
         # Not above the picture.
-        place = f'x="{row.x_px + side:.1f}" y="{row.y_px + (-r if row.y_px > 5.0 * r else 3.5 * r):.1f}"'
+        place = (
+            f'x="{row.x_px + side:.1f}" '
+            f'y="{row.y_px + (-r if row.y_px > 5.0 * r else 3.5 * r):.1f}"'
+        )
         texts.append(f"<text {place}{anchor}>{escape(short_name(row.star_id, row.mag))}</text>")
     return "".join(texts)
 
@@ -300,7 +367,8 @@ def _compass(frame: InspectedFrame, r: float) -> str:
         dx, dy = np.sin(angle), -np.cos(angle)
         parts.append(f'<path class="c" d="M{x:.1f} {y:.1f}l{length * dx:.1f} {length * dy:.1f}"/>')
         parts.append(
-            f'<text class="middle" x="{x + 1.5 * length * dx:.1f}" y="{y + 1.5 * length * dy + r:.1f}">{name}</text>'
+            f'<text class="middle" x="{x + 1.5 * length * dx:.1f}" '
+            f'y="{y + 1.5 * length * dy + r:.1f}">{name}</text>'
         )
     return "".join(parts)
 

@@ -24,7 +24,11 @@ _PARTS = (
         "calibration",
         "The estimate",
         "Every stage on its way to the optimum, and what the model leaves of each star.",
-        ["run.calibration", "run.calibration.plot.convergence()", "run.calibration.plot.residuals(run.observations)"],
+        [
+            "run.calibration",
+            "run.calibration.plot.convergence()",
+            "run.calibration.plot.residuals(run.observations)",
+        ],
     ),
     (
         "posterior",
@@ -41,26 +45,34 @@ _PARTS = (
     (
         "attitude",
         "What it does to attitude",
-        "The common rotation is one constant, which an alignment calibration with the same parameters absorbs; the "
+        "The common rotation is one constant, which an alignment calibration with the same "
+        "parameters absorbs; the "
         "rest changes from frame to frame.",
         ["run.attitude", "run.attitude.plot.contributors();"],
     ),
     ("field_map", "Where on the detector", "", ["run.field_map.plot.maps()"]),
     ("diagnosis", "Does the model hold?", "", ["run.diagnosis", "run.diagnosis.plot.diagnosis()"]),
-    ("budget", "The error budget", "", ["run.error_budget", "run.error_budget.plot.contributors()"]),
+    (
+        "budget",
+        "The error budget",
+        "",
+        ["run.error_budget", "run.error_budget.plot.contributors()"],
+    ),
     (
         "calibration",
         "May it be used?",
         "Every check, with its bound; the remedy of each stands in `run.verdict.checks`.",
         [
             "import pandas as pd\n\n"
-            'pd.DataFrame(run.verdict.to_dict()["checks"])[["level", "name", "value", "bound"]].set_index("name")'
+            'pd.DataFrame(run.verdict.to_dict()["checks"])[["level", "name", "value", '
+            '"bound"]].set_index("name")'
         ],
     ),
     (
         "posterior",
         "Go on",
-        "`run.posterior.to_dataframe()` has the draws, `run.arviz()` all groups of ArviZ, `run.calibration.camera` and "
+        "`run.posterior.to_dataframe()` has the draws, `run.arviz()` all groups of ArviZ, "
+        "`run.calibration.camera` and "
         "`sc.export(run, ...)` the camera for other programs.",
         ["run.posterior.summary()"],
     ),
@@ -68,13 +80,15 @@ _PARTS = (
 
 
 def write_cells(name: str, parts: Collection[str], folder: str) -> Iterator[tuple[str, str]]:
-    """Kind (``markdown``, ``code``, or ``parameters``) and source of each cell of the notebook on a run in `folder`.
+    """Kind (``markdown``, ``code``, or ``parameters``) and source of each cell of the notebook on a
+    run in `folder`.
 
     `parts` are names of the files that the run holds, such as ``posterior``.
     """
     yield (
         "markdown",
-        f"# Calibration `{name}`\n\nWritten by `starcal-uq report RUN --notebook`. The folder below is all that it "
+        f"# Calibration `{name}`\n\nWritten by `starcal-uq report RUN --notebook`. The folder "
+        "below is all that it "
         "depends on: name another run there, and run all cells.",
     )
     yield "parameters", f"folder = {folder!r}"
@@ -85,8 +99,11 @@ def write_cells(name: str, parts: Collection[str], folder: str) -> Iterator[tupl
             yield from (("code", cell) for cell in cells)
 
 
-def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress | None = None) -> str:
-    """A notebook of these cells, as its file holds it, executed by this Python in the folder `place`.
+def executed(
+    cells: Iterator[tuple[str, str]], place: Path, progress: Progress | None = None
+) -> str:
+    """A notebook of these cells, as its file holds it, executed by this Python in the folder
+    `place`.
 
     MissingExtraError if a library is not installed. RunFolderError if a cell fails.
     """
@@ -120,14 +137,18 @@ def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress |
     notebook = make.new_notebook(cells=made, metadata=kernel)
     with TemporaryFolder() as own:
         # The kernel draws inline, whatever this process draws with.
-        env = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"} | {"IPYTHONDIR": own}
+        env = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"} | {
+            "IPYTHONDIR": own
+        }
         client = NotebookClient(
             notebook,
             kernel_manager_class=ThisPython,
             timeout=None,
             resources={"metadata": {"path": str(place)}},
             record_timing=False,
-            on_cell_complete=lambda cell, cell_index: progress(cell_index + 1, len(made)) if progress else None,
+            on_cell_complete=lambda cell, cell_index: (
+                progress(cell_index + 1, len(made)) if progress else None
+            ),
         )
         handlers = _handlers()
         try:
@@ -137,11 +158,15 @@ def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress |
             if hasattr(client, "_async_cleanup_kernel_future"):
                 raise KeyboardInterrupt from None
             if isinstance(error, DeadKernelError):
-                raise RunFolderError("the notebook's kernel ended unexpectedly: is there enough memory?") from None
+                raise RunFolderError(
+                    "the notebook's kernel ended unexpectedly: is there enough memory?"
+                ) from None
             if not isinstance(error, CellExecutionError):
                 raise
             said = f"{error.ename}: {error.evalue}".splitlines()[0]
-            raise RunFolderError(f"a cell of the notebook failed ({said}): try `starcal-uq report RUN`.") from None
+            raise RunFolderError(
+                f"a cell of the notebook failed ({said}): try `starcal-uq report RUN`."
+            ) from None
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
@@ -149,7 +174,9 @@ def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress |
 
 
 def _handlers() -> dict[signal.Signals, Any]:
-    """What takes the signals now, where this thread may say so: the client of the notebook takes them meanwhile."""
+    """What takes the signals now, where this thread may say so: the client of the notebook takes
+    them meanwhile.
+    """
     if threading.current_thread() is not threading.main_thread():
         return {}
     return {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

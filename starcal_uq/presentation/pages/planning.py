@@ -61,12 +61,17 @@ _GROUPS = (
 
 
 def write_plan(
-    plan: Plan, folder: str | os.PathLike[str], choice: FrameChoice | None = None, check: ForecastCheck | None = None
+    plan: Plan,
+    folder: str | os.PathLike[str],
+    choice: FrameChoice | None = None,
+    check: ForecastCheck | None = None,
 ) -> Path:
-    """Write ``plan.html`` (self-contained), the tables as CSV, ``plan.json`` and the figures into a folder.
+    """Write ``plan.html`` (self-contained), the tables as CSV, ``plan.json`` and the figures into a
+    folder.
 
-    All files count at once, when they are complete, in place of those of a plan of before. `choice` are the frames to
-    take, for the page and ``frames.csv``, `check` is the forecast against simulation, for the page and ``check.csv``.
+    All files count at once, when they are complete, in place of those of a plan of before. `choice`
+    are the frames to take, for the page and ``frames.csv``, `check` is the forecast against
+    simulation, for the page and ``check.csv``.
     """
     images = plan_figures(plan, choice, check)
     page = render_plan(plan, images, choice, check)
@@ -131,7 +136,9 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def plan_figures(plan: Plan, choice: FrameChoice | None = None, check: ForecastCheck | None = None) -> dict[str, bytes]:
+def plan_figures(
+    plan: Plan, choice: FrameChoice | None = None, check: ForecastCheck | None = None
+) -> dict[str, bytes]:
     """Every figure as SVG, by name."""
     figures = {"forecast": plot_forecast(plan)}
     if plan.sweeps is not None:
@@ -169,7 +176,14 @@ def _frame_table(choice: FrameChoice) -> TextTable:
         )
         for row in choice.to_dataframe().head(_FRAMES_SHOWN).to_dict("records")
     )
-    heads = ("Order", "RA [deg]", "Dec [deg]", "Position angle of +Y [deg]", "Stars", "Criterion after it")
+    heads = (
+        "Order",
+        "RA [deg]",
+        "Dec [deg]",
+        "Position angle of +Y [deg]",
+        "Stars",
+        "Criterion after it",
+    )
     return TextTable(heads, rows, align="rrrrrr")
 
 
@@ -188,7 +202,11 @@ def _needs_table(plan: Plan) -> TextTable:
     )
     over = () if spread is None else (f"Distortion of {span(spread)}",)
     heads = ("Part of the error", "On average", "In 95 % of campaigns", *over, "Floor [arcsec]")
-    return TextTable(heads, rows, marks=tuple("chosen" if need.scope == plan.scope else "" for need in plan.needs))
+    return TextTable(
+        heads,
+        rows,
+        marks=tuple("chosen" if need.scope == plan.scope else "" for need in plan.needs),
+    )
 
 
 def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
@@ -215,7 +233,9 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
         "rows": [
             {
                 "n": count(int(row["n_frames"])),
-                "cells": [(significant(float(row[column])), column in edges) for column, _ in shown],
+                "cells": [
+                    (significant(float(row[column])), column in edges) for column, _ in shown
+                ],
                 "radius": significant(float(row["radius_arcsec"]), 3),
                 "range": f"{significant(float(row['radius_low_arcsec']), 3)} to "
                 f"{significant(float(row['radius_high_arcsec']), 3)}",
@@ -227,7 +247,9 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
             for row in table.to_dict("records")
         ],
         "nea": [significant(float(value)) for value in plan.nea_arcsec],
-        "camera_rows": [(key, value) for key, value in plan.camera.to_dict().items() if key != "name"],
+        "camera_rows": [
+            (key, value) for key, value in plan.camera.to_dict().items() if key != "name"
+        ],
         "unreached": plan.frames_needed is not None
         and plan.sweeps is not None
         and not bool(np.isfinite(plan.sweeps["frames_needed"]).all()),

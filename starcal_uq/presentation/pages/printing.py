@@ -27,7 +27,8 @@ _SECONDS = 180.0
 def pdf_bytes(page: Path) -> bytes:
     """A page, one file that needs no other, as PDF.
 
-    MissingExtraError if there is neither a browser nor WeasyPrint. RunFolderError if what there is makes no PDF of it.
+    MissingExtraError if there is neither a browser nor WeasyPrint. RunFolderError if what there is
+    makes no PDF of it.
     """
     said = ""
     for browser in browsers():
@@ -39,9 +40,12 @@ def pdf_bytes(page: Path) -> bytes:
     # A library that it needs may be missing.
     except (ImportError, OSError):
         if said:
-            raise RunFolderError(f"{page}: {said}; open the page and print it from there.") from None
+            raise RunFolderError(
+                f"{page}: {said}; open the page and print it from there."
+            ) from None
         raise MissingExtraError(
-            "a PDF takes a browser, and none was found: install Chromium, Chrome or Edge, or `pip install weasyprint`."
+            "a PDF takes a browser, and none was found: install Chromium, Chrome or Edge, or "
+            "`pip install weasyprint`."
         ) from None
     made = weasyprint.HTML(filename=str(page)).write_pdf()
     return bytes(made)
@@ -53,7 +57,10 @@ def browsers() -> Iterator[str]:
     if sys.platform == "darwin":
         places = [Path(f"/Applications/{name}.app/Contents/MacOS/{name}") for name in _APPLICATIONS]
     else:
-        roots = [os.environ.get(name, "") for name in ("PROGRAMFILES", "PROGRAMFILES(X86)", "LOCALAPPDATA")]
+        roots = [
+            os.environ.get(name, "")
+            for name in ("PROGRAMFILES", "PROGRAMFILES(X86)", "LOCALAPPDATA")
+        ]
         places = [Path(root, name) for root in roots if root for name in _WINDOWS]
     yield from (str(place) for place in places if place.is_file())
 
@@ -64,8 +71,17 @@ def _printed(browser: str, page: Path) -> tuple[bytes, str]:
     with TemporaryFolder() as folder:
         to = Path(folder, "page.pdf")
         # Nothing on the page asks for the network; nor should the browser itself.
-        options = ["--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
-        options += ["--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={folder}", "--no-pdf-header-footer"]
+        options = [
+            "--headless",
+            "--disable-gpu",
+            "--no-first-run",
+            "--disable-background-networking",
+        ]
+        options += [
+            "--host-resolver-rules=MAP * ~NOTFOUND",
+            f"--user-data-dir={folder}",
+            "--no-pdf-header-footer",
+        ]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
             # Root, as in a container, has no other way.
             options.append("--no-sandbox")
@@ -75,4 +91,8 @@ def _printed(browser: str, page: Path) -> tuple[bytes, str]:
         except (OSError, subprocess.TimeoutExpired) as error:
             return b"", f"{name} could not print it ({type(error).__name__})"
         made = to.read_bytes() if to.is_file() else b""
-    return (made, "") if made.startswith(b"%PDF") else (b"", f"{name} made no PDF (exit status {ended.returncode})")
+    return (
+        (made, "")
+        if made.startswith(b"%PDF")
+        else (b"", f"{name} made no PDF (exit status {ended.returncode})")
+    )

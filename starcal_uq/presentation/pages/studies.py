@@ -43,33 +43,46 @@ _CELLS_SHOWN = 60
 _CAPTIONS = {
     "correlation": (
         "What couples, and what changes it",
-        "Size of the correlation, on a scale that grows as its price in sigma does; a pair whose entries err together "
+        "Size of the correlation, on a scale that grows as its price in sigma does; a pair whose "
+        "entries err together "
         "is marked alike, else opposite. {band}",
     ),
     "maps": (
         "Over two axes",
-        "Medians over seeds. Left below: the error of the calibration that differs from frame to frame, 1 sigma per "
-        "axis across the boresight; right below: the rotation common to all frames, which alignment absorbs.",
+        "Medians over seeds. Left below: the error of the calibration that differs from frame to "
+        "frame, 1 sigma per "
+        "axis across the boresight; right below: the rotation common to all frames, which "
+        "alignment absorbs.",
     ),
-    "matrices": ("The whole matrix", "Correlations of the parameters; grey where a model lacks one."),
+    "matrices": (
+        "The whole matrix",
+        "Correlations of the parameters; grey where a model lacks one.",
+    ),
     "weakest": (
         "The weakest direction",
-        "The combination of parameters, each in its own sigma, that is determined worst: its parts, and above them its "
+        "The combination of parameters, each in its own sigma, that is determined worst: its "
+        "parts, and above them its "
         "variance over that of uncoupled parameters.",
     ),
     "inflation": (
         "Sigmas and the price of coupling",
-        "Full lines: all parameters unknown. Dashed: all others known. The gap is the price of coupling. {band}",
+        (
+            "Full lines: all parameters unknown. Dashed: all others known. The gap is the price of "
+            "coupling. {band}"
+        ),
     ),
     "needed": (
         "What a target takes",
-        "The error that differs from frame to frame, 1 sigma per axis across the boresight, and, where there is a "
+        "The error that differs from frame to frame, 1 sigma per axis across the boresight, and, "
+        "where there is a "
         "target, the frames that it takes. {band}",
     ),
     "simpler": (
         "Would a simpler model do?",
-        "Frame-dependent attitude error across the boresight that a simpler distortion model would leave, beside that "
-        "of the calibration (grey). Where a line lies below the grey one, the simpler model is rich enough.",
+        "Frame-dependent attitude error across the boresight that a simpler distortion model "
+        "would leave, beside that "
+        "of the calibration (grey). Where a line lies below the grey one, the simpler model is "
+        "rich enough.",
     ),
     "coverage": (
         "Coverage",
@@ -80,7 +93,9 @@ _SIMULATED = " Crosses: the posterior's correlation, median and range over seeds
 
 
 def write_study(study: Study, folder: str | os.PathLike[str]) -> Path:
-    """Write the figures into a folder, then ``report.html`` (self-contained), in place of those of before."""
+    """Write the figures into a folder, then ``report.html`` (self-contained), in place of those of
+    before.
+    """
     path = new_folder(folder)
     images = study_figures(study)
     page = render_study(study, images)
@@ -105,7 +120,9 @@ def study_figures(study: Study) -> dict[str, bytes]:
         "inflation": plot_inflation(study),
         "needed": plot_needed(study),
     }
-    if "simpler" in study.data.dims and np.any(np.nan_to_num(study.data["model_bias_arcsec"].values) > 0.0):
+    if "simpler" in study.data.dims and np.any(
+        np.nan_to_num(study.data["model_bias_arcsec"].values) > 0.0
+    ):
         drawn["simpler"] = plot_simpler(study)
     if "covered_95" in study.data:
         drawn["coverage"] = plot_coverage(study)
@@ -115,12 +132,18 @@ def study_figures(study: Study) -> dict[str, bytes]:
 def render_study(study: Study, images: Mapping[str, bytes]) -> str:
     """The page; `images` are SVG by the names of `study_figures`."""
     definition, data = study.definition, study.data
-    band = "Bands: range over what else was drawn." if study.sweep.drawn else "Bands: range over seeds."
+    band = (
+        "Bands: range over what else was drawn."
+        if study.sweep.drawn
+        else "Bands: range over seeds."
+    )
     figures = []
     for name in images:
         title, caption = _CAPTIONS[name]
         simulated = _SIMULATED if name == "correlation" and "posterior_correlation" in data else ""
-        figures.append({"name": name, "title": title, "caption": caption.format(band=band) + simulated})
+        figures.append(
+            {"name": name, "title": title, "caption": caption.format(band=band) + simulated}
+        )
     failed = int((~study.sweep.ok).sum())
     context = {
         "title": definition.name,
@@ -135,7 +158,10 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
         "summary": study_table(study),
         "figures": figures,
         "cells": cells_table(study, _CELLS_SHOWN),
-        "cells_words": f"{plural(min(_CELLS_SHOWN, len(study.sweep.ok)), 'cell')} of {count(len(study.sweep.ok))}",
+        "cells_words": (
+            f"{plural(min(_CELLS_SHOWN, len(study.sweep.ok)), 'cell')} of "
+            f"{count(len(study.sweep.ok))}"
+        ),
         "provenance": _provenance(study),
         "images": images,
     }
@@ -151,10 +177,14 @@ def cells_table(study: Study, n: int) -> TextTable:
         where = [value_words(_plain(study.data[axis].values[cell])) for axis in sweep.axes]
         numbers = [form(float(values[cell])) for _, values, form in columns]
         status = str(study.data["status"].values[cell])
-        rows.append((*where, value_words(int(study.data["seed_index"].values[cell])), *numbers, status))
+        rows.append(
+            (*where, value_words(int(study.data["seed_index"].values[cell])), *numbers, status)
+        )
     heads = (*map(axis_label, sweep.axes), "Seed", *(head for head, _, _ in columns), "Status")
     marks = tuple("" if good else "warning" for good in sweep.ok[:n])
-    return TextTable(heads, tuple(rows), "", "l" * len(sweep.axes) + "r" * (1 + len(columns)) + "l", marks)
+    return TextTable(
+        heads, tuple(rows), "", "l" * len(sweep.axes) + "r" * (1 + len(columns)) + "l", marks
+    )
 
 
 def _plain(value: Any) -> Any:
@@ -167,7 +197,11 @@ def _provenance(study: Study) -> list[tuple[str, str]]:
     for key, value in study.definition.to_dict().items():
         entries = value.items() if isinstance(value, Mapping) else [("", value)]
         rows += [(f"{key}: {name}" if name else key, _told(entry)) for name, entry in entries]
-    rows += [(str(key), _told(value)) for key, value in study.data.attrs.items() if key not in ("definition", "title")]
+    rows += [
+        (str(key), _told(value))
+        for key, value in study.data.attrs.items()
+        if key not in ("definition", "title")
+    ]
     return rows
 
 

@@ -19,7 +19,9 @@ from starcal_uq.studies.result import Study
 
 
 def write_page(
-    what: Plan | CameraComparison | Budget | Study | Frames, to: str | os.PathLike[str], **options: Any
+    what: Plan | CameraComparison | Budget | Study | Frames,
+    to: str | os.PathLike[str],
+    **options: Any,
 ) -> Path:
     """Write a result for people to read.
 
@@ -28,8 +30,9 @@ def write_page(
     what : Plan, CameraComparison, Budget, Study or Frames
         The result.
     to : path
-        A folder for a plan, a comparison or a study, made if it is missing; a file for frames, and for a budget, whose
-        ending names the format (``.html``, ``.xlsx``, ``.tex``, ``.csv``). What is there is overwritten.
+        A folder for a plan, a comparison or a study, made if it is missing; a file for frames, and
+        for a budget, whose ending names the format (``.html``, ``.xlsx``, ``.tex``, ``.csv``). What
+        is there is overwritten.
     **options
         For a plan, ``choice`` and ``check``: frames to take, and the forecast against simulation.
 
@@ -56,5 +59,6 @@ def write_page(
     if isinstance(what, Frames):
         return write_frames(what, to, **options)
     raise TypeError(
-        f"there is no page for a {type(what).__name__}: give a Plan, a CameraComparison, a Budget, a Study or Frames."
+        f"there is no page for a {type(what).__name__}: give a Plan, a CameraComparison, a "
+        "Budget, a Study or Frames."
     )

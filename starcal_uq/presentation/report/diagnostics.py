@@ -1,4 +1,6 @@
-"""The tables on what questions the model: tests for misfit, jackknife, models, replicated data, derived quantities."""
+"""The tables on what questions the model: tests for misfit, jackknife, models, replicated data,
+derived quantities.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import count, decimals_for, fixed, p_words, percent, significant
-from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, models_sentence, sensitivity, star_sentence
+from starcal_uq.diagnostics.verdict.estimate import (
+    MISFIT_P,
+    models_sentence,
+    sensitivity,
+    star_sentence,
+)
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.diagnostics import (
@@ -33,7 +40,9 @@ def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> dict[str
     return {
         "misfit_table": misfit_table(diagnosis.misfit),
         "misfit_sentence": f"{_misfit_sentence(diagnosis)} {sensitivity(diagnosis)}".strip(),
-        "jackknife_table": None if jackknife is None else jackknife_table(jackknife, parameters(cal.camera.distortion)),
+        "jackknife_table": None
+        if jackknife is None
+        else jackknife_table(jackknife, parameters(cal.camera.distortion)),
         "jackknife_sentence": "" if jackknife is None else jackknife_text(jackknife),
         "star_table": None
         if stars is None or not stars.applicable

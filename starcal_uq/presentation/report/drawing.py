@@ -28,11 +28,18 @@ T = TypeVar("T")
 
 # Figures by the step after which they can be drawn.
 AFTER_CALIBRATION = ("residuals", "residual_profiles", "convergence")
-AFTER_SAMPLING = ("corner", "prior_posterior", "correlation", "price_of_coupling", "distortion_curve")
+AFTER_SAMPLING = (
+    "corner",
+    "prior_posterior",
+    "correlation",
+    "price_of_coupling",
+    "distortion_curve",
+)
 AFTER_PROPAGATION = ("field_map",)
 AFTER_DIAGNOSIS = ("glance", "misfit", "attitude")
 AFTER_BUDGET = ("budget",)
-# The frames of a run from images stand among the figures by this name: a piece of a page, not a picture.
+# The frames of a run from images stand among the figures by this name: a piece of a page, not a
+# picture.
 GALLERY = "gallery"
 FIGURES = (*AFTER_CALIBRATION, *AFTER_SAMPLING, *AFTER_PROPAGATION, *AFTER_DIAGNOSIS, *AFTER_BUDGET)
 
@@ -61,7 +68,12 @@ def draw_gallery(frames: Frames) -> dict[str, bytes]:
 def _figure(results: Results, name: str) -> Any:
     """One figure; None where the results lack what it shows."""
     cal, obs, truth = results.calibration, results.observations, results.truth
-    if name == "glance" and results.attitude is not None and results.field_map is not None and len(cal.residuals_px):
+    if (
+        name == "glance"
+        and results.attitude is not None
+        and results.field_map is not None
+        and len(cal.residuals_px)
+    ):
         return plot_glance(results.attitude, cal, obs, results.field_map)
     if name == "residuals":
         return plot_residuals(cal, obs)
@@ -91,7 +103,9 @@ def _figure(results: Results, name: str) -> Any:
 
 
 class Ahead:
-    """Another process that draws the figures of a report while what comes after them is computed; a context."""
+    """Another process that draws the figures of a report while what comes after them is computed; a
+    context.
+    """
 
     def __init__(self) -> None:
         self._beside = Beside()
@@ -106,7 +120,9 @@ class Ahead:
         self._beside.__exit__(*error)
 
     def begin(self, function: Callable[..., T], *arguments: Any) -> Callable[[], T | None]:
-        """Begin something else that can be done meanwhile; what waits for its result, None if it failed."""
+        """Begin something else that can be done meanwhile; what waits for its result, None if it
+        failed.
+        """
         return partial(self._beside.result, self._beside.call(function, *arguments))
 
     def draw(self, results: Results, names: Collection[str]) -> None:
@@ -127,8 +143,8 @@ class Ahead:
 
 def _load() -> None:
     """Load what drawing needs, in a process that only draws."""
-    # A figure is thousands of objects that refer to each other: looking for those that can go takes a fifth of the
-    # time, and a dozen of them fit into memory.
+    # A figure is thousands of objects that refer to each other: looking for those that can go takes
+    # a fifth of the time, and a dozen of them fit into memory.
     gc.disable()
     ax = new_axes(1.0, 1.0)
     label(ax, "", "x")

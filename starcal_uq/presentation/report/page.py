@@ -33,7 +33,8 @@ def render(results: Results, figures: Mapping[str, bytes], gallery: str = "") ->
     results
         What to report.
     figures
-        SVG images by the names of `starcal_uq.presentation.report.drawing.draw_figures`; a missing one is left out.
+        SVG images by the names of `starcal_uq.presentation.report.drawing.draw_figures`; a missing
+        one is left out.
     gallery
         The frames of a run from images, as a piece of a page.
     """
@@ -41,7 +42,9 @@ def render(results: Results, figures: Mapping[str, bytes], gallery: str = "") ->
 
 
 def prepared(results: Results) -> Callable[[Mapping[str, bytes], str], str]:
-    """The report as a function of figures and gallery, for whoever waits for these: everything else is done."""
+    """The report as a function of figures and gallery, for whoever waits for these: everything else
+    is done.
+    """
     template, known = template_environment().get_template("report.html.j2"), context(results)
 
     def document(figures: Mapping[str, bytes], gallery: str) -> str:
@@ -65,8 +68,12 @@ def context(results: Results) -> dict[str, Any]:
         "version": version,
         "usable": usable,
         "unusable": unusable,
-        "attitude_summary": None if results.attitude is None else summary.attitude_summary(results.attitude),
-        "budget_summary": None if results.budget is None else summary.budget_summary(results.budget),
+        "attitude_summary": None
+        if results.attitude is None
+        else summary.attitude_summary(results.attitude),
+        "budget_summary": None
+        if results.budget is None
+        else summary.budget_summary(results.budget),
         "glance_caption": summary.glance_caption(results),
         "methods_paragraph": summary.methods_paragraph(results),
         "citations": [line.format(version=version) for line in summary.CITATIONS],
@@ -86,20 +93,30 @@ def context(results: Results) -> dict[str, Any]:
         "names": [p.name for p in tables.all_parameters(results)],
         "parameter_rows": tables.parameter_rows(results),
         "attitude_rows": [] if results.attitude is None else tables.attitude_rows(results.attitude),
-        "alignment_sentence": "" if results.attitude is None else alignment_sentence(results.attitude),
-        "one_number_sentence": "" if results.attitude is None else one_number_sentence(results.attitude),
+        "alignment_sentence": ""
+        if results.attitude is None
+        else alignment_sentence(results.attitude),
+        "one_number_sentence": ""
+        if results.attitude is None
+        else one_number_sentence(results.attitude),
         "misfit_attitude_sentence": ""
         if results.attitude is None
         else results.located(misfit_sentence(results.attitude)),
         "attitude_sentence": words.attitude_sentence(results),
-        "corner_sentence": "" if results.distortion_curve is None else corner_sentence(results.distortion_curve),
+        "corner_sentence": ""
+        if results.distortion_curve is None
+        else corner_sentence(results.distortion_curve),
         "equivalent_sentence": words.equivalent_sentence(results.field_map),
         "coupling_table": None
         if results.coupling is None
         else coupling_table(results.coupling, parameters(cal.camera.distortion)),
-        "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
+        "weak_directions": []
+        if results.coupling is None
+        else tables.weak_directions(results.coupling),
         "diagnostics_table": None if post is None else tables.diagnostics_table(post),
-        "agreement": next((check.value for check in verdict.checks if check.name == "Independent posterior"), ""),
+        "agreement": next(
+            (check.value for check in verdict.checks if check.name == "Independent posterior"), ""
+        ),
         "methods_rows": tables.methods_rows(results),
         "derived_table": None if post is None else model_tables.derived_table(post),
         **model_tables.diagnosis_context(results.diagnosis, cal),
@@ -147,9 +164,15 @@ def _answer(checks: tuple[Check, ...]) -> str:
         every = "Both" if len(checks) == 2 else f"All {len(checks)}"
         return f"{every} checks passed."
     parts = []
-    for level, verb in ((Level.FAIL, "failed"), (Level.WARN, "raised a warning"), (Level.PASS, "passed")):
+    for level, verb in (
+        (Level.FAIL, "failed"),
+        (Level.WARN, "raised a warning"),
+        (Level.PASS, "passed"),
+    ):
         found = tuple(check for check in checks if check.level is level)
         if found:
-            names = "" if level is Level.PASS else f": {join_words([check.phrase for check in found])}"
+            names = (
+                "" if level is Level.PASS else f": {join_words([check.phrase for check in found])}"
+            )
             parts.append(f"{len(found)} of {len(checks)} {verb}{names}.")
     return " ".join(parts)

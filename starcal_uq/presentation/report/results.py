@@ -38,9 +38,9 @@ class Missing:
 class Results(Shown):
     """Everything that a report is made from; None for what the run does not hold.
 
-    The couplings are those of the posterior if there is one, else of the estimate; `truth` is the camera of a
-    simulation, `place` where the run is. That the file of the nominal camera was changed after the run was made is a
-    sentence in `camera_changed`, empty if not.
+    The couplings are those of the posterior if there is one, else of the estimate; `truth` is the
+    camera of a simulation, `place` where the run is. That the file of the nominal camera was
+    changed after the run was made is a sentence in `camera_changed`, empty if not.
     """
 
     name: str
@@ -77,7 +77,9 @@ class Results(Shown):
 
     @cached_property
     def distortion_curve(self) -> DistortionCurve | None:
-        """Distortion against radius with its bands; None without a posterior or distortion, or where a draw folds."""
+        """Distortion against radius with its bands; None without a posterior or distortion, or
+        where a draw folds.
+        """
         from starcal_uq.core.errors import DistortionError
         from starcal_uq.propagation.distortion import distortion_curve
 

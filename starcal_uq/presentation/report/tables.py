@@ -1,4 +1,6 @@
-"""The tables of a report: rows of finished text, with digits that end where the uncertainty begins."""
+"""The tables of a report: rows of finished text, with digits that end where the uncertainty
+begins.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +54,9 @@ def parameter_rows(results: Results) -> list[Row]:
         mean, sd = post.draws.mean(axis=0), post.sd
         low, high = np.quantile(post.draws, (0.025, 0.975), axis=0)
         names = post.parameter_names
-        prior = list(zip(post.priors.mean(names).tolist(), post.priors.sd(names).tolist(), strict=True))
+        prior = list(
+            zip(post.priors.mean(names).tolist(), post.priors.sd(names).tolist(), strict=True)
+        )
     start: list[float | None] = [*cal.nominal.theta.tolist(), None]
     true: list[float | None] = [None] * len(mean)
     z = np.full(len(mean), np.nan)
@@ -99,10 +103,14 @@ def _parameter_row(
         "unit": pretty_unit(unit),
         "estimate": fixed(mean / scale, decimals) if known else significant(mean / scale, 4),
         "sigma": significant(spread) if known else "given",
-        "interval": f"{fixed(low / scale, decimals)} … {fixed(high / scale, decimals)}" if known else "",
+        "interval": f"{fixed(low / scale, decimals)} … {fixed(high / scale, decimals)}"
+        if known
+        else "",
         "prior": prior_text,
         "start": "" if start is None else with_sigma(start / scale, spread * 10.0),
-        "truth": "" if true is None else with_sigma(true / scale, spread / 10.0).rstrip("0").rstrip("."),
+        "truth": ""
+        if true is None
+        else with_sigma(true / scale, spread / 10.0).rstrip("0").rstrip("."),
         "z": "" if not np.isfinite(z) else ("+" if z > 0 else "") + fixed(z, 1),
     }
 
@@ -117,17 +125,26 @@ _ATTITUDE_NOTES = (
 
 
 def attitude_rows(error: AttitudeError) -> list[Row]:
-    """Contributions to the attitude error by both their figures: 1 sigma, 95 % and 99.7 % for each axis, arcsec."""
+    """Contributions to the attitude error by both their figures: 1 sigma, 95 % and 99.7 % for each
+    axis, arcsec.
+    """
     table = error.to_dataframe()
     rows = []
-    for (contributor, group), note in zip(table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True):
+    for (contributor, group), note in zip(
+        table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True
+    ):
         text = str(contributor)
         shown = _small if text == INTERACTION else significant
         figures = []
-        for name, column in ((WITH_MISFIT_FOUND, "with_misfit_found"), (IF_MODEL_HOLDS, "if_model_holds")):
+        for name, column in (
+            (WITH_MISFIT_FOUND, "with_misfit_found"),
+            (IF_MODEL_HOLDS, "if_model_holds"),
+        ):
             untested = column == "with_misfit_found" and error.misfit is None
             values = {
-                head: [] if untested else [shown(float(v)) for v in group[f"{start}{column}_arcsec"]]
+                head: []
+                if untested
+                else [shown(float(v)) for v in group[f"{start}{column}_arcsec"]]
                 for head, start in (("sigma", ""), ("p95", "p95_"), ("p997", "p997_"))
             }
             figures.append({"name": name, "untested": untested, **values})
@@ -151,10 +168,16 @@ def attitude_rows(error: AttitudeError) -> list[Row]:
 
 
 def _small(arcsec: float) -> str:
-    """The interaction is shown to be small, and no more: twelve columns leave no room for powers of ten."""
+    """The interaction is shown to be small, and no more: twelve columns leave no room for powers of
+    ten.
+    """
     if np.isnan(arcsec):
         return "—"
-    return "< 0.001".replace(" ", "\N{NO-BREAK SPACE}") if 0.0 < arcsec < 0.001 else significant(arcsec)
+    return (
+        "< 0.001".replace(" ", "\N{NO-BREAK SPACE}")
+        if 0.0 < arcsec < 0.001
+        else significant(arcsec)
+    )
 
 
 def weak_directions(coupling: Coupling) -> list[Row]:
@@ -189,12 +212,22 @@ def diagnostics_table(post: Posterior) -> TextTable:
                 fixed(float(d.autocorrelation[i]), 1),
             )
         )
-    heads = ("", "R-hat", "ESS, bulk", "ESS, tail", "Mean, to the digits of its MCSE", "MCSE of the mean", "MCSE / σ")
+    heads = (
+        "",
+        "R-hat",
+        "ESS, bulk",
+        "ESS, tail",
+        "Mean, to the digits of its MCSE",
+        "MCSE of the mean",
+        "MCSE / σ",
+    )
     return TextTable((*heads, "Autocorrelation [steps]"), tuple(rows))
 
 
 def mean_to_mcse(mean: float, mcse: float) -> str:
-    """A mean with the digits that its Monte Carlo error leaves: the last one is larger than the error."""
+    """A mean with the digits that its Monte Carlo error leaves: the last one is larger than the
+    error.
+    """
     decimals = 0 if not mcse > 0.0 else max(0, int(np.floor(-np.log10(mcse))))
     return fixed(mean, decimals)
 
@@ -211,14 +244,22 @@ def methods_rows(results: Results) -> list[Row]:
         return []
     d, estimate = post.diagnostics, np.append(cal.theta, cal.sigma)
     spread, draws_mean = np.append(cal.sigmas, cal.sigma_std), post.draws.mean(axis=0)
-    sources = ((estimate, spread), (d.laplace_mean, d.laplace_sd), (d.psis_mean, d.psis_sd), (draws_mean, post.sd))
+    sources = (
+        (estimate, spread),
+        (d.laplace_mean, d.laplace_sd),
+        (d.psis_mean, d.psis_sd),
+        (draws_mean, post.sd),
+    )
     rows = []
     for i in post.sampled:
         parameter = post.parameters[i]
         # One digit more than elsewhere: the table is there to show small differences.
         decimals = decimals_for(float(post.sd[i]) / parameter.scale, 3)
         cells = [
-            f"{fixed(float(m[i]) / parameter.scale, decimals)} ± {fixed(float(s[i]) / parameter.scale, decimals)}"
+            (
+                f"{fixed(float(m[i]) / parameter.scale, decimals)} ± "
+                f"{fixed(float(s[i]) / parameter.scale, decimals)}"
+            )
             for m, s in sources
         ]
         unit = pretty_unit(parameter.scaled_unit)
@@ -262,7 +303,12 @@ def pair_table(cal: Calibration) -> TextTable:
         )
         for i, p in enumerate(specs)
     )
-    heads = ("", "Interstar angles (stage 3)", "Marginal likelihood (stage 4)", "Ratio of variances")
+    heads = (
+        "",
+        "Interstar angles (stage 3)",
+        "Marginal likelihood (stage 4)",
+        "Ratio of variances",
+    )
     return with_units(TextTable(heads, rows), specs)
 
 
@@ -275,7 +321,9 @@ def noise_table(cal: Calibration) -> TextTable | None:
         for term, value, error in zip(model.terms, model.coefficients, model.errors, strict=True)
     ]
     if model.frame_dof is not None:
-        rows.append(("frames", f"inverse chi-square, {significant(model.frame_dof)} degrees of freedom"))
+        rows.append(
+            ("frames", f"inverse chi-square, {significant(model.frame_dof)} degrees of freedom")
+        )
     return TextTable(("Term", "Coefficient of the log variance"), tuple(rows))
 
 
@@ -292,8 +340,12 @@ def image_context(record: ImageRecord | None, cal: Calibration) -> dict[str, Any
     return {
         "image_record": record,
         "image_rows": rows,
-        "image_reasons": [f"{plural(number, 'image')}: {reason}" for reason, number in reasons.most_common()],
-        "image_listing": "Every image." if len(record.rows) <= _LISTED else _listing(len(record.left_out)),
+        "image_reasons": [
+            f"{plural(number, 'image')}: {reason}" for reason, number in reasons.most_common()
+        ],
+        "image_listing": "Every image."
+        if len(record.rows) <= _LISTED
+        else _listing(len(record.left_out)),
         "round_rows": _round_rows(record, cal),
     }
 
@@ -305,12 +357,19 @@ def _listing(left_out: int) -> str:
 
 
 def _round_rows(record: ImageRecord, cal: Calibration) -> list[Row]:
-    """One row per quantity, after the first and the last round; none where both have the same stars."""
+    """One row per quantity, after the first and the last round; none where both have the same
+    stars.
+    """
     first, last = record.rounds[0], record.rounds[-1]
     if last.n_stars and not (last.new or last.given_up):
         return []
     rows: list[Row] = [
-        {"name": "images identified", "values": [count(r.n_frames) for r in (first, last)], "change": "", "unit": ""},
+        {
+            "name": "images identified",
+            "values": [count(r.n_frames) for r in (first, last)],
+            "change": "",
+            "unit": "",
+        },
         {
             "name": "stars calibrated",
             "values": [count(r.n_stars) for r in (first, last)],
@@ -321,18 +380,29 @@ def _round_rows(record: ImageRecord, cal: Calibration) -> list[Row]:
     for parameter in parameters(cal.camera.distortion):
         if parameter.name not in first.parameters or parameter.name not in last.parameters:
             continue
-        (old, old_sigma), (new, sigma) = first.parameters[parameter.name], last.parameters[parameter.name]
+        (old, old_sigma), (new, sigma) = (
+            first.parameters[parameter.name],
+            last.parameters[parameter.name],
+        )
         scale = parameter.scale
         rows.append(
             {
                 "name": symbol(parameter.name),
-                "values": [plus_minus(old / scale, old_sigma / scale), plus_minus(new / scale, sigma / scale)],
+                "values": [
+                    plus_minus(old / scale, old_sigma / scale),
+                    plus_minus(new / scale, sigma / scale),
+                ],
                 "change": f"{fixed((new - old) / sigma, 1)} σ" if sigma > 0.0 else "",
                 "unit": pretty_unit(parameter.scaled_unit),
             }
         )
     unit = "times the stated noise" if last.sigma_name == "sigma_scale" else "px per axis"
     rows.append(
-        {"name": "noise", "values": [significant(r.sigma, 3) for r in (first, last)], "change": "", "unit": unit}
+        {
+            "name": "noise",
+            "values": [significant(r.sigma, 3) for r in (first, last)],
+            "change": "",
+            "unit": unit,
+        }
     )
     return rows

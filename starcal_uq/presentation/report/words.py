@@ -31,17 +31,26 @@ _DIRECTIONS = {
 
 
 def run_text(results: Results) -> str:
-    """A run in a few lines: the verdict, what it rests on, the attitude error, and what it lacks."""
+    """A run in a few lines: the verdict, what it rests on, the attitude error, and what it
+    lacks.
+    """
     obs, error = results.observations, results.attitude
-    lines = [results.verdict.headline, f"{plural(obs.n_stars, 'star')} in {plural(obs.n_frames, 'frame')}."]
+    lines = [
+        results.verdict.headline,
+        f"{plural(obs.n_stars, 'star')} in {plural(obs.n_frames, 'frame')}.",
+    ]
     if error is not None:
         lines.append(one_number_sentence(error))
-    lines += [f"{missing.what}: not there yet (`{missing.command}`)." for missing in results.missing]
+    lines += [
+        f"{missing.what}: not there yet (`{missing.command}`)." for missing in results.missing
+    ]
     return "\n".join(lines)
 
 
 def run_html(results: Results) -> str:
-    """The same for a notebook, with the table of the parameters and the checks that did not pass."""
+    """The same for a notebook, with the table of the parameters and the checks that did not
+    pass.
+    """
     post, cal = results.posterior, results.calibration
     table = calibration_table(cal, results.truth) if post is None else posterior_table(post)
     doubts = (str(check) for check in results.verdict.doubts)
@@ -53,13 +62,18 @@ def data_sentence(results: Results) -> str:
     obs, cal = results.observations, results.calibration
     per_frame = obs.stars_per_frame
     low, high = int(per_frame.min()), int(per_frame.max())
-    each = f"{low} stars each" if low == high else f"{low} to {high} stars each, median {np.median(per_frame):g}"
+    each = (
+        f"{low} stars each"
+        if low == high
+        else f"{low} to {high} stars each, median {np.median(per_frame):g}"
+    )
     source = {"simulated": "Simulated data: "}.get(str(obs.meta.get("source", "")), "")
     stars = f"{plural(obs.n_stars, 'star')} in {plural(obs.n_frames, 'frame')} ({each})"
     if cal.partitions is not None:
         files = plural(len(cal.partitions.n_stars), "file")
         stars = (
-            f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')} of {files}, of which a sample of "
+            f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')} of {files}, of "
+            "which a sample of "
             f"{plural(obs.n_frames, 'frame')} ({each}) is shown and questioned star by star"
         )
     unique = ""
@@ -96,11 +110,16 @@ def _air_words(results: Results) -> str:
 def _noise_words(results: Results) -> str:
     cal, post = results.calibration, results.posterior
     if cal.fitted_noise is not None:
-        return f"fitted: {cal.fitted_noise}; the data ask for {significant(cal.sigma, 3)} times that"
+        return (
+            f"fitted: {cal.fitted_noise}; the data ask for {significant(cal.sigma, 3)} times that"
+        )
     if cal.sigma_name == "sigma_scale":
         floor = results.observations.meta.get("noise_floor_px")
         more = (
-            f", with {significant(float(floor))} px per axis added that even bright stars show in their residuals"
+            (
+                f", with {significant(float(floor))} px per axis added that even bright stars show "
+                "in their residuals"
+            )
             if floor
             else ""
         )
@@ -119,8 +138,13 @@ def sigma_sentence(results: Results) -> str:
     if post is None:
         return f"The noise σ ({kind}) is estimated from the residuals and their degrees of freedom."
     if post.sigma_sampled:
-        return f"The noise σ ({kind}) is a parameter: it is sampled with the others, on its logarithm."
-    return f"The noise σ ({kind}) was given as {significant(float(post.sigma_draws[0]), 4)} and not sampled."
+        return (
+            f"The noise σ ({kind}) is a parameter: it is sampled with the others, on its logarithm."
+        )
+    return (
+        f"The noise σ ({kind}) was given as {significant(float(post.sigma_draws[0]), 4)} and not "
+        "sampled."
+    )
 
 
 def likelihood_sentence(results: Results) -> str:
@@ -130,19 +154,25 @@ def likelihood_sentence(results: Results) -> str:
     known = {
         "marginal": "",
         "student_t": (
-            "The posterior of this run is that of the robust variant: each star’s residual follows a bivariate Student "
-            "t instead of a Gaussian, with the attitude of the frame integrated out in the same way."
+            "The posterior of this run is that of the robust variant: each star’s residual "
+            "follows a bivariate Student "
+            "t instead of a Gaussian, with the attitude of the frame integrated out in the same "
+            "way."
         ),
         "pairs": (
-            "The posterior of this run is that of the angles between stars, a composite likelihood whose curvature is "
+            "The posterior of this run is that of the angles between stars, a composite "
+            "likelihood whose curvature is "
             "adjusted to its Godambe information."
         ),
         "pairs_naive": (
-            "The posterior of this run takes the angles between stars as independent, which they are not: its "
+            "The posterior of this run takes the angles between stars as independent, which they "
+            "are not: its "
             "intervals are several times too narrow."
         ),
     }
-    return known.get(kind, f"The posterior of this run is that of the likelihood “{kind}” that was passed.")
+    return known.get(
+        kind, f"The posterior of this run is that of the likelihood “{kind}” that was passed."
+    )
 
 
 def attitude_sentence(results: Results) -> str:
@@ -158,14 +188,26 @@ def attitude_sentence(results: Results) -> str:
 
 # What the uncertainties assume, and the checks that look for the opposite.
 _ASSUMPTIONS = (
-    ("Centroid errors are Gaussian, with the noise that is stated.", ("Outliers", "Posterior predictive check")),
-    ("The noise is the same over field, magnitude and time, or stated star by star.", ("Evenness of the noise",)),
+    (
+        "Centroid errors are Gaussian, with the noise that is stated.",
+        ("Outliers", "Posterior predictive check"),
+    ),
+    (
+        "The noise is the same over field, magnitude and time, or stated star by star.",
+        ("Evenness of the noise",),
+    ),
     (
         "Stars of one frame share no error but the attitude (motion, refraction, temperature).",
         ("Jackknife over frames", "Unexplained structure"),
     ),
-    ("A star brings no error along (catalogue position and motion, blend, colour).", ("Errors of the stars",)),
-    ("Directions are those that the camera saw: aberration, and refraction in air.", ("Catalogue directions",)),
+    (
+        "A star brings no error along (catalogue position and motion, blend, colour).",
+        ("Errors of the stars",),
+    ),
+    (
+        "Directions are those that the camera saw: aberration, and refraction in air.",
+        ("Catalogue directions",),
+    ),
     (
         "The lens follows the distortion model, the same in all frames.",
         ("Pattern in the residuals", "Unexplained structure", "Distortion model"),
@@ -177,7 +219,10 @@ _ASSUMPTIONS = (
 def assumption_rows(verdict: Verdict) -> list[dict[str, Any]]:
     """What is assumed, with the outcome of the checks that were made for it."""
     made = {check.name: check for check in verdict.checks}
-    return [{"assumed": words, "checks": [made[n] for n in names if n in made]} for words, names in _ASSUMPTIONS]
+    return [
+        {"assumed": words, "checks": [made[n] for n in names if n in made]}
+        for words, names in _ASSUMPTIONS
+    ]
 
 
 def prior_rows(results: Results) -> list[dict[str, str]]:
@@ -185,7 +230,9 @@ def prior_rows(results: Results) -> list[dict[str, str]]:
     if results.posterior is None:
         return []
     table = results.posterior.priors.to_dataframe()
-    return [{"name": str(row.parameter), "statement": str(row.statement)} for row in table.itertuples()]
+    return [
+        {"name": str(row.parameter), "statement": str(row.statement)} for row in table.itertuples()
+    ]
 
 
 def sampling_sentence(results: Results) -> str:
@@ -198,14 +245,18 @@ def sampling_sentence(results: Results) -> str:
     moves = f", moves “{settings['moves']}”" if "moves" in settings else ""
     rates = f"{fixed(float(d.acceptance.min()), 2)} to {fixed(float(d.acceptance.max()), 2)}"
     return (
-        f"emcee: {post.n_ensembles} separately seeded ensembles of {post.n_walkers} walkers, {post.n_steps} kept steps "
-        f"each{moves}; {count(d.n_evaluations)} evaluations of the {d.likelihood_used} likelihood; acceptance {rates}."
+        f"emcee: {post.n_ensembles} separately seeded ensembles of {post.n_walkers} walkers, "
+        f"{post.n_steps} kept steps "
+        f"each{moves}; {count(d.n_evaluations)} evaluations of the {d.likelihood_used} "
+        f"likelihood; acceptance {rates}."
     )
 
 
 def provenance_rows(results: Results) -> list[tuple[str, str]]:
     """What is needed to repeat the run."""
-    rows: list[tuple[str, str]] = [("Data, SHA-256", results.calibration.data_hash_of(results.observations))]
+    rows: list[tuple[str, str]] = [
+        ("Data, SHA-256", results.calibration.data_hash_of(results.observations))
+    ]
     source = results.observations.meta.get("source")
     if source:
         rows.append(("Source of the data", str(source)))
@@ -222,7 +273,12 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
             rows.append((f"{name}, seed", str(step["seed"])))
         rows.append((f"{name}, settings", _settings_text(step.get("settings", {}))))
     versions: Mapping[str, Any] = steps[-1][1].get("versions", {})
-    rows.append(("Versions", ", ".join(f"{name} {version}" for name, version in versions.items() if version)))
+    rows.append(
+        (
+            "Versions",
+            ", ".join(f"{name} {version}" for name, version in versions.items() if version),
+        )
+    )
     return rows
 
 
@@ -239,12 +295,15 @@ def _plain(value: Any) -> str:
 
 
 def equivalent_sentence(field: FieldMap | None) -> str:
-    """The common rotation as an error of the principal point; empty without a map, or for one that does not hold it."""
+    """The common rotation as an error of the principal point; empty without a map, or for one that
+    does not hold it.
+    """
     shift = None if field is None else equivalent_shift(field)
     if shift is None:
         return ""
     x, y = shift
     return (
-        "Equivalent principal point: the rotation that is removed on the right is what an error of the principal point "
+        "Equivalent principal point: the rotation that is removed on the right is what an error "
+        "of the principal point "
         f"of {x} along x and {y} along y (1 sigma) would do by itself."
     )

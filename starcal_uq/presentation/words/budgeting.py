@@ -1,4 +1,6 @@
-"""The budget in sentences and tables: contributors, totals, requirements, and why two bounds differ."""
+"""The budget in sentences and tables: contributors, totals, requirements, and why two bounds
+differ.
+"""
 
 from __future__ import annotations
 
@@ -69,13 +71,19 @@ def headline(budget: Budget) -> str:
     if missing:
         parts.append(f"{plural(missing, 'requirement')} open: contributors are missing.")
     if between:
-        parts.append(f"{plural(len(between), 'requirement')} open: only an upper bound exceeds the limit.")
+        parts.append(
+            f"{plural(len(between), 'requirement')} open: only an upper bound exceeds the limit."
+        )
     if unresolved:
-        parts.append(f"{plural(len(unresolved), 'requirement')} open: the samples do not resolve so high a confidence.")
+        parts.append(
+            f"{plural(len(unresolved), 'requirement')} open: the samples do not resolve so high "
+            "a confidence."
+        )
     if budget.not_assessed:
         every = len(by_contributor(budget.rows))
         parts.append(
-            f"{len(budget.not_assessed)} of {every} contributors are not assessed on one axis or more, so the totals "
+            f"{len(budget.not_assessed)} of {every} contributors are not assessed on one axis or "
+            "more, so the totals "
             "read “at least”."
         )
     elif not budget.outcomes:
@@ -128,11 +136,17 @@ def _sigma(row: Contributor | None) -> str:
     if not row.assessed:
         return NOT_ASSESSED
     # With the digits of the attitude table, where it is the same number.
-    return significant(row.sigma_arcsec, 2 if row.source == "posterior" else 3) if row.applies else "n/a"
+    return (
+        significant(row.sigma_arcsec, 2 if row.source == "posterior" else 3)
+        if row.applies
+        else "n/a"
+    )
 
 
 def _figures(axes: dict[str, Contributor]) -> list[tuple[str, list[str]]]:
-    """What the posterior fills, by the two names that every attitude error has; empty where there is one figure."""
+    """What the posterior fills, by the two names that every attitude error has; empty where there
+    is one figure.
+    """
     rows = list(axes.values())
     if any(math.isnan(row.if_model_holds_arcsec) for row in rows):
         return []
@@ -140,7 +154,10 @@ def _figures(axes: dict[str, Contributor]) -> list[tuple[str, list[str]]]:
         (WITH_MISFIT_FOUND, [row.with_misfit_found_arcsec for row in rows]),
         (IF_MODEL_HOLDS, [row.if_model_holds_arcsec for row in rows]),
     )
-    told = [(name, [NOT_ASSESSED if math.isnan(v) else significant(v) for v in values]) for name, values in pairs]
+    told = [
+        (name, [NOT_ASSESSED if math.isnan(v) else significant(v) for v in values])
+        for name, values in pairs
+    ]
     return told if told[0][1] != told[1][1] else []
 
 
@@ -150,7 +167,9 @@ def _listed(values: list[str]) -> str:
 
 def _means(axes: dict[str, Contributor]) -> str:
     """Means of the three axes, or one 0 for all."""
-    values = [axes[axis].mean_arcsec if axis in axes and axes[axis].assessed else None for axis in AXES]
+    values = [
+        axes[axis].mean_arcsec if axis in axes and axes[axis].assessed else None for axis in AXES
+    ]
     if not any(values):
         return "0" if any(value is not None for value in values) else ""
     return ", ".join("–" if value is None else significant(value, 3) for value in values)
@@ -158,7 +177,11 @@ def _means(axes: dict[str, Contributor]) -> str:
 
 def _tails(rows: list[Contributor]) -> str:
     """The range of the tails where sigma changes from frame to frame."""
-    tails = [row.tail_997 for row in rows if row.distribution == "gaussian" and row.tail_997 > _GAUSSIAN_TAIL]
+    tails = [
+        row.tail_997
+        for row in rows
+        if row.distribution == "gaussian" and row.tail_997 > _GAUSSIAN_TAIL
+    ]
     if not tails:
         return ""
     ends = " to ".join(dict.fromkeys(significant(tail, 3) for tail in (min(tails), max(tails))))
@@ -190,7 +213,9 @@ def total_rows(budget: Budget) -> list[Row]:
                 {
                     "scope": scope,
                     "axis": AXIS_LABELS[axis],
-                    "mean": "–" if math.isnan(mixed.mean_arcsec) else significant(mixed.mean_arcsec, 3),
+                    "mean": "–"
+                    if math.isnan(mixed.mean_arcsec)
+                    else significant(mixed.mean_arcsec, 3),
                     "sigma": bound(mixed.sigma_arcsec, mixed.at_least),
                     "factor": "–" if math.isnan(mixed.factor) else fixed(mixed.factor, 3),
                     "rule": bound(mixed.rule_arcsec, mixed.at_least),
@@ -234,7 +259,9 @@ def _requirement_row(outcome: Outcome) -> Row:
         "rule": bound(outcome.total.rule_arcsec, outcome.total.at_least),
         "sampled": _sampled(outcome.total),
         "least": bound(outcome.least_arcsec, outcome.total.at_least),
-        "margin": "–" if math.isnan(outcome.margin_arcsec) else significant(outcome.margin_arcsec, 3),
+        "margin": "–"
+        if math.isnan(outcome.margin_arcsec)
+        else significant(outcome.margin_arcsec, 3),
         "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),
         "verdict": outcome.verdict,
         "level": outcome.level.value,
@@ -280,8 +307,10 @@ def factor_sentence(budget: Budget) -> str:
     """Which quantiles the rule took."""
     level = budget.confidence
     return (
-        f"At {confidence_text(level)} a Gaussian error stays within {fixed(one_axis_factor(level), 3)} sigma on one "
-        f"axis, but the angle of two equal axes within {fixed(two_axis_radius(level, 1.0, 1.0), 3)} sigma per axis; "
+        f"At {confidence_text(level)} a Gaussian error stays within "
+        f"{fixed(one_axis_factor(level), 3)} sigma on one "
+        "axis, but the angle of two equal axes within "
+        f"{fixed(two_axis_radius(level, 1.0, 1.0), 3)} sigma per axis; "
         "for unequal ones the factor refers to the root mean square of both."
     )
 
@@ -291,12 +320,17 @@ def outcome_text(outcome: Outcome) -> str:
     asked, total = outcome.requirement, outcome.total
     axis = axis_label(asked)
     what = f"{axis}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
-    numbers = f"{significant(outcome.bound_arcsec, 3)} arcsec against a limit of {significant(asked.limit_arcsec, 3)}"
+    numbers = (
+        f"{significant(outcome.bound_arcsec, 3)} arcsec against a limit of "
+        f"{significant(asked.limit_arcsec, 3)}"
+    )
     least = "at least " if total.at_least else ""
     if outcome.unresolved:
         return (
-            f"{asked.name!r} ({what}) is open: {total.explanation.removesuffix('.')}. The rule, which knows "
-            f"Gaussian tails only, says {least}{significant(total.rule_arcsec, 3)} arcsec against a limit of "
+            f"{asked.name!r} ({what}) is open: {total.explanation.removesuffix('.')}. The rule, "
+            "which knows "
+            f"Gaussian tails only, says {least}{significant(total.rule_arcsec, 3)} arcsec "
+            "against a limit of "
             f"{significant(asked.limit_arcsec, 3)}; judged_by = 'rule' would let it judge alone."
         )
     if math.isnan(outcome.bound_arcsec):
@@ -304,24 +338,32 @@ def outcome_text(outcome: Outcome) -> str:
     if outcome.verdict == "violated":
         cause = f"; {total.dominant!r} dominates" if total.dominant else ""
         reached = (
-            f"{significant(outcome.least_arcsec, 3)} arcsec against a limit of {significant(asked.limit_arcsec, 3)}"
+            f"{significant(outcome.least_arcsec, 3)} arcsec against a limit of "
+            f"{significant(asked.limit_arcsec, 3)}"
         )
         least = least or ("at least " if outcome.least_arcsec < outcome.bound_arcsec else "")
         return f"{asked.name!r} ({what}) is violated: {least}{reached}{cause}."
     if outcome.between:
         so_far = " so far" if total.at_least else ""
         lower = significant(outcome.least_arcsec, 3)
-        return f"{asked.name!r} ({what}) is open: at the least {lower} and at most {numbers}{so_far}."
+        return (
+            f"{asked.name!r} ({what}) is open: at the least {lower} and at most {numbers}{so_far}."
+        )
     if outcome.verdict == "open":
         count = len(total.not_assessed)
         missing = f"{count} contributors are" if count > 1 else "1 contributor is"
         return f"{asked.name!r} ({what}) is open: {numbers} so far, but {missing} not assessed."
-    return f"{asked.name!r} ({what}) is met: {numbers}, margin {significant(outcome.margin_arcsec, 3)} arcsec."
+    return (
+        f"{asked.name!r} ({what}) is met: {numbers}, margin "
+        f"{significant(outcome.margin_arcsec, 3)} arcsec."
+    )
 
 
 def requirement_checks(budget: Budget | None) -> tuple[Check, ...]:
     """The requirements of a budget as checks of a run's verdict; none without a budget."""
-    return tuple(_requirement_check(outcome) for outcome in (() if budget is None else budget.outcomes))
+    return tuple(
+        _requirement_check(outcome) for outcome in (() if budget is None else budget.outcomes)
+    )
 
 
 def _requirement_check(outcome: Outcome) -> Check:
@@ -352,16 +394,22 @@ def _requirement_advice(outcome: Outcome) -> str:
 
 
 def contributors_table(budget: Budget) -> TextTable:
-    """One row per contributor, 1 sigma on its axes; what the posterior fills by both its figures."""
+    """One row per contributor, 1 sigma on its axes; what the posterior fills by both its
+    figures.
+    """
     rows: list[tuple[str, ...]] = []
     for row in contributor_rows(budget):
         # What is not assessed is said once where it holds for all axes.
         sigma = row["sigma"] if row["assessed"] else (NOT_ASSESSED, "", "")
         shown = ("", "", "") if row["figures"] else sigma
-        rows.append((row["name"], row["ecss_class"], *shown, row["interpretation"], row["absorbed"]))
+        rows.append(
+            (row["name"], row["ecss_class"], *shown, row["interpretation"], row["absorbed"])
+        )
         rows += [(f"  {name}", "", *values, "", "") for name, values in row["figures"]]
     heads = ("contributor", "class", "X", "Y", "Z", "random over", "absorbed")
-    return TextTable(heads, tuple(rows), f"{budget.title}: contributors, 1 sigma, arcsec", "lllllll")
+    return TextTable(
+        heads, tuple(rows), f"{budget.title}: contributors, 1 sigma, arcsec", "lllllll"
+    )
 
 
 def totals_table(budget: Budget) -> TextTable:

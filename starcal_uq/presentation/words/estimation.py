@@ -6,7 +6,14 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
-from starcal_uq.core.formatting import decimals_for, fixed, percent, plural, pretty_unit, significant
+from starcal_uq.core.formatting import (
+    decimals_for,
+    fixed,
+    percent,
+    plural,
+    pretty_unit,
+    significant,
+)
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.merging import ALPHA, Consistency
@@ -36,10 +43,14 @@ def fitted_noise_text(cal: Calibration) -> str:
 
 
 def calibration_text(cal: Calibration) -> str:
-    """What was calibrated, how it ended, the focal length, and what was decided on the way: noise, model."""
+    """What was calibrated, how it ended, the focal length, and what was decided on the way: noise,
+    model.
+    """
     first = (
-        f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')}, {cal.method} ({cal.solver}): "
-        f"{cal.status.name.lower().replace('_', ' ')}; focal length {focal_length(cal)}.{fitted_noise_text(cal)}"
+        f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')}, {cal.method} "
+        f"({cal.solver}): "
+        f"{cal.status.name.lower().replace('_', ' ')}; focal length "
+        f"{focal_length(cal)}.{fitted_noise_text(cal)}"
     )
     return f"{first} {fallback_words(cal)}".strip()
 
@@ -51,7 +62,10 @@ def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTabl
     specs = parameters(cal.camera.distortion)
     for index, (spec, value, sigma) in enumerate(zip(specs, cal.theta, cal.sigmas, strict=True)):
         decimals = decimals_for(sigma / spec.scale)
-        cells = [fixed(number / spec.scale, decimals) for number in (cal.nominal.theta[index], value, sigma)]
+        cells = [
+            fixed(number / spec.scale, decimals)
+            for number in (cal.nominal.theta[index], value, sigma)
+        ]
         if truth is not None:
             true = truth.theta[index]
             cells += [fixed(true / spec.scale, decimals), fixed((value - true) / sigma, 2)]
@@ -69,19 +83,27 @@ def screening_text(screening: Screening) -> str:
     """What was rejected and why, at which risk, in a few lines."""
     n = len(screening.kept)
     lines = [
-        f"{plural(screening.n_rejected, 'star')} of {n} rejected ({percent(screening.n_rejected / n)}), "
+        f"{plural(screening.n_rejected, 'star')} of {n} rejected "
+        f"({percent(screening.n_rejected / n)}), "
         f"{plural(len(screening.dropped_frames), 'frame')} of {len(screening.frame_ids)} dropped, "
         f"{plural(len(screening.rounds), 'round')}."
     ]
-    lines += [f"{plural(number, 'star')}: {REASONS[reason]}." for reason, number in screening.counts.items()]
+    lines += [
+        f"{plural(number, 'star')}: {REASONS[reason]}."
+        for reason, number in screening.counts.items()
+    ]
     lines.append(
-        f"Limits: a star {significant(float(np.sqrt(screening.star_threshold)), 3)} sigma from the prediction of the "
-        f"others (p < {significant(screening.star_p_value)}), a frame at p < {significant(screening.frame_p_value)}; "
-        f"at most {significant(screening.expected_false)} right stars are expected among the rejected."
+        f"Limits: a star {significant(float(np.sqrt(screening.star_threshold)), 3)} sigma from "
+        "the prediction of the "
+        f"others (p < {significant(screening.star_p_value)}), a frame at p < "
+        f"{significant(screening.frame_p_value)}; "
+        f"at most {significant(screening.expected_false)} right stars are expected among the "
+        "rejected."
     )
     if screening.sigma_shrinkage > 1e-3:
         lines.append(
-            f"The estimated {screening.calibration.sigma_name} is {percent(screening.sigma_shrinkage)} too small, "
+            f"The estimated {screening.calibration.sigma_name} is "
+            f"{percent(screening.sigma_shrinkage)} too small, "
             "because right stars in the tails were cut off."
         )
     return "\n".join([*lines, *(f"Warning: {text}" for text in screening.warnings)])
@@ -96,16 +118,21 @@ def screening_table(screening: Screening) -> TextTable | None:
         return "∞" if np.isinf(value) else fixed(value, 3)
 
     rejected = screening.rejected.head(_SHOWN_ROWS)
-    formats = dict.fromkeys(("x_px", "y_px", "residual_px", "offset_deg", "statistic", "threshold"), number)
+    formats = dict.fromkeys(
+        ("x_px", "y_px", "residual_px", "offset_deg", "statistic", "threshold"), number
+    )
     more = f", the first {len(rejected)}" if len(rejected) < screening.n_rejected else ""
     return TextTable.of(rejected, f"Rejected stars{more}", formats=formats, missing="")
 
 
 def consistency_text(consistency: Consistency) -> str:
     """Whether the runs show the same camera."""
-    verdict = "show the same camera" if consistency.p_value >= ALPHA else "do not show the same camera"
+    verdict = (
+        "show the same camera" if consistency.p_value >= ALPHA else "do not show the same camera"
+    )
     return (
-        f"The runs {verdict} (F = {consistency.statistic:.3g} with {consistency.dof[0]} and {consistency.dof[1]:.0f} "
+        f"The runs {verdict} (F = {consistency.statistic:.3g} with {consistency.dof[0]} and "
+        f"{consistency.dof[1]:.0f} "
         f"degrees of freedom, p = {consistency.p_value:.2g})."
     )
 

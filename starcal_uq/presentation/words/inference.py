@@ -17,7 +17,11 @@ def priors_text(priors: Priors) -> str:
     """Every prior as a statement."""
     table = priors.to_dataframe()
     return (
-        "; ".join(f"{name}: {words}" for name, words in zip(table["parameter"], table["statement"], strict=True)) + "."
+        "; ".join(
+            f"{name}: {words}"
+            for name, words in zip(table["parameter"], table["statement"], strict=True)
+        )
+        + "."
     )
 
 
@@ -37,7 +41,10 @@ def posterior_table(post: Posterior) -> TextTable:
         rows.append(
             (
                 parameter.name,
-                *(fixed(float(number), decimals) for number in (mean, sd, *np.quantile(column, [0.025, 0.975]))),
+                *(
+                    fixed(float(number), decimals)
+                    for number in (mean, sd, *np.quantile(column, [0.025, 0.975]))
+                ),
                 fixed(float(diagnostics.rhat[index]), 4),
                 f"{diagnostics.ess_bulk[index]:.0f}",
                 f"{diagnostics.ess_tail[index]:.0f}",
@@ -55,9 +62,13 @@ def predictive_text(predictive: PriorPredictive) -> str:
         words = "No observations were given to compare with."
     elif not predictive.ok:
         names = ", ".join(predictive.surprising)
-        words = f"The prior does not expect the data in {names}: check the nominal camera, or widen the prior."
+        words = (
+            f"The prior does not expect the data in {names}: check the nominal camera, or widen "
+            "the prior."
+        )
     return (
-        f"{words} {100 * predictive.folded:.1f} % of the cameras drawn from the prior fold over inside the field, "
+        f"{words} {100 * predictive.folded:.1f} % of the cameras drawn from the prior fold over "
+        "inside the field, "
         f"{100 * predictive.off_detector:.1f} % have their principal point off the detector."
     )
 
@@ -66,9 +77,15 @@ def sensitivity_text(sensitivity: PriorSensitivity) -> str:
     """Whether the priors matter, and for which parameters."""
     if sensitivity.ok:
         largest = f"{sensitivity.prior.max():.2g}"
-        return f"The priors do not matter: largest sensitivity {largest}, threshold {sensitivity.threshold:g}."
+        return (
+            f"The priors do not matter: largest sensitivity {largest}, threshold "
+            f"{sensitivity.threshold:g}."
+        )
     parts = [
-        f"{word} for {', '.join(n for n, w in zip(sensitivity.names, sensitivity.diagnosis, strict=True) if w == word)}"
+        (
+            f"{word} for "
+            f"{', '.join(n for n, w in zip(sensitivity.names, sensitivity.diagnosis, strict=True) if w == word)}"
+        )
         for word in (CONFLICT, WEAK)
         if word in sensitivity.diagnosis
     ]
@@ -78,7 +95,13 @@ def sensitivity_text(sensitivity: PriorSensitivity) -> str:
 def shift_text(shift: ShiftTest) -> str:
     """Whether the camera changed between two runs."""
     largest = int(np.argmax(np.abs(shift.z)))
-    where = f"largest change {shift.names[largest]}, {shift.z[largest]:+.1f} sigma; p = {shift.p_value:.2g}"
+    where = (
+        f"largest change {shift.names[largest]}, {shift.z[largest]:+.1f} sigma; p = "
+        f"{shift.p_value:.2g}"
+    )
     if shift.significant:
-        return f"The camera changed between the runs ({where}): widen the prior by an allowed shift, or start afresh."
+        return (
+            f"The camera changed between the runs ({where}): widen the prior by an allowed "
+            "shift, or start afresh."
+        )
     return f"Nothing shows that the camera changed between the runs ({where})."

@@ -20,7 +20,8 @@ _FIRST_ROWS = 5
 
 # What a result says beside a focal length in pixels.
 PITCH_UNKNOWN = (
-    "The pixel pitch is unknown, so that nothing is in millimetres: state it with --pixel-um UM, or as pixel_um in the "
+    "The pixel pitch is unknown, so that nothing is in millimetres: state it with --pixel-um UM, "
+    "or as pixel_um in the "
     "camera file."
 )
 
@@ -28,13 +29,21 @@ PITCH_UNKNOWN = (
 def detector_words(camera: Camera) -> str:
     """Size of the detector, and of its pixels where it is known."""
     size = f"{camera.width_px} × {camera.height_px} pixels"
-    return f"{size} of unknown pitch" if camera.pixel_um is None else f"{size} of {camera.pixel_um:g} µm"
+    return (
+        f"{size} of unknown pitch"
+        if camera.pixel_um is None
+        else f"{size} of {camera.pixel_um:g} µm"
+    )
 
 
 def focal_words(camera: Camera) -> str:
     """Focal length in pixels, and in millimetres where the pitch is known."""
     pixels = f"{camera.focal_px:.5g} px"
-    return pixels if camera.pixel_um is None else f"{pixels} ({camera.length_text(camera.focal_px, 4)})"
+    return (
+        pixels
+        if camera.pixel_um is None
+        else f"{pixels} ({camera.length_text(camera.focal_px, 4)})"
+    )
 
 
 def camera_text(camera: Camera) -> str:
@@ -53,7 +62,10 @@ def camera_table(camera: Camera) -> TextTable:
         *(() if camera.focal_mm is None else (("focal length", f"{camera.focal_mm:.6g} mm"),)),
         ("principal point", f"({camera.x0_px:.3f}, {camera.y0_px:.3f}) px"),
         ("distortion", camera.distortion),
-        *((c.name, f"{k:.6g} {pretty_unit(c.unit)}") for c, k in zip(coefficients, camera.coefficients, strict=True)),
+        *(
+            (c.name, f"{k:.6g} {pretty_unit(c.unit)}")
+            for c, k in zip(coefficients, camera.coefficients, strict=True)
+        ),
     ]
     return TextTable(("", "value"), tuple(rows), align="ll")
 
@@ -95,7 +107,9 @@ def profile_text(profile: AttitudeProfile) -> str:
     speed = profile.rate_deg_s
     name = f"{profile.name}: " if profile.name else ""
     return (
-        f"{name}{len(profile.time_s)} attitudes over {significant(profile.duration_s, 3)} s, turning at "
-        f"{significant(float(np.median(speed)), 3)} (median) to {significant(float(speed.max()), 3)} degrees per "
+        f"{name}{len(profile.time_s)} attitudes over {significant(profile.duration_s, 3)} s, "
+        "turning at "
+        f"{significant(float(np.median(speed)), 3)} (median) to "
+        f"{significant(float(speed.max()), 3)} degrees per "
         "second."
     )

@@ -71,7 +71,11 @@ def _range(plan: Plan) -> str:
 def range_words(least: float, most: float) -> str:
     """A range of numbers of frames; infinite where none does."""
     ends = [frames(None if np.isinf(n) else int(n)) for n in (least, most)]
-    return ends[0] if ends[0] == ends[1] else f"{ends[0].removesuffix('s').removesuffix(' frame')} to {ends[1]}"
+    return (
+        ends[0]
+        if ends[0] == ends[1]
+        else f"{ends[0].removesuffix('s').removesuffix(' frame')} to {ends[1]}"
+    )
 
 
 def corner(percent: float) -> str:
@@ -89,7 +93,9 @@ def span(found: DistortionRange) -> str:
 
 
 def distortion_sentence(plan: Plan) -> str:
-    """What the open distortion does, which distortion is the worst, and why; empty where the distortion is known."""
+    """What the open distortion does, which distortion is the worst, and why; empty where the
+    distortion is known.
+    """
     found = plan.distortion
     if found is None:
         return ""
@@ -100,10 +106,14 @@ def distortion_sentence(plan: Plan) -> str:
     worst = corner(float(found.percent[np.argmax(radius)]))
     point, focal = (_px_range(sigmas) for sigmas in (found.principal_point_px, found.focal_px))
     return (
-        f"{open_words} The worst is {worst}. What decides is how well the principal point can be told from a rotation "
-        f"of the camera: its sigma after {frames(AFTER_FRAMES)} is {point}, that of the focal length {focal}. A "
-        "rotation moves stars the more the further out they are; barrel distortion undoes that, most nearly in an "
-        f"f-theta lens ({significant(abs(found.f_theta_percent))} %). If the lens is known better, narrow the range "
+        f"{open_words} The worst is {worst}. What decides is how well the principal point can be "
+        "told from a rotation "
+        f"of the camera: its sigma after {frames(AFTER_FRAMES)} is {point}, that of the focal "
+        f"length {focal}. A "
+        "rotation moves stars the more the further out they are; barrel distortion undoes that, "
+        "most nearly in an "
+        f"f-theta lens ({significant(abs(found.f_theta_percent))} %). If the lens is known "
+        "better, narrow the range "
         "with --distortion-percent LOW HIGH, or give the coefficients."
     )
 
@@ -121,7 +131,11 @@ def _needed(need: Need, target: str) -> str:
                 f"{significant(need.floor_arcsec, 3)} arcsec."
             )
         return f"Not even ten million frames keep {target} for the {name}."
-    surely = "" if need.frames_surely is None else f" ({frames(need.frames_surely)} for 95 % of campaigns to keep it)"
+    surely = (
+        ""
+        if need.frames_surely is None
+        else f" ({frames(need.frames_surely)} for 95 % of campaigns to keep it)"
+    )
     return f"To keep {target} for the {name} takes {frames(need.frames)}{surely}."
 
 
@@ -131,7 +145,8 @@ def _others(plan: Plan) -> str:
         return ""
     rest = next(need for need in plan.needs if need.scope == "rest")
     return (
-        f" If alignment is calibrated with the same parameters, only the rest counts: {need_words(rest, rest.frames)}."
+        " If alignment is calibrated with the same parameters, only the rest counts: "
+        f"{need_words(rest, rest.frames)}."
     )
 
 
@@ -141,8 +156,10 @@ def _largest(plan: Plan) -> str:
     rest = max(found.of("rest_pitch_arcsec")[-1], found.of("rest_yaw_arcsec")[-1])
     return (
         f"{frames(int(found.n_frames[-1]))} of {significant(plan.mean_stars, 3)} stars at "
-        f"{significant(plan.sigma_px)} px give a common rotation of {significant(common)} and a rest of "
-        f"{significant(rest)} arcsec (1 sigma per axis across the boresight), beside centroid noise of "
+        f"{significant(plan.sigma_px)} px give a common rotation of {significant(common)} and a "
+        "rest of "
+        f"{significant(rest)} arcsec (1 sigma per axis across the boresight), beside centroid "
+        "noise of "
         f"{significant(float(max(plan.nea_arcsec[:2])))} arcsec in every frame."
     )
 
@@ -150,8 +167,10 @@ def _largest(plan: Plan) -> str:
 def settings_sentence(plan: Plan) -> str:
     """What the forecast assumes."""
     return (
-        f"Stars to magnitude {plan.max_mag:.2f} ({significant(plan.mean_stars, 3)} a frame on average), centroid noise "
-        f"of {significant(plan.sigma_px)} px per axis, frames at random attitudes with at least {plan.min_stars} "
+        f"Stars to magnitude {plan.max_mag:.2f} ({significant(plan.mean_stars, 3)} a frame on "
+        "average), centroid noise "
+        f"of {significant(plan.sigma_px)} px per axis, frames at random attitudes with at least "
+        f"{plan.min_stars} "
         f"stars: {percent(plan.sky_fraction)} of the sky shows them."
     )
 
@@ -170,10 +189,17 @@ def choice_text(choice: FrameChoice) -> str:
         )
     main = "rest" if choice.scope == "rest" else "common"
     cross = [choice.names.index(f"{main}_{axis}_arcsec") for axis in AXES[:2]]
-    richest = fixed(float(np.sqrt(np.mean(choice.richest[cross] ** 2) / np.mean(choice.after[cross] ** 2))), 2)
-    aim = "the parameters as a whole" if choice.criterion == "D" else f"the {SCOPE_NAMES[choice.scope]}"
+    richest = fixed(
+        float(np.sqrt(np.mean(choice.richest[cross] ** 2) / np.mean(choice.after[cross] ** 2))), 2
+    )
+    aim = (
+        "the parameters as a whole"
+        if choice.criterion == "D"
+        else f"the {SCOPE_NAMES[choice.scope]}"
+    )
     return (
-        f"{frames(len(choice.rotations))} of {count(choice.n_candidates)} candidates, chosen for {aim}, give "
+        f"{frames(len(choice.rotations))} of {count(choice.n_candidates)} candidates, chosen for "
+        f"{aim}, give "
         f"{join_words(parts)} than as many random frames; the frames with most stars would give a "
         f"{SCOPE_NAMES[main]} {richest} times as large."
     )
@@ -181,19 +207,22 @@ def choice_text(choice: FrameChoice) -> str:
 
 def check_text(check: ForecastCheck) -> str:
     """Whether forecast and simulation agree."""
-    outside = [int(n) for n, bad in zip(check.forecast.n_frames, check.nees_rejected, strict=True) if bad]
+    outside = [
+        int(n) for n, bad in zip(check.forecast.n_frames, check.nees_rejected, strict=True) if bad
+    ]
     g, q = np.unravel_index(int(np.argmax(np.abs(check.ratio - 1.0))), check.ratio.shape)
     ratio = float(check.ratio[g, q] - 1.0)
     sign = "+" if ratio > 0.0 else MINUS
     sentence = (
-        f"{count(check.n_campaigns)} simulated campaigns of each size: the sigmas they state differ from the forecast "
+        f"{count(check.n_campaigns)} simulated campaigns of each size: the sigmas they state "
+        "differ from the forecast "
         f"by at most {sign}{percent(abs(ratio))} ({check.forecast.names[q]}, "
         f"{plural(int(check.forecast.n_frames[g]), 'frame')}); "
     )
     if outside:
-        return (
-            sentence
-            + f"squared errors are not what they should be with {join_words([count(n) for n in outside])} frames."
+        return sentence + (
+            "squared errors are not what they should be with "
+            f"{join_words([count(n) for n in outside])} frames."
         )
     return sentence + "their squared errors are what they should be."
 
@@ -201,7 +230,14 @@ def check_text(check: ForecastCheck) -> str:
 def plan_table(plan: Plan) -> TextTable:
     """The forecast by number of frames."""
     focal = "f_px" if plan.camera.pixel_um is None else "f_mm"
-    columns = ("n_frames", "x0_px", focal, "common_pitch_arcsec", "rest_pitch_arcsec", "nea_pitch_arcsec")
+    columns = (
+        "n_frames",
+        "x0_px",
+        focal,
+        "common_pitch_arcsec",
+        "rest_pitch_arcsec",
+        "nea_pitch_arcsec",
+    )
     title = "Forecast, standard deviations; the radius holds the stated confidence"
     spread = () if plan.distortion is None else ("radius_least_arcsec", "radius_most_arcsec")
     return TextTable.of(plan.to_dataframe(), title, (*columns, "radius_arcsec", *spread))
@@ -210,10 +246,16 @@ def plan_table(plan: Plan) -> TextTable:
 def need_sentence(plan: Plan, need: Need) -> str:
     """`need_text` after the part of the error, with the range over the open distortion."""
     spread = plan.distortion
-    words = "" if spread is None else f" ({range_words(*spread.frames_range(need.scope))} over the open distortion)"
+    words = (
+        ""
+        if spread is None
+        else f" ({range_words(*spread.frames_range(need.scope))} over the open distortion)"
+    )
     return f"{need.scope}: {need_text(need)}{words}"
 
 
 def choice_table(choice: FrameChoice, n: int = 20) -> TextTable:
     """The first frames to take, most valuable first."""
-    return TextTable.of(choice.to_dataframe().head(n), f"The first {min(n, len(choice.candidate))} frames to take")
+    return TextTable.of(
+        choice.to_dataframe().head(n), f"The first {min(n, len(choice.candidate))} frames to take"
+    )

@@ -9,7 +9,14 @@ import pandas as pd
 
 from starcal_uq.camera.distortion import Parameter
 from starcal_uq.core.constants import AXES, TOTAL_AXES
-from starcal_uq.core.formatting import fixed, join_words, percent, plus_minus, pretty_unit, significant
+from starcal_uq.core.formatting import (
+    fixed,
+    join_words,
+    percent,
+    plus_minus,
+    pretty_unit,
+    significant,
+)
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import (
@@ -37,14 +44,16 @@ def agreement_text(agreement: Agreement) -> str:
     """What the ratios of sampled to first-order standard deviations mean."""
     if agreement.largest <= _AGREE:
         return (
-            f"Sampled and first-order standard deviations agree within {percent(max(agreement.largest, 1e-6))}: "
+            "Sampled and first-order standard deviations agree within "
+            f"{percent(max(agreement.largest, 1e-6))}: "
             "attitude errors are linear in parameters and noise."
         )
     distance = np.where(np.isfinite(agreement.ratio), np.abs(agreement.ratio - 1.0), 0.0)
     row, axis = np.unravel_index(int(np.argmax(distance)), distance.shape)
     return (
         f"Sampled and first-order standard deviations differ by up to {percent(agreement.largest)} "
-        f"({agreement.contributors[row]}, {AXES[axis]}): attitude errors are not linear over this posterior, and the "
+        f"({agreement.contributors[row]}, {AXES[axis]}): attitude errors are not linear over "
+        "this posterior, and the "
         "sampled values hold."
     )
 
@@ -52,14 +61,17 @@ def agreement_text(agreement: Agreement) -> str:
 def agreement_table(agreement: Agreement) -> TextTable:
     """One row per contributor and axis."""
     return TextTable.of(
-        agreement.to_dataframe(), formats={"sampled_over_first_order": lambda v: fixed(v, 5)}, missing="not known"
+        agreement.to_dataframe(),
+        formats={"sampled_over_first_order": lambda v: fixed(v, 5)},
+        missing="not known",
     )
 
 
 def one_number_sentence(error: AttitudeError) -> str:
     """What a single number for the calibration would hide, by both figures of every error."""
     common, rest, both = (
-        (error.with_misfit_found_arcsec[row, 3], error.if_model_holds_arcsec[row, 3]) for row in (1, 2, 3)
+        (error.with_misfit_found_arcsec[row, 3], error.if_model_holds_arcsec[row, 3])
+        for row in (1, 2, 3)
     )
     words = "Across the boresight, 1 sigma per axis, the calibration"
     # Below this it is rounding: frames that all show the same stars have no part that changes.
@@ -72,7 +84,8 @@ def one_number_sentence(error: AttitudeError) -> str:
             f"{two_figures(*rest)}, and no alignment absorbs it."
         )
     return (
-        f"{words} contributes {two_figures(*both)}. Most of it is a constant that alignment calibration with the same "
+        f"{words} contributes {two_figures(*both)}. Most of it is a constant that alignment "
+        "calibration with the same "
         f"parameters absorbs; what remains in flight is {two_figures(*rest)}."
     )
 
@@ -89,14 +102,19 @@ def misfit_sentence(error: AttitudeError) -> str:
 
 def _found_sentence(found: MisfitFound) -> str:
     if not found.reasons:
-        return f"The tests of the model found nothing: an error {WITH_MISFIT_FOUND} is that {IF_MODEL_HOLDS}."
+        return (
+            f"The tests of the model found nothing: an error {WITH_MISFIT_FOUND} is that "
+            f"{IF_MODEL_HOLDS}."
+        )
     common, rest = found.common_reasons, found.rest_reasons
     parts = (
         ("common rotation", [reason for reason in common if reason not in rest]),
         ("rest", [reason for reason in rest if reason not in common]),
         ("common rotation and the rest", [reason for reason in common if reason in rest]),
     )
-    return " ".join(f"Found for the {name}: {'; '.join(reasons)}." for name, reasons in parts if reasons)
+    return " ".join(
+        f"Found for the {name}: {'; '.join(reasons)}." for name, reasons in parts if reasons
+    )
 
 
 def alignment_sentence(error: AttitudeError) -> str:
@@ -108,28 +126,44 @@ def alignment_sentence(error: AttitudeError) -> str:
     text = f"{head}, whose noise leaves {sizes} arcsec ({', '.join(AXES)}) for good."
     if error.stays.any():
         axes = join_words([axis for axis, stays in zip(AXES, error.stays, strict=True) if stays])
-        text += f" The mission's frames see one field: the rest in {axes} is a bias that stays, too."
+        text += (
+            f" The mission's frames see one field: the rest in {axes} is a bias that stays, too."
+        )
     return text
 
 
 def attitude_text(error: AttitudeError) -> str:
-    """Whether first order holds, what a single number would hide, what alignment is, and what the misfit adds."""
+    """Whether first order holds, what a single number would hide, what alignment is, and what the
+    misfit adds.
+    """
     parts = (agreement_text(error.agreement), one_number_sentence(error), alignment_sentence(error))
     return " ".join((*parts, misfit_sentence(error)))
 
 
 def attitude_table(error: AttitudeError) -> TextTable:
-    """Contributors by axis, by both figures: 1 sigma, and the half-width across the boresight that holds 95 %."""
+    """Contributors by axis, by both figures: 1 sigma, and the half-width across the boresight that
+    holds 95 %.
+    """
     held, found = error.if_model_holds_arcsec, error.with_misfit_found_arcsec
     widths = (error.half_widths_with_misfit_found_arcsec[0], error.p95_arcsec)
-    absorbed = error.to_dataframe().groupby("contributor", sort=False)["absorbed_by_alignment"].first()
+    absorbed = (
+        error.to_dataframe().groupby("contributor", sort=False)["absorbed_by_alignment"].first()
+    )
     rows: list[tuple[str, ...]] = []
     for place, (contributor, words) in enumerate(absorbed.items()):
         figures = []
-        for name, sigma, width in zip((WITH_MISFIT_FOUND, IF_MODEL_HOLDS), (found, held), widths, strict=True):
+        for name, sigma, width in zip(
+            (WITH_MISFIT_FOUND, IF_MODEL_HOLDS), (found, held), widths, strict=True
+        ):
             values = [*sigma[place], width[place, 3]]
             # The interaction is not known of runs of old.
-            figures.append((f"  {name}", *("not known" if np.isnan(v) else significant(float(v)) for v in values), ""))
+            figures.append(
+                (
+                    f"  {name}",
+                    *("not known" if np.isnan(v) else significant(float(v)) for v in values),
+                    "",
+                )
+            )
         once = error.misfit is None or figures[0][1:] == figures[1][1:]
         rows.append((str(contributor), *(figures[1][1:-1] if once else [""] * 5), str(words)))
         rows += [] if once else figures
@@ -146,8 +180,14 @@ def coupling_text(coupling: Coupling) -> str:
 
 
 def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextTable:
-    """What not knowing the others costs every parameter; sigmas in the units of `specs`, or in px units."""
-    scales = np.array([spec.scale for spec in specs]) if specs else np.ones(len(coupling.parameter_names))
+    """What not knowing the others costs every parameter; sigmas in the units of `specs`, or in px
+    units.
+    """
+    scales = (
+        np.array([spec.scale for spec in specs])
+        if specs
+        else np.ones(len(coupling.parameter_names))
+    )
     columns = {
         "σ": coupling.sigma_marginal / scales,
         "σ, others known": coupling.sigma_conditional / scales,
@@ -157,13 +197,19 @@ def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextT
     }
     texts = {head: [significant(float(v)) for v in column] for head, column in columns.items()}
     if coupling.contraction is not None:
-        # The factor by which the data shrank the prior's sigma: a contraction of 1 - 1e-6 would print as 1.
+        # The factor by which the data shrank the prior's sigma: a contraction of 1 - 1e-6 would
+        # print as 1.
         shrunk = np.sqrt(np.maximum(1.0 - coupling.contraction, 1e-30))
         texts["prior σ / σ"] = [f"{significant(float(1.0 / v))} ×" for v in shrunk]
-    texts["unit"] = [pretty_unit(unit) for unit in ([s.scaled_unit for s in specs] or coupling.units)]
+    texts["unit"] = [
+        pretty_unit(unit) for unit in ([s.scaled_unit for s in specs] or coupling.units)
+    ]
     rows = tuple(zip(coupling.parameter_names, *texts.values(), strict=True))
     return TextTable(
-        ("", *texts), rows, "Coupling: what not knowing the others costs", "l" + "r" * (len(texts) - 1) + "l"
+        ("", *texts),
+        rows,
+        "Coupling: what not knowing the others costs",
+        "l" + "r" * (len(texts) - 1) + "l",
     )
 
 
@@ -173,14 +219,19 @@ def correlation_table(coupling: Coupling) -> TextTable:
         (name, *(fixed(float(value), 2) for value in row))
         for name, row in zip(coupling.extended_names, coupling.extended_correlation, strict=True)
     )
-    return TextTable(("", *coupling.extended_names), rows, "Correlations, with the rotation common to all frames")
+    return TextTable(
+        ("", *coupling.extended_names), rows, "Correlations, with the rotation common to all frames"
+    )
 
 
 def field_text(field: FieldMap) -> str:
     """The middle of both maps, and the common rotation as an error of the principal point."""
-    absolute, rest = (float(np.median(m)) for m in (field.sigma_absolute_arcsec, field.sigma_compensated_arcsec))
+    absolute, rest = (
+        float(np.median(m)) for m in (field.sigma_absolute_arcsec, field.sigma_compensated_arcsec)
+    )
     text = (
-        f"If the model holds, half of the detector knows its directions to {significant(absolute)} arcsec (1 sigma per "
+        "If the model holds, half of the detector knows its directions to "
+        f"{significant(absolute)} arcsec (1 sigma per "
         f"axis), or to {significant(rest)} arcsec once the best rotation is removed."
     )
     shift = equivalent_shift(field)
@@ -192,25 +243,40 @@ def field_text(field: FieldMap) -> str:
 
 
 def equivalent_shift(field: FieldMap) -> tuple[str, str] | None:
-    """Error of the principal point along x and y that alone would cause the common rotation; None if not known."""
+    """Error of the principal point along x and y that alone would cause the common rotation; None
+    if not known.
+    """
     pixels, angles = field.equivalent_principal_point_px, field.equivalent_principal_point_arcsec
     if pixels is None or angles is None:
         return None
-    x, y = (f"{significant(float(p))} px ({significant(float(a))} arcsec)" for p, a in zip(pixels, angles, strict=True))
+    x, y = (
+        f"{significant(float(p))} px ({significant(float(a))} arcsec)"
+        for p, a in zip(pixels, angles, strict=True)
+    )
     return x, y
 
 
 def field_table(field: FieldMap) -> TextTable:
-    """Least, median and largest uncertainty over the detector, before and after the best rotation is removed."""
+    """Least, median and largest uncertainty over the detector, before and after the best rotation
+    is removed.
+    """
     maps = (
         ("absolute", field.sigma_absolute_arcsec, field.worst_absolute_arcsec),
         ("best rotation removed", field.sigma_compensated_arcsec, field.worst_compensated_arcsec),
     )
     rows = tuple(
-        (name, *(significant(float(v)) for v in (np.min(sigma), np.median(sigma), np.max(sigma), np.max(worst))))
+        (
+            name,
+            *(
+                significant(float(v))
+                for v in (np.min(sigma), np.median(sigma), np.max(sigma), np.max(worst))
+            ),
+        )
         for name, sigma, worst in maps
     )
-    return TextTable(("", "least", "median", "largest", "worst direction"), rows, "1 sigma per axis, arcsec")
+    return TextTable(
+        ("", "least", "median", "largest", "worst direction"), rows, "1 sigma per axis, arcsec"
+    )
 
 
 def corner_sentence(curve: DistortionCurve) -> str:
@@ -227,42 +293,63 @@ def corner_sentence(curve: DistortionCurve) -> str:
 
 def distortion_text(curve: DistortionCurve) -> str:
     """Displacement at the largest radius, and what the bands are."""
-    bands = f"Bands of {percent(curve.level)}; the simultaneous one is ±{curve.multiplier:.2f} sd wide."
+    bands = (
+        f"Bands of {percent(curve.level)}; the simultaneous one is ±{curve.multiplier:.2f} sd wide."
+    )
     return f"{corner_sentence(curve)} {bands}"
 
 
 def spectrum_text(spectrum: ErrorSpectrum) -> str:
     """How fast the frame-dependent part changes, and what averaging does to it."""
-    rest, tau, nyquist = spectrum.rest_arcsec, spectrum.correlation_time_s, float(spectrum.frequency_hz[-1])
+    rest, tau, nyquist = (
+        spectrum.rest_arcsec,
+        spectrum.correlation_time_s,
+        float(spectrum.frequency_hz[-1]),
+    )
     share = spectrum.share_below(0.1 * nyquist)
     if not np.all(rest > _ROUNDING_ARCSEC):
-        return "The calibration has no frame-dependent part along this profile: its frames all show the same stars."
+        return (
+            "The calibration has no frame-dependent part along this profile: its frames all show "
+            "the same stars."
+        )
     words = (
-        f"If the model holds, along {spectrum.frames} the frame-dependent part of the calibration error is "
-        f"{_listed(rest)} arcsec ({', '.join(AXES)}), beside {_listed(spectrum.nea_arcsec)} arcsec of centroid noise "
+        f"If the model holds, along {spectrum.frames} the frame-dependent part of the "
+        "calibration error is "
+        f"{_listed(rest)} arcsec ({', '.join(AXES)}), beside {_listed(spectrum.nea_arcsec)} "
+        "arcsec of centroid noise "
         f"in each frame. It keeps its value for about {_listed(tau)} s; "
         f"{', '.join(percent(float(v)) for v in share)} of its variance lie "
-        f"below a tenth of the highest frequency ({significant(0.1 * nyquist)} Hz). {_averaging(spectrum)}"
+        f"below a tenth of the highest frequency ({significant(0.1 * nyquist)} Hz). "
+        f"{_averaging(spectrum)}"
     )
     if spectrum.gap_share > 0.0:
-        words += f" {percent(spectrum.gap_share)} of the instants have no frame and were interpolated."
+        words += (
+            f" {percent(spectrum.gap_share)} of the instants have no frame and were interpolated."
+        )
     return words
 
 
 def _averaging(spectrum: ErrorSpectrum) -> str:
     after = spectrum.dominates_after_s
     if np.isfinite(after).any():
-        axes = [f"{axis} after {significant(t)} s" for axis, t in zip(AXES, after, strict=True) if np.isfinite(t)]
+        axes = [
+            f"{axis} after {significant(t)} s"
+            for axis, t in zip(AXES, after, strict=True)
+            if np.isfinite(t)
+        ]
         return f"Where frames are averaged, it comes to exceed centroid noise: {join_words(axes)}."
     rest, noise = spectrum.averaged_arcsec(spectrum.longest_average_s)
     return (
-        f"Averaging of frames, up to {significant(spectrum.longest_average_s)} s, leaves it below centroid noise: "
+        f"Averaging of frames, up to {significant(spectrum.longest_average_s)} s, leaves it "
+        "below centroid noise: "
         f"{_listed(rest)} against {_listed(noise)} arcsec."
     )
 
 
 def _listed(values: FloatArray) -> str:
-    return ", ".join(significant(float(v)) if np.isfinite(v) else "an unknown number of" for v in values)
+    return ", ".join(
+        significant(float(v)) if np.isfinite(v) else "an unknown number of" for v in values
+    )
 
 
 def spectrum_table(spectrum: ErrorSpectrum) -> TextTable:

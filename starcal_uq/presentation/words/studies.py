@@ -1,4 +1,5 @@
-"""Coupling studies in words: what couples with what, what would decouple it, and what a designer can do about it.
+"""Coupling studies in words: what couples with what, what would decouple it, and what a designer
+can do about it.
 
 Every sentence is made from the numbers at hand: a study that finds no coupling says so.
 """
@@ -13,12 +14,27 @@ import numpy as np
 
 from starcal_uq.camera.distortion import COEFFICIENTS, parameter_called, parameters
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import count, fixed, join_words, percent, plural, pretty_unit, significant
+from starcal_uq.core.formatting import (
+    count,
+    fixed,
+    join_words,
+    percent,
+    plural,
+    pretty_unit,
+    significant,
+)
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.axes import axis_label, axis_name, capital, place, said, value_words
+from starcal_uq.presentation.words.axes import (
+    axis_label,
+    axis_name,
+    capital,
+    place,
+    said,
+    value_words,
+)
 from starcal_uq.propagation.coupling import COUPLED
 from starcal_uq.studies.findings import Curve, Direction, Pair, Sweep
 
@@ -53,7 +69,10 @@ def study_text(study: Study) -> str:
         return f"{text} {capital(_nothing_decouples(sweep))}."
     # What can be chosen comes before what a lens is.
     other, size, cost = max(found, key=lambda entry: (entry[1].axis not in NATURE, entry[2].change))
-    return f"{text} {capital(the(size.axis))} changes how {dashed(other)} are coupled: {_ends(size, cost)}."
+    return (
+        f"{text} {capital(the(size.axis))} changes how {dashed(other)} are coupled: "
+        f"{_ends(size, cost)}."
+    )
 
 
 def study_answer(study: Study) -> list[str]:
@@ -89,8 +108,12 @@ def _range(pair: Pair) -> str:
     """The correlations of a pair over the sweep, and how much other seeds change them."""
     low, high = sorted((pair.strongest, pair.weakest))
     ends = f"{correlation_text(low)} to {correlation_text(high)}"
-    text = "correlation " + (correlation_text(high) if correlation_text(low) == correlation_text(high) else ends)
-    return text + (f", ±{significant(0.5 * pair.seeds, 1)} over seeds" if pair.seeds >= 5e-4 else "")
+    text = "correlation " + (
+        correlation_text(high) if correlation_text(low) == correlation_text(high) else ends
+    )
+    return text + (
+        f", ±{significant(0.5 * pair.seeds, 1)} over seeds" if pair.seeds >= 5e-4 else ""
+    )
 
 
 def _uncoupled(sweep: Sweep) -> str:
@@ -99,7 +122,8 @@ def _uncoupled(sweep: Sweep) -> str:
     pair = sweep.pairs[0]
     at = f", with {place(pair.strongest_at)}" if pair.strongest_at else ""
     return (
-        f"No pair of parameters is coupled: the largest correlation anywhere is {correlation_text(pair.strongest)} "
+        "No pair of parameters is coupled: the largest correlation anywhere is "
+        f"{correlation_text(pair.strongest)} "
         f"({_names(pair)}{at})."
     )
 
@@ -107,7 +131,10 @@ def _uncoupled(sweep: Sweep) -> str:
 def _couplings(sweep: Sweep) -> str:
     if not sweep.coupled:
         return _uncoupled(sweep)
-    told = [f"{dashed(pair)} ({_range(pair).removeprefix('correlation ')})" for pair in sweep.coupled[:TOLD]]
+    told = [
+        f"{dashed(pair)} ({_range(pair).removeprefix('correlation ')})"
+        for pair in sweep.coupled[:TOLD]
+    ]
     more = len(sweep.coupled) - len(told)
     rest = f"; {plural(more, 'more pair')} above {COUPLED:g} in size somewhere" if more > 0 else ""
     others = len(sweep.pairs) - len(sweep.coupled)
@@ -124,7 +151,10 @@ def _what_decouples(sweep: Sweep) -> list[str]:
     for pair in sweep.coupled[:TOLD]:
         for size, cost in pair.decoupling()[:1]:
             told.setdefault((capital(the(size.axis)), _ends(size, cost)), []).append(dashed(pair))
-    parts = [f"{axis} changes how {join_words(pairs)} are coupled: {ends}." for (axis, ends), pairs in told.items()]
+    parts = [
+        f"{axis} changes how {join_words(pairs)} are coupled: {ends}."
+        for (axis, ends), pairs in told.items()
+    ]
     helping = {size.axis for pair in sweep.coupled for size, _ in pair.decoupling()}
     idle = [axis for axis in sweep.axes if axis not in helping]
     if not helping:
@@ -133,7 +163,11 @@ def _what_decouples(sweep: Sweep) -> list[str]:
         changes = [c for pair in sweep.coupled for c in pair.sizes if c.axis in idle]
         names = join_words([the(axis) for axis in idle])
         do, them = ("does", "it") if len(idle) == 1 else ("do", "them")
-        most = f": along {them} no correlation changes by more than {_change(changes)}" if changes else ""
+        most = (
+            f": along {them} no correlation changes by more than {_change(changes)}"
+            if changes
+            else ""
+        )
         parts.append(f"{capital(names)} {do} little to the couplings{most}.")
     return parts
 
@@ -142,15 +176,22 @@ def _ends(size: Curve, cost: Curve) -> str:
     """From what to what an axis changes a coupling."""
     high, low = cost.most, cost.least
     prices = (fixed(float(np.exp(cost.median[i])), 1) for i in (high, low))
-    ends = [f"{correlation_text(float(size.median[i]))} with {said(size.axis, size.values[i])}" for i in (high, low)]
-    return f"from {ends[0]} to {ends[1]} in size, which takes the price in sigma from {' to '.join(prices)}"
+    ends = [
+        f"{correlation_text(float(size.median[i]))} with {said(size.axis, size.values[i])}"
+        for i in (high, low)
+    ]
+    return (
+        f"from {ends[0]} to {ends[1]} in size, which takes the price in sigma from "
+        f"{' to '.join(prices)}"
+    )
 
 
 def _nothing_decouples(sweep: Sweep) -> str:
     names = join_words([axis_name(axis) for axis in sweep.axes])
     changes = [curve for pair in sweep.coupled for curve in pair.sizes]
     return (
-        f"nothing that was varied ({names}) decouples {'them' if len(sweep.coupled) == 1 else 'any pair'}: along no "
+        f"nothing that was varied ({names}) decouples "
+        f"{'them' if len(sweep.coupled) == 1 else 'any pair'}: along no "
         f"axis does a correlation change by more than {_change(changes)}"
     )
 
@@ -173,16 +214,25 @@ def _weakest(sweep: Sweep) -> str:
     sizes = _span(variance)
     if len(kinds) == 1:
         if not kinds[0].together:
-            return "No combination of parameters is much worse determined than the parameters themselves."
+            return (
+                "No combination of parameters is much worse determined than the parameters "
+                "themselves."
+            )
         return (
-            f"The weakest direction is {_direction(kinds[0])} everywhere, with {sizes} times the variance of uncoupled "
+            f"The weakest direction is {_direction(kinds[0])} everywhere, with {sizes} times the "
+            "variance of uncoupled "
             "parameters."
         )
     turn = sweep.turn
     if turn is None or turn.told < max(0.75, kinds[0].share + 0.05):
         told = [f"{_direction(kind)} in {percent(kind.share)}" for kind in kinds[:3]]
-        return f"The weakest direction is {join_words(told)} of the places, and no one axis tells which."
-    runs = [f"{_direction(kinds[kind])} {_run(turn.axis, values)}" for values, kind in turn.runs[:6]]
+        return (
+            f"The weakest direction is {join_words(told)} of the places, and no one axis tells "
+            "which."
+        )
+    runs = [
+        f"{_direction(kinds[kind])} {_run(turn.axis, values)}" for values, kind in turn.runs[:6]
+    ]
     right = "" if turn.told > 0.999 else f" (so in {percent(turn.told)} of the places)"
     return f"The weakest direction turns with {the(turn.axis)}: {'; '.join(runs)}{right}."
 
@@ -197,7 +247,10 @@ def _direction(kind: Direction) -> str:
 
 def _run(axis: str, values: Sequence[Any]) -> str:
     if len(values) == 1 or isinstance(values[0], str):
-        return f"with {join_words([said(axis, value) for value in values[:1]] + list(map(value_words, values[1:])))}"
+        return (
+            "with "
+            f"{join_words([said(axis, value) for value in values[:1]] + list(map(value_words, values[1:])))}"
+        )
     return f"from {said(axis, values[0])} to {value_words(values[-1])}"
 
 
@@ -211,9 +264,15 @@ def _price(study: Study) -> str:
             found.append((float(np.nanmedian(factor)), name, _span(factor)))
     dear = [entry for entry in sorted(found, reverse=True) if entry[0] >= HARDLY]
     if not dear:
-        return "Coupling costs nothing: every sigma is what it would be if the other parameters were known."
+        return (
+            "Coupling costs nothing: every sigma is what it would be if the other parameters "
+            "were known."
+        )
     told = [f"{name} {words} times" for _, name, words in dear[:TOLD]]
-    return f"The price, as sigma over what it would be if the other parameters were known: {join_words(told)}."
+    return (
+        "The price, as sigma over what it would be if the other parameters were known: "
+        f"{join_words(told)}."
+    )
 
 
 def _span(values: FloatArray) -> str:
@@ -236,15 +295,19 @@ def _gauge(study: Study) -> str:
         return ""
     least = min(r for _, r in found)
     return (
-        f"In the whole sweep, {join_words([words for words, _ in found])} cannot be told apart (at least "
-        f"{correlation_text(min(least, 0.9999))} in size): a rotation common to all frames, which an alignment with "
+        f"In the whole sweep, {join_words([words for words, _ in found])} cannot be told apart "
+        "(at least "
+        f"{correlation_text(min(least, 0.9999))} in size): a rotation common to all frames, "
+        "which an alignment with "
         "the same parameters absorbs."
     )
 
 
 @dataclass(frozen=True)
 class Effect:
-    """What an axis does to an error: the largest over the smallest median, and the law between if there is one."""
+    """What an axis does to an error: the largest over the smallest median, and the law between if
+    there is one.
+    """
 
     curve: Curve
     factor: float
@@ -285,7 +348,11 @@ def _error(head: str, sweep: Sweep, numbers: FloatArray) -> str:
     if strong:
         text += f". {_medians(len(sweep.axes))}{', '.join(strong)}"
     if weak:
-        text += f"; it hardly depends on {join_words(weak)}" if strong else f", whatever {join_words(weak)} may be"
+        text += (
+            f"; it hardly depends on {join_words(weak)}"
+            if strong
+            else f", whatever {join_words(weak)} may be"
+        )
     return text + "."
 
 
@@ -302,7 +369,10 @@ def _effect(effect: Effect) -> str:
         ends = [curve.least, curve.most]
     else:
         ends = [first, last]
-    words = " to ".join(f"{significant(float(curve.median[i]))} with {said(curve.axis, curve.values[i])}" for i in ends)
+    words = " to ".join(
+        f"{significant(float(curve.median[i]))} with {said(curve.axis, curve.values[i])}"
+        for i in ends
+    )
     law = ""
     if effect.exponent is not None and curve.axis != "max_mag":
         law = f" (proportional to its power {fixed(effect.exponent, 2)})"
@@ -324,7 +394,10 @@ def _target(study: Study) -> str:
     elif not met.any():
         text = f"{head} nowhere"
     else:
-        text = f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} places{_where(sweep, met, known)}"
+        text = (
+            f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} "
+            f"places{_where(sweep, met, known)}"
+        )
     return f"{text}{_crossings(study)}. {_frames_needed(study, target)}".strip()
 
 
@@ -357,7 +430,10 @@ def _target_sigmas(study: Study) -> list[str]:
         if met.all() or not met.any():
             text = f"{head} {'everywhere' if met.any() else 'nowhere'}"
         else:
-            text = f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} places{_where(sweep, met, known)}"
+            text = (
+                f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} "
+                f"places{_where(sweep, met, known)}"
+            )
         needed = study.values("frames_needed_sigma", parameter=name)
         parts.append(f"{text}. {_range_of_frames(sweep, needed)}".strip())
     return parts
@@ -381,7 +457,11 @@ def _range_of_frames(sweep: Sweep, cells: FloatArray) -> str:
         return f"{plural(int(good[index]), 'frame')}{f' ({at})' if at else ''}"
 
     never = int(np.isinf(needed).sum())
-    floor = f" In {plural(never, 'place')} no number of frames does: errors of the stars stay." if never else ""
+    floor = (
+        f" In {plural(never, 'place')} no number of frames does: errors of the stars stay."
+        if never
+        else ""
+    )
     if good[least] == good[most]:
         return f"It takes {plural(int(good[least]), 'frame')}.{floor}"
     return f"It takes from {told(least)} to {told(most)}.{floor}"
@@ -397,14 +477,24 @@ def _where(sweep: Sweep, flag: BoolArray, known: BoolArray) -> str:
             share = [float(np.take(flag, i, position).sum()) for i in range(len(values))]
             total = [float(np.take(known, i, position).sum()) for i in range(len(values))]
             inside = [i for i in range(len(values)) if 2.0 * share[i] > total[i]]
-            right = sum(share[i] if i in inside else total[i] - share[i] for i in range(len(values)))
+            right = sum(
+                share[i] if i in inside else total[i] - share[i] for i in range(len(values))
+            )
             if inside and len(inside) < len(values):
-                words = f"with {join_words([said(axis, values[inside[0]]), *(values[i] for i in inside[1:])])}"
+                words = (
+                    "with "
+                    f"{join_words([said(axis, values[inside[0]]), *(values[i] for i in inside[1:])])}"
+                )
                 best = max(best, (right / float(known.sum()), words))
             continue
-        index = np.arange(len(values)).reshape([-1 if i == position else 1 for i in range(flag.ndim)])
+        index = np.arange(len(values)).reshape(
+            [-1 if i == position else 1 for i in range(flag.ndim)]
+        )
         for cut in range(1, len(values)):
-            for inside_is, value, side in ((index >= cut, values[cut], "on"), (index < cut, values[cut - 1], "down")):
+            for inside_is, value, side in (
+                (index >= cut, values[cut], "on"),
+                (index < cut, values[cut - 1], "down"),
+            ):
                 right = float((known & (flag == inside_is)).sum()) / float(known.sum())
                 words = f"from {said(axis, value)} {'on' if side == 'on' else 'downwards'}"
                 best = max(best, (right, words), key=lambda entry: entry[0])
@@ -422,8 +512,14 @@ def _price_of_models(study: Study) -> str:
         return ""
     order = sorted(range(len(curve.values)), key=lambda i: len(parameters(curve.values[i])))
     first = order[0]
-    told = [f"{significant(float(curve.median[i] / curve.median[first]))} with {curve.values[i]}" for i in order[1:]]
-    return f"Beside the model {curve.values[first]}, the sigma of f is larger by factors of {join_words(told)}."
+    told = [
+        f"{significant(float(curve.median[i] / curve.median[first]))} with {curve.values[i]}"
+        for i in order[1:]
+    ]
+    return (
+        f"Beside the model {curve.values[first]}, the sigma of f is larger by factors of "
+        f"{join_words(told)}."
+    )
 
 
 def _models(study: Study) -> list[str]:
@@ -444,7 +540,9 @@ def _models(study: Study) -> list[str]:
     for model in names[1:]:
         factors = []
         for words, grid in grids.items():
-            first, other = (np.take(grid, known.index(name), position) for name in (names[0], model))
+            first, other = (
+                np.take(grid, known.index(name), position) for name in (names[0], model)
+            )
             if np.isfinite(other / first).any():
                 factors.append(f"{_span(other / first)} times {words}")
         if factors:
@@ -460,14 +558,20 @@ def _simpler(study: Study) -> list[str]:
     parts = []
     for model in map(str, study.data["simpler"].values):
         bias = model_bias(study, model)
-        grid, error = sweep.over(bias), sweep.over(np.where(np.isfinite(bias), sweep.frame_error, np.nan))
+        grid, error = (
+            sweep.over(bias),
+            sweep.over(np.where(np.isfinite(bias), sweep.frame_error, np.nan)),
+        )
         known = np.isfinite(grid) & np.isfinite(error)
         if not known.any():
             continue
         # Where the coefficients that it leaves out are zero, nothing was tried.
         known &= grid > 0.0
         if not known.any():
-            parts.append(f"The model {model} lacks nothing here: the coefficients that it leaves out are zero.")
+            parts.append(
+                f"The model {model} lacks nothing here: the coefficients that it leaves out are "
+                "zero."
+            )
             continue
         good = known & (grid < error)
         size = f"{_span(grid[known])} arcsec against {_span(error[known])} of the calibration"
@@ -477,17 +581,24 @@ def _simpler(study: Study) -> list[str]:
             parts.append(f"The model {model} would do nowhere: it leaves {size}.")
         else:
             share = f"{count(int(good.sum()))} of {count(int(known.sum()))} places"
-            parts.append(f"The model {model} would do in {share}{_where(sweep, good, known)}: it leaves {size}.")
+            parts.append(
+                f"The model {model} would do in {share}{_where(sweep, good, known)}: it leaves "
+                f"{size}."
+            )
     return parts
 
 
 def model_bias(study: Study, simpler: str) -> FloatArray:
-    """Frame-dependent attitude error across the boresight (C,) that a simpler model would leave, arcsec."""
+    """Frame-dependent attitude error across the boresight (C,) that a simpler model would leave,
+    arcsec.
+    """
     return study.values("model_bias_attitude_arcsec", axis="cross", simpler=simpler)
 
 
 def _simulated(study: Study) -> list[str]:
-    """Whether intervals of simulated cells hold the truth as often as they say, and posteriors are as forecast."""
+    """Whether intervals of simulated cells hold the truth as often as they say, and posteriors are
+    as forecast.
+    """
     if "covered_95" not in study.data:
         return []
     sweep = study.sweep
@@ -497,7 +608,9 @@ def _simulated(study: Study) -> list[str]:
     for axis in ("method", "likelihood", "prior"):
         if axis in sweep.axes:
             names = study.data[axis].values
-            groups += [(f" with {said(axis, value)}", names == value) for value in sweep.values[axis]]
+            groups += [
+                (f" with {said(axis, value)}", names == value) for value in sweep.values[axis]
+            ]
     told, wrong = [], []
     # One false alarm in a hundred studies, however many intervals are looked at.
     level = 1.0 - 0.01 / (len(groups) * len(sweep.names))
@@ -516,9 +629,14 @@ def _simulated(study: Study) -> list[str]:
     if not told:
         return []
     cells_words = count(int(sweep.ok.sum()))
-    text = f"In {cells_words} simulated cells the 95 % intervals hold the truth as often as this: {join_words(told)}"
+    text = (
+        f"In {cells_words} simulated cells the 95 % intervals hold the truth as often as this: "
+        f"{join_words(told)}"
+    )
     if wrong:
-        text += f". That is not 95 % for {join_words(wrong)}: do not use these intervals as they are."
+        text += (
+            f". That is not 95 % for {join_words(wrong)}: do not use these intervals as they are."
+        )
     else:
         text += "; chance explains what differs from 95 %."
     return [text, *_posteriors(study)]
@@ -534,7 +652,8 @@ def _posteriors(study: Study) -> list[str]:
         return []
     low, middle, high = (fixed(float(q), 2) for q in np.nanquantile(ratio, (0.05, 0.5, 0.95)))
     return [
-        f"Sigmas of the posteriors are {middle} times what the information forecasts (median; {low} to {high} for 90 % "
+        f"Sigmas of the posteriors are {middle} times what the information forecasts (median; "
+        f"{low} to {high} for 90 % "
         "of cells and parameters)."
     ]
 
@@ -548,21 +667,29 @@ def study_limits(study: Study) -> list[str]:
         reasons = [f"{count(n)}: {reason.rstrip('.')}" for reason, n in sweep.failures[:3]]
         more = len(sweep.failures) - len(reasons)
         rest = f"; {plural(more, 'further reason')}" if more > 0 else ""
-        parts.append(f"{count(failed)} of {plural(total, 'cell')} have no numbers ({'; '.join(reasons)}{rest}).")
+        parts.append(
+            f"{count(failed)} of {plural(total, 'cell')} have no numbers "
+            f"({'; '.join(reasons)}{rest})."
+        )
     seeds = len(np.unique(study.data["seed_index"].values))
     if seeds == 1 and not sweep.drawn:
         parts.append("One seed: what another sky or other frames would change was not assessed.")
     if sweep.drawn:
         parts.append(
-            f"Drawn from a Latin hypercube: {join_words([axis_name(axis) for axis in sweep.drawn])}. Each is told in "
+            "Drawn from a Latin hypercube: "
+            f"{join_words([axis_name(axis) for axis in sweep.drawn])}. Each is told in "
             "parts of equal number, by their middles."
         )
     if study.definition.mode == "simulate":
-        parts.append("Simulated with the noise and the distortion model that the calibration assumes.")
+        parts.append(
+            "Simulated with the noise and the distortion model that the calibration assumes."
+        )
     else:
         parts.append(
-            "From Fisher information: Gaussian noise, right identifications and a right distortion model are assumed. "
-            'Coverage, bias of the estimates and convergence were not assessed; mode = "simulate" does.'
+            "From Fisher information: Gaussian noise, right identifications and a right "
+            "distortion model are assumed. "
+            "Coverage, bias of the estimates and convergence were not assessed; mode = "
+            '"simulate" does.'
         )
     return parts
 
@@ -583,10 +710,15 @@ def study_table(study: Study) -> TextTable | None:
         pooled = [other for other in sweep.axes if other != axis]
         grids = [sweep.over(numbers, "median", pooled).ravel() for _, numbers, _ in columns]
         for i, value in enumerate(sweep.values[axis]):
-            cells = (form(float(grid[i])) for (_, _, form), grid in zip(columns, grids, strict=True))
+            cells = (
+                form(float(grid[i])) for (_, _, form), grid in zip(columns, grids, strict=True)
+            )
             rows.append((axis_label(axis) if i == 0 else "", value_words(value), *cells))
     heads = ("Along", "Value", *(head for head, _, _ in columns))
-    title = "Medians over seeds and all other axes; pairs: correlation; rest: error that differs from frame to frame"
+    title = (
+        "Medians over seeds and all other axes; pairs: correlation; rest: error that differs "
+        "from frame to frame"
+    )
     return TextTable(heads, tuple(rows), title, "ll" + "r" * len(columns))
 
 
@@ -598,7 +730,13 @@ def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
         columns.append((dashed(pair), correlations(study, pair), _correlation))
     factor = np.sqrt(study.values("variance_inflation", parameter="f"))
     spec = parameter_called("f")
-    columns.append((f"Sigma f [{pretty_unit(spec.scaled_unit)}]", study.values("sigma", parameter="f"), _number))
+    columns.append(
+        (
+            f"Sigma f [{pretty_unit(spec.scaled_unit)}]",
+            study.values("sigma", parameter="f"),
+            _number,
+        )
+    )
     columns.append(("Price f", factor, _number))
     columns.append(("Common [arcsec]", sweep.common_rotation, _number))
     columns.append(("Rest [arcsec]", sweep.frame_error, _number))

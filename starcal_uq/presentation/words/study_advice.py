@@ -1,4 +1,6 @@
-"""What a designer can do about what a study has found, and what it cannot: advice from its numbers."""
+"""What a designer can do about what a study has found, and what it cannot: advice from its
+numbers.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,12 @@ def study_advice(study: Study) -> list[str]:
     sweep = study.sweep
     if not sweep.ok.any():
         return ["Nothing can be advised: see why the cells failed."]
-    parts = [*_advice_couplings(study), *_advice_errors(sweep), _advice_target(study), _advice_models(study)]
+    parts = [
+        *_advice_couplings(study),
+        *_advice_errors(sweep),
+        _advice_target(study),
+        _advice_models(study),
+    ]
     return [part for part in parts if part]
 
 
@@ -48,28 +55,38 @@ def _advice_couplings(study: Study) -> list[str]:
     stuck = []
     for pair in sweep.coupled:
         found = pair.decoupling()
-        free = [entry for entry in found if entry[0].axis not in NATURE or entry[0].axis == "distortion"]
+        free = [
+            entry for entry in found if entry[0].axis not in NATURE or entry[0].axis == "distortion"
+        ]
         if free:
             _, cost = free[0]
             key = cost.axis, cost.values[cost.least], _pays(study, pair, cost)
             best.setdefault(key, []).append(dashed(pair))
-        elif not found and float(np.exp(max((c.median.min() for c in pair.costs), default=0.0))) >= _DEAR:
+        elif (
+            not found
+            and float(np.exp(max((c.median.min() for c in pair.costs), default=0.0))) >= _DEAR
+        ):
             stuck.append(dashed(pair))
     for (axis, value, pays), names in best.items():
         if not pays:
             parts.append(
-                f"{join_words(names)} are least coupled with {said(axis, value)}, but their sigmas are no smaller "
+                f"{join_words(names)} are least coupled with {said(axis, value)}, but their "
+                "sigmas are no smaller "
                 "there: that alone is no reason to go there."
             )
         elif axis == "distortion":
-            parts.append(f"To tell {join_words(names)} apart, take the model {value} if its bias allows.")
+            parts.append(
+                f"To tell {join_words(names)} apart, take the model {value} if its bias allows."
+            )
         else:
             go = "take" if isinstance(value, str) else "go to"
             parts.append(f"To tell {join_words(names)} apart, {go} {said(axis, value)}.")
     if stuck:
         parts.append(
-            f"Do not expect {join_words(stuck[:TOLD])} to come apart by what was varied here. Report them with their "
-            "covariance, never one alone; to know one of them, measure it otherwise and give it as a prior, or take a "
+            f"Do not expect {join_words(stuck[:TOLD])} to come apart by what was varied here. "
+            "Report them with their "
+            "covariance, never one alone; to know one of them, measure it otherwise and give it "
+            "as a prior, or take a "
             "model with fewer coefficients where its bias allows."
         )
     return parts
@@ -79,7 +96,9 @@ def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
     """Whether both sigmas are smaller where the pair is least coupled than where it is most."""
     sweep = study.sweep
     for name in pair.names:
-        sigma = np.where(np.isfinite(correlations(study, pair)), study.values("sigma", parameter=name), np.nan)
+        sigma = np.where(
+            np.isfinite(correlations(study, pair)), study.values("sigma", parameter=name), np.nan
+        )
         curve = sweep.along(sigma, cost.axis)
         if curve is None or curve.median[cost.least] >= curve.median[cost.most]:
             return False
@@ -94,11 +113,17 @@ def _advice_errors(sweep: Sweep) -> list[str]:
     if numeric:
         top = numeric[0]
         parts.append(
-            f"For the attitude error, {the(top.curve.axis)} is worth most within this sweep: a factor of "
-            f"{significant(top.factor)} between {said(top.curve.axis, top.curve.values[top.curve.most])} and "
+            f"For the attitude error, {the(top.curve.axis)} is worth most within this sweep: a "
+            "factor of "
+            f"{significant(top.factor)} between "
+            f"{said(top.curve.axis, top.curve.values[top.curve.most])} and "
             f"{value_words(top.curve.values[top.curve.least])}."
         )
-    laws = {e.curve.axis: e.exponent for e in effects if e.exponent is not None and e.curve.axis != "max_mag"}
+    laws = {
+        e.curve.axis: e.exponent
+        for e in effects
+        if e.exponent is not None and e.curve.axis != "max_mag"
+    }
     deeper = next((_per_magnitude(e.curve) for e in effects if e.curve.axis == "max_mag"), None)
     if deeper is not None and deeper > HARDLY:
         also = []
@@ -107,16 +132,22 @@ def _advice_errors(sweep: Sweep) -> list[str]:
         if laws.get("sigma_px"):
             also.append(f"noise {significant(deeper ** (1.0 / laws['sigma_px']))} times smaller")
         same = f", as much as {join_words(also)}" if also else ""
-        parts.append(f"One magnitude more in the limit divides the attitude error by {significant(deeper)}{same}.")
+        parts.append(
+            "One magnitude more in the limit divides the attitude error by "
+            f"{significant(deeper)}{same}."
+        )
     worth = []
     for axis, law in laws.items():
         if laws.get("frames") and axis != "frames" and abs(law) > 0.2:
             more = "half" if law > 0.0 else "twice"
             worth.append(
-                f"{more} the {axis_name(axis)} is worth {significant(2.0 ** (-abs(law) / laws['frames']))} times"
+                f"{more} the {axis_name(axis)} is worth "
+                f"{significant(2.0 ** (-abs(law) / laws['frames']))} times"
             )
     if worth:
-        parts.append(f"{capital(join_words(worth))} the frames: they do the same to the attitude error.")
+        parts.append(
+            f"{capital(join_words(worth))} the frames: they do the same to the attitude error."
+        )
     common = sweep.over(sweep.common_rotation).ravel()
     least, most = int(np.nanargmin(common)), int(np.nanargmax(common))
     if sweep.axes and common[most] >= _MIND * common[least]:
@@ -147,23 +178,37 @@ def _advice_target(study: Study) -> str:
             return f"{target:g} arcsec is out of reach here: lower the noise, or relax the target."
         best = int(np.argmin(np.where(np.isfinite(needed), needed, np.inf)))
         at = place({axis: v for axis, v in sweep.at(best).items() if axis != "frames"})
-        return f"For {target:g} arcsec take {plural(int(needed[best]), 'frame')}{f' with {at}' if at else ''}."
+        return (
+            f"For {target:g} arcsec take "
+            f"{plural(int(needed[best]), 'frame')}{f' with {at}' if at else ''}."
+        )
     if "frames" not in sweep.axes:
         return ""
     # What the lens is, nobody chooses: the target is to be met whatever it is.
     given = [i for i, axis in enumerate(sweep.axes) if axis in NATURE]
     worst = np.max(sweep.over(sweep.frame_error), axis=tuple(given), keepdims=True)
     met = np.broadcast_to(worst <= target, sweep.shape).ravel()
-    whatever = f", whatever {join_words([the(sweep.axes[i]) for i in given])} of this sweep" if given else ""
+    whatever = (
+        f", whatever {join_words([the(sweep.axes[i]) for i in given])} of this sweep"
+        if given
+        else ""
+    )
     if not met.any():
-        return f"No place of this sweep keeps {target:g} arcsec{whatever}: take more frames." if given else ""
+        return (
+            f"No place of this sweep keeps {target:g} arcsec{whatever}: take more frames."
+            if given
+            else ""
+        )
     frames = np.array([sweep.at(i)["frames"] for i in range(len(met))], dtype=np.float64)
     fewest = met & (frames == frames[met].min())
     # Of those, the one with most to spare.
     errors = np.where(fewest, np.broadcast_to(worst, sweep.shape).ravel(), np.inf)
     best = int(np.argmin(errors))
     at = place({axis: value for axis, value in sweep.at(best).items() if axis not in NATURE})
-    return f"The fewest frames that keep {target:g} arcsec{whatever}: {at} ({significant(float(errors[best]))} arcsec)."
+    return (
+        f"The fewest frames that keep {target:g} arcsec{whatever}: {at} "
+        f"({significant(float(errors[best]))} arcsec)."
+    )
 
 
 def _advice_models(study: Study) -> str:
@@ -181,10 +226,14 @@ def _advice_models(study: Study) -> str:
             (good if np.all(bias[known] < sweep.frame_error[known]) else bad).append(model)
     order = sorted(good, key=lambda model: len(parameters(model)))
     if order:
-        return f"The model {order[0]} is rich enough everywhere in this sweep: more coefficients only add sigma."
+        return (
+            f"The model {order[0]} is rich enough everywhere in this sweep: more coefficients "
+            "only add sigma."
+        )
     if len(bad) == study.data.sizes["simpler"]:
         return (
-            "No simpler distortion model is safe over the whole sweep: keep the coefficients, and live with their "
+            "No simpler distortion model is safe over the whole sweep: keep the coefficients, "
+            "and live with their "
             "coupling."
         )
     return ""
