@@ -85,9 +85,9 @@ class Limit:
             return False
         if isinstance(value, tuple | list):
             return all(map(self.holds, value))
-        return not isinstance(value, Integral if self.whole else Real) or bool(
-            self.low <= value <= self.high
-        )  # type: ignore[operator]
+        if not isinstance(value, Integral if self.whole else Real):
+            return True
+        return bool(self.low <= value <= self.high)  # type: ignore[operator]
 
 
 def wanted(low: float, high: float, whole: bool, verb: str = "give") -> str:
