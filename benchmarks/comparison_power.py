@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.comparison.compare import compare
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
@@ -26,7 +26,7 @@ from starcal_uq.sky.catalogue import load_catalogue
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.comparison.result import CameraComparison
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.sky.catalogue import StarCatalogue
 
 _ALPHA = 0.05

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.misfit import misfit_tests
-from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.simulation.frames import simulate

@@ -35,7 +35,7 @@ from benchmarks.pages import between, put  # noqa: E402
 from starcal_uq.core.status import Level  # noqa: E402
 from starcal_uq.core.tasks import processors, run_tasks  # noqa: E402
 from starcal_uq.diagnostics.verdict.judge import judge  # noqa: E402
-from starcal_uq.estimation.pairs import PairObjective  # noqa: E402
+from starcal_uq.likelihood.pairs import PairObjective  # noqa: E402
 from starcal_uq.maths.intervals import binomial_interval  # noqa: E402
 from starcal_uq.observations.frames import StarFrames  # noqa: E402
 from tests.diagnostics import test_air, test_pattern  # noqa: E402

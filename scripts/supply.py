@@ -41,7 +41,7 @@ TESTS = (
     ),
     *(
         "tests/sky/test_catalogue.py",
-        "tests/estimation/test_sums.py",
+        "tests/likelihood/test_sums.py",
         "tests/inference/test_arviz_compat.py",
     ),
     *(

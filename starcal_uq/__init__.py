@@ -12,7 +12,6 @@ from collections.abc import Mapping
 import lazy_loader
 
 from starcal_uq.core.display import View, register
-from starcal_uq.core.errors import Reason, register_reason
 
 __version__ = "0.1.0"
 
@@ -26,12 +25,3 @@ def _views() -> Mapping[type, View]:
 
 
 register(_views)
-
-
-def _wrong_time() -> Reason:
-    from starcal_uq.diagnostics.verdict.observed import wrong_time
-
-    return wrong_time
-
-
-register_reason(_wrong_time)

@@ -1,5 +1,6 @@
 from . import attitude as attitude
 from . import budgeting as budgeting
+from . import calibration as calibration
 from . import camera as camera
 from . import comparison as comparison
 from . import core as core
@@ -8,6 +9,7 @@ from . import estimation as estimation
 from . import identification as identification
 from . import images as images
 from . import inference as inference
+from . import likelihood as likelihood
 from . import observations as observations
 from . import paper as paper
 from . import pipeline as pipeline
@@ -18,14 +20,15 @@ from . import simulation as simulation
 from . import sky as sky
 from . import studies as studies
 from .budgeting.budget import budget as budget
+from .calibration.calibrate import calibrate as calibrate
 from .camera.camera import Camera as Camera
 from .comparison.compare import compare as compare
 from .core import errors as errors
 from .core.errors import StarcalError as StarcalError
 from .diagnostics.diagnose import diagnose as diagnose
+from .diagnostics.explain import explain as explain
 from .diagnostics.validation.validate import validate as validate
-from .estimation.calibrate import calibrate as calibrate
-from .estimation.calibration import Calibration as Calibration
+from .estimation.result import Calibration as Calibration
 from .inference.posterior import Posterior as Posterior
 from .inference.priors import Priors as Priors
 from .inference.sample import sample as sample

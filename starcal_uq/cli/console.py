@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
-    from starcal_uq.estimation.calibration import Calibration
-    from starcal_uq.estimation.screening.result import Screening
+    from starcal_uq.calibration.screening.result import Screening
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
@@ -73,7 +73,7 @@ def quiet(wanted: bool) -> Iterator[None]:
 
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
     """Table of start, estimate and sigma; with a truth, also truth and z."""
-    from starcal_uq.estimation.fallback import fallback_words
+    from starcal_uq.calibration.fallback import fallback_words
     from starcal_uq.presentation.words.estimation import (
         calibration_table,
         fitted_noise_text,

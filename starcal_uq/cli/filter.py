@@ -86,10 +86,10 @@ def filter_command(
     """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an
     interrupted call goes on.
     """
+    from starcal_uq.paper.recursive.folder import filter_run
     from starcal_uq.runs.folder import HISTORY
-    from starcal_uq.runs.streams import filter_run
 
-    options = sc.estimation.RecursionOptions(
+    options = sc.paper.RecursionOptions(
         pair_covariance=pair_covariance,
         parameters="optics" if method == "samaan" else parameters,
         forgetting=forgetting,

@@ -158,7 +158,7 @@ def parse_dof(text: str | None) -> float | Literal["free"] | None:
     """``free`` or a number of degrees of freedom."""
     if text is None or text == "free":
         return None if text is None else "free"
-    from starcal_uq.estimation import student
+    from starcal_uq.likelihood import student
 
     try:
         value = float(text)

@@ -42,7 +42,7 @@ class Calibration(Part):
 
     @classmethod
     def take(cls, result: Any) -> Mapping[str, Any]:
-        from starcal_uq.estimation.fallback import fallback_words
+        from starcal_uq.calibration.fallback import fallback_words
         from starcal_uq.presentation.words.estimation import fitted_noise_text
 
         cal, truth = result if isinstance(result, list) else (result, None)

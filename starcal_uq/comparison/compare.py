@@ -29,6 +29,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import rotation_vector
 from starcal_uq.attitude.wahba import quest
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.camera.fields import area_weights, detector_axes, grid_points, tangent_axes
 from starcal_uq.camera.projection import project, unproject
@@ -48,14 +49,13 @@ from starcal_uq.core.errors import ComparisonError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.splits import split_frames, split_labels
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.estimation.calibration import Calibration
-    from starcal_uq.estimation.fingerprints import Fingerprints
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.repeats import Fingerprints
     from starcal_uq.observations.table import Observations
 
 # A prior that is less than so many times wider than the posterior has a say in it.

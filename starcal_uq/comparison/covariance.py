@@ -19,12 +19,12 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import data_hashes
-from starcal_uq.estimation.fingerprints import shared
 from starcal_uq.inference.priors import GaussianPriors
+from starcal_uq.observations.repeats import shared
 from starcal_uq.observations.splits import shared_frames
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.fingerprints import Fingerprints
+    from starcal_uq.observations.repeats import Fingerprints
     from starcal_uq.observations.table import Observations
 
 INDEPENDENT, SAME, A_IN_B, B_IN_A, OVERLAP = (

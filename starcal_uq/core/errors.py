@@ -7,7 +7,7 @@ line prints it as it stands and exits with status 2.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -130,19 +130,6 @@ class CalibrationError(StarcalError):
         self.status = status
         self.undetermined = tuple(undetermined)
         self.calibration = calibration
-
-
-# From observations and a calibration that failed: what is wrong with the former, in a sentence, or
-# None.
-Reason = Callable[[Any, Any], str | None]
-REASONS: list[Callable[[], Reason]] = []
-
-
-def register_reason(load: Callable[[], Reason]) -> None:
-    """Add what those above an estimate know of why it fails; `load` is called when one does, and
-    may import then.
-    """
-    REASONS.append(load)
 
 
 class RepeatedFramesError(CalibrationError):

@@ -30,9 +30,9 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.shapes import View, focal_drift, frame_shapes, lens_shapes
 from starcal_uq.diagnostics.stars import StarTest, star_test
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, weighed
-from starcal_uq.estimation.star_errors import StarErrors, StarLikelihood
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood
 from starcal_uq.observations.splits import one_of_each
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
 from starcal_uq.sky.site import Site
@@ -40,7 +40,7 @@ from starcal_uq.sky.site import Site
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 # False alarms where there is no air.

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import METHODS, calibrate
+from starcal_uq.calibration.cameras import MixedCameras
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.provenance import provenance
@@ -27,10 +29,9 @@ from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_model
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.diagnostics.times import TimeTest, UnseenAberration, time_test, unseen_aberration
-from starcal_uq.estimation.calibrate import METHODS, calibrate, fit
-from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.cameras import MixedCameras
+from starcal_uq.estimation.fit import fit
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:

@@ -23,8 +23,8 @@ from starcal_uq.estimation.normals import FrameNormals
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.estimation.residual_map import FrameScatter
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 # Degrees of freedom of a noise that is taken as known.

@@ -38,7 +38,6 @@ from starcal_uq.diagnostics.shapes import (
     run_clock,
     shapes,
 )
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import (
     NoiseModel,
     axis_noise,
@@ -47,7 +46,8 @@ from starcal_uq.estimation.noise_model import (
     sigma_ratios,
     weighed,
 )
-from starcal_uq.estimation.star_errors import StarModel
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 # Directions of which the fit absorbs all but this share of the square are not there to be tested.

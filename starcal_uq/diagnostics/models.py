@@ -25,18 +25,18 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.calibrate import refit
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.fit import refit
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.inference.arviz import psis
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.observations.splits import one_of_each
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 MODELS = ("none", "k1", "brown", "brown3", "brown_tangential")

@@ -37,14 +37,14 @@ from starcal_uq.diagnostics.shapes import (
     frame_shapes,
     shapes,
 )
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.propagate import FrameGeometry
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
 

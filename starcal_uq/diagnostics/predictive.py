@@ -17,16 +17,16 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
 from starcal_uq.estimation.noise_model import weighed
-from starcal_uq.estimation.star_errors import StarLikelihood
+from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
+from starcal_uq.likelihood.star_errors import StarLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
 from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
 

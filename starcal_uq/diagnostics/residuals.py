@@ -14,7 +14,7 @@ from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, ResidualMap
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 _MIN_STARS = 5

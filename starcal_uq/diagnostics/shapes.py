@@ -18,7 +18,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model, model_names
 from starcal_uq.core.constants import LIGHT_SPEED_KM_S
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
-from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
+from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

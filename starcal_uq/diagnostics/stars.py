@@ -24,16 +24,16 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import StarNormals
-from starcal_uq.estimation.star_errors import StarSums, add_linearised, star_numbers
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import StarSums, add_linearised, star_numbers
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 _LEAST_DOF = 10

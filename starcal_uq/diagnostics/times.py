@@ -22,14 +22,14 @@ from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.diagnostics.air import Remainder
 from starcal_uq.estimation.noise_model import weighed
-from starcal_uq.estimation.star_errors import star_numbers
+from starcal_uq.likelihood.star_errors import star_numbers
 from starcal_uq.sky.apparent import earth_velocity_km_s
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
 from starcal_uq.sky.site import Site
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 Cause: TypeAlias = Literal["epoch", "no aberration", "aberration twice", "date", "hour"]

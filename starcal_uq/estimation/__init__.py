@@ -1,4 +1,4 @@
-"""From observations to a calibration: likelihoods, solvers, stages."""
+"""A fit: stages, refinement, the estimate with its covariance, and what adds such fits up."""
 
 import lazy_loader
 

@@ -23,13 +23,8 @@ from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import compress, optimum, settled, unit_covariance
-from starcal_uq.estimation.fingerprints import Fingerprints
-from starcal_uq.estimation.marginal import TURN_RAD, MarginalLikelihood
-from starcal_uq.estimation.solvers import is_singular
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.estimation.star_errors import StarLikelihood, StarModel
 from starcal_uq.estimation.undetermined import (
     EXPLAINED,
     WEAK,
@@ -38,7 +33,12 @@ from starcal_uq.estimation.undetermined import (
     remedy_of,
     undetermined,
 )
+from starcal_uq.likelihood.compressed import compress, optimum, settled, unit_covariance
+from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
+from starcal_uq.likelihood.solvers import is_singular
+from starcal_uq.likelihood.star_errors import StarLikelihood, StarModel
 from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
+from starcal_uq.observations.repeats import Fingerprints
 
 if TYPE_CHECKING:
     from starcal_uq.observations.frames import StarFrames
@@ -289,3 +289,25 @@ def check_camera(camera: Camera, status: Status) -> Status:
     ):
         return Status.FOLDED
     return status
+
+
+def check_count(likelihood: MarginalLikelihood, camera: Camera) -> None:
+    """Raise `CalibrationError` where there are fewer numbers than unknowns."""
+    p, frames = len(camera.theta), likelihood.frames
+    if likelihood.dof <= p:
+        raise CalibrationError(
+            f"{frames.n_stars} stars in {frames.n_frames} frames give {likelihood.dof} "
+            f"independent numbers for {p} "
+            "parameters and the noise: add stars or frames, or choose a distortion model with "
+            "fewer coefficients.",
+            Status.SINGULAR,
+        )
+
+
+def raise_unless_good(
+    status: Status, remedy: str = "", calibration: Calibration | None = None
+) -> None:
+    """Raise the `CalibrationError` of a status that is not CONVERGED."""
+    if not status.ok:
+        message = f"the calibration did not end well ({status.name}): {remedy or status.remedy}."
+        raise CalibrationError(message, status, calibration=calibration)

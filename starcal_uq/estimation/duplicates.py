@@ -9,10 +9,10 @@ import numpy as np
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.settings import Duplicates
 from starcal_uq.core.types import IntArray
-from starcal_uq.estimation.fingerprints import Fingerprints, repeats, shared
+from starcal_uq.observations.repeats import Fingerprints, repeats, shared
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 DUPLICATES = get_args(Duplicates)

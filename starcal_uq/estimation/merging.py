@@ -27,13 +27,13 @@ from starcal_uq.core.settings import MergedNoise
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
-from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import Optimum, combined, optimum, scaled, total
 from starcal_uq.estimation.duplicates import check_duplicates, fingerprints_of
-from starcal_uq.estimation.fingerprints import Fingerprints, shared
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.likelihood.compressed import Optimum, combined, optimum, scaled, total
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import correlation_of
+from starcal_uq.observations.repeats import Fingerprints, shared
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:

@@ -29,8 +29,8 @@ from starcal_uq.core.formatting import fixed, significant
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.settings import NoiseKind
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.stages import refinement_stage
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.partitions import PartitionedObservations

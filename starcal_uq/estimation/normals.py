@@ -14,14 +14,14 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.residual_map import FrameScatter
-from starcal_uq.estimation.star_errors import StarSums, add_by_star
-from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, frame_normals
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import StarSums, add_by_star
+from starcal_uq.likelihood.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, frame_normals
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 _STARS_AT_ONCE = 20_000

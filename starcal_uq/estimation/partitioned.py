@@ -29,12 +29,8 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation import loops
 from starcal_uq.estimation.assemble import check_camera, check_noise
-from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import GramSums, gram_sums, optimum, settled
 from starcal_uq.estimation.duplicates import repeated
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.residual_map import (
     OUTLIER_SIGMA,
@@ -43,9 +39,13 @@ from starcal_uq.estimation.residual_map import (
     ResidualMap,
     RicherModel,
 )
-from starcal_uq.estimation.solvers import Normal, is_singular, levenberg_marquardt
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.estimation.sums import NormalSums, frame_sums, settled_sums, sum_of
+from starcal_uq.likelihood import loops
+from starcal_uq.likelihood.compressed import GramSums, gram_sums, optimum, settled
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.solvers import Normal, is_singular, levenberg_marquardt
+from starcal_uq.likelihood.sums import NormalSums, frame_sums, settled_sums, sum_of
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.checks import mixed_bits
 from starcal_uq.observations.partitions import (

@@ -15,11 +15,11 @@ from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import BoolArray, FloatArray
-from starcal_uq.estimation.compressed import CompressedLikelihood, compress
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.estimation.student import (
+from starcal_uq.likelihood.compressed import CompressedLikelihood, compress
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.solvers import is_singular
+from starcal_uq.likelihood.student import (
     DEFAULT_DOF,
     DOF_RANGE,
     Information,
@@ -193,7 +193,7 @@ def refine(
 
     Camera and shape of the noise are nearly independent (one is odd in the residuals, the other
     even), so that Newton's method on one and the other in turn converges in a few rounds. A free nu
-    has the prior of `starcal_uq.estimation.student.log_excess_prior`, without which clean data
+    has the prior of `starcal_uq.likelihood.student.log_excess_prior`, without which clean data
     would send it to infinity.
     """
     began = perf_counter()

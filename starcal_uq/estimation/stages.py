@@ -17,10 +17,10 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import monotonic_expression
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.estimation.loops import attitude_loop, kernels
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.solvers import (
+from starcal_uq.likelihood.loops import attitude_loop, kernels
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.pairs import PairObjective
+from starcal_uq.likelihood.solvers import (
     Constraints,
     Last,
     Normal,
@@ -28,7 +28,7 @@ from starcal_uq.estimation.solvers import (
     levenberg_marquardt,
     minpack,
 )
-from starcal_uq.estimation.sums import Descent
+from starcal_uq.likelihood.sums import Descent
 from starcal_uq.observations.frames import StarFrames
 
 # Relative gain that the last step of a pair stage promises: 1e-4 sigma or less for 30,000
@@ -121,7 +121,7 @@ def _solve(
 ) -> Solution:
     if solver == "ipopt":
         # CasADi takes a while to load, and few need it.
-        from starcal_uq.estimation.ipopt import ipopt
+        from starcal_uq.likelihood.ipopt import ipopt
 
         constraints = constraints_for(camera, objective.n_parameters)
         return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)

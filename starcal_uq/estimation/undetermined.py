@@ -9,7 +9,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.status import Status
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:

@@ -35,12 +35,12 @@ from starcal_uq.core.status import (
     pass_or_warn,
 )
 from starcal_uq.core.types import BoolArray, FloatArray
-from starcal_uq.estimation.student import DEFAULT_DOF
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.ensemble import Chains, autocorrelation
 from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.inference.posterior import Derived, Diagnostics, Laplace, Posterior
 from starcal_uq.inference.target import ImportanceCheck, LogLikelihood, Target
+from starcal_uq.likelihood.student import DEFAULT_DOF
 
 if TYPE_CHECKING:
     from starcal_uq.inference.exact import FrameSample

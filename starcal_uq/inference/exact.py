@@ -17,14 +17,14 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.compressed import compress
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.star_errors import StarLikelihood
+from starcal_uq.likelihood.compressed import compress
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import StarLikelihood
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 # Frames of a sample, and the batches that tell its standard error.

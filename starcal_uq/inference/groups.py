@@ -10,7 +10,7 @@ derivative with respect to it,
     pi),
 
 a density per px^(2 m), the attitude being flat in its rotation vector (rad); with Student's t as in
-`starcal_uq.estimation.student`. Nothing is linearised in the parameters.
+`starcal_uq.likelihood.student`. Nothing is linearised in the parameters.
 
 A drawn image is one that the same stars would make in another exposure of the same frame:
 parameters, noise and attitude are drawn, and noise is added. What the eye can compare is its
@@ -31,11 +31,11 @@ from starcal_uq.core.files import PathLike, write_netcdf
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
-from starcal_uq.estimation.student import StudentLikelihood
 from starcal_uq.inference.arviz import to_arviz
 from starcal_uq.inference.posterior import Variables, write_group
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.student import StudentLikelihood
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import frame_sample
 

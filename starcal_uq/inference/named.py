@@ -22,13 +22,13 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.settings import Evaluation, LikelihoodName
 from starcal_uq.core.status import CALIBRATE, Check, Level, Question
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
+from starcal_uq.likelihood.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.exact import FrameSample
     from starcal_uq.observations.table import Observations
 
@@ -257,7 +257,7 @@ def _marginal(obs: Observations | None, cal: Calibration) -> Source:
 
 
 def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
-    from starcal_uq.estimation.composite import pair_likelihood
+    from starcal_uq.likelihood.composite import pair_likelihood
 
     expanded = pair_likelihood(
         StarFrames.from_observations(obs),

@@ -27,7 +27,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:

@@ -47,7 +47,7 @@ from starcal_uq.inference.target import (
 from starcal_uq.inference.update import check_chain
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 

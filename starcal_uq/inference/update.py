@@ -26,7 +26,7 @@ from starcal_uq.maths.linear import correlation_of
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
 
 NOISES = ("default", "posterior")
 SHIFT_KEYS = ("principal_point_px", "focal_fraction", "distortion_corner_px")

@@ -2,6 +2,10 @@ from .camera import paper_camera as paper_camera
 from .camera import paper_start as paper_start
 from .interaction import InteractionStudy as InteractionStudy
 from .interaction import interaction_study as interaction_study
+from .recursive.frames import stream_frames as stream_frames
+from .recursive.start import RecursionOptions as RecursionOptions
+from .recursive.stream import FilterStep as FilterStep
+from .recursive.stream import RecursiveCalibration as RecursiveCalibration
 from .replicates import Replicates as Replicates
 from .replicates import replicate as replicate
 from .reproduction import reproduce as reproduce

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import SamplingError, StarcalError
@@ -37,10 +38,9 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
+from starcal_uq.paper.recursive.start import RecursionOptions
 from starcal_uq.paper.replicates import check_settings, crlb_sigmas
 from starcal_uq.paper.statistics import chi_interval
 from starcal_uq.simulation.frames import Campaign

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject_jacobian
@@ -25,10 +26,8 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
+from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
 from starcal_uq.paper.commands import run_or_stop
@@ -42,6 +41,7 @@ from starcal_uq.paper.published import (
     SAMAAN,
     Printed,
 )
+from starcal_uq.paper.recursive.start import RecursionOptions
 from starcal_uq.paper.replicates import pinhole
 from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue

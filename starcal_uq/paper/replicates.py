@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.display import Shown
@@ -26,15 +27,14 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import inverse_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import map_error, reprojection_error_px
+from starcal_uq.paper.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.paper.statistics import FAMILY_LEVEL, classical_words, summarise, words
 from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue
@@ -42,7 +42,7 @@ from starcal_uq.sky.catalogue import load_catalogue
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.calibration.cameras import frame_focals
 from starcal_uq.core.errors import IdentificationError
-from starcal_uq.estimation.cameras import frame_focals
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.calibration.noise_floor import settle_noise
 from starcal_uq.core.errors import CalibrationError, IdentificationError, ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, Engine, bounded
 from starcal_uq.core.times import TIMES_IN_NAMES, julian_year, utc_text
-from starcal_uq.estimation.noise_floor import settle_noise
 from starcal_uq.observations.matches import is_fits_table
 from starcal_uq.sky.apparent import catalogue_directions, make_apparent, without_low_stars
 from starcal_uq.sky.site import check_sky
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.core.tasks import Progress
     from starcal_uq.core.types import FloatArray, StrArray
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.inference.posterior import Posterior

@@ -16,7 +16,7 @@ from starcal_uq.pipeline.cameras import OtherCamera, other_cameras
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations

@@ -20,7 +20,7 @@ from starcal_uq.pipeline.displacement import ToCatalogue, as_measured, mirrored,
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations
@@ -139,7 +139,7 @@ def _calibrated(
     """The calibration with the lens of a camera; with the model that was asked for where that is of
     no avail.
     """
-    from starcal_uq.estimation.calibrate import calibrate
+    from starcal_uq.calibration.calibrate import calibrate
 
     try:
         return calibrate(obs, camera, **options)

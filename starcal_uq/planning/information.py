@@ -18,8 +18,8 @@ import numpy as np
 
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NoiseModel
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from starcal_uq.attitude.profile import AttitudeProfile
 from starcal_uq.budgeting.result import Budget, Outcome
+from starcal_uq.calibration.screening.result import Screening
 from starcal_uq.camera.camera import Camera
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.display import View
@@ -19,9 +20,8 @@ from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.verdict.estimate import models_sentence, star_sentence
 from starcal_uq.diagnostics.verdict.judge import Verdict
-from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import Consistency
-from starcal_uq.estimation.screening.result import Screening
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.identification.result import Identification
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.inference.posterior import Posterior

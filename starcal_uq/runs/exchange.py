@@ -17,7 +17,7 @@ from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, write
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
-from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.groups import write_arviz
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.presentation.tables import TextTable

@@ -9,14 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.files import PathLike, check_new_folder
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import optimum
 from starcal_uq.estimation.duplicates import fingerprints_of
-from starcal_uq.estimation.fingerprints import shared
 from starcal_uq.estimation.merging import (
     check_mergeable,
     merge,
@@ -24,6 +21,9 @@ from starcal_uq.estimation.merging import (
     refuse_shared,
     renumbered,
 )
+from starcal_uq.estimation.result import Calibration
+from starcal_uq.likelihood.compressed import optimum
+from starcal_uq.observations.repeats import shared
 from starcal_uq.observations.table import Observations, joined_columns
 from starcal_uq.runs.run import Run
 

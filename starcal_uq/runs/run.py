@@ -36,8 +36,8 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import write_json
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress
-from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.files import arrow_values
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations, load_observations
@@ -60,11 +60,11 @@ if TYPE_CHECKING:
 
     from starcal_uq.budgeting.file import BudgetFile
     from starcal_uq.budgeting.result import Budget
+    from starcal_uq.calibration.screening.result import Screening
     from starcal_uq.core.settings import Scalar, Sense
     from starcal_uq.diagnostics.diagnose import Diagnosis
     from starcal_uq.diagnostics.verdict.judge import Verdict
     from starcal_uq.diagnostics.verdict.remedies import Place
-    from starcal_uq.estimation.screening.result import Screening
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.inference.posterior import Posterior
@@ -702,15 +702,22 @@ class Run:
             partitioned=isinstance(obs, PartitionedObservations),
         )
         if screening:
-            from starcal_uq.estimation.screening.screening import screen
+            from starcal_uq.calibration.screening.screening import screen
 
             assert isinstance(obs, Observations)
             screened = screen(obs, camera, **options)
             obs, calibration = screened.observations, screened.calibration
         else:
-            from starcal_uq.estimation.calibrate import calibrate
+            from starcal_uq.calibration.calibrate import calibrate
+            from starcal_uq.diagnostics.explain import explain
 
-            calibration = calibrate(obs, camera, progress=progress, **options)
+            try:
+                calibration = calibrate(obs, camera, progress=progress, **options)
+            except CalibrationError as error:
+                known = explain(error, obs) if isinstance(obs, Observations) else error
+                if known is error:
+                    raise
+                raise known from error
             if isinstance(obs, PartitionedObservations):
                 # The stars stay where they are; the run holds the sample of frames that its results
                 # are shown by.

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from starcal_uq.calibration.calibrate import METHODS
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, get_model, model_names
 from starcal_uq.camera.projection import fold_radius_px
@@ -14,7 +15,6 @@ from starcal_uq.core.errors import StudyError
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import KEYS, Limit
 from starcal_uq.core.types import AnyDict
-from starcal_uq.estimation.calibrate import METHODS
 from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.simulation.pointing import POINTINGS
 

@@ -21,8 +21,8 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.formatting import count
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.star_errors import add_by_star, offset_columns, sky_axes
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import add_by_star, offset_columns, sky_axes
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.information import frame_matrices
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Window

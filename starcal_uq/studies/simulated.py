@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, run_ensembles
 from starcal_uq.inference.named import NaivePairsWarning, find_source
 from starcal_uq.inference.priors import GaussianPriors, Priors
@@ -55,7 +55,7 @@ from starcal_uq.studies.geometry import (
 from starcal_uq.studies.result import VARIABLES
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
 
 # What is decided after the frames were taken: cells that differ in nothing else share their data.
 _AFTERWARDS = ("method", "likelihood", "prior")

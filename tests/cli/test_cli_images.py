@@ -213,7 +213,7 @@ def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatc
     def stuck(*_arguments, **_options):
         raise sc.errors.CalibrationError("it went nowhere.")
 
-    monkeypatch.setattr("starcal_uq.estimation.calibrate.calibrate", stuck)
+    monkeypatch.setattr("starcal_uq.calibration.calibrate.calibrate", stuck)
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--max-mag", 6, "--in-space")
     assert status == 2

@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.runs import streams as filter_runs
+from starcal_uq.paper.recursive import folder as filter_runs
+from starcal_uq.paper.recursive.folder import STATE, filter_run
 from starcal_uq.runs.folder import HISTORY
-from starcal_uq.runs.streams import STATE, filter_run
 from tests.helpers.scenes import camera, nominal, observations
 
-ALL = sc.estimation.RecursionOptions(parameters="all")
+ALL = sc.paper.RecursionOptions(parameters="all")
 
 
 @pytest.fixture
@@ -52,18 +52,18 @@ def test_posterior_and_couplings_follow_and_propagation_says_what_it_needs(table
 def test_an_interrupted_run_goes_on_bit_for_bit(table, tmp_path, monkeypatch):
     whole = filter_run(table, nominal(camera()), tmp_path / "whole", options=ALL)
 
-    update = sc.estimation.RecursiveCalibration.update
+    update = sc.paper.RecursiveCalibration.update
 
     def stop_at_20(self, frame):
         if self.n_frames == 20:
             raise KeyboardInterrupt
         return update(self, frame)
 
-    monkeypatch.setattr(sc.estimation.RecursiveCalibration, "update", stop_at_20)
+    monkeypatch.setattr(sc.paper.RecursiveCalibration, "update", stop_at_20)
     with pytest.raises(KeyboardInterrupt):
         filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
     monkeypatch.undo()
-    assert sc.estimation.RecursiveCalibration.load(tmp_path / "run" / STATE).n_frames == 20
+    assert sc.paper.RecursiveCalibration.load(tmp_path / "run" / STATE).n_frames == 20
 
     # With other settings it starts again, and nothing of the first goes in.
     shutil.copytree(tmp_path / "run", tmp_path / "other")
@@ -82,9 +82,9 @@ def test_an_interrupted_run_goes_on_bit_for_bit(table, tmp_path, monkeypatch):
 def test_a_state_is_saved_on_the_way(table, tmp_path, monkeypatch):
     monkeypatch.setattr(filter_runs, "_SAVE_EVERY", 25)
     saved = []
-    save = sc.estimation.RecursiveCalibration.save
+    save = sc.paper.RecursiveCalibration.save
     monkeypatch.setattr(
-        sc.estimation.RecursiveCalibration,
+        sc.paper.RecursiveCalibration,
         "save",
         lambda self, path: (saved.append(self.n_frames), save(self, path)),
     )

@@ -17,12 +17,12 @@ import pytest
 import typer
 
 import starcal_uq as sc
+from starcal_uq.calibration.cameras import MixedCameras
 from starcal_uq.cli.commands import app
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.diagnose import MultiStart
 from starcal_uq.diagnostics.times import TimeTest
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
-from starcal_uq.estimation.cameras import MixedCameras
 from starcal_uq.inference import checks
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.runs.folder import FILES
@@ -346,7 +346,7 @@ ARGUMENTS = {
     "method='griffith'": "sc.calibrate(obs, camera, {})",
     "method='three_stage'": "sc.calibrate(obs, camera, {})",
     "parameters='all'": (
-        "sc.calibrate(obs, camera, method='griffith', recursion=sc.estimation.RecursionOptions({}))"
+        "sc.calibrate(obs, camera, method='griffith', recursion=sc.paper.RecursionOptions({}))"
     ),
     "solver='ipopt'": "sc.calibrate(obs, camera, {})",
     "solver='minpack'": "sc.calibrate(obs, camera, {})",

@@ -16,6 +16,7 @@ from scipy.stats import kstest
 
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.projection import unproject
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.comparison.covariance import difference_rule
@@ -27,8 +28,7 @@ from starcal_uq.core.errors import (
     RunFolderError,
 )
 from starcal_uq.core.status import Status
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.priors import GaussianPriors
 from starcal_uq.observations.splits import shared_frames, split_frames
 from starcal_uq.presentation.pages.comparison import write_comparison

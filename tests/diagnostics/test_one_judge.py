@@ -187,7 +187,7 @@ def test_remedies_name_the_files_of_the_run():
             "starcal-uq run /data/obs.csv /data/camera.toml --noise model --screen -o '/a b/run' "
             "--force"
         ),
-        "sc.estimation.screen(obs, camera)",
+        "sc.calibration.screen(obs, camera)",
     )
     steps = Place("/run or that").exact(check)
     files = "'/run or that/observations.parquet' '/run or that/camera.toml' -o '/run or that-2'"

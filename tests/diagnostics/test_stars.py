@@ -15,9 +15,9 @@ from starcal_uq.core.status import Level
 from starcal_uq.diagnostics import stars as diagnostics_stars
 from starcal_uq.diagnostics.stars import star_test
 from starcal_uq.diagnostics.verdict.estimate import stars as check
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.normals import StarNormals
-from starcal_uq.estimation.star_errors import StarModel, star_numbers
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import StarModel, star_numbers
 from tests.helpers.outside import campaign
 
 

@@ -177,8 +177,8 @@ def test_shuffled_identifications_are_not_called_a_calibration():
 
 def test_ipopt_keeps_the_principal_point_on_the_detector():
     """A handful of stars lets the optics run away; IPOPT's constraints hold."""
-    from starcal_uq.estimation.pairs import PairObjective
     from starcal_uq.estimation.stages import constraints_for, joint_stage
+    from starcal_uq.likelihood.pairs import PairObjective
     from starcal_uq.observations.frames import StarFrames
 
     obs = observations(n_frames=60, sigma_px=3.0)

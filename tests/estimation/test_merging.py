@@ -13,16 +13,16 @@ import pytest
 from scipy.special import fdtrc
 from scipy.stats import kstest
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import Optimum, moved, optimum, scaled, total
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.merging import Consistency, consistency_of, merge, welch_james
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.sample import sample
+from starcal_uq.likelihood.compressed import Optimum, moved, optimum, scaled, total
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.propagation.coupling import coupling
 from starcal_uq.runs.merge import join_observations, merge_runs

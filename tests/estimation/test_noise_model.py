@@ -12,9 +12,9 @@ import starcal_uq as sc
 from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.misfit import misfit_tests
 from starcal_uq.diagnostics.verdict.estimate import even_noise
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import fit_noise, noise_model_of, weighed
 from starcal_uq.estimation.stages import refinement_stage
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from tests.helpers.outside import campaign
 
 
@@ -104,7 +104,7 @@ def test_every_reader_of_a_run_sees_the_same_weights_and_the_data_stay_what_they
 def test_screening_measures_stars_by_the_noise_where_they_are():
     _, obs, camera = scene(worse_outside, n_frames=60)
     plain, fitted = (
-        sc.estimation.screen(obs, camera, noise=noise) for noise in ("common", "model")
+        sc.calibration.screen(obs, camera, noise=noise) for noise in ("common", "model")
     )
     assert plain.model_is_wrong and not fitted.model_is_wrong and fitted.n_rejected == 0
     assert fitted.observations.sigma_px is None and fitted.calibration.noise_model.varies

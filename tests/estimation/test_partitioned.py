@@ -18,7 +18,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError, ObservationError, RepeatedFramesError
 from starcal_uq.diagnostics.jackknife import jackknife_frames, jackknife_of_all
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.presentation.report.words import data_sentence
@@ -255,7 +255,7 @@ def test_frames_are_counted_once(small, tmp_path: Path, monkeypatch: pytest.Monk
     ):
         sc.calibrate(doubled, camera)
     # Of a larger table the sample may not hold both.
-    monkeypatch.setattr("starcal_uq.estimation.calibrate.repeating_frames", lambda *_: np.empty(0))
+    monkeypatch.setattr("starcal_uq.calibration.calibrate.repeating_frames", lambda *_: np.empty(0))
     with pytest.raises(RepeatedFramesError, match="frame 60 holds the same pixels as frame 7:"):
         sc.calibrate(doubled, camera)
     assert sc.calibrate(doubled, camera, duplicates="keep").n_frames == 61
@@ -328,7 +328,7 @@ def test_memory_and_time_grow_with_the_partition_and_the_stars(tmp_path: Path) -
         "import resource, sys, time\n"
         "import numpy as np\n"
         "import starcal_uq as sc\n"
-        "from starcal_uq.estimation.calibrate import calibrate\n"
+        "from starcal_uq.calibration.calibrate import calibrate\n"
         "camera, start, stars = sc.paper.paper_camera(), sc.paper.paper_start(), "
         "sc.load_catalogue(max_mag=6.0)\n"
         "sc.calibrate(sc.simulate(stars, camera, n_frames=300), start)\n"

@@ -9,10 +9,10 @@ from scipy import stats
 import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.estimation.recursive import innovations
-from starcal_uq.estimation.recursive.innovations import frame_normals
 from starcal_uq.estimation.robust import star_scores
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.paper.recursive import innovations
+from starcal_uq.paper.recursive.innovations import frame_normals
 from tests.helpers.outside import Campaign, campaign
 
 # Field (deg), side (px), focal length (mm), stars a frame, frames, noise (px), focal length of the
@@ -105,7 +105,7 @@ def test_student_t_leaves_the_minimum_that_interstar_angles_stray_into(name):
 
 
 def filtered(c, sheet):
-    options = sc.estimation.RecursionOptions(parameters="all")
+    options = sc.paper.RecursionOptions(parameters="all")
     return sc.calibrate(sc.Observations(**c.columns), sheet, method="griffith", recursion=options)
 
 

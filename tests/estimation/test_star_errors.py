@@ -10,9 +10,9 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import CalibrationError, SamplingError
-from starcal_uq.estimation.compressed import compress
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.star_errors import SolvedStars, StarErrors, StarLikelihood, StarModel
+from starcal_uq.likelihood.compressed import compress
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import SolvedStars, StarErrors, StarLikelihood, StarModel
 from tests.helpers.outside import campaign
 
 

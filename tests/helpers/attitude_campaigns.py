@@ -23,9 +23,9 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation, left_error
 from starcal_uq.attitude.wahba import quest
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project, unproject_theta
-from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.propagation.attitude_error import AttitudeError

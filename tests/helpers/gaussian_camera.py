@@ -12,7 +12,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.status import Status
-from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.maths.linear import symmetric_inverse
 
 SD = np.array([0.15, 0.15, 0.028, 0.39e-10, 0.073e-15])

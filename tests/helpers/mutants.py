@@ -181,13 +181,13 @@ SAMPLES = (
     Sample("observations.parquet", sc.load_observations, ("load_observations",)),
     Sample(
         "stream.csv",
-        lambda path: _all(sc.observations.stream_frames(path)),
-        ("observations.stream_frames",),
+        lambda path: _all(sc.paper.stream_frames(path)),
+        ("paper.stream_frames",),
     ),
     Sample(
         "stream.parquet",
-        lambda path: _all(sc.observations.stream_frames(path)),
-        ("observations.stream_frames",),
+        lambda path: _all(sc.paper.stream_frames(path)),
+        ("paper.stream_frames",),
     ),
     Sample("part.parquet", _partitions, ("observations.open_partitions",)),
     Sample("frames.parquet", _frames, ("Run",)),
@@ -216,8 +216,8 @@ SAMPLES = (
     Sample("checkpoint.npz", _checkpoint, ("sample",)),
     Sample(
         "state.npz",
-        sc.estimation.RecursiveCalibration.load,
-        ("estimation.RecursiveCalibration.load",),
+        sc.paper.RecursiveCalibration.load,
+        ("paper.RecursiveCalibration.load",),
     ),
     Sample("attitude.csv", sc.propagation.AttitudeError.load, ("propagation.AttitudeError.load",)),
     Sample("field_map.npz", sc.propagation.FieldMap.load, ("propagation.FieldMap.load",)),

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import PriorError
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import merge
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import GaussianPriors, Priors
 from starcal_uq.inference.sample import sample

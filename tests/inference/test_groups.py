@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 import starcal_uq as sc
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.diagnostics.models import compare_models
-from starcal_uq.estimation.student import StudentLikelihood
 from starcal_uq.inference import groups
 from starcal_uq.inference.groups import GROUPS, LOG_LIKELIHOOD, arviz_data
 from starcal_uq.inference.posterior import Posterior
+from starcal_uq.likelihood.student import StudentLikelihood
 from starcal_uq.observations.frames import StarFrames
 from tests.helpers import outside, scenes
 

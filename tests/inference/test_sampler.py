@@ -14,13 +14,11 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, SamplingError, SettingError
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.jackknife import accept_inflation, jackknife_frames
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.student import DEFAULT_DOF
 from starcal_uq.inference import named
 from starcal_uq.inference.checks import _OPTIONS, check_compression
 from starcal_uq.inference.exact import ExactMarginal, FrameSample
@@ -28,6 +26,8 @@ from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
 from starcal_uq.inference.target import importance_check, laplace_approximation, start_target
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.student import DEFAULT_DOF
 from starcal_uq.maths.linear import symmetric_inverse
 from starcal_uq.observations.table import Observations
 from tests.helpers.gaussian_camera import COVARIANCE, SD, GaussianLikelihood, gaussian_calibration
@@ -388,11 +388,11 @@ def test_a_sample_of_frames_bounds_the_error_of_the_expansion(
 def test_a_check_by_a_sample_costs_the_same_at_any_number_of_frames(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from starcal_uq.estimation.marginal import MarginalLikelihood
+    from starcal_uq.likelihood.marginal import MarginalLikelihood
 
     monkeypatch.setattr("starcal_uq.inference.exact.SAMPLED_FRAMES", 20)
     # One point at a time, so that visits are counted.
-    monkeypatch.setattr("starcal_uq.estimation.marginal.BLOCK_STARS", 1)
+    monkeypatch.setattr("starcal_uq.likelihood.marginal.BLOCK_STARS", 1)
     visited: list[int] = []
     sums = MarginalLikelihood.sums
 

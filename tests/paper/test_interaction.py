@@ -12,7 +12,6 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError, SamplingError, SettingError
-from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.paper.interaction import (
     AXES,
     HANDLING,
@@ -26,6 +25,7 @@ from starcal_uq.paper.interaction import (
     solid_angle_sr,
     study_points,
 )
+from starcal_uq.paper.recursive.start import RecursionOptions
 from starcal_uq.simulation.frames import Campaign
 from tests.helpers.scenes import camera, observations
 

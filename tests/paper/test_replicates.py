@@ -18,8 +18,8 @@ from starcal_uq.core.errors import (
     SamplingError,
     SettingError,
 )
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.maths.intervals import holm, wilson_interval
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.replicates import METHODS, Method, Replicates, replicate, solve_all

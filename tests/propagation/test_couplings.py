@@ -107,7 +107,7 @@ def test_principal_point_and_boresight_are_one_near_gauge(calibrated, found):
 def test_common_rotation_is_what_a_wrong_principal_point_does():
     """The analytic response against attitudes solved again with a shifted principal point."""
     from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_vector
-    from starcal_uq.estimation.marginal import MarginalLikelihood
+    from starcal_uq.likelihood.marginal import MarginalLikelihood
 
     obs = observations(n_frames=40)
     cal = sc.calibrate(obs, sc.paper.paper_start())

@@ -13,9 +13,9 @@ import pytest
 
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.attitude.wahba import quest
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import AttitudeProfileError, RunFolderError, SamplingError
-from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.table import Observations
 from starcal_uq.propagation.propagate import propagate
 from starcal_uq.propagation.spectrum import ErrorSpectrum, _neighbours, error_spectrum

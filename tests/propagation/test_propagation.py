@@ -17,11 +17,11 @@ from scipy.stats import norm
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
 from starcal_uq.attitude.wahba import quest
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import DistortionError, ObservationError, RunFolderError, SamplingError
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_start
 from starcal_uq.propagation.alignment import alignment_weights

@@ -14,7 +14,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.presentation.report.words import provenance_rows
 from tests.helpers.scenes import observations
 
@@ -68,7 +68,7 @@ def test_a_reader_between_two_files_that_are_exchanged_is_refused(folders: dict[
     other = Calibration.load(folders["other"] / FILES[0])
     replace = dataclasses.replace
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("starcal_uq.estimation.calibration.write_json", lambda *_: None)
+        patch.setattr("starcal_uq.estimation.result.write_json", lambda *_: None)
         replace(other, residuals_px=other.residuals_px + 1.0).save(folders["one"] / FILES[0])
     with pytest.raises(
         RunFolderError,

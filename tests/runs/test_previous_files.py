@@ -20,10 +20,10 @@ from starcal_uq.core.records import from_plain, read_arrays, to_plain, write_jso
 from starcal_uq.core.status import Status
 from starcal_uq.diagnostics.diagnose import Diagnosis
 from starcal_uq.diagnostics.validation.result import Validation
-from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import Consistency
-from starcal_uq.estimation.recursive.stream import RecursiveCalibration
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.table import load_observations
+from starcal_uq.paper.recursive.stream import RecursiveCalibration
 from starcal_uq.paper.replicates import Replicates
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.propagation.attitude_error import AttitudeError

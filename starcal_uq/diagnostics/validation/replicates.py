@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import CatalogueError, PriorError, SamplingError, StarcalError
 from starcal_uq.core.settings import Truth
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.inference.ensemble import EnsembleSettings, run_ensembles
 from starcal_uq.inference.named import NaivePairsWarning, find_source
 from starcal_uq.inference.target import (
@@ -31,12 +30,13 @@ from starcal_uq.inference.target import (
     laplace_approximation,
     start_target,
 )
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import symmetric_inverse
 from starcal_uq.simulation.frames import Campaign
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.priors import Priors
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from starcal_uq.core.types import FloatArray
     from starcal_uq.diagnostics.misfit import MisfitTest
     from starcal_uq.diagnostics.pattern import Pattern
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.propagation.attitude_error import AttitudeError
 
 # What keeps its place in the field bends directions; so does a scale of each frame's own, whose

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.calibration.fallback import fallback_words
 from starcal_uq.camera.distortion import get_model, next_simpler
 from starcal_uq.core.formatting import count, fixed, join_words, p_words, plural, significant
 from starcal_uq.core.status import (
@@ -36,13 +37,13 @@ from starcal_uq.diagnostics.verdict.observed import (
     SCREEN,
     lens_remedy,
 )
-from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.undetermined import what_is_open
 from starcal_uq.inference.checks import resample
 from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.maths.intervals import student_quantile
 
 if TYPE_CHECKING:
+    from starcal_uq.calibration.cameras import MixedCameras
     from starcal_uq.camera.camera import Camera
     from starcal_uq.core.types import FloatArray
     from starcal_uq.diagnostics.diagnose import Diagnosis, MultiStart
@@ -51,8 +52,7 @@ if TYPE_CHECKING:
     from starcal_uq.diagnostics.models import ModelComparison
     from starcal_uq.diagnostics.predictive import PredictiveCheck
     from starcal_uq.diagnostics.stars import StarTest
-    from starcal_uq.estimation.calibration import Calibration
-    from starcal_uq.estimation.cameras import MixedCameras
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.propagation.attitude_error import AttitudeError
 

@@ -23,7 +23,7 @@ from starcal_uq.estimation.noise_model import weighed
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.diagnostics.diagnose import Diagnosis
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError

@@ -17,7 +17,7 @@ from starcal_uq.propagation.attitude_error import choice_words, two_figures
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.diagnostics.air import AirTest
     from starcal_uq.diagnostics.times import TimeTest, UnseenAberration
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 
@@ -47,7 +47,7 @@ MIN_FRAMES = 5
 # What a wrong time may move parameters by and the numbers be used.
 _SMALL_SIGMA = 1.0
 # Commands and calls that checks give as remedies.
-SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
+SCREEN = f"{CALIBRATE} --screen or sc.calibration.screen(obs, camera)"
 _RICHEST = "brown_tangential"
 _NO_MODEL = (
     "Count the pattern as an error of the directions, as the attitude error with the misfit "

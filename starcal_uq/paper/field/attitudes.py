@@ -17,6 +17,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
 from starcal_uq.attitude.wahba import quest
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.constants import ARCSEC
@@ -24,7 +25,6 @@ from starcal_uq.core.errors import CalibrationError, DistortionError
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.identification.search import LEAST_SIGMA_PX
 from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.field.frames import FieldFrames, FieldIdentification, true_pixels

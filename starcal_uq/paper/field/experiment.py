@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import PathLike, atomic_write_text
@@ -16,7 +17,6 @@ from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.store import Kept
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.paper.commands import Bar, write_tables
 from starcal_uq.paper.field.attitudes import (
     Repetition,

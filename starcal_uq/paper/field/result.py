@@ -14,7 +14,7 @@ import pandas as pd
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import AnyDict
-from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.maths.intervals import wilson_interval
 from starcal_uq.paper.field.attitudes import (
     PARTS,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.paper.field.result import FieldExperiment
     from starcal_uq.paper.interaction import InteractionStudy
     from starcal_uq.paper.judgement import Judged

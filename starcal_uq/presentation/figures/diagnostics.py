@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from starcal_uq.diagnostics.misfit import Misfit
     from starcal_uq.diagnostics.models import ModelComparison
     from starcal_uq.diagnostics.validation.result import Validation
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 # Mean width of a letter of a tick label.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 _BANDS = ("#eef3f7", "#ffffff")

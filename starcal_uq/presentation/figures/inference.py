@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.inference.priors import Priors
 

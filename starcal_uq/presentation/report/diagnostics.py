@@ -27,7 +27,7 @@ from starcal_uq.presentation.words.diagnostics import (
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
 
 

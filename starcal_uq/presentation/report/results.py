@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
-from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.table import Observations
 from starcal_uq.presentation.words.budgeting import requirement_checks
 

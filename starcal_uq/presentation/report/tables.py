@@ -28,7 +28,7 @@ from starcal_uq.presentation.tables import TextTable, with_units
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.pipeline.record import ImageRecord
     from starcal_uq.presentation.report.results import Results

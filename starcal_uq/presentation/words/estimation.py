@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from starcal_uq.calibration.fallback import fallback_words
+from starcal_uq.calibration.screening.result import REASONS, Screening
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import (
@@ -14,10 +16,8 @@ from starcal_uq.core.formatting import (
     pretty_unit,
     significant,
 )
-from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.merging import ALPHA, Consistency
-from starcal_uq.estimation.screening.result import REASONS, Screening
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.presentation.tables import TextTable
 
 _SHOWN_ROWS = 30

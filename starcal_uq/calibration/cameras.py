@@ -1,0 +1,244 @@
+"""Are all frames of one camera? Each frame's own focal length, and whether these fall into groups.
+
+A frame tells its focal length by itself, through the angles between its stars. Frames of one camera
+scatter around one value, by noise and by what the model leaves over; those of two, around two. The
+split of the sorted values that leaves the least scatter within is held against the same of as many
+values of one camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.formatting import join_words, plural
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation.consensus import frame_focal_ratios, measured_directions
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.splits import one_of_each
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.observations.table import Observations
+
+# False alarms of frames of one camera.
+GROUPS_P = 1e-3
+# Relative difference that thermal drift and poor frames do not reach.
+_LEAST_APART, _SIGMAS_APART = 3e-3, 6.0
+_LEAST_FRAMES, _LEAST_STARS, _FRAMES, _DRAWS, _STEPS = 4, 4, 300, 4000, 6
+# Groups that are looked for together; each may fall into more.
+_MOST_AT_ONCE = 4
+_WORDS = 12
+
+
+@dataclass(frozen=True)
+class FrameFocals:
+    """Focal length of each frame by itself."""
+
+    frame_ids: IntArray  # (K,): frames with at least four stars; of more than 300, a sample
+    # `focal_px`, `sigma_px`, (K,): estimate at the given distortion, and its standard error from
+    # the scatter of the frame's stars, px.
+    focal_px: FloatArray
+    sigma_px: FloatArray
+    # (K,): number of the group that a frame is of, from 0, by focal length; all 0 where there is
+    # one camera.
+    group: IntArray
+    p_value: float  # Probability that frames of one camera fall apart so
+
+    @property
+    def n_groups(self) -> int:
+        """Number of cameras that the frames ask for."""
+        return int(self.group.max()) + 1 if len(self.group) else 0
+
+    @property
+    def largest(self) -> str:
+        """Frames of the largest group, as ``--only-frames`` takes them."""
+        return frame_ranges(self.frame_ids[self.group == np.bincount(self.group).argmax()])
+
+    def words(self, camera: Camera) -> str:
+        """Each group's focal length and frames, in one clause, with the option that selects a
+        group.
+        """
+        told = []
+        for number in range(self.n_groups):
+            mine = self.group == number
+            focal = camera.length_text(float(np.median(self.focal_px[mine])), 4)
+            told.append(f"{focal} in {_listed(self.frame_ids[mine])}")
+        chosen = self.largest if self.largest.count(",") < _WORDS else "LIST"
+        return (
+            f"the frames are of {plural(self.n_groups, 'camera')}, or some are wrong: focal "
+            f"length {join_words(told)}; "
+            f"calibrate each by itself (--only-frames {chosen})"
+        )
+
+
+@dataclass(frozen=True)
+class MixedCameras:
+    """Frames that ask for several cameras."""
+
+    n: int  # Number of cameras
+    words: str  # What is known of them, in one clause
+    frames: str  # Frames of the largest group, as ``--only-frames`` takes them
+
+    @classmethod
+    def of(cls, obs: Observations, camera: Camera) -> MixedCameras | None:
+        """Several cameras, where the frames of a calibration with this camera ask for them."""
+        found = frame_focals(obs, camera)
+        if found.n_groups < 2:
+            return None
+        return cls(found.n_groups, found.words(camera), found.largest)
+
+
+def _listed(frames: IntArray) -> str:
+    text = frame_ranges(frames)
+    if text.count(",") >= _WORDS:
+        return plural(len(frames), "frame")
+    return f"{'frame' if len(frames) == 1 else 'frames'} {text}"
+
+
+def frame_ranges(frames: IntArray) -> str:
+    """Frame numbers as ``--only-frames`` takes them, such as 0-4,7."""
+    ends = np.flatnonzero(np.diff(frames) != 1)
+    first, last = frames[np.concatenate([[0], ends + 1])], frames[np.append(ends, len(frames) - 1)]
+    return ",".join(
+        str(a) if a == b else f"{a}-{b}" for a, b in zip(first.tolist(), last.tolist(), strict=True)
+    )
+
+
+def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFocals:
+    """Estimate the focal length of every frame by itself, and look for groups among them.
+
+    `camera`: principal point and distortion, and the focal length to start from.
+    `seed`: seed of the draws that the split is held against.
+    """
+    enough = np.flatnonzero(obs.stars_per_frame >= _LEAST_STARS)
+    chosen = enough[one_of_each(len(enough), _FRAMES, seed)]
+    none = FrameFocals(
+        np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), 1.0
+    )
+    if not len(chosen):
+        return none
+    some = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
+    frames = StarFrames.from_observations(some)
+    b = measured_directions(camera, frames)
+    if not np.isfinite(b).all():
+        camera = camera.replace(distortion="none", coefficients=())
+        b = measured_directions(camera, frames)
+    tangent = b[:2] / b[2]
+    theta = np.array([0.0, 0.0, camera.focal_px])
+    log_scale = -np.log(frame_focal_ratios(tangent, frames))
+    for _ in range(_STEPS):
+        pixel = np.ascontiguousarray(camera.focal_px * tangent * frames.spread(np.exp(log_scale)))
+        likelihood = MarginalLikelihood(
+            StarFrames(pixel, frames.r, frames.weight, frames.starts), "none"
+        )
+        state, cost = likelihood.profile(theta)
+        if not np.isfinite(cost):
+            return none
+        # A focal length that is longer by one per cent is a pattern that is larger by as much.
+        slope = (
+            likelihood.project_out(state, likelihood.derivatives(theta, state)[2:3])[0]
+            * camera.focal_px
+        )
+        curvature = frames.sum(np.sum(slope**2, axis=0))
+        step = frames.sum(np.sum(slope * state.e, axis=0)) / curvature
+        log_scale -= np.clip(step, -0.2, 0.2)
+    left = frames.sum(np.sum(state.e**2, axis=0))
+    sigma = np.sqrt(left / np.maximum(2 * frames.sizes - 4, 1) / curvature)
+    group, p_value = _grouped(-log_scale, sigma, seed)
+    focal = camera.focal_px * np.exp(-log_scale)
+    return FrameFocals(some.frame_ids, focal, sigma * focal, group, p_value)
+
+
+def _grouped(value: FloatArray, sigma: FloatArray, seed: int) -> tuple[IntArray, float]:
+    """Groups of values (K,), numbered upwards, and the probability of the first split."""
+    group = np.zeros(len(value), dtype=np.int64)
+    rng = np.random.default_rng(seed)
+    order = np.argsort(value)
+    first, todo, done = 1.0, [order], 0
+    while todo:
+        rows = todo.pop(0)
+        parts, p_value = _split(value[rows], sigma[rows], rng)
+        first = p_value if len(rows) == len(order) else first
+        if len(parts) > 1:
+            todo = [rows[part] for part in parts] + todo
+            continue
+        group[rows] = done
+        done += 1
+    return group, first
+
+
+def _split(
+    value: FloatArray, sigma: FloatArray, rng: np.random.Generator
+) -> tuple[list[slice], float]:
+    """Groups of sorted values, one where they are no more, and the probability of so clear ones
+    among one camera's.
+    """
+    n, whole = len(value), [slice(0, len(value))]
+    if n < _LEAST_FRAMES:
+        return whole, 1.0
+    smallest = 1.0
+    for number in range(2, min(_MOST_AT_ONCE, n - 2) + 1):
+        # What frames scatter by beyond their own noise is the same for all of them.
+        cuts, _ = _cut(value[None], np.ones(n), number)
+        common = max(_within(value, cuts[0]) - float(np.median(sigma) ** 2), 0.0)
+        weight = 1.0 / (np.maximum(sigma, 1e-12) ** 2 + common)
+        cuts, ratio = _cut(value[None], weight, number)
+        null = np.sort(rng.standard_normal((_DRAWS, n)) / np.sqrt(weight), axis=1)
+        as_clear = np.count_nonzero(_cut(null, np.ones(n), number)[1] >= ratio[0])
+        p_value = (1.0 + float(as_clear)) / (_DRAWS + 1.0) * (_MOST_AT_ONCE - 1.0)
+        smallest = min(smallest, p_value)
+        edges = [0, *cuts[0].tolist(), n]
+        parts = [slice(low, high) for low, high in pairwise(edges)]
+        apart = np.diff([np.median(value[part]) for part in parts])
+        if p_value < GROUPS_P and np.min(apart) > max(
+            _LEAST_APART, _SIGMAS_APART / np.sqrt(np.median(weight))
+        ):
+            return parts, smallest
+    return whole, smallest
+
+
+def _within(value: FloatArray, cuts: IntArray) -> float:
+    """Mean square of sorted values around the medians of their groups."""
+    return float(
+        np.mean(np.concatenate([part - np.median(part) for part in np.split(value, cuts)]) ** 2)
+    )
+
+
+def _cut(value: FloatArray, weight: FloatArray, number: int) -> tuple[IntArray, FloatArray]:
+    """Where rows of sorted values (d, n) fall into groups, (d, number - 1), and scatter between
+    over within, (d,).
+
+    Two groups are those with the least scatter within, more are cut at the widest gaps.
+    """
+    mass = np.concatenate([[0.0], np.cumsum(weight)])
+    running = np.concatenate([np.zeros((len(value), 1)), np.cumsum(value * weight, axis=1)], axis=1)
+    middle = running[:, -1:] / mass[-1]
+    if number == 2:
+        part = mass[1:-1]
+        cuts = (
+            1
+            + np.argmax(
+                (running[:, 1:-1] - part * middle) ** 2 / (part * (mass[-1] - part)), axis=1
+            )[:, None]
+        )
+    else:
+        cuts = (
+            np.sort(
+                np.argpartition(-np.diff(value, axis=1), number - 2, axis=1)[:, : number - 1],
+                axis=1,
+            )
+            + 1
+        )
+    edges = np.concatenate(
+        [np.zeros((len(value), 1), dtype=int), cuts, np.full((len(value), 1), value.shape[1])],
+        axis=1,
+    )
+    sums = np.diff(np.take_along_axis(running, edges, axis=1), axis=1)
+    between = np.sum(sums**2 / np.diff(mass[edges], axis=1), axis=1) - middle[:, 0] ** 2 * mass[-1]
+    within = np.sum(weight * (value - middle) ** 2, axis=1) - between
+    return cuts, between / np.maximum(within, 1e-300)

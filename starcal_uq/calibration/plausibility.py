@@ -1,0 +1,405 @@
+"""Why a calibration fails: the slip in table or camera file that would explain the stars, or what
+is known of them.
+
+Slips are tried on some frames: columns in other units or order, a mirrored image, frames put
+together anew. What explains the stars lets those of each frame agree on one attitude (`consensus`),
+at the focal length that their angles ask for. Nothing is blamed while the table as it is does
+nearly as well.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import wraps
+from itertools import islice
+from typing import ParamSpec, TypeVar
+
+import numpy as np
+
+from starcal_uq.calibration.cameras import frame_focals
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.formatting import significant
+from starcal_uq.core.status import Status
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.estimation.consensus import consensus, focal_ratio, measured_directions
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.table import Observations
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_FRAMES, _STARS = 16, 30
+# Frames of a stream, of which those are chosen.
+_HEAD = 64
+# Width of the field from which a focal length is looked for: angles are nearly proportional to it.
+_FIELD_RAD = np.radians(20.0)
+# Stars farther from their attitude's place than this fraction of the detector do not agree with it.
+_TOLERANCE = 0.02
+# Mean truncated square below which the stars are explained; that of other axes or units is above a
+# half.
+_EXPLAINED = 0.35
+# A slip must explain the stars so many times better than the table as it is, or any other slip.
+_CLEARLY = 0.5
+# Focal lengths that are taken for the camera's own, and for those of a wrong unit.
+_SAME_CAMERA, _SAME_UNIT = 1.6, 1.3
+_NEIGHBOURS = 8
+# Scatter of stars that agree, as a fraction of the tolerance: that of noise, or no reason for
+# anything.
+_NOISY, _QUIET = 0.2, 0.1
+_FEW_WRONG = 0.02
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Rows of some frames: pixels (2, N), directions (N,) in degrees, first rows of the frames (K +
+    1,).
+    """
+
+    pixel: FloatArray
+    ra: FloatArray
+    dec: FloatArray
+    starts: IntArray
+
+    @property
+    def frames(self) -> StarFrames:
+        ra, dec = np.radians(self.ra), np.radians(self.dec)
+        r = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+        return StarFrames(self.pixel, r, None, self.starts)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How well stars agree: mean truncated square, share that agrees, its scatter and the focal
+    length in px.
+    """
+
+    cost: float
+    share: float
+    scatter_px: float
+    focal_px: float
+
+    def badness(self, camera: Camera) -> float:
+        """Less is better; among what fits alike, the focal length nearest to the camera's."""
+        return self.cost + 0.02 * abs(float(np.log(self.focal_px / camera.focal_px)))
+
+
+def explained(function: Callable[P, R]) -> Callable[P, R]:
+    """A calibration of observations with a camera, whose error says what is wrong with them where
+    that can be told.
+    """
+    names = tuple(inspect.signature(function).parameters)
+
+    @wraps(function)
+    def calibrated(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return function(*args, **kwargs)
+        except RepeatedFramesError:
+            raise
+        except CalibrationError as error:
+            given = dict(zip(names, args, strict=False)) | kwargs
+            found = explanation(
+                error, given["obs"], given["camera"], screened=function.__name__ == "screen"
+            )
+            if found is None:
+                raise
+            raise found from error
+
+    return calibrated
+
+
+def explanation(
+    error: CalibrationError, obs: object, camera: object, *, screened: bool = False
+) -> Exception | None:
+    """The error of a calibration with what is wrong with its stars, where that can be told; a
+    stream by its head.
+    """
+    if error.status is None or not isinstance(camera, Camera):
+        return None
+    if not isinstance(obs, Observations):
+        obs = _head(obs)
+    sentence = None if obs is None else find_reason(obs, camera, error.status, screened=screened)
+    if sentence is not None:
+        return CalibrationError(f"{str(error).partition(':')[0]}: {sentence}.", error.status)
+    return None
+
+
+def _head(stream: object) -> Observations | None:
+    """The first frames of a stream that can be read again, numbered anew."""
+    if not isinstance(stream, Iterable) or isinstance(stream, Iterator | str):
+        return None
+    parts = list(islice(stream, _HEAD))
+    if not parts or not all(isinstance(part, Observations) for part in parts):
+        return None
+    columns: AnyDict = {
+        n: np.concatenate([getattr(part, n) for part in parts])
+        for n in ("x_px", "y_px", "ra_deg", "dec_deg")
+    }
+    # Frames of one part need not be those of another, whatever their numbers.
+    sizes = np.concatenate([np.diff(part.frame_starts) for part in parts])
+    return Observations(frame=np.repeat(np.arange(len(sizes)), sizes), **columns)
+
+
+def find_reason(
+    obs: Observations, camera: Camera, status: Status, *, screened: bool = False
+) -> str | None:
+    """What explains that a calibration of these stars with this camera fails, in a clause with its
+    remedy.
+
+    None where the stars agree, so that the status has said all there is: too few of them, or the
+    wrong model.
+    """
+    # The attitudes come without distortion, which bends them less than the slips do.
+    camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))
+    table = _sample(obs)
+    plain = _fit(table, camera)
+    if plain.cost > _EXPLAINED:
+        tried = [(_fit(other, camera), text) for text, other in _slips(table, camera)]
+        centred = camera.replace(
+            x0_px=0.5 * (camera.width_px - 1), y0_px=0.5 * (camera.height_px - 1)
+        )
+        tried.append((_fit(table, centred), _off_centre(camera)))
+        tried += _regrouped(obs, camera)
+        enough = min(_EXPLAINED, _CLEARLY * plain.cost)
+        if all(fit.cost >= enough for fit, _ in tried):
+            tried = [(_fit(other, camera), text) for text, other in _two_slips(table, camera)]
+        good = [one for one in tried if one[0].cost < enough]
+        if good:
+            fit, text = min(good, key=lambda one: one[0].badness(camera))
+            focal = _wrong_focal(fit, camera)
+            return text if focal is None else f"{text}; and {focal}"
+        if _far_apart(table, camera):
+            return _far_apart_words(obs, camera)
+    focals = frame_focals(obs, camera)
+    if focals.n_groups > 1:
+        return focals.words(camera)
+    if plain.share < 1.0 - _FEW_WRONG and plain.scatter_px > _NOISY * _tolerance_px(camera):
+        # Stars that noise throws beyond the tolerance are not wrong ones.
+        wider = (_fit(table, camera, by) for by in (3.0, 9.0))
+        plain = next((fit for fit in wider if fit.share >= 1.0 - _FEW_WRONG), plain)
+    return _wrong_focal(plain, camera) or _as_it_is(plain, camera, status, screened)
+
+
+def _sample(obs: Observations) -> _Table:
+    """Some frames, spread over the table, of those with the most stars, and some stars of each."""
+    sizes = np.diff(obs.frame_starts)
+    most = np.flatnonzero(sizes >= np.median(sizes))
+    chosen = most[np.unique(np.linspace(0, len(most) - 1, min(_FRAMES, len(most))).astype(int))]
+    rows = []
+    for frame in chosen:
+        first, n = int(obs.frame_starts[frame]), int(sizes[frame])
+        rows.append(first + np.unique(np.linspace(0, n - 1, min(n, _STARS)).astype(np.int64)))
+    return _of_rows(obs, rows)
+
+
+def _of_rows(obs: Observations, frames: list[IntArray]) -> _Table:
+    rows = np.concatenate(frames)
+    starts = np.cumsum([0, *map(len, frames)])
+    return _Table(np.ascontiguousarray(obs.xy[rows].T), obs.ra_deg[rows], obs.dec_deg[rows], starts)
+
+
+def _tolerance_px(camera: Camera) -> float:
+    return _TOLERANCE * max(camera.width_px, camera.height_px)
+
+
+def _fit(table: _Table, camera: Camera, wider: float = 1.0) -> _Fit:
+    """How well the stars of each frame agree on an attitude, with the focal length that their
+    angles ask for.
+    """
+    frames = table.frames
+    size = max(camera.width_px, camera.height_px)
+    focal_px = 0.5 * size / np.tan(0.5 * _FIELD_RAD)
+    found = camera.replace(focal_px=focal_px)
+    found = found.replace(focal_px=focal_px * focal_ratio(found, frames))
+    tolerance_px = wider * _tolerance_px(camera)
+    b = measured_directions(found, frames)
+    best = consensus(b, frames.r, frames.starts, tolerance_px / found.focal_px)
+    offset_px = np.where(np.isfinite(best.offset_rad), best.offset_rad, np.inf) * found.focal_px
+    cost = float(np.mean(np.minimum((offset_px / tolerance_px) ** 2, 1.0)))
+    # Of two axes, with as many degrees of freedom as three stars more than an attitude has.
+    scatter = float(np.median(offset_px[best.agree])) / 1.1774 if best.agree.any() else np.inf
+    return _Fit(cost, float(np.mean(best.agree)), scatter, found.focal_px)
+
+
+def _slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
+    """Slips that the numbers allow, each as a clause with its remedy, and the table without it."""
+    yield from _units(table)
+    yield _mirrored(table, camera)
+
+
+def _two_slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
+    """Two of them at once."""
+    for text, other in _units(table):
+        second, both = _mirrored(other, camera)
+        yield f"{text}; and {second}", both
+        for more, again in _units(table):
+            if other.dec is table.dec and again.ra is table.ra:
+                second = more.replace(", ra_deg does not", "")
+                yield (
+                    f"{text}; and {second}",
+                    _Table(table.pixel, other.ra, again.dec, table.starts),
+                )
+
+
+def _units(table: _Table) -> Iterator[tuple[str, _Table]]:
+    ra, dec, starts = table.ra, table.dec, table.starts
+    in_degrees = np.degrees
+    if ra.max() <= 24.0:
+        text = f"ra_deg looks like hours ({ra.min():.3g} to {ra.max():.3g}): multiply it by 15"
+        yield text, _Table(table.pixel, 15.0 * ra, dec, starts)
+    if ra.max() <= 2.0 * np.pi:
+        if np.abs(dec).max() <= 0.5 * np.pi:
+            text = (
+                f"ra_deg and dec_deg look like radians (ra_deg up to {ra.max():.3g}): multiply "
+                "them by 180/pi"
+            )
+            yield text, _Table(table.pixel, in_degrees(ra), in_degrees(dec), starts)
+        text = (
+            f"ra_deg looks like radians (up to {ra.max():.3g}), dec_deg does not: multiply "
+            "ra_deg by 180/pi"
+        )
+        yield text, _Table(table.pixel, in_degrees(ra), dec, starts)
+    if np.abs(dec).max() <= 0.5 * np.pi < ra.max():
+        text = (
+            f"dec_deg looks like radians (up to {np.abs(dec).max():.3g}), ra_deg does not: "
+            "multiply it by 180/pi"
+        )
+        yield text, _Table(table.pixel, ra, in_degrees(dec), starts)
+    if ra.max() <= 90.0:
+        yield (
+            "ra_deg and dec_deg look swapped: exchange the two columns",
+            _Table(table.pixel, dec % 360.0, ra, starts),
+        )
+
+
+def _mirrored(table: _Table, camera: Camera) -> tuple[str, _Table]:
+    x, y = table.pixel
+    ways = f"count x_px from the right edge ({camera.width_px - 1} - x_px), or y_px from the bottom"
+    if x.max() <= camera.height_px - 0.5 and y.max() <= camera.width_px - 0.5:
+        ways += ", or exchange x_px and y_px"
+    text = f"the image is mirrored: {ways}; a wrong sign of ra_deg or dec_deg looks the same"
+    return text, _Table(np.array([camera.width_px - 1.0 - x, y]), table.ra, table.dec, table.starts)
+
+
+def _off_centre(camera: Camera) -> str:
+    given = (
+        f"the principal point of the camera, ({camera.x0_px:g}, {camera.y0_px:g}) px, is far off"
+    )
+    centre = f"({0.5 * (camera.width_px - 1):g}, {0.5 * (camera.height_px - 1):g})"
+    return f"{given}: start from the detector's centre, {centre}"
+
+
+def _one_frame_number() -> str:
+    return (
+        "all rows have one frame number, but are stars of several images: give each image its "
+        "own in column frame"
+    )
+
+
+def _regrouped(obs: Observations, camera: Camera) -> list[tuple[_Fit, str]]:
+    """Whether stars that are neighbours in the sky are so in an image, whatever frame they are said
+    to be of.
+    """
+    from scipy.spatial import cKDTree
+
+    if obs.n_stars < 2 * _NEIGHBOURS:
+        return []
+    sky = cKDTree(obs.directions_icrs)
+    seeds = np.unique(np.linspace(0, obs.n_stars - 1, _FRAMES).astype(np.int64))
+    near = [np.sort(rows) for rows in sky.query(obs.directions_icrs[seeds], k=_NEIGHBOURS)[1]]
+    text = (
+        "the stars fit each other but not their frame numbers: check column frame, which is "
+        "mixed up"
+    )
+    return [(_fit(_of_rows(obs, near), camera), _one_frame_number() if obs.n_frames == 1 else text)]
+
+
+def _far_apart(table: _Table, camera: Camera) -> bool:
+    """Whether most frames hold stars that cannot be in one field."""
+    r = table.frames.r
+    spans = []
+    for start, stop in zip(table.starts[:-1], table.starts[1:], strict=True):
+        chord = np.linalg.norm(r[:, start:stop, None] - r[:, None, start:stop], axis=0).max()
+        spans.append(2.0 * np.arcsin(min(0.5 * chord, 1.0)))
+    return float(np.median(spans)) > 2.0 * _field_rad(camera)
+
+
+def _field_rad(camera: Camera) -> float:
+    return float(
+        2.0 * np.arctan(0.5 * np.hypot(camera.width_px, camera.height_px) / camera.focal_px)
+    )
+
+
+def _far_apart_words(obs: Observations, camera: Camera) -> str:
+    if obs.n_frames == 1:
+        return _one_frame_number()
+    field = significant(float(np.degrees(_field_rad(camera))), 2)
+    return (
+        f"frames hold stars that lie farther apart in the sky than the camera sees ({field} "
+        "degrees): their frame "
+        "numbers or directions belong to other rows"
+    )
+
+
+def _wrong_focal(plain: _Fit, camera: Camera) -> str | None:
+    """A focal length that the stars contradict, with the unit that would explain it."""
+    if plain.cost > _EXPLAINED:
+        return None
+    ratio = plain.focal_px / camera.focal_px
+    if 1.0 / _SAME_CAMERA < ratio < _SAME_CAMERA:
+        return None
+    for unit, reason in _other_units(camera).items():
+        if 1.0 / _SAME_UNIT < ratio / unit < _SAME_UNIT:
+            return reason
+    return (
+        f"the stars ask for a focal length of about {camera.length_text(plain.focal_px, 3)}, not "
+        f"{camera.length_text(camera.focal_px, 6)}: start from that, or give the camera that "
+        "took the images"
+    )
+
+
+def _other_units(camera: Camera) -> dict[float, str]:
+    """What the lengths of a camera file look like when they are off by these factors."""
+    if camera.pixel_um is None or camera.focal_mm is None:
+        return {}
+    short = f"focal_mm looks like micrometres ({camera.focal_mm:g}): divide it by 1000"
+    if camera.pixel_um < 0.5:
+        short = f"pixel_um looks like millimetres ({camera.pixel_um:g}): multiply it by 1000"
+    return {
+        1e-3: short,
+        1e3: f"focal_mm looks like metres ({camera.focal_mm:g}): multiply it by 1000",
+        1e-3
+        * camera.pixel_um: f"focal_mm looks like pixels ({camera.focal_mm:g}): multiply it by the pixel pitch, "
+        f"{1e-3 * camera.pixel_um:g} mm",
+        25.4: f"focal_mm looks like inches ({camera.focal_mm:g}): multiply it by 25.4",
+    }
+
+
+def _as_it_is(plain: _Fit, camera: Camera, status: Status, screened: bool) -> str | None:
+    """What is known of stars that no slip explains."""
+    wrong = 1.0 - plain.share
+    if wrong > 0.8:
+        return (
+            "the stars of a frame fit no common attitude, whatever units, axes and focal length: "
+            "check their "
+            "identification and the frame numbers"
+        )
+    if wrong > _FEW_WRONG:
+        told = f"about {100.0 * wrong:.0f} % of the stars do not fit the others of their frame"
+        if screened or wrong > 0.6:
+            return f"{told}: identify them again"
+        return (
+            f"{told}: leave out wrong identifications (`starcal-uq calibrate OBS CAMERA -o RUN "
+            "--screen`)"
+        )
+    quiet = plain.scatter_px < _QUIET * _tolerance_px(camera)
+    if quiet or status in (Status.SINGULAR, Status.FOLDED, Status.OUTSIDE_DETECTOR):
+        return None
+    return (
+        f"the stars scatter by about {significant(plain.scatter_px, 2)} px around their "
+        "attitudes, by noise or by "
+        "distortion that the model lacks: measure the centroids again, or choose another "
+        "distortion model"
+    )

@@ -1,0 +1,421 @@
+"""Stages and refinement on observations in memory: what a likelihood makes of them, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_quaternion
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model, sigma_parameter
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.provenance import provenance
+from starcal_uq.core.status import Status
+from starcal_uq.core.tasks import one_thread
+from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.assemble import (
+    IMPLAUSIBLE_NOISE,
+    assemble,
+    check_camera,
+    check_count,
+    check_noise,
+    failed,
+    noise_of,
+    noise_px,
+    raise_unless_good,
+)
+from starcal_uq.estimation.noise_model import fit_noise
+from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
+from starcal_uq.estimation.stages import (
+    PAIR_TOLERANCE,
+    REFINEMENT_TOLERANCE,
+    Stage,
+    begun_on_sample,
+    direct_stage,
+    distortion_stage,
+    focal_stage,
+    joint_stage,
+    optics_stage,
+    refinement_stage,
+)
+from starcal_uq.estimation.undetermined import EXPLAINED, coma_record, undetermined
+from starcal_uq.likelihood.composite import enough_frames, pair_covariance
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.pairs import PairObjective
+from starcal_uq.likelihood.solvers import Last, is_singular
+from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.repeats import Fingerprints
+from starcal_uq.observations.splits import one_of_each
+from starcal_uq.observations.table import Observations
+
+# Stage 1 that moves the principal point by more than this fraction of the width has met strong
+# distortion.
+_FAR = 0.05
+ITERATIONS = 200
+# From the nominal optics positions take some fifteen.
+_DIRECT_ITERATIONS = 60
+# Frames and stars of a sample that is near enough to the minimum of all, and the relative gain of
+# its last steps.
+_SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-4
+# Standard deviations of the last step: of the estimate from interstar angles of all frames, which
+# is then known to a thousandth of that, and of the refinement, which is left to Newton's method on
+# the expansion: a few 1e-9 of them.
+_LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.006
+
+
+def gaussian_fit(
+    obs: Observations,
+    camera: Camera,
+    likelihood: MarginalLikelihood,
+    method: str,
+    solver: str,
+    max_iterations: int,
+) -> Calibration:
+    pairs = PairObjective(likelihood.frames, camera.distortion)
+    last = _gain(likelihood, _LAST_STEP)
+    stages, status = _stages(
+        pairs, camera, likelihood, method, solver, max_iterations, last, "left"
+    )
+    pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
+    covariance = _pair_covariance(pairs, likelihood, pair_theta)
+    return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance)
+
+
+def _pair_covariance(
+    pairs: PairObjective, likelihood: MarginalLikelihood, pair_theta: FloatArray
+) -> FloatArray:
+    # The scatter of many frames needs no noise.
+    chi2 = (
+        np.nan if enough_frames(pairs) else likelihood.profile(pair_theta, likelihood.rotations)[1]
+    )
+    # The last step was not followed by an evaluation.
+    near = _gain(likelihood, _LAST_PAIR_STEP)
+    return pair_covariance(pairs, pair_theta, chi2, likelihood.dof - len(pair_theta), near)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An estimate and nothing else."""
+
+    theta: FloatArray  # (p,): end of the last stage, px units
+    chi2: float  # Sum of squared residuals there, px^2 or in units of the stated noise
+    rotations: FloatArray  # (K, 3, 3): best attitudes
+
+
+@one_thread()
+def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
+    """Go through the stages of `calibrate` without covariances, compression and whatever else a
+    result holds.
+
+    CalibrationError as for `calibrate`, whose ``efficient`` and ``three_stage`` are the methods.
+    """
+    likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
+    check_count(likelihood, camera)
+    pairs = PairObjective(likelihood.frames, camera.distortion)
+    stages, status = _stages(
+        pairs, camera, likelihood, method, "lm", ITERATIONS, pairs_read=method != "efficient"
+    )
+    return _fitted(likelihood, camera, stages[-1].theta, status)
+
+
+@one_thread()
+def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
+    """Another distortion model on the same stars, from the optics and attitudes of a calibration.
+
+    CalibrationError when neither they nor the nominal camera lead to an estimate.
+    """
+    likelihood = MarginalLikelihood(obs, model, axes=True)
+    start = cal.nominal.replace(
+        distortion=model, coefficients=(0.0,) * len(get_model(model).coefficients)
+    )
+    check_count(likelihood, start)
+    known = dict(zip(cal.parameter_names, cal.theta, strict=True))
+    if get_model(model).direction != get_model(cal.camera.distortion).direction:
+        known = dict(list(known.items())[:3])
+    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    theta = np.array([known.get(name, 0.0) for name in start.parameter_names])
+    stage = refinement_stage(likelihood, theta, ITERATIONS, _gain(likelihood, _LAST_STEP), "unseen")
+    try:
+        return _fitted(likelihood, start, stage.theta, stage.status)
+    except CalibrationError:
+        return fit(obs, start)
+
+
+def _fitted(
+    likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, status: Status
+) -> Fit:
+    raise_unless_good(check_camera(camera.with_theta(theta), status))
+    sums, attitudes = likelihood.sums(theta)
+    raise_unless_good(
+        check_noise(noise_of(sums.normal.cost, likelihood.frames), camera, Status.CONVERGED)
+    )
+    return Fit(theta, sums.normal.cost, attitudes.rotations)
+
+
+def _gain(likelihood: MarginalLikelihood, step: float) -> float:
+    """Relative gain of a step of so many standard deviations."""
+    return step**2 / max(likelihood.dof, 1)
+
+
+def _stages(
+    pairs: PairObjective,
+    camera: Camera,
+    likelihood: MarginalLikelihood,
+    method: str,
+    solver: str,
+    max_iterations: int,
+    tolerance: float = REFINEMENT_TOLERANCE,
+    last: Last = "seen",
+    pairs_read: bool = True,
+) -> tuple[list[Stage], Status]:
+    """All stages of a Gaussian fit, and how they ended; `tolerance` and `last` are those of the
+    refinement.
+
+    Where nobody reads the estimate from interstar angles, it need only lead to the refinement.
+    """
+    sampled = method == "efficient" and solver == "lm"
+    stages = (
+        _sampled_stages(pairs, camera, max_iterations, _gain(likelihood, _LAST_PAIR_STEP))
+        if sampled
+        else []
+    )
+    ending: tuple[float, Last] = (
+        (PAIR_TOLERANCE, "seen") if pairs_read else (_SAMPLE_TOLERANCE, "unseen")
+    )
+    stages = stages or _pair_stages(pairs, camera, solver, max_iterations, *ending)
+    most = IMPLAUSIBLE_NOISE * camera.width_px
+    noise = _noise_at(pairs, likelihood, stages[-1].theta)
+    if _strayed(stages[-1], camera) or noise > most:
+        # In a field of few degrees interstar angles hardly see the principal point, and where stars
+        # state very unequal noise they go by the worst ones; positions lead to the estimate from
+        # the nominal optics in a few steps.
+        own = MarginalLikelihood(likelihood.frames, camera.distortion)
+        direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
+        if direct.status.ok:
+            if pairs_read or noise_px(own, direct.theta) > noise:
+                again = joint_stage(pairs, camera, direct.theta, solver, max_iterations, *ending)
+                stages[-1] = min(stages[-1], again, key=_badness)
+                noise = _noise_at(pairs, likelihood, stages[-1].theta)
+            if method == "efficient" and noise_px(own, direct.theta) <= min(noise, most):
+                likelihood.use_sums(*own.sums(direct.theta))
+                return [*stages, direct], direct.status
+    # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions
+    # do.
+    status = check_noise(noise, camera, stages[-1].status)
+    if status.ok and method == "efficient":
+        stages.append(
+            refinement_stage(likelihood, stages[-1].theta, max_iterations, tolerance, last)
+        )
+        status = stages[-1].status
+    return stages, status
+
+
+def _noise_at(pairs: PairObjective, likelihood: MarginalLikelihood, theta: FloatArray) -> float:
+    rotations = pairs.rotations_at(theta)
+    likelihood.use_rotations(likelihood.start_rotations(theta) if rotations is None else rotations)
+    return noise_px(likelihood, theta)
+
+
+def _strayed(stage: Stage, camera: Camera) -> bool:
+    """Whether a stage did not converge, or ended far from the nominal principal point."""
+    return not stage.status.ok or _far(stage, camera)
+
+
+def _far(stage: Stage, camera: Camera) -> bool:
+    return float(np.max(np.abs(stage.theta[:2] - camera.theta[:2]))) > _FAR * camera.width_px
+
+
+def noise_model_fit(
+    obs: Observations, camera: Camera, method: str, solver: str, max_iterations: int
+) -> Calibration:
+    """Calibrate, fit how the noise varies, and refine with the weights that follow; even noise
+    changes nothing.
+    """
+    calibration = gaussian_fit(
+        obs, camera, MarginalLikelihood(obs, camera.distortion), method, solver, max_iterations
+    )
+    if calibration.status.ok:
+        model, theta = fit_noise(obs, calibration.camera, max_iterations=max_iterations)
+        if model.varies:
+            obs = obs.weighted(model.sigma_px(obs), model.axes)
+            likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
+            likelihood.use_rotations(likelihood.start_rotations(theta))
+            # The estimate from interstar angles has no weights; its covariance and the refinement
+            # do.
+            stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]
+            pair_theta = calibration.pair_theta
+            covariance = _pair_covariance(
+                PairObjective(likelihood.frames, camera.distortion), likelihood, pair_theta
+            )
+            status = stages[-1].status
+            calibration = assemble(
+                obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance
+            )
+        settings = {**calibration.provenance["settings"], "noise": "model"}
+        record = {**calibration.provenance, "settings": settings, "noise_model": model.record()}
+        calibration = replace(calibration, provenance=record)
+    return calibration
+
+
+def robust_fit(
+    obs: Observations,
+    camera: Camera,
+    frames: StarFrames,
+    solver: str,
+    max_iterations: int,
+    nu: float | None,
+) -> Calibration:
+    model = camera.distortion
+
+    def fit(trusted: StarFrames, all_parameters: bool) -> list[Stage]:
+        if not all_parameters:
+            stage = optics_stage(trusted, camera, solver, max_iterations)
+            return [stage if stage.status.ok else focal_stage(trusted, camera, max_iterations)]
+        pairs = PairObjective(trusted, model)
+        stages = _pair_stages(pairs, camera, solver, max_iterations)
+        if _strayed(stages[-1], camera):
+            own = MarginalLikelihood(trusted, model)
+            direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
+            noise = _noise_at(pairs, MarginalLikelihood(trusted, model), stages[-1].theta)
+            if direct.status.ok and not (
+                stages[-1].status.ok and noise < noise_px(own, direct.theta)
+            ):
+                stages[-1] = replace(direct, name=stages[-1].name)
+        return stages
+
+    try:
+        start = robust_start(frames, model, camera.theta, fit)
+    except CalibrationError as error:
+        if error.status is None or error.status not in EXPLAINED:
+            raise
+        raise failed(
+            MarginalLikelihood(frames, model), camera.theta, camera, error.status
+        ) from None
+    pair_theta = start.stages[-1].theta
+    found = refine(frames, model, pair_theta, start.rotations, nu, max_iterations)
+    theta, sigma, state, information = (
+        found.stage.theta,
+        found.sigma,
+        found.state,
+        found.information,
+    )
+    status = found.stage.status
+    if (
+        not np.isfinite(state.value)
+        or is_singular(information.matrix)
+        or is_singular(found.covariance)
+    ):
+        reason = status if not status.ok else Status.SINGULAR
+        raise failed(MarginalLikelihood(start.frames, model), theta, camera, reason)
+    result = camera.with_theta(theta)
+    status = check_camera(result, status)
+    gaussian, matrix = (
+        MarginalLikelihood(start.frames, model),
+        scaled_inverse(found.covariance) * sigma**2,
+    )
+    names, factors = undetermined(gaussian, theta, matrix, sigma, camera, status)
+    if names:
+        status = Status.SINGULAR
+    settings: dict[str, object] = {"method": "efficient", "solver": solver, "distortion": model}
+    settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
+    record = provenance(None, settings, obs.data_hash) | coma_record(camera, factors)
+    residuals = frames.in_pixels(state.e).T
+    record["student_t"] = {
+        "dof": found.nu,
+        "dof_std": found.nu_std,
+        "stars_out_of_field": int(np.sum(~state.seen)),
+    }
+    return Calibration(
+        camera=result,
+        nominal=camera,
+        method="efficient",
+        solver=solver,
+        theta=theta,
+        covariance=found.covariance * np.outer(factors, factors),
+        sigma=sigma,
+        sigma_std=found.sigma_std,
+        sigma_name=sigma_parameter(frames.weight is not None).name,
+        stages=(*start.stages, found.stage),
+        status=status,
+        undetermined=names,
+        frame_ids=obs.frame_ids,
+        quaternions=rotation_to_quaternion(state.rotations),
+        residuals_px=residuals,
+        chi2=float(np.sum(state.weight * state.e**2)),
+        dof=state.dof - len(theta),
+        information=information.matrix,
+        rotation_per_theta=information.rotation_per_theta,
+        attitude_noise=information.attitude_noise,
+        pair_theta=pair_theta,
+        pair_covariance=_pair_covariance(PairObjective(start.frames, model), gaussian, pair_theta),
+        compressed=compress_reweighted(found),
+        provenance=record,
+        fingerprints=Fingerprints.of(obs, residuals, camera.centre_px),
+    )
+
+
+def _sampled_stages(
+    pairs: PairObjective, camera: Camera, max_iterations: int, tolerance: float
+) -> list[Stage]:
+    """The stages on interstar angles, from their start values near to the minimum on a sample of
+    the frames alone.
+
+    The last stage ends on all frames, so that the estimate is theirs. Empty where there are not so
+    many frames that it saves time, or where the sample or all frames from its estimate do not
+    converge.
+    """
+    frames = pairs.frames
+    wanted = max(_SAMPLE_FRAMES, -(-_SAMPLE_STARS * frames.n_frames // frames.n_stars))
+    if frames.n_frames < 3 * wanted:
+        return []
+    chosen = np.zeros(frames.n_frames, dtype=bool)
+    chosen[one_of_each(frames.n_frames, wanted)] = True
+    sample = PairObjective(frames.select(np.repeat(chosen, frames.sizes)), pairs.model_name)
+    stages = _pair_stages(sample, camera, "lm", max_iterations, _SAMPLE_TOLERANCE, "unseen")
+    if not stages[-1].status.ok:
+        return []
+    last = joint_stage(pairs, camera, stages[-1].theta, "lm", max_iterations, tolerance, "unseen")
+    if not last.status.ok:
+        return []
+    scales = {"distortion": frames.n_stars / sample.frames.n_stars}
+    by_pair = pairs.n_pairs / sample.n_pairs
+    first = [
+        replace(stage, cost=stage.cost * scales.get(stage.name, by_pair)) for stage in stages[:-1]
+    ]
+    return [*first, begun_on_sample(stages[-1], last, by_pair)]
+
+
+def _pair_stages(
+    pairs: PairObjective,
+    camera: Camera,
+    solver: str,
+    max_iterations: int,
+    tolerance: float = PAIR_TOLERANCE,
+    last: Last = "seen",
+) -> list[Stage]:
+    frames = pairs.frames
+    stages = [optics_stage(frames, camera, solver, max_iterations, tolerance, last)]
+    # Without an optical axis there is nothing to attach the distortion to; later stages would only
+    # hide it.
+    if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
+        stages.append(distortion_stage(frames, camera, stages[0].theta))
+        stages.append(
+            joint_stage(pairs, camera, stages[1].theta, solver, max_iterations, tolerance, last)
+        )
+        if not stages[-1].status.ok or _far(stages[0], camera):
+            # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the
+            # linear stage may then lead to another minimum or into a fold; the nominal optics
+            # without distortion are the safer start.
+            start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
+            again = joint_stage(pairs, camera, start, solver, max_iterations, tolerance, last)
+            stages[-1] = min(stages[-1], again, key=_badness)
+    return stages
+
+
+def _badness(stage: Stage) -> tuple[bool, float]:
+    """Converged before not, then by cost."""
+    cost = float(stage.cost[-1])
+    return not stage.status.ok, cost if np.isfinite(cost) else float("inf")

@@ -1,0 +1,418 @@
+"""The result of a calibration: estimate, uncertainty and how it was reached; saves itself without
+loss.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.display import Shown
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path, reading
+from starcal_uq.core.manifest import digest
+from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
+from starcal_uq.core.status import Status
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
+from starcal_uq.estimation.residual_map import PartitionSums
+from starcal_uq.estimation.stages import Stage
+from starcal_uq.estimation.undetermined import remedy_of
+from starcal_uq.likelihood.compressed import CompressedLikelihood
+from starcal_uq.likelihood.star_errors import StarErrors
+from starcal_uq.maths.intervals import student_quantile
+from starcal_uq.maths.linear import correlation_of, is_positive
+from starcal_uq.observations.repeats import Fingerprints
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.estimation.noise_model import NoiseModel
+    from starcal_uq.observations.table import Observations
+
+# Fields whose arrays grow with the data or the iterations: they stand in an archive beside the
+# document.
+_APART = (
+    "frame_ids",
+    "quaternions",
+    "residuals_px",
+    "trajectory",
+    "cost",
+    "sigmas",
+    "sizes",
+    "xy_px",
+    "error_px",
+)
+# Fields of the document, in the order in which it is read.
+_DOCUMENT = (
+    *(
+        "status",
+        "parameter_names",
+        "method",
+        "solver",
+        "sigma",
+        "sigma_std",
+        "sigma_name",
+        "chi2",
+        "dof",
+        "provenance",
+    ),
+    *(
+        "theta",
+        "covariance",
+        "information",
+        "rotation_per_theta",
+        "attitude_noise",
+        "pair_theta",
+        "pair_covariance",
+    ),
+    *(
+        "camera",
+        "nominal",
+        "stages",
+        "compressed",
+        "fingerprints",
+        "star_errors",
+        "partitions",
+        "undetermined",
+    ),
+)
+# Hash of the archive that belongs to the document.
+_ARCHIVE = "archive_sha256"
+# What the document says of a stage; its last estimate is there for readers.
+_STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
+
+
+@dataclass(frozen=True)
+class Calibration(Shown):
+    """Optics and distortion estimated from star observations.
+
+    p is the number of parameters, K of frames, N of stars. A recursive method that was given a
+    stream of frames has kept none of them: its `frame_ids`, `quaternions` and `residuals_px` are
+    empty, `chi2` and `compressed` are those of the linearised frames, and `n_stars` and `n_frames`
+    count what went by.
+
+    Attributes
+    ----------
+    camera : Camera
+        The estimate.
+    nominal : Camera
+        The start.
+    method : str
+        ``efficient``, ``three_stage``, ``least_squares``, ``samaan`` or ``griffith``.
+    solver : str
+        ``lm``, ``minpack``, ``ipopt``, or ``filter`` for the recursive methods.
+    theta : (p,) array
+        Estimate in px units, order x0, y0, f, k...
+    covariance : (p, p) array
+        Covariance of `theta` at the estimated noise, px units.
+    sigma : float
+        Estimated noise: px per axis, or a factor on the stated noise of the stars.
+    sigma_std : float
+        Standard error of `sigma`, in its unit.
+    sigma_name : str
+        ``sigma`` or ``sigma_scale``.
+    stages : tuple of Stage
+        Trajectories of the stages.
+    status : Status
+        Converged, or why not.
+    frame_ids : (K,) array of int
+        Frames.
+    quaternions : (K, 4) array
+        Scalar-last R_cam_icrs at the estimate.
+    residuals_px : (N, 2) array
+        Observed minus predicted, px, rows as in the observations.
+    chi2 : float
+        Sum of squared residuals, px^2 (or in units of the stated noise).
+    dof : int
+        Degrees of freedom: ``sum_k (2 m_k - 3) - p``.
+    information : (p, p) array
+        Fisher information of the likelihood with the attitudes eliminated, at `sigma`.
+    rotation_per_theta : (3, p) array
+        Mean over frames of d(attitude, rad)/d(theta): the common rotation that a wrong parameter
+        causes.
+    attitude_noise : (3, 3) array
+        Mean over frames of the attitude covariance due to centroid noise, rad^2.
+    pair_theta : (p,) array
+        Estimate from interstar angles: that of stage 3, the paper's, or of the method itself where
+        it has no other.
+    pair_covariance : (p, p) array
+        Sandwich (Godambe) covariance of `pair_theta`, px units; with fewer than 50 frames per
+        parameter that which Gaussian noise gives.
+    compressed : CompressedLikelihood
+        The whole data set's likelihood around the estimate.
+    provenance : dict
+        Versions, settings, time and the hash of the data.
+    fingerprints : Fingerprints or None
+        What identifies the frames, so that a measurement is not counted twice; None for a stream,
+        and for a calibration by a version before this one.
+    star_errors : StarErrors or None
+        Direction errors of the stars, where they were asked for: `covariance`, `information` and
+        `compressed` hold them, and residuals and attitudes are those after each star's own offset.
+    partitions : PartitionSums or None
+        Of a calibration of partitioned observations, sums over all of their residuals: `frame_ids`,
+        `quaternions`, `residuals_px`, `pair_theta` and `pair_covariance` are those of a sample of
+        frames, everything else of all.
+    undetermined : tuple of str
+        Names of parameters that the data leave open; `status` is then SINGULAR.
+    """
+
+    camera: Camera
+    nominal: Camera
+    method: str
+    solver: str
+    theta: FloatArray
+    covariance: FloatArray
+    sigma: float
+    sigma_std: float
+    sigma_name: str
+    stages: tuple[Stage, ...]
+    status: Status
+    frame_ids: IntArray
+    quaternions: FloatArray
+    residuals_px: FloatArray
+    chi2: float
+    dof: int
+    information: FloatArray
+    rotation_per_theta: FloatArray
+    attitude_noise: FloatArray
+    pair_theta: FloatArray
+    pair_covariance: FloatArray
+    compressed: CompressedLikelihood
+    provenance: AnyDict
+    fingerprints: Fingerprints | None = None
+    star_errors: StarErrors | None = None
+    partitions: PartitionSums | None = None
+    undetermined: tuple[str, ...] = ()
+
+    SHAPES: ClassVar[Shapes] = {
+        **{
+            "parameter_names": ("p",),
+            "theta": ("p",),
+            "covariance": ("p", "p"),
+            "information": ("p", "p"),
+        },
+        **{"frame_ids": ("k",), "quaternions": ("k", 4), "residuals_px": ("n", 2)},
+        **{"rotation_per_theta": (3, "p"), "attitude_noise": (3, 3)},
+        **{"pair_theta": ("p",), "pair_covariance": ("p", "p")},
+    }
+    FINITE: ClassVar[tuple[str, ...]] = ("theta", "covariance", "sigma", "sigma_std", "information")
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        return self.camera.parameter_names
+
+    @property
+    def remedy(self) -> str:
+        """What is wrong with a calibration that did not end well, and what helps, in one clause."""
+        return remedy_of(self.status, self.undetermined, self.solver)
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviation of each parameter, (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation matrix, (p, p)."""
+        return correlation_of(self.covariance)[0]
+
+    def interval(self, probability: float = 0.95) -> FloatArray:
+        """Interval of each parameter without sampling, (p, 2), px units: Student's with `dof`
+        degrees of freedom.
+
+        A sigma from the scatter of frames has its own degrees of freedom, which provenance states.
+        """
+        own = self.provenance.get("interval_dof", {})
+        half = self.sigmas * [
+            student_quantile(probability, own.get(n, self.dof)) for n in self.parameter_names
+        ]
+        return np.stack([self.theta - half, self.theta + half], axis=1)
+
+    def sigma_interval(self, probability: float = 0.95) -> FloatArray:
+        """Interval of the noise without sampling, (2,), in the unit of `sigma`: of chi-square with
+        `dof`.
+        """
+        from scipy.special import chdtri
+
+        tail = 0.5 * (1.0 - probability)
+        return self.sigma * np.sqrt(
+            [self.dof / float(chdtri(self.dof, q)) for q in (tail, 1.0 - tail)]
+        )
+
+    @property
+    def noise_model(self) -> NoiseModel | None:
+        """How the noise varies, of a calibration with ``noise="model"``; None otherwise."""
+        from starcal_uq.estimation.noise_model import noise_model_of
+
+        return noise_model_of(self)
+
+    @property
+    def fitted_noise(self) -> NoiseModel | None:
+        """The noise model where it found that the noise varies; otherwise stars have what they
+        state, or one noise.
+        """
+        model = self.noise_model
+        return model if model is not None and model.varies else None
+
+    @property
+    def inflation(self) -> FloatArray | None:
+        """Factors (p,) that `covariance` was accepted to be wider by, per sigma; None for that of
+        the likelihood.
+        """
+        factors = self.provenance.get("settings", {}).get("inflation")
+        return (
+            None if factors is None else np.array([factors[name] for name in self.parameter_names])
+        )
+
+    @property
+    def coma_factors(self) -> FloatArray | None:
+        """Factors (p,) on the sigmas of the likelihood that leave out the coma of a distortion that
+        may be none.
+        """
+        factors = self.provenance.get("without_coma")
+        return (
+            None if factors is None else np.array([factors[name] for name in self.parameter_names])
+        )
+
+    @property
+    def n_stars(self) -> int:
+        """Number of stars."""
+        return (
+            self.compressed.n_stars
+            if self.partitions
+            else len(self.residuals_px) or self.compressed.n_stars
+        )
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return (
+            self.compressed.n_frames
+            if self.partitions
+            else len(self.frame_ids) or self.compressed.n_frames
+        )
+
+    def data_hash_of(self, obs: Observations) -> str:
+        """Hash of the data that a table stands for: that of all partitions for the sample that was
+        kept of them.
+        """
+        record = self.provenance.get("partitions", {})
+        if record.get("sample_sha256") == obs.data_hash:
+            return str(self.provenance["data_sha256"])
+        return obs.data_hash
+
+    @property
+    def has_residuals(self) -> bool:
+        """False for the result of a stream, whose stars are gone."""
+        return len(self.residuals_px) > 0
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per parameter: start, estimate, sigma, 95 % interval and unit; the noise is the
+        last row.
+        """
+        import pandas as pd
+
+        rows = [
+            {
+                "parameter": p.name,
+                "start": start,
+                "estimate": value,
+                "sigma": sigma,
+                "low": low,
+                "high": high,
+            }
+            | {"unit": p.unit}
+            for p, start, value, sigma, (low, high) in zip(
+                *(
+                    parameters(self.camera.distortion),
+                    self.nominal.theta,
+                    self.theta,
+                    self.sigmas,
+                    self.interval(),
+                ),
+                strict=True,
+            )
+        ]
+        unit = "px" if self.sigma_name == "sigma" else "1"
+        rows.append(
+            {
+                "parameter": self.sigma_name,
+                "start": np.nan,
+                "estimate": self.sigma,
+                "sigma": self.sigma_std,
+                "low": float(self.sigma_interval()[0]),
+                "high": float(self.sigma_interval()[1]),
+                "unit": unit,
+            }
+        )
+        return pd.DataFrame(rows)
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name}={value:.8g}+-{sigma:.2g}"
+            for name, value, sigma in zip(
+                self.parameter_names, self.theta, self.sigmas, strict=True
+            )
+        )
+        return f"Calibration({values}, {self.sigma_name}={self.sigma:.4g}, {self.status.name})"
+
+    def save(self, path: str | Path) -> None:
+        """Write ``path`` (JSON) and, beside it, the large arrays as ``.npz``; each file atomically.
+
+        Parameters
+        ----------
+        path : str or Path
+            File ending in ``.json``; overwritten.
+        """
+        path = Path(path)
+        arrays: Arrays = {}
+        plain = to_plain(self, arrays, _APART) | {"parameter_names": list(self.parameter_names)}
+        for stage, kept in zip(self.stages, plain["stages"], strict=True):
+            kept |= {"iterations": stage.iterations, "theta": stage.theta.tolist()}
+        plain["stages"] = [{name: kept[name] for name in _STAGE} for kept in plain["stages"]]
+        with atomic_path(path.with_suffix(".npz")) as temporary:
+            with temporary.open("wb") as stream:
+                np.savez_compressed(stream, allow_pickle=False, **arrays)
+            archive = digest(temporary)
+        kept = {
+            name: plain[name] for name in _DOCUMENT if plain[name] is not None and plain[name] != []
+        }
+        write_json(kept | {_ARCHIVE: archive}, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Calibration:
+        """Inverse of `save`.
+
+        Raises
+        ------
+        RunFolderError
+            When a file is missing or not a calibration, when the two are not of one calibration, or
+            when the information matrix is not positive definite.
+        """
+        path, remedy = Path(path), "run `starcal-uq calibrate` again"
+        beside = path.with_suffix(".npz")
+        with reading(path, "a calibration", remedy):
+            document = json.loads(path.read_text(encoding="utf-8"))
+        with reading(beside, "the archive of a calibration", remedy):
+            arrays = read_arrays(beside)
+            archive = digest(beside)
+        with reading(path, "a calibration", remedy):
+            # Files of versions before this one do not name their archive.
+            if document.pop(_ARCHIVE, archive) != archive:
+                raise RunFolderError(
+                    f"{path}: is not of the same calibration as {beside.name} beside it; read it "
+                    "again if it is being "
+                    f"written, or {remedy}."
+                )
+            found = from_plain(cls, document, arrays)
+            # What the data leave open has no information.
+            if not is_positive(found.information, strictly=not found.undetermined):
+                raise ValueError("its information matrix is not positive definite")
+            return found

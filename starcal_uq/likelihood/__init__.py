@@ -1,0 +1,1 @@
+"""Likelihoods of identified stars, their sums, and the solvers that maximise them."""

@@ -1,0 +1,325 @@
+"""The attitude-marginalised Gaussian likelihood of star positions.
+
+Each frame's attitude has a flat prior on rotations and is integrated out by Laplace's method around
+its best value:
+
+    log L(theta, sigma) = sum_k [ -S_k(theta) / (2 sigma^2) - (2 m_k - 3) log sigma - 1/2 log |A_k^T
+    A_k| ],
+
+where S_k is the sum of squared (whitened) residuals at the frame's best attitude and A_k the
+derivative of its pixels with respect to that attitude. The information on theta is the Schur
+complement of the attitudes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
+from starcal_uq.core.types import FloatArray
+from starcal_uq.likelihood.loops import kernels
+from starcal_uq.likelihood.solvers import Normal
+from starcal_uq.likelihood.sums import (
+    ATTITUDE_STEPS,
+    ATTITUDE_TOLERANCE_RAD,
+    BLOCK_STARS,
+    Attitudes,
+    NormalSums,
+    settled_sums,
+)
+from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
+from starcal_uq.observations.frames import StarFrames
+
+if TYPE_CHECKING:
+    from starcal_uq.observations.table import Observations
+
+# Attitudes that are wrong by this much cost a likelihood nothing that is left after their
+# elimination to first order.
+TURN_RAD = 1e-8
+# The same of a table of a few hundred stars, whose likelihood is then known to 1e-5.
+_NEAR_RAD = 1e-6
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The model at the best attitude of every frame."""
+
+    rotations: FloatArray  # (K, 3, 3): R_cam_icrs
+    b: FloatArray  # (3, N): catalogue directions in the camera frame
+    # (2, N): residuals, observed minus predicted, divided by the stated noise where there is one
+    e: FloatArray
+    # (3, 2, N): derivative of the (whitened) prediction with respect to the frame's rotation
+    # vector.
+    attitude: FloatArray
+    inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
+    log_determinant: FloatArray  # (K,): log |A^T A|
+
+
+class MarginalLikelihood:
+    """Exact attitude-marginalised likelihood of a table of observations.
+
+    With `axes` it knows the noise of x and y apart, where a noise model has fitted it; without,
+    stars are weighed alike along both.
+    """
+
+    def __init__(self, obs: Observations | StarFrames, model_name: str, axes: bool = False) -> None:
+        self.frames = (
+            obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes)
+        )
+        self.model_name = model_name
+        self._rotations: FloatArray | None = None
+        self._last: tuple[NormalSums, Attitudes] | None = None
+
+    @property
+    def dof(self) -> int:
+        """Independent numbers in the data after the attitudes: ``sum_k (2 m_k - 3)``."""
+        return 2 * self.frames.n_stars - 3 * self.frames.n_frames
+
+    @property
+    def kernels(self) -> str:
+        """``numpy`` or ``numba``: what sums over all frames are made with."""
+        return (
+            "numpy"
+            if self.frames.axes is not None
+            else kernels(self.model_name, self.frames.n_stars)
+        )
+
+    def start_rotations(self, theta: FloatArray) -> FloatArray:
+        """Attitudes (K, 3, 3) by QUEST at theta."""
+        b = unproject_theta(self.model_name, theta, self.frames.pixel.T)
+        weights = self._quest_weights()
+        found = quest(
+            b, self.frames.r.T, self.frames.starts, weights, covariance=False, on_degenerate="flag"
+        )
+        return found.rotations
+
+    def _quest_weights(self) -> FloatArray | None:
+        return None if self.frames.weight is None else self.frames.weight**2
+
+    def profile(
+        self,
+        theta: FloatArray,
+        rotations: FloatArray | None = None,
+        tolerance: float = ATTITUDE_TOLERANCE_RAD,
+    ) -> tuple[Profile, float]:
+        """The model at the best attitudes for theta (p,), px units, searched from `rotations` (K,
+        3, 3) or QUEST's.
+
+        With `rotations`, theta may be that of every star, (p, N). Attitudes are the best ones to
+        `tolerance`, rad. The second value is the sum of squared whitened residuals S(theta);
+        infinite when the model is not finite.
+        """
+        theta, frames = np.asarray(theta, dtype=np.float64), self.frames
+        n, k = frames.n_stars, frames.n_frames
+        state = Profile(
+            rotations=np.empty((k, 3, 3)),
+            b=np.empty((3, n)),
+            e=np.empty((2, n)),
+            attitude=np.empty((3, 2, n)),
+            inverse=np.empty((3, 3, k)),
+            log_determinant=np.empty(k),
+        )
+        total = 0.0
+        with np.errstate(all="ignore"):
+            if rotations is None:
+                rotations = self.start_rotations(theta)
+            # Blocks whose arrays stay in the cache while their attitudes are searched.
+            for first, last in frames.parts(BLOCK_STARS):
+                stars = slice(int(frames.starts[first]), int(frames.starts[last]))
+                own = theta if theta.ndim == 1 else theta[:, stars]
+                total += self._settle(
+                    state, slice(first, last), stars, own, rotations[first:last], tolerance
+                )
+        # Noise-free data leave rounding, of either sign.
+        return state, max(total, 0.0) if np.isfinite(total) else float("inf")
+
+    def _settle(
+        self,
+        state: Profile,
+        which: slice,
+        stars: slice,
+        theta: FloatArray,
+        rotations: FloatArray,
+        tolerance: float,
+    ) -> float:
+        """Search the attitudes of some frames and write the model at them into `state`; the sum of
+        squares, or NaN.
+        """
+        part = self.frames.part(which.start, which.stop)
+        n = part.n_stars
+        e, a = np.empty((2, n)), np.empty((3, 2, n))
+        kernel, cost = forward_kernel(self.model_name, "attitude"), np.nan
+        for _ in range(ATTITUDE_STEPS):
+            b = part.rotated(rotations)
+            kernel.into((theta, b, forward_root(self.model_name, theta, b)), (e, a.reshape(6, n)))
+            np.subtract(part.pixel, e, out=e)
+            part.whiten(e)
+            part.whiten(a)
+            products = np.stack(
+                [np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)]
+            )
+            inverse, determinant = inverse_symmetric(part.sum(products))
+            slope = part.sum(np.sum(a * e[None], axis=1))
+            step = np.einsum("ijk,jk->ik", inverse, slope)
+            left = float(np.sum(e * e) - np.sum(step * slope))
+            if not np.isfinite(left):
+                break
+            if np.max(np.abs(step)) < tolerance:
+                cost = left
+                break
+            # Stars that fit no attitude never come here for the last time: nothing there is a
+            # minimum.
+            rotations = exp_rotation(step.T) @ rotations
+        state.rotations[which], state.inverse[..., which], state.log_determinant[which] = (
+            rotations,
+            inverse,
+            np.log(determinant),
+        )
+        state.b[:, stars], state.e[:, stars], state.attitude[..., stars] = b, e, a
+        return cost
+
+    def rotations_at(self, theta: FloatArray) -> FloatArray:
+        """Best attitudes (K, 3, 3) at theta."""
+        return self.profile(theta, self.rotations)[0].rotations
+
+    @property
+    def rotations(self) -> FloatArray | None:
+        """Where attitude searches start, (K, 3, 3), if that was said."""
+        if self._rotations is None and self._last is not None:
+            attitudes = self._last[1]
+            self._rotations = attitudes.at(attitudes.theta)
+        return self._rotations
+
+    def use_rotations(self, rotations: FloatArray) -> None:
+        """Start later attitude searches here, which saves QUEST when theta moves little."""
+        self._rotations, self._last = rotations, None
+
+    @property
+    def last_sums(self) -> tuple[NormalSums, Attitudes] | None:
+        """What `use_sums` was told."""
+        return self._last
+
+    def use_sums(self, sums: NormalSums, attitudes: Attitudes) -> None:
+        """Start later attitude searches from those that follow from these sums, and take them for
+        settled if they are.
+
+        `sums` and `attitudes` are those of all frames at one point, as
+        `starcal_uq.likelihood.sums.frame_sums` gives them.
+        """
+        self._rotations, self._last = None, (sums, attitudes)
+
+    def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
+        """Log likelihood at theta (p,) and sigma (px, or the common factor on stated noise)."""
+        sums, _ = self.sums(theta, tolerance=TURN_RAD)
+        if not np.isfinite(sums.cost):
+            return -np.inf
+        return float(
+            -0.5 * sums.cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * sums.log_determinant
+        )
+
+    def log_likelihoods(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Log likelihood (n,) at theta (n, p) and sigma (n,), many points of a small table at a
+        time.
+
+        A pass over a few hundred stars spends its time between the arrays: the table is repeated
+        for as many points as fill a block, and attitudes start from those that follow from the last
+        sums.
+        """
+        frames, last = self.frames, self._last
+        together = BLOCK_STARS // frames.n_stars
+        if last is None or together < 2:
+            return np.array(
+                [self.log_likelihood(t, float(s)) for t, s in zip(theta, sigma, strict=True)]
+            )
+        values = np.empty(len(theta))
+        for first in range(0, len(theta), together):
+            some = slice(first, min(first + together, len(theta)))
+            points = theta[some]
+            n = len(points)
+            rotations = np.concatenate([last[1].at(point) for point in points])
+            copies = MarginalLikelihood(StarFrames.joined([frames] * n), self.model_name)
+            own = np.repeat(points.T, frames.n_stars, axis=1)
+            state, cost = copies.profile(own, rotations, _NEAR_RAD)
+            if not np.isfinite(cost):
+                # One point without attitudes leaves those of the others unsettled.
+                values[some] = [
+                    self.log_likelihood(t, float(s))
+                    for t, s in zip(points, sigma[some], strict=True)
+                ]
+                continue
+            left = copies.project_out(state, state.e[None])[0]
+            squares = np.sum(left**2, axis=0).reshape(n, -1).sum(axis=1)
+            volume = state.log_determinant.reshape(n, -1).sum(axis=1)
+            values[some] = (
+                -0.5 * squares / sigma[some] ** 2 - self.dof * np.log(sigma[some]) - 0.5 * volume
+            )
+        return values
+
+    def derivatives(self, theta: FloatArray, state: Profile) -> FloatArray:
+        """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed
+        attitudes.
+        """
+        _, h, _ = forward_kernel(self.model_name, "first")(
+            self.frames.n_stars, theta, state.b, forward_root(self.model_name, theta, state.b)
+        )
+        self.frames.whiten(h)
+        return h
+
+    def attitude_response(self, state: Profile, columns: FloatArray) -> FloatArray:
+        """Least-squares rotation vectors (q, 3, K) that reproduce columns (q, 2, N) of pixel
+        shifts.
+        """
+        products = [np.sum(a * columns, axis=1) for a in state.attitude]
+        x, y, z = (self.frames.sum(product)[:, None, :] for product in products)
+        response: FloatArray = x * state.inverse[0] + y * state.inverse[1] + z * state.inverse[2]
+        return response
+
+    def project_out(self, state: Profile, columns: FloatArray) -> FloatArray:
+        """Remove from columns (q, 2, N) what a rotation of each frame can reproduce."""
+        response = self.frames.spread(self.attitude_response(state, columns))
+        a = state.attitude
+        remainder: FloatArray = columns - sum(response[:, i, None, :] * a[i] for i in range(3))
+        return remainder
+
+    def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
+        """Turn columns (q, 2, N) into (q, m) with products by the covariance of the data, attitudes
+        eliminated.
+        """
+        return self.project_out(state, columns).reshape(len(columns), -1)
+
+    def evaluate(self, theta: FloatArray) -> Normal:
+        """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable
+        projection).
+        """
+        return self.sums(theta)[0].normal
+
+    def sums(
+        self,
+        theta: FloatArray,
+        residuals: FloatArray | None = None,
+        tolerance: float = ATTITUDE_TOLERANCE_RAD,
+    ) -> tuple[NormalSums, Attitudes]:
+        """Normal equations and attitudes at theta, searched from where they were last, from
+        `rotations` or by QUEST.
+
+        The whitened residuals there are written into `residuals` (2, N). Attitudes are the best
+        ones to `tolerance` (rad), and the sums those of the best ones to first order.
+        """
+        theta = np.asarray(theta, dtype=np.float64)
+        if self._last is not None:
+            sums, attitudes = self._last
+            if (
+                residuals is None
+                and sums.turn < tolerance
+                and np.array_equal(theta, attitudes.theta)
+            ):
+                return self._last
+            rotations = attitudes.at(theta)
+        else:
+            rotations = self.start_rotations(theta) if self._rotations is None else self._rotations
+        return settled_sums(self.frames, self.model_name, theta, rotations, residuals, tolerance)

@@ -1,0 +1,362 @@
+"""What a part of the frames says at one point of the parameters, in one pass over its stars.
+
+`frame_sums` gives the normal equations of the marginal likelihood with every frame's attitude
+eliminated: `NormalSums`, which add up over parts, and `Attitudes`, which stay with the part: where
+its attitudes stand, and how they follow the parameters to first order. A solver that moves both
+together, as bundle adjusters do, needs one pass for each of its steps:
+
+    sums, attitudes = frame_sums(part, model, theta, rotations)            # on every part, wherever
+    it is normal = sum_of(all_sums).normal                                       # cost, gradient,
+    Gauss-Newton matrix sums, attitudes = frame_sums(part, model, theta + step, attitudes.at(theta +
+    step))
+
+The stars are visited in blocks of whole frames whose temporaries stay in the processor's cache and
+are used again. In a block, A (3, 2, n) are the derivatives of the pixels with respect to the
+frames' rotation vectors, H (p, 2, n) those with respect to theta, and e the residuals, all
+whitened. With C the turn of all frames together that follows theta best, and H' = H - A C, the sums
+are
+
+    cost = e^T e - sum_k (A^T e)_k^T (A^T A)_k^-1 (A^T e)_k,
+    matrix = H'^T H' - sum_k (A^T H')_k^T (A^T A)_k^-1 (A^T H')_k.
+
+The principal point and the attitudes are nearly one gauge: without C, the difference of H^T H and
+what the attitudes take of it would lose five digits in a field of ten degrees, and nine in one of
+one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera.projection import forward_kernel, forward_root
+from starcal_uq.core.types import FloatArray
+from starcal_uq.likelihood import loops
+from starcal_uq.likelihood.solvers import Normal
+from starcal_uq.maths.linear import inverse_symmetric
+from starcal_uq.observations.frames import StarFrames
+
+# Stars whose arrays stay in the second-level cache, and are enough to hide the interpreter.
+BLOCK_STARS = 3072
+T = TypeVar("T")
+ATTITUDE_STEPS = 12
+ATTITUDE_TOLERANCE_RAD = 1e-9
+
+
+@dataclass(frozen=True)
+class NormalSums:
+    """Normal equations of some frames; they add up."""
+
+    cost: float  # Sum of squared whitened residuals, each frame's attitude best to first order
+    gradient: FloatArray  # (p,): half its derivative with respect to theta
+    matrix: FloatArray  # (p, p): Gauss-Newton matrix
+    log_determinant: float  # ``sum_k log |A^T A|_k``
+    turn: float  # Largest attitude step that is left, rad
+    # `n_stars`, `n_frames`: what was summed.
+    n_stars: int
+    n_frames: int
+
+    def __add__(self, other: NormalSums) -> NormalSums:
+        return NormalSums(
+            self.cost + other.cost,
+            self.gradient + other.gradient,
+            self.matrix + other.matrix,
+            self.log_determinant + other.log_determinant,
+            max(self.turn, other.turn),
+            self.n_stars + other.n_stars,
+            self.n_frames + other.n_frames,
+        )
+
+    @property
+    def normal(self) -> Normal:
+        """Cost, gradient and matrix for a solver; infinite where the model is not finite."""
+        if not (np.isfinite(self.cost) and np.isfinite(self.matrix).all()):
+            p = len(self.gradient)
+            return Normal(float("inf"), np.full(p, np.nan), np.full((p, p), np.nan))
+        # Noise-free data leave rounding, of either sign.
+        return Normal(max(self.cost, 0.0), self.gradient, 0.5 * (self.matrix + self.matrix.T))
+
+
+def sum_of(parts: Sequence[T]) -> T:
+    """All parts together, of whatever adds up."""
+    total: T = reduce(add, parts)
+    return total
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """Attitudes of K frames, and how the best ones follow the parameters."""
+
+    theta: FloatArray  # (p,): where the sums were taken, px units
+    rotations: FloatArray  # (K, 3, 3): R_cam_icrs there
+    shift: FloatArray  # (3, K): rotation vectors from them to the best ones, rad
+    response: FloatArray  # (3, p, K): derivative of the best ones with respect to theta
+    inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
+    log_determinant: FloatArray  # (K,): log |A^T A|
+    loops: str | None = None  # Distortion model whose loops made them; None where NumPy did
+
+    def at(self, theta: FloatArray) -> FloatArray:
+        """Best attitudes (K, 3, 3) at theta (p,), to first order."""
+        step = self.shift + np.einsum("ipk,p->ik", self.response, theta - self.theta)
+        if self.loops is not None:
+            return loops.turned_loop(self.loops, step, self.rotations)
+        return np.asarray(exp_rotation(step.T) @ self.rotations)
+
+
+class _Buffers:
+    """Arrays of one block, used again for the next one."""
+
+    def __init__(self, p: int, n: int) -> None:
+        self._columns = np.empty((4 + p) * 2 * n)
+        self._products = np.empty((4 + p) * (5 + p) // 2 * n)
+        self._one, self._two = np.empty((4 + p) * n), np.empty((4 + p) * n)
+        self.p = p
+
+    def columns(self, n: int) -> FloatArray:
+        """A, e and H: (3 + 1 + p, 2, n)."""
+        return self._columns[: (4 + self.p) * 2 * n].reshape(4 + self.p, 2, n)
+
+    def products(self, columns: FloatArray, depth: int) -> FloatArray:
+        """Products of the first rows (those of A) with themselves and the ones that follow, over
+        both axes: (.., n).
+        """
+        rows, _, n = columns.shape
+        total = depth * rows - depth * (depth - 1) // 2
+        out = self._products[: total * n].reshape(total, n)
+        first = 0
+        for i in range(depth):
+            count = rows - i
+            one, two = (buffer[: count * n].reshape(count, n) for buffer in (self._one, self._two))
+            np.multiply(columns[i:, 0], columns[i, 0], out=one)
+            np.multiply(columns[i:, 1], columns[i, 1], out=two)
+            np.add(one, two, out=out[first : first + count])
+            first += count
+        return out
+
+
+def _unpacked(sums: FloatArray, rows: int) -> tuple[FloatArray, FloatArray]:
+    """From the sums of `_Buffers.products`: packed A^T A (6, K), and A^T [e, H] (3, p + 1, K)."""
+    starts = (0, rows, 2 * rows - 1)
+    packed = np.concatenate([sums[first : first + 3 - i] for i, first in enumerate(starts)])
+    rest = np.stack([sums[first + 3 - i : first + rows - i] for i, first in enumerate(starts)])
+    return packed, rest
+
+
+def _common_turn(columns: FloatArray) -> FloatArray:
+    """C (3, p): the turn of all frames of a block together that follows theta best."""
+    flat = columns.reshape(len(columns), -1)
+    a, h = flat[:3], flat[4:]
+    none = np.zeros((3, len(h)))
+    try:
+        with np.errstate(all="ignore"):
+            turn = np.linalg.solve(a @ a.T, a @ h.T)
+    except np.linalg.LinAlgError:
+        return none
+    return np.asarray(turn) if np.isfinite(turn).all() else none
+
+
+def frame_sums(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    residuals: FloatArray | None = None,
+) -> tuple[NormalSums, Attitudes]:
+    """Normal equations of some frames, attitudes eliminated, in one pass.
+
+    `rotations` (K, 3, 3) are R_cam_icrs, the best ones to first order or better, as `Attitudes.at`
+    gives them, and `residuals` (2, N) is filled with the whitened ones there. Returns what adds up
+    over parts, not finite where the model is not, and what stays with the part.
+    """
+    theta = np.asarray(theta, dtype=np.float64)
+    fast = frames.axes is None and loops.kernels(model_name, frames.n_stars) == "numba"
+    path = loops.frame_loop if fast else _frame_blocks
+    with np.errstate(all="ignore"):
+        gram, shift, response, inverse, volume = path(
+            frames, model_name, theta, rotations, residuals
+        )
+        sums = NormalSums(
+            cost=float(gram[0, 0]),
+            gradient=-gram[0, 1:],
+            matrix=gram[1:, 1:],
+            log_determinant=float(np.sum(volume)),
+            turn=float(np.max(np.abs(shift), initial=0.0)),
+            n_stars=frames.n_stars,
+            n_frames=frames.n_frames,
+        )
+    return sums, Attitudes(
+        theta, rotations, shift, response, inverse, volume, model_name if fast else None
+    )
+
+
+def _frame_blocks(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    residuals: FloatArray | None,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """As `starcal_uq.likelihood.loops.frame_loop`, with NumPy."""
+    p, k = len(theta), frames.n_frames
+    gram, turn = np.zeros((p + 1, p + 1)), np.zeros((3, p))
+    packed, mixed = np.empty((6, k)), np.empty((3, p + 1, k))
+    for block in _columns(frames, model_name, theta, rotations, residuals):
+        flat, turn = block.columns.reshape(p + 4, -1), block.turn
+        gram += flat[3:] @ flat[3:].T
+        packed[:, block.place], mixed[:, :, block.place] = _unpacked(block.products(3), p + 4)
+    inverse, determinant = inverse_symmetric(packed)
+    solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
+    gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
+    return gram, solved[:, 0], -solved[:, 1:] - turn[:, :, None], inverse, np.log(determinant)
+
+
+class _Block(NamedTuple):
+    """A (3, 2, n), e (2, n) and H' (p, 2, n) of some frames, in a buffer that the next block uses
+    again.
+    """
+
+    place: slice
+    part: StarFrames
+    columns: FloatArray
+    turn: FloatArray
+    buffers: _Buffers
+
+    def products(self, depth: int) -> FloatArray:
+        """Sums over the stars of each frame of `_Buffers.products`."""
+        return self.part.sum(self.buffers.products(self.columns, depth))
+
+
+def _columns(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    residuals: FloatArray | None = None,
+) -> Iterator[_Block]:
+    """All frames in blocks, whitened; the common turn C is that of the first."""
+    p, starts = len(theta), frames.starts
+    blocks = frames.parts(BLOCK_STARS)
+    largest = max((int(starts[last] - starts[first]) for first, last in blocks), default=0)
+    buffers, kernel, turn = (
+        _Buffers(p, largest),
+        forward_kernel(model_name, "first"),
+        np.zeros((3, p)),
+    )
+    for first, last in blocks:
+        part = frames.part(first, last)
+        columns = buffers.columns(part.n_stars)
+        b = part.rotated(rotations[first:last])
+        flat = columns.reshape(2 * (p + 4), -1)
+        kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
+        np.subtract(part.pixel, columns[3], out=columns[3])
+        part.whiten(columns)
+        if residuals is not None:
+            residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
+        if first == 0:
+            turn = _common_turn(columns)
+        flat = columns.reshape(p + 4, -1)
+        flat[4:] -= turn.T @ flat[:3]
+        yield _Block(slice(first, last), part, columns, turn, buffers)
+
+
+def frame_normals(
+    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Normal equations of every single frame, attitudes eliminated, in one pass.
+
+    Returns products (K, p + 1, p + 1) of e and H without what the frame's attitude can reproduce,
+    rotation vectors (3, K) to the best attitudes, rad, and log |A^T A| (K,).
+    """
+    p, k = len(theta), frames.n_frames
+    rows = p + 4
+    sums = np.empty((rows * (rows + 1) // 2, k))
+    with np.errstate(all="ignore"):
+        for block in _columns(frames, model_name, theta, rotations):
+            sums[:, block.place] = block.products(rows)
+        packed, mixed = _unpacked(sums[: 3 * (rows - 1)], rows)
+        inverse, determinant = inverse_symmetric(packed)
+        solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
+        gram = np.empty((k, p + 1, p + 1))
+        i, j = np.triu_indices(p + 1)
+        gram[:, i, j] = gram[:, j, i] = (
+            sums[3 * (rows - 1) :] - np.einsum("cqk,cqk->qk", mixed[:, i], solved[:, j])
+        ).T
+        return gram, solved[:, 0], np.log(determinant)
+
+
+def settled_sums(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    residuals: FloatArray | None = None,
+    tolerance: float = ATTITUDE_TOLERANCE_RAD,
+) -> tuple[NormalSums, Attitudes]:
+    """As `frame_sums`, passes repeated until every attitude is the best one; a cost of infinity
+    where there is none.
+    """
+    theta = np.asarray(theta, dtype=np.float64)
+    for _ in range(ATTITUDE_STEPS):
+        sums, attitudes = frame_sums(frames, model_name, theta, rotations, residuals)
+        if sums.turn < tolerance or not np.isfinite(sums.cost):
+            return sums, attitudes
+        rotations = attitudes.at(theta)
+    # Stars that fit no attitude: nothing here is a minimum.
+    return replace(sums, cost=float("inf")), attitudes
+
+
+class Descent:
+    """Normal equations for a solver that moves parameters and attitudes together: one pass for each
+    point.
+
+    Parameters
+    ----------
+    frames : StarFrames
+        Data.
+    model_name : str
+        Distortion model.
+    rotations : (K, 3, 3) array
+        Attitudes to start from.
+    best : tuple of NormalSums and Attitudes, optional
+        Sums at a first point.
+
+    Attributes
+    ----------
+    best : tuple of NormalSums and Attitudes, or None
+        Those of the best point so far; None before there is one.
+    """
+
+    def __init__(
+        self,
+        frames: StarFrames,
+        model_name: str,
+        rotations: FloatArray,
+        best: tuple[NormalSums, Attitudes] | None = None,
+    ) -> None:
+        self.frames, self.model_name = frames, model_name
+        self._start, self.best = rotations, best
+
+    def evaluate(self, theta: FloatArray) -> Normal:
+        """Cost, gradient and matrix at theta (p,), from the attitudes of the best point so far."""
+        theta = np.array(theta, dtype=np.float64)
+        if self.best is not None and np.array_equal(theta, self.best[1].theta):
+            return self.best[0].normal
+        rotations = self._start if self.best is None else self.best[1].at(theta)
+        found = frame_sums(self.frames, self.model_name, theta, rotations)
+        normal = found[0].normal
+        if np.isfinite(normal.cost) and (
+            self.best is None or _reaches(normal.cost, self.best[0].cost)
+        ):
+            self.best = found
+        return normal
+
+
+def _reaches(cost: float, best: float) -> bool:
+    """Whether a cost is as low as the best one, but for rounding."""
+    return cost <= best + 1e-12 * abs(best)

@@ -1,0 +1,409 @@
+"""Least squares, Samaan's and Griffith's method: same call, same result, covariances that hold, and
+streams.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.calibration.calibrate import METHODS
+from starcal_uq.camera.distortion import model_names
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.status import Status
+from starcal_uq.paper.recursive.start import RecursionOptions
+from starcal_uq.paper.recursive.stream import RecursiveCalibration
+from tests.helpers.same import assert_same
+from tests.helpers.scenes import camera, nominal, observations, with_sigmas
+
+ALL = RecursionOptions(parameters="all")
+BASELINES = [("least_squares", None), ("samaan", None), ("griffith", None), ("griffith", ALL)]
+
+
+def run(obs, start, method, options=None, **keywords):
+    if options is not None:
+        keywords["recursion"] = options
+    return sc.calibrate(obs, start, method=method, **keywords)
+
+
+def one_by_one(obs):
+    return [obs.select_frames([k]) for k in obs.frame_ids]
+
+
+@pytest.mark.parametrize("model", model_names())
+@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize(("method", "options"), BASELINES)
+def test_every_method_on_every_model(model, stated, method, options):
+    truth, obs = camera(model), observations(model, max_mag=6.5)
+    obs = with_sigmas(obs) if stated else obs
+    cal = run(obs, nominal(truth), method, options)
+    assert cal.status is Status.CONVERGED
+    keeps = method == "samaan" or options is ALL
+    assert cal.camera.distortion == (model if keeps else "none")
+    assert cal.method == method
+    assert cal.parameter_names == cal.nominal.parameter_names
+    assert cal.residuals_px.shape == (obs.n_stars, 2)
+    assert (cal.n_stars, cal.n_frames) == (obs.n_stars, obs.n_frames)
+    assert cal.sigma_name == ("sigma_scale" if stated else "sigma")
+    np.linalg.cholesky(cal.correlation)
+    if options is ALL or model == "none":
+        # Nothing is ignored: the truth is within the sigmas, and the noise is the noise.
+        assert np.max(np.abs(cal.theta - truth.theta) / cal.sigmas) < 4.5
+        reference = sc.calibrate(obs, nominal(truth))
+        assert cal.sigma == pytest.approx(reference.sigma, rel=0.03)
+        if method != "least_squares":
+            assert np.max(np.abs(cal.theta - reference.theta) / reference.sigmas) < 0.3
+            assert np.allclose(cal.sigmas, reference.sigmas, rtol=0.5 if model == "none" else 0.03)
+    if method == "samaan":
+        assert [stage.name for stage in cal.stages] == (
+            ["optics", "filter"] if model == "none" else ["optics", "filter", "distortion"]
+        )
+    elif method == "griffith":
+        assert [stage.name for stage in cal.stages] == ["filter"]
+        assert (
+            cal.stages[0].trajectory.shape
+            == cal.stages[0].sigmas.shape
+            == (obs.n_frames + 1, len(cal.theta))
+        )
+
+
+def test_least_squares_is_stage_one():
+    obs = observations(n_frames=200)
+    cal = sc.calibrate(obs, sc.paper.paper_start(), method="least_squares")
+    efficient = sc.calibrate(obs, sc.paper.paper_start())
+    assert np.array_equal(cal.theta, efficient.stages[0].theta[:3])
+    assert np.array_equal(cal.stages[0].trajectory, efficient.stages[0].trajectory[:, :3])
+    assert np.array_equal(cal.covariance, cal.pair_covariance)
+    assert cal.provenance["settings"]["ignored_distortion"] == "brown"
+    # Ignored distortion looks like noise.
+    assert cal.sigma > 1.3 * efficient.sigma
+
+
+@pytest.mark.parametrize("solver", ["minpack", "ipopt"])
+def test_least_squares_with_every_solver(solver):
+    obs = observations()
+    cal = sc.calibrate(obs, sc.paper.paper_start(), method="least_squares", solver=solver)
+    reference = sc.calibrate(obs, sc.paper.paper_start(), method="least_squares")
+    assert np.max(np.abs(cal.theta - reference.theta) / cal.sigmas) < 1e-4
+
+
+def test_least_squares_prints_the_focal_length_of_the_paper():
+    """70.2122 mm in its Table 2, without distortion; 1000 frames scatter by 0.0002 mm."""
+    obs = observations(n_frames=1000, seed=2017)
+    cal = sc.calibrate(obs, sc.paper.paper_start(), method="least_squares")
+    assert cal.camera.focal_mm == pytest.approx(70.211, abs=1e-3)
+    # Control: the other reading of the distortion, from measured to ideal points, goes to the other
+    # side.
+    inverse = camera("inverse").replace(coefficients=camera("brown").coefficients)
+    other = sc.simulate(
+        sc.load_catalogue(max_mag=6.0, epoch=2026.9), inverse, n_frames=300, sigma_px=0.05, seed=1
+    )
+    assert (
+        sc.calibrate(other, sc.paper.paper_start(), method="least_squares").camera.focal_mm > 70.235
+    )
+
+
+def test_samaan_decouples_what_griffith_with_all_parameters_couples():
+    obs = observations(n_frames=300)
+    samaan, griffith = (
+        run(obs, sc.paper.paper_start(), "samaan"),
+        run(obs, sc.paper.paper_start(), "griffith", ALL),
+    )
+    truth = camera().theta
+    assert np.max(np.abs(griffith.theta - truth) / griffith.sigmas) < 4.0
+    # The optics have absorbed the distortion, and k1 comes out several times too large, by any
+    # sigma.
+    assert 3.0 < samaan.theta[3] / truth[3] < 16.0
+    assert np.abs(samaan.theta[3] - truth[3]) / samaan.sigmas[3] > 20.0
+    optics = run(obs, sc.paper.paper_start(), "griffith")
+    assert np.max(np.abs(samaan.theta[:3] - optics.theta) / optics.sigmas) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("method", "options"), [("samaan", None), ("griffith", None), ("griffith", ALL)]
+)
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_stream_gives_what_the_table_gives(method, options, stated):
+    obs = observations(n_frames=200)
+    obs = with_sigmas(obs) if stated else obs
+    table = run(obs, sc.paper.paper_start(), method, options)
+    frames = one_by_one(obs)
+    for source, twice in ((frames, True), (iter(frames), False), ([obs], True)):
+        cal = run(source, sc.paper.paper_start(), method, options)
+        assert np.array_equal(cal.theta[:3], table.theta[:3])
+        # An iterator is read once: its sums come to the final optics to first order.
+        bound = 1e-6 if twice or method == "griffith" else 0.5
+        assert np.max(np.abs(cal.theta - table.theta) / table.sigmas) < bound
+        assert np.allclose(
+            cal.sigmas, table.sigmas, rtol=1e-6 if twice or method == "griffith" else 0.03
+        )
+        assert cal.sigma == pytest.approx(table.sigma, rel=2e-3)
+        assert cal.chi2 == pytest.approx(table.chi2, rel=4e-3)
+        assert (cal.dof, cal.n_stars, cal.n_frames) == (table.dof, table.n_stars, table.n_frames)
+        assert cal.frame_ids.shape == (0,)
+        assert cal.residuals_px.shape == (0, 2)
+        assert not cal.has_residuals
+        if method == "griffith":
+            unit = np.sqrt(np.diag(table.information))
+            assert np.max(np.abs(cal.information - table.information) / np.outer(unit, unit)) < 0.03
+        turned = table.rotation_per_theta * table.sigmas
+        assert np.max(np.abs(cal.rotation_per_theta * table.sigmas - turned)) < 0.02 * np.max(
+            np.abs(turned)
+        )
+        assert np.allclose(np.diag(cal.attitude_noise), np.diag(table.attitude_noise), rtol=5e-3)
+
+
+def test_the_likelihood_of_a_stream_is_that_of_the_table():
+    obs = observations(n_frames=200)
+    table, stream = (
+        run(source, sc.paper.paper_start(), "griffith", ALL)
+        for source in (obs, iter(one_by_one(obs)))
+    )
+    rng = np.random.default_rng(0)
+    z = rng.normal(size=(50, 5))
+    theta = table.theta + z @ table.compressed.whitening.T
+    ours, theirs = (c.compressed.log_likelihood(theta, table.sigma) for c in (stream, table))
+    assert np.std(ours - theirs) < 0.15
+    # Control: without the frames' gradients the likelihood would stand elsewhere.
+    assert np.std(ours) > 1.0
+    post = sc.sample(None, stream, seed=1, n_steps=100)
+    reference = sc.sample(obs, table, seed=1, n_steps=100)
+    sigmas = np.sqrt(np.diag(reference.covariance))
+    assert np.max(np.abs(post.mean[:5] - reference.mean[:5]) / sigmas[:5]) < 0.15
+
+
+def test_a_stream_calibration_saves_itself(tmp_path):
+    cal = run(iter(one_by_one(observations())), sc.paper.paper_start(), "samaan")
+    cal.save(tmp_path / "calibration.json")
+    again = sc.Calibration.load(tmp_path / "calibration.json")
+    assert_same(cal, again)
+    assert (again.n_stars, again.n_frames) == (cal.n_stars, 60)
+    assert "focal length" in again._repr_html_()
+    with pytest.raises(CalibrationError, match="kept no residuals"):
+        again.plot.residuals(observations())
+
+
+@pytest.mark.parametrize(("method", "options"), BASELINES)
+def test_what_follows_a_calibration_follows_these(method, options):
+    obs = observations(n_frames=100)
+    cal = run(obs, sc.paper.paper_start(), method, options)
+    post = sc.sample(obs, cal, seed=3, n_steps=60)
+    coupling = sc.coupling(post)
+    assert coupling.correlation.shape == (len(cal.theta),) * 2
+    error = sc.propagate(post, obs, n_draws=50, seed=1)
+    assert np.isfinite(error.calibration_total_arcsec).all()
+
+
+@pytest.mark.parametrize("method", ["samaan", "griffith"])
+def test_a_mirror_is_seen(method):
+    obs = observations(n_frames=30)
+    mirrored = dataclasses.replace(obs, y_px=1023.0 - obs.y_px)
+    with pytest.raises(CalibrationError, match="the image is mirrored") as caught:
+        run(mirrored, sc.paper.paper_start(), method)
+    assert caught.value.status is Status.INCONSISTENT
+    # Of a list of frames the first ones are looked at.
+    with pytest.raises(CalibrationError, match="the image is mirrored"):
+        run(one_by_one(mirrored), sc.paper.paper_start(), method)
+    assert (
+        run(one_by_one(mirrored), sc.paper.paper_start(), method, throw=False).status
+        is Status.INCONSISTENT
+    )
+    rng = np.random.default_rng(0)
+    mixed = rng.permutation(obs.n_stars)
+    wrong = dataclasses.replace(obs, ra_deg=obs.ra_deg[mixed], dec_deg=obs.dec_deg[mixed])
+    with pytest.raises(CalibrationError):
+        run(wrong, sc.paper.paper_start(), method)
+
+
+def test_what_is_refused():
+    obs = observations()
+    with pytest.raises(CalibrationError, match="least_squares, samaan, griffith"):
+        sc.calibrate(obs, sc.paper.paper_start(), method="magic")
+    with pytest.raises(CalibrationError, match="needs all frames at once"):
+        sc.calibrate(one_by_one(obs), sc.paper.paper_start())
+    with pytest.raises(CalibrationError, match="recursion needs method='samaan' or 'griffith'"):
+        sc.calibrate(obs, sc.paper.paper_start(), recursion=RecursionOptions())
+    with pytest.raises(CalibrationError, match="holds a str"):
+        sc.calibrate(["frames.parquet"], sc.paper.paper_start(), method="griffith")
+    with pytest.raises(CalibrationError, match="no frame yet"):
+        sc.calibrate([], sc.paper.paper_start(), method="griffith")
+    for method in ("least_squares", "samaan", "griffith"):
+        with pytest.raises(
+            CalibrationError, match="likelihood='student_t' needs method='efficient'"
+        ):
+            sc.calibrate(obs, sc.paper.paper_start(), method=method, likelihood="student_t")
+        three = obs.select(np.isin(np.arange(obs.n_stars), [0, 1, 2]))
+        with pytest.raises(CalibrationError, match="3 stars in 1 frames"):
+            sc.calibrate(three, sc.paper.paper_start(), method=method)
+
+
+def test_a_source_that_changes_is_found_out():
+    frames = one_by_one(observations())
+
+    class Leaking:
+        reads = 0
+
+        def __iter__(self):
+            self.reads += 1
+            return iter(frames if self.reads == 1 else frames[:-1])
+
+    with pytest.raises(
+        CalibrationError, match="gave 60 frames at first and 59 when it was read again"
+    ):
+        sc.calibrate(Leaking(), sc.paper.paper_start(), method="samaan")
+
+
+@lru_cache(maxsize=1)
+def drifting(px_per_frame, n_frames=200, seed=5):
+    """Frames of a camera whose focal length grows."""
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    truth = camera("none")
+    step = np.array([0.0, 0.0, px_per_frame])
+    cameras = [truth.with_theta(truth.theta + k * step) for k in range(n_frames)]
+    return [
+        sc.simulate(stars, now, n_frames=1, min_stars=10, sigma_px=0.05, seed=seed * 1000 + k)
+        for k, now in enumerate(cameras)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("samaan", RecursionOptions(process_noise=(0.0, 0.0, 0.1), sigma_px=0.05)),
+        ("griffith", RecursionOptions(forgetting=0.9)),
+    ],
+)
+def test_a_drifting_focal_length_is_followed(method, options):
+    final = camera("none").theta[2] + 0.05 * 199
+    steps = RecursiveCalibration(nominal(camera("none")), method, options)
+    for frame in drifting(0.05):
+        step = steps.update(frame)
+    assert abs(step.theta[2] - final) < 4.0 * step.sigmas[2] + 0.5
+    # Control: a filter that takes the camera as constant stays behind by half of the drift, and
+    # does not know it.
+    still = RecursiveCalibration(nominal(camera("none")), method)
+    for frame in drifting(0.05):
+        stays = still.update(frame)
+    assert final - stays.theta[2] > 3.0
+    assert (final - stays.theta[2]) / stays.sigmas[2] > 10.0
+
+
+def replicates(truth, start, method, options, n, n_frames=200):
+    """Estimates, their sigmas, and those that the filter itself claims."""
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    found, sigmas, claimed = [], [], []
+    for seed in range(n):
+        obs = sc.simulate(stars, truth, n_frames=n_frames, min_stars=10, sigma_px=0.05, seed=seed)
+        cal = run(obs, start, method, options)
+        found.append(cal.theta)
+        sigmas.append(cal.sigmas)
+        claimed.extend(stage.sigmas[-1] for stage in cal.stages if stage.name == "filter")
+    return np.array(found), np.array(sigmas), np.array(claimed)
+
+
+def variance_ratio(errors, sigmas):
+    return np.mean(errors**2, axis=0) / np.mean(sigmas**2, axis=0)
+
+
+# 300 replicates: a right variance ratio strays by 0.08 (one sigma), a right coverage by 1.3 %.
+N_REPLICATES = 300
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["griffith", "samaan"])
+def test_the_filter_is_right_where_its_model_is(method):
+    """Without distortion, full covariance: estimate, sigmas and the filter's own claim agree with
+    the spread.
+    """
+    truth = camera("none")
+    found, sigmas, claimed = replicates(truth, nominal(truth), method, None, N_REPLICATES)
+    errors = found - truth.theta
+    for widths in (sigmas, claimed):
+        assert np.all(np.abs(variance_ratio(errors, widths) - 1.0) < 0.3), variance_ratio(
+            errors, widths
+        )
+        coverage = np.mean(np.abs(errors / widths) < 1.96, axis=0)
+        assert (coverage > 0.91).all(), coverage
+        assert (coverage < 0.985).all(), coverage
+    assert (np.abs(np.mean(errors / sigmas, axis=0)) < 4.0 / np.sqrt(N_REPLICATES)).all()
+
+
+@pytest.mark.slow
+def test_pairs_taken_as_independent_claim_too_little():
+    """The historical covariance claims a third of its spread; the sigmas of the result are those of
+    the spread.
+    """
+    truth = camera("none")
+    options = RecursionOptions(pair_covariance="diagonal")
+    found, sigmas, claimed = replicates(truth, nominal(truth), "griffith", options, N_REPLICATES)
+    errors = found - truth.theta
+    assert np.all(np.abs(variance_ratio(errors, sigmas) - 1.0) < 0.3), variance_ratio(
+        errors, sigmas
+    )
+    assert (variance_ratio(errors, claimed) > 5.0).all()
+    assert (np.mean(np.abs(errors / claimed) < 1.96, axis=0) < 0.6).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["least_squares", "samaan", "griffith"])
+def test_sigmas_are_the_spread_although_distortion_is_ignored(method):
+    found, sigmas, claimed = replicates(
+        camera(), sc.paper.paper_start(), method, None, N_REPLICATES
+    )
+    errors = found - np.mean(found, axis=0)
+    ratio = variance_ratio(errors, sigmas)
+    assert np.all(np.abs(ratio - 1.0) < 0.35), ratio
+    coverage = np.mean(np.abs(errors / sigmas) < 1.96, axis=0)
+    assert (coverage > 0.91).all(), coverage
+    assert (coverage < 0.985).all(), coverage
+    if method != "least_squares":
+        # Control: the filter, which takes its model for granted, claims about half.
+        assert (variance_ratio(errors[:, :3], claimed[:, :3]) > 2.0).all()
+    # What no sigma here contains: the bias.
+    bias = np.abs(np.mean(found, axis=0)[:3] - camera().theta[:3])
+    assert bias[2] > 10.0 * np.mean(sigmas[:, 2])
+
+
+def test_methods_are_those_that_the_documentation_names():
+    assert METHODS == ("efficient", "three_stage", "least_squares", "samaan", "griffith")
+    assert all(f"``{method}``" in (sc.calibrate.__doc__ or "") for method in METHODS)
+
+
+class TestDownstream:
+    """What a posterior may be made of, and what is refused."""
+
+    def test_ignored_distortion_fails_the_posterior(self) -> None:
+        truth = camera()
+        obs = observations(n_frames=20)
+        cal = sc.calibrate(obs, nominal(truth), method="least_squares")
+        for likelihood in ("marginal", "pairs"):
+            posterior = sc.sample(obs, cal, seed=1, n_steps=40, likelihood=likelihood)
+            assert not posterior.diagnostics.ok
+            assert any(
+                "ignores the distortion" in check.sentence for check in posterior.diagnostics.checks
+            )
+        honest = sc.sample(obs, sc.calibrate(obs, nominal(truth)), seed=1)
+        assert not any(
+            "ignores the distortion" in check.sentence for check in honest.diagnostics.checks
+        )
+
+    @pytest.mark.parametrize(
+        ("method", "stream", "given", "likelihood", "words"),
+        [
+            ("samaan", True, False, "marginal", "parameters='all'"),
+            ("samaan", False, True, "pairs", "method='three_stage'"),
+            ("griffith", True, True, "student_t", "a stream does not keep"),
+        ],
+    )
+    def test_refusals_name_the_remedy(
+        self, method: str, stream: bool, given: bool, likelihood: str, words: str
+    ) -> None:
+        obs = observations(n_frames=20)
+        cal = sc.calibrate(iter([obs]) if stream else obs, nominal(camera()), method=method)
+        with pytest.raises(sc.errors.SamplingError, match=re.escape(words)):
+            sc.sample(obs if given else None, cal, seed=1, likelihood=likelihood)
