@@ -24,7 +24,7 @@ from starcal_uq.core.files import listed, read_parquet, reading, shown, table_en
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.settings import Scalar, Sense, bounded
 from starcal_uq.core.times import julian_days
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, PathLike
 
 _UNIT = 1e-6
 _NEARLY_UNIT = 1e-3
@@ -160,7 +160,7 @@ class AttitudeProfile(Shown):
 
 
 def load_attitude_profile(
-    path: str | os.PathLike[str], *, scalar: Scalar | None = None, sense: Sense = "icrs_to_camera"
+    path: PathLike, *, scalar: Scalar | None = None, sense: Sense = "icrs_to_camera"
 ) -> AttitudeProfile:
     """Read an attitude profile (``.csv``, ``.ecsv`` or ``.parquet``).
 
@@ -248,7 +248,7 @@ class ProfileTable:
     word: str
 
 
-def read_profile(path: str | os.PathLike[str], scalar: str | None) -> ProfileTable:
+def read_profile(path: PathLike, scalar: str | None) -> ProfileTable:
     """Read times and quaternions; see `starcal_uq.attitude.profile.load_attitude_profile`."""
     path = Path(path)
     with reading(

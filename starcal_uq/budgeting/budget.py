@@ -9,7 +9,6 @@ the totals then say "at least".
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -31,7 +30,7 @@ from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -49,7 +48,7 @@ def budget(
     obs: Observations,
     attitude: AttitudeError | None = None,
     *,
-    file: BudgetFile | str | os.PathLike[str] | None = None,
+    file: BudgetFile | PathLike | None = None,
     confidence: float | None = None,
     misfit: Diagnosis | None = None,
     n_samples: int = N_SAMPLES,

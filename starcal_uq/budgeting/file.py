@@ -5,7 +5,6 @@ TOML file.
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
@@ -32,7 +31,7 @@ from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.settings import PROBABILITY
 from starcal_uq.core.toml import Key, Section, read_toml
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
 # As people write them: X and Y are across the boresight, Z is along it.
 _AXIS_NAMES = {
@@ -198,7 +197,7 @@ def checked_confidence(value: float, where: str) -> float:
     return value
 
 
-def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
+def load_budget_file(path: PathLike) -> BudgetFile:
     """Read and check a budget file.
 
     Raises
@@ -235,7 +234,7 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
     )
 
 
-def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
+def _frames(tables: Any, path: PathLike) -> dict[str, FloatArray]:
     """Rotations by frame: a matrix, or a quaternion with its scalar last."""
     if not isinstance(tables, Mapping) or not all(
         isinstance(table, Mapping) for table in tables.values()
@@ -267,9 +266,7 @@ def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
     return frames
 
 
-def _tables(
-    content: Mapping[str, Any], key: str, path: str | os.PathLike[str]
-) -> Iterator[tuple[Any, str]]:
+def _tables(content: Mapping[str, Any], key: str, path: PathLike) -> Iterator[tuple[Any, str]]:
     """The tables of one kind, and how messages call each: by its number and name."""
     found = content.get(key, [])
     if not isinstance(found, list):
@@ -490,7 +487,7 @@ def _entry(entry: Expected, axes: Sequence[str]) -> str:
 
 
 def write_budget_template(
-    path: str | os.PathLike[str], rows: Sequence[Contributor] = (), *, force: bool = False
+    path: PathLike, rows: Sequence[Contributor] = (), *, force: bool = False
 ) -> None:
     """Write a starter budget file that lists every contributor which is not assessed.
 

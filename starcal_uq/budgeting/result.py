@@ -6,7 +6,6 @@ import csv
 import itertools
 import json
 import math
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -22,7 +21,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, cell_content, cell_text, reading
 from starcal_uq.core.status import Level
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -283,7 +282,7 @@ class Budget(Shown):
             "provenance": self.provenance,
         }
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: PathLike) -> None:
         """Write everything as CSV, to the last digit and atomically; overwritten.
 
         Raises
@@ -334,7 +333,7 @@ class Budget(Shown):
             )
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Budget:
+    def load(cls, path: PathLike) -> Budget:
         """Read what `save` wrote, without loss.
 
         Raises

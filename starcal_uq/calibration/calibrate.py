@@ -19,7 +19,8 @@ from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import Method, RecursiveMethod, Solver, bounded
-from starcal_uq.core.tasks import Progress, one_thread, processors
+from starcal_uq.core.tasks import one_thread, processors
+from starcal_uq.core.types import Progress
 from starcal_uq.estimation.assemble import (
     check_count,
     raise_unless_good,

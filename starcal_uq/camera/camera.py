@@ -27,7 +27,7 @@ from starcal_uq.core.errors import CameraError, DistortionError
 from starcal_uq.core.files import reading
 from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import BoolArray, FloatArray, PathLike
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ class Camera(Shown):
         return cls(**_checked(table, "camera"))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Camera:
+    def load(cls, path: PathLike) -> Camera:
         """Read a camera from a TOML file, or from one of OpenCV, ROS, Kalibr or mrcal by its
         ending.
 
@@ -278,7 +278,7 @@ class Camera(Shown):
         )
 
     @classmethod
-    def _of_others(cls, path: str | os.PathLike[str]) -> Camera:
+    def _of_others(cls, path: PathLike) -> Camera:
         with reading(
             path, "a camera of OpenCV, ROS, Kalibr or mrcal", "check the file", CameraError
         ):
@@ -295,7 +295,7 @@ class Camera(Shown):
         except CameraError as error:
             raise CameraError(f"{path}: {error}") from None
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+    def save(self, path: PathLike, force: bool = False) -> None:
         """Write the camera to a TOML file without loss of digits.
 
         Raises

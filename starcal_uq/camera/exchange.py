@@ -22,8 +22,8 @@ from starcal_uq.camera.formats import ENDINGS, KEPT, Pinhole, write_pinhole
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CameraError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.files import PathLike, atomic_path, ensure_new
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.files import atomic_path, ensure_new
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
 # Points along each side of the detector at which a fit is made, and checked between them.
 _POINTS = 33

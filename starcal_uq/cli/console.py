@@ -15,8 +15,7 @@ from rich.table import Table
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.status import Level
-from starcal_uq.core.tasks import Progress
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, Progress
 from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -12,7 +11,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import read_json, to_plain, write_json
-from starcal_uq.core.types import AnyDict, FloatArray, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Shapes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -243,7 +242,7 @@ class CameraComparison(Shown):
             }
         )
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: PathLike) -> None:
         """Write everything as JSON, atomically; overwritten."""
         write_json(self.to_dict(), path)
 
@@ -252,7 +251,7 @@ class CameraComparison(Shown):
         return {"verdict": self.verdict, **to_plain(self, null=True)}
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> CameraComparison:
+    def load(cls, path: PathLike) -> CameraComparison:
         """Read ``comparison.json``, or the folder that holds it, without loss.
 
         Raises

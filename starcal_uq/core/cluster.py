@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from starcal_uq.core.errors import ClusterError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.tasks import Progress, interrupt_between_steps, processors
+from starcal_uq.core.tasks import interrupt_between_steps, processors
+from starcal_uq.core.types import Progress
 
 if TYPE_CHECKING:
     from distributed import Client

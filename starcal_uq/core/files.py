@@ -27,13 +27,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import MissingExtraError, ObservationError, RunFolderError, StarcalError
+from starcal_uq.core.types import PathLike
 
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
     from pyarrow.parquet import ParquetFile
 
-PathLike = str | os.PathLike[str]
 # Names of files that are being written; a killed process leaves them.
 TEMPORARY = re.compile(r"\.[0-9a-f]{16}\.tmp")
 # Where a command keeps what it has not finished, and a step of a run its files; gone at their end.

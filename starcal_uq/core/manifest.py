@@ -23,7 +23,6 @@ from starcal_uq.core.files import (
     STEP,
     TEMPORARY,
     UNFINISHED,
-    PathLike,
     check_new_folder,
     flush_folder,
     new_folder,
@@ -33,7 +32,7 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.store import finished
 from starcal_uq.core.temporary import lock
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 
 MANIFEST, NEW = "run.json", ".new"
 _FORMAT = "starcal_uq run 1"

@@ -22,15 +22,8 @@ from typing import IO, Any, ClassVar, Literal, TypeVar, Union, get_args, get_ori
 
 import numpy as np
 
-from starcal_uq.core.files import (
-    PathLike,
-    atomic_path,
-    atomic_write_text,
-    check_size,
-    reading,
-    shown,
-)
-from starcal_uq.core.types import AnyDict, unaliased
+from starcal_uq.core.files import atomic_path, atomic_write_text, check_size, reading, shown
+from starcal_uq.core.types import AnyDict, PathLike, unaliased
 
 Record = TypeVar("Record")
 S = TypeVar("S", bound="Saved")

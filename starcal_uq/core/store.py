@@ -20,7 +20,6 @@ import numpy as np
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import (
     UNFINISHED,
-    PathLike,
     atomic_path,
     new_folder,
     read_parquet,
@@ -29,7 +28,7 @@ from starcal_uq.core.files import (
 )
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import to_plain
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.temporary import TemporaryFolder
+from starcal_uq.core.types import Progress
 
 if TYPE_CHECKING:
     from starcal_uq.core.store import Kept
 
-Progress = Callable[[int, int], None]
 Item = TypeVar("Item")
 T = TypeVar("T")
 # Numbers of the tasks and their results.

@@ -8,6 +8,8 @@ import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 
+from starcal_uq.core.types import PathLike
+
 _PREFIX, _LOCK = "starcal-uq-", ".starcal-uq-lock"
 _NAME = re.compile(rf"{_PREFIX}[a-z0-9_]{{8}}")
 
@@ -33,7 +35,7 @@ class TemporaryFolder(TemporaryDirectory[str]):
         self._handle = -1
 
 
-def lock(path: str | os.PathLike[str], flags: int = os.O_RDONLY) -> int | None:
+def lock(path: PathLike, flags: int = os.O_RDONLY) -> int | None:
     """Lock a file or a folder as long as the handle is open and the process lives.
 
     Returns the handle, None where another process has the lock or the path is gone, and -1 where

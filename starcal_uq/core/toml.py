@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, shown
+from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.settings import Limit
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

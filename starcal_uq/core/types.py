@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias, get_args, get_origin
 
 import numpy as np
@@ -13,6 +14,9 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 StrArray: TypeAlias = NDArray[np.str_]
 AnyDict: TypeAlias = dict[str, Any]
+PathLike: TypeAlias = str | os.PathLike[str]
+# Called with how many are done, and of how many.
+Progress: TypeAlias = Callable[[int, int], None]
 # Sizes of the arrays of a record, by field; see `starcal_uq.core.records`.
 Shapes: TypeAlias = Mapping[str, tuple[int | str, ...]]
 

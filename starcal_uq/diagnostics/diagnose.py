@@ -20,8 +20,8 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.tasks import Progress, one_thread
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.tasks import one_thread
+from starcal_uq.core.types import AnyDict, FloatArray, Progress
 from starcal_uq.diagnostics.air import AirTest, air_test
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests

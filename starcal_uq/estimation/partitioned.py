@@ -27,8 +27,7 @@ from starcal_uq.core.cluster import Cluster
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
-from starcal_uq.core.tasks import Progress
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, Progress
 from starcal_uq.estimation.assemble import check_camera, check_noise
 from starcal_uq.estimation.duplicates import repeated
 from starcal_uq.estimation.normals import FrameNormals

@@ -25,7 +25,7 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, Progress
 from starcal_uq.identification.blind import (
     AGREEMENT,
     FIRST_GROUP,
@@ -137,7 +137,7 @@ def identify(
     share_camera: bool = True,
     cache: bool = True,
     cache_dir: str | PathLike[str] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Identification:
     """Identify the stars of every frame, knowing nothing about where the camera pointed.
 
@@ -335,7 +335,7 @@ class _Attempt:
             if solved is not None:
                 self.results[k] = self.search.near(self.field, k, solved.patch.rotation)
 
-    def filled(self, progress: Callable[[int, int], None] | None) -> _Attempt:
+    def filled(self, progress: Progress | None) -> _Attempt:
         """The frames with the lens that the best of them shows, where that explains more than this
         camera does.
 
@@ -366,7 +366,7 @@ class _Attempt:
     def _failed(self) -> list[int]:
         return _failed(self.results, self.field)
 
-    def run(self, progress: Callable[[int, int], None] | None, stop: bool) -> None:
+    def run(self, progress: Progress | None, stop: bool) -> None:
         """Search every frame, those with most stars first; with `stop`, only while a third of them
         is found.
 
@@ -418,7 +418,7 @@ class _Attempt:
         camera = _moved(self.field.camera, shared)
         return self.search.narrowed(camera, covariance), self.field.seen_by(camera), shared
 
-    def finish(self, progress: Callable[[int, int], None] | None, hopeless: bool = False) -> None:
+    def finish(self, progress: Progress | None, hopeless: bool = False) -> None:
         """Search what is left, as mirror images and with a worse lens where most frames fail.
 
         Where a search at any focal length, mirror images included, was in vain, the frames left get

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.records import read_arrays
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, PathLike
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -244,7 +244,7 @@ def prepared_star_pairs(
     field_sr: float,
     max_angle_rad: float,
     cache: bool,
-    cache_dir: str | os.PathLike[str] | None = None,
+    cache_dir: PathLike | None = None,
 ) -> StarPairs:
     """The pairs that this process has used before, or else those of the file where `cache` is on,
     or new ones.
@@ -273,7 +273,7 @@ def cached_star_pairs(
     mag: FloatArray,
     field_sr: float,
     max_angle_rad: float,
-    cache_dir: str | os.PathLike[str] | None = None,
+    cache_dir: PathLike | None = None,
     per_field: int = PATTERN_STARS,
 ) -> StarPairs:
     """`find_star_pairs`, from a file of the cache folder where there is one, leaving one there

@@ -27,7 +27,7 @@ from starcal_uq.core.files import (
     reading,
     table_ending,
 )
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, StrArray
 from starcal_uq.observations.rows import FrameRows, locked
 
 if TYPE_CHECKING:
@@ -207,7 +207,7 @@ class Centroids(FrameRows, Shown):
         table.insert(1, "n_stars", self.stars_per_frame)
         return table.rename(columns={"frame_ids": "frame"})
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+    def save(self, path: PathLike, force: bool = False) -> None:
         """Write the table without loss; the ending decides: ``.csv``, ``.ecsv`` or ``.parquet``.
 
         The frames, `messages` and `meta` go along: in CSV as comments at the top.
@@ -254,7 +254,7 @@ class Centroids(FrameRows, Shown):
         return table
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Centroids:
+    def load(cls, path: PathLike) -> Centroids:
         """Read a table that `save` wrote.
 
         Raises

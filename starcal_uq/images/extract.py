@@ -19,8 +19,8 @@ from starcal_uq.core.errors import ImageError, MissingExtraError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, bounded
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import Progress, one_thread, processors, run_tasks
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.tasks import one_thread, processors, run_tasks
+from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
 from starcal_uq.images.image import IMAGE_ENDINGS, Image, read_images
@@ -40,7 +40,7 @@ _WORTH_PROCESSES, _CHUNK = 100, 16
 # Just below the most that glibc keeps.
 _KEPT_BYTES = 31 << 20
 
-Source = Image | str | os.PathLike[str]
+Source = Image | PathLike
 
 
 @bounded
@@ -60,7 +60,7 @@ def extract_centroids(
     bayer: Bayer | None = None,
     workers: int | None = 0,
     progress: Progress | None = None,
-    keep: str | os.PathLike[str] | None = None,
+    keep: PathLike | None = None,
 ) -> Centroids:
     """Find the stars in images and measure their positions with covariances.
 

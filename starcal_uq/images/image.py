@@ -26,7 +26,7 @@ from starcal_uq.core.files import check_fits, check_size, unpack
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, Mosaic
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR, utc_of_scale
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.images.optics import exif_of
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ class Image:
         return f"Image({self.name!r}, {size}{', ' + self.time_utc if self.time_utc else ''})"
 
 
-def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Image:
+def read_image(path: PathLike, camera: Camera | None = None) -> Image:
     """Read one frame (``.fits``, ``.fits.gz``, ``.tiff``, ``.png``, ``.jpg``, ``.bmp``, or a
     camera's raw file).
 
@@ -211,7 +211,7 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     return image
 
 
-def read_images(path: str | os.PathLike[str], camera: Camera | None = None) -> list[Image]:
+def read_images(path: PathLike, camera: Camera | None = None) -> list[Image]:
     """Read all frames of a file: planes of a FITS cube, images of a FITS file, pages of a TIFF
     file.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,8 +15,8 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.records import read_arrays
 from starcal_uq.core.settings import Moves
-from starcal_uq.core.tasks import Progress, interrupt_between_steps
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.tasks import interrupt_between_steps
+from starcal_uq.core.types import FloatArray, IntArray, PathLike, Progress
 from starcal_uq.inference.target import Density, student_t_log_density
 
 # Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is
@@ -86,7 +85,7 @@ def run_ensembles(
     settings: EnsembleSettings,
     *,
     progress: Progress | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint: PathLike | None = None,
     fingerprint: str = "",
     moves: list[tuple[Any, float]] | None = None,
 ) -> Chains:
@@ -171,7 +170,7 @@ class _Store:
         n_ensembles: int,
         settings: EnsembleSettings,
         dim: int,
-        path: str | os.PathLike[str] | None,
+        path: PathLike | None,
         fingerprint: str,
     ) -> None:
         shape = (n_ensembles, settings.n_steps, settings.n_walkers)
@@ -221,7 +220,7 @@ class _Store:
     def chains(self) -> Chains:
         return Chains(self._u, self._log_density, self._accepted)
 
-    def _write(self, path: str | os.PathLike[str]) -> None:
+    def _write(self, path: PathLike) -> None:
         _, key, position, has_gauss, gauss = self.state.random_state
         with atomic_path(path, durable=False) as temporary, open(temporary, "wb") as file:
             np.savez(
@@ -239,7 +238,7 @@ class _Store:
                 accepted=self._accepted,
             )
 
-    def _read(self, path: str | os.PathLike[str]) -> None:
+    def _read(self, path: PathLike) -> None:
         import emcee
 
         try:

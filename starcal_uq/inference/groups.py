@@ -27,10 +27,10 @@ import numpy as np
 
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.files import PathLike, write_netcdf
+from starcal_uq.core.files import write_netcdf
 from starcal_uq.core.settings import bounded, check_memory
-from starcal_uq.core.tasks import Progress, one_thread
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.tasks import one_thread
+from starcal_uq.core.types import FloatArray, PathLike, Progress
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.inference.arviz import to_arviz
 from starcal_uq.inference.posterior import Variables, write_group

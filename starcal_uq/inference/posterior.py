@@ -6,7 +6,6 @@ Opening a saved posterior needs neither the sampler nor the symbolic model nor a
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +22,7 @@ from starcal_uq.core.files import check_hdf5, ensure_new, reading, write_netcdf
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Check, Level, worst
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Shapes
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 
 if TYPE_CHECKING:
@@ -456,7 +455,7 @@ class Posterior(Shown):
         rng = np.random.default_rng(seed)
         return self.draws[rng.permutation(len(self.draws))[:n]]
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+    def save(self, path: PathLike, force: bool = False) -> None:
         """Write everything to one netCDF file that ArviZ opens as well.
 
         Raises
@@ -489,7 +488,7 @@ class Posterior(Shown):
         write_netcdf(path, fill)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Posterior:
+    def load(cls, path: PathLike) -> Posterior:
         """Read what `save` wrote, without loss.
 
         Raises

@@ -19,8 +19,8 @@ from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.settings import Evaluation, LikelihoodName, Moves, bounded, check_memory
 from starcal_uq.core.status import Status
-from starcal_uq.core.tasks import Progress, one_thread
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.tasks import one_thread
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.undetermined import open_parameters
 from starcal_uq.inference.checks import (
@@ -81,7 +81,7 @@ def sample(
     evaluation: Evaluation = "auto",
     dof: float | Literal["free"] | None = None,
     progress: Progress | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
+    checkpoint: PathLike | None = None,
 ) -> Posterior:
     """Draw from the posterior of camera parameters and noise.
 
@@ -256,7 +256,7 @@ class _Run:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def sample(
-        self, name: str, log_likelihood: LogLikelihood, checkpoint: str | os.PathLike[str] | None
+        self, name: str, log_likelihood: LogLikelihood, checkpoint: PathLike | None
     ) -> _Outcome:
         target, laplace = laplace_approximation(self.start(log_likelihood))
         chains = run_ensembles(
@@ -280,7 +280,7 @@ class _Outcome:
         target: Target,
         laplace: Laplace,
         chains: Chains,
-        checkpoint: str | os.PathLike[str] | None,
+        checkpoint: PathLike | None,
     ) -> None:
         self.name, self.target, self.laplace, self.chains, self.checkpoint = (
             name,
@@ -295,7 +295,7 @@ class _Outcome:
 
 
 def _with_fallback(
-    run: _Run, evaluation: Evaluation, checkpoint: str | os.PathLike[str] | None
+    run: _Run, evaluation: Evaluation, checkpoint: PathLike | None
 ) -> tuple[_Outcome, CompressionCheck]:
     exact, fast = run.source.exact, run.source.fast
     if exact is None:
@@ -342,7 +342,7 @@ def _present(fast: LogLikelihood | None) -> LogLikelihood:
     return fast
 
 
-def _attempt(checkpoint: str | os.PathLike[str] | None, files: list[str]) -> str | None:
+def _attempt(checkpoint: PathLike | None, files: list[str]) -> str | None:
     """The checkpoint of the next attempt."""
     if checkpoint is None:
         return None

@@ -36,7 +36,7 @@ from starcal_uq.core.files import (
     shown,
     table_ending,
 )
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, StrArray
 from starcal_uq.observations.checks import (
     Problem,
     check_columns,
@@ -100,7 +100,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def read_table(
-    path: str | os.PathLike[str],
+    path: PathLike,
     camera: Camera | None,
     mapping: Mapping[str, str],
     only: Sequence[str] = tuple(COLUMNS),
@@ -587,7 +587,7 @@ def astropy_table(columns: Mapping[str, Any], meta: AnyDict) -> Any:
 def write_table(
     columns: Mapping[str, Any],
     meta: AnyDict,
-    path: str | os.PathLike[str],
+    path: PathLike,
     force: bool,
     camera: Camera | None = None,
 ) -> None:

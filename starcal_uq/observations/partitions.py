@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.files import PathLike
 from starcal_uq.core.manifest import read_manifest
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.types import AnyDict, IntArray
+from starcal_uq.core.types import AnyDict, IntArray, PathLike
 from starcal_uq.observations.checks import check_mapping
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import (

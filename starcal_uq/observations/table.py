@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, StrArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, StrArray
 from starcal_uq.observations.checks import check_columns, raise_problems
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import astropy_table, read_table, write_table
@@ -268,9 +268,7 @@ class Observations(FrameRows, Shown):
         """The first `n` rows as a pandas DataFrame."""
         return self.to_dataframe().head(n)
 
-    def save(
-        self, path: str | os.PathLike[str], force: bool = False, camera: Camera | None = None
-    ) -> None:
+    def save(self, path: PathLike, force: bool = False, camera: Camera | None = None) -> None:
         """Write the table without loss of digits; the ending decides what as.
 
         ECSV, Parquet and FITS (``.ecsv``, ``.parquet``, ``.fits``) carry `meta`; CSV is plain, so
@@ -336,7 +334,7 @@ class Observations(FrameRows, Shown):
 
 
 def load_observations(
-    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    path: PathLike | Sequence[PathLike],
     camera: Camera | None = None,
     columns: Mapping[str, str] | None = None,
 ) -> Observations:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from starcal_uq.core.files import atomic_write_bytes, new_folder, write_csv
-from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.tasks import run_tasks
+from starcal_uq.core.types import Progress
 
 if TYPE_CHECKING:
     import pandas as pd

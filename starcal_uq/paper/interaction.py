@@ -18,7 +18,6 @@ random numbers).
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -32,12 +31,12 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import SamplingError, StarcalError
-from starcal_uq.core.files import PathLike, cell_content, reading, write_csv
+from starcal_uq.core.files import cell_content, reading, write_csv
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import Progress, run_tasks
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.tasks import run_tasks
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.recursive.start import RecursionOptions
@@ -193,12 +192,12 @@ class InteractionStudy(Shown):
             f"the study has no {kind!r} threshold of {parameter!r} by {method!r} along {axis!r}."
         )
 
-    def save_csv(self, path: str | os.PathLike[str]) -> None:
+    def save_csv(self, path: PathLike) -> None:
         """Write the table, atomically; overwritten. Numbers keep all digits."""
         write_csv(self.table, path)
 
     @classmethod
-    def load_csv(cls, path: str | os.PathLike[str]) -> InteractionStudy:
+    def load_csv(cls, path: PathLike) -> InteractionStudy:
         """Read what `save_csv` wrote.
 
         Raises

@@ -21,11 +21,9 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.files import PathLike
 from starcal_uq.core.status import Status
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import Progress
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, PathLike, Progress
 from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames

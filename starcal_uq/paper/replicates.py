@@ -20,13 +20,12 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
-from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import Progress, run_tasks
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
+from starcal_uq.core.tasks import run_tasks
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Progress, Shapes
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.maths.intervals import holm

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.files import PathLike, atomic_write_text
+from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.tasks import Progress
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.checks import paper_checks
 from starcal_uq.paper.commands import Bar, write_tables

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
@@ -12,6 +11,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import SettingError
 from starcal_uq.core.files import atomic_write_bytes, ensure_new, new_folder, shown
 from starcal_uq.core.settings import ExampleName
+from starcal_uq.core.types import PathLike
 from starcal_uq.observations.table import load_observations
 from starcal_uq.sky.site import Site
 
@@ -46,7 +46,7 @@ class ExampleData(Shown):
     site: Site
     notice: str
 
-    def save(self, folder: str | os.PathLike[str], force: bool = False) -> list[Path]:
+    def save(self, folder: PathLike, force: bool = False) -> list[Path]:
         """Write ``stars.ecsv``, ``camera.toml``, ``site.toml`` and ``NOTICE`` into a folder, which
         is made.
 

@@ -21,8 +21,7 @@ from starcal_uq.sky.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.core.tasks import Progress
-    from starcal_uq.core.types import FloatArray, StrArray
+    from starcal_uq.core.types import FloatArray, Progress, StrArray
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids

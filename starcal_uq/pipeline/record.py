@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcal_uq.core.display import Shown
-from starcal_uq.core.files import PathLike
 from starcal_uq.core.records import Saved
+from starcal_uq.core.types import PathLike
 from starcal_uq.pipeline.cameras import OtherCamera, other_cameras
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
 

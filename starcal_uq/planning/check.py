@@ -15,8 +15,8 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, CatalogueError, PlanningError, StarcalError
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.tasks import Progress, run_tasks
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.tasks import run_tasks
+from starcal_uq.core.types import BoolArray, FloatArray, Progress
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import N_FRAMES, Forecast, Forecaster, spreads
 from starcal_uq.planning.information import random_frames

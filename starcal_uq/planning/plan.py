@@ -21,8 +21,8 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.tasks import Progress, one_thread
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.tasks import one_thread
+from starcal_uq.core.types import AnyDict, FloatArray, Progress
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.planning.forecast import (
     N_CAMPAIGNS,

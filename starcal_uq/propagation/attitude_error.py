@@ -12,7 +12,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +22,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
 from starcal_uq.core.formatting import count, join_words, plural, significant
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import BoolArray, FloatArray, PathLike
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
 
@@ -408,7 +407,7 @@ class AttitudeError(Shown):
             )
         return table
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: PathLike) -> None:
         """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are
         not kept.
         """
@@ -441,7 +440,7 @@ class AttitudeError(Shown):
         write_csv(table.assign(misfit=[misfit] + [""] * (len(table) - 1)), path)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> AttitudeError:
+    def load(cls, path: PathLike) -> AttitudeError:
         """Read what `save` wrote.
 
         A table of a version that did not sample the interaction is read; the interaction is then

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.core.errors import ComparisonError, RunFolderError
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.types import PathLike
 from starcal_uq.estimation.duplicates import fingerprints_of
 from starcal_uq.runs.run import Run
 
 if TYPE_CHECKING:
     from starcal_uq.comparison.result import CameraComparison
-    from starcal_uq.core.files import PathLike
     from starcal_uq.observations.table import Observations
 
 

@@ -13,10 +13,9 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.camera.exchange import CAMERA_FORMATS, Exported, export_camera
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, write_csv
+from starcal_uq.core.files import atomic_write_text, ensure_new, write_csv
 from starcal_uq.core.formatting import join_words
-from starcal_uq.core.tasks import Progress
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.groups import write_arviz
 from starcal_uq.inference.posterior import Posterior

@@ -17,14 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import (
-    STEP,
-    PathLike,
-    as_plain,
-    check_new_folder,
-    flushed_together,
-    new_folder,
-)
+from starcal_uq.core.files import STEP, as_plain, check_new_folder, flushed_together, new_folder
 from starcal_uq.core.manifest import (
     MANIFEST,
     NEW,
@@ -42,7 +35,7 @@ from starcal_uq.core.manifest import (
     write_manifest,
 )
 from starcal_uq.core.status import Level, Question
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 
 _CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN"
 

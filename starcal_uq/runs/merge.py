@@ -11,8 +11,8 @@ import numpy as np
 
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.core.errors import CalibrationError, RunFolderError
-from starcal_uq.core.files import PathLike, check_new_folder
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.files import check_new_folder
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 from starcal_uq.estimation.duplicates import fingerprints_of
 from starcal_uq.estimation.merging import (
     check_mergeable,

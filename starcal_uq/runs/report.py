@@ -6,13 +6,13 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from starcal_uq.core.types import PathLike
 from starcal_uq.runs.run import Run
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.camera.camera import Camera
     from starcal_uq.comparison.result import CameraComparison
-    from starcal_uq.core.files import PathLike
     from starcal_uq.core.settings import ReportFormat
     from starcal_uq.pipeline.inspection import Frames
     from starcal_uq.planning.plan import Plan

@@ -21,7 +21,6 @@ from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError, RunFolderError, StarcalError
 from starcal_uq.core.files import (
-    PathLike,
     atomic_write_bytes,
     atomic_write_text,
     check_new_folder,
@@ -35,7 +34,7 @@ from starcal_uq.core.manifest import entry_of
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import write_json
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.tasks import Progress
+from starcal_uq.core.types import PathLike, Progress
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.files import arrow_values

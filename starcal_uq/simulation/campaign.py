@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ from starcal_uq.core.errors import RunFolderError, SensorError
 from starcal_uq.core.files import ensure_new
 from starcal_uq.core.manifest import alone
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, PathLike, Progress
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
 from starcal_uq.simulation.rendering import Scene
 from starcal_uq.simulation.sensor import Sensor
@@ -31,7 +30,7 @@ _PATTERN = "frame_*.fits"
 def render_frames(
     stars: StarCatalogue,
     camera: Camera,
-    out_dir: str | os.PathLike[str],
+    out_dir: PathLike,
     *,
     n_frames: int = 100,
     min_stars: int = 10,
@@ -42,7 +41,7 @@ def render_frames(
     times_utc: Sequence[str] | None = None,
     sigma_px: float = 0.05,
     force: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[Path]:
     """Render frames at random attitudes into FITS files ``frame_00000.fits``, ``frame_00001.fits``,
     ...

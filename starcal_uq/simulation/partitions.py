@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,10 +12,10 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import ObservationError, RunFolderError
-from starcal_uq.core.files import UNFINISHED, PathLike, new_folder
+from starcal_uq.core.files import UNFINISHED, new_folder
 from starcal_uq.core.manifest import alone, making, read_manifest
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.observations.files import parquet_summary, write_partition
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, observed, simulated_meta
@@ -44,7 +43,7 @@ def simulate_partitions(
     force: bool = False,
     scheduler: Scheduler = None,
     workers: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> PartitionedObservations:
     """Simulate identified stars, as `simulate` does, into a folder of Parquet files.
 

@@ -5,7 +5,6 @@ in them.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 
 from starcal_uq.core.errors import SensorError
 from starcal_uq.core.toml import Key, Section, read_section, write_section
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, PathLike
 from starcal_uq.simulation.psf import KINDS, profiles
 
 _HEADER = """\
@@ -242,7 +241,7 @@ class Sensor:
         return cls(**_SECTION.check(table, "sensor"))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Sensor:
+    def load(cls, path: PathLike) -> Sensor:
         """Read a sensor from a TOML file with a [sensor] section.
 
         Raises
@@ -255,7 +254,7 @@ class Sensor:
             **_SECTION.check(read_section(path, "sensor", SensorError), f"{path}, section [sensor]")
         )
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+    def save(self, path: PathLike, force: bool = False) -> None:
         """Write the sensor to a TOML file without loss of digits; `force` allows to write over
         one.
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from starcal_uq.core.errors import ImageError, SensorError, StarcalError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_bytes, ensure_new
 from starcal_uq.core.provenance import installed_version
-from starcal_uq.core.types import FloatArray, StrArray
+from starcal_uq.core.types import FloatArray, PathLike, StrArray
 from starcal_uq.images.image import Image
 from starcal_uq.observations.table import Observations
 from starcal_uq.simulation.sensor import Sensor
@@ -185,7 +184,7 @@ _TRUTH_COLUMNS = {
 }
 
 
-def write_frame(frame: RenderedFrame, path: str | os.PathLike[str], force: bool = False) -> None:
+def write_frame(frame: RenderedFrame, path: PathLike, force: bool = False) -> None:
     """Write a rendered frame and its truth as FITS; the same frame gives the same bytes.
 
     Quantised counts become 16-bit integers (``BZERO`` = 32768), others 64-bit floats.
@@ -261,7 +260,7 @@ def _cards(truth: FrameTruth) -> list[tuple[str, Any, str]]:
     ]
 
 
-def read_truth(path: str | os.PathLike[str]) -> FrameTruth:
+def read_truth(path: PathLike) -> FrameTruth:
     """What a rendered frame shows, from its file.
 
     Raises
@@ -327,7 +326,7 @@ def read_truth(path: str | os.PathLike[str]) -> FrameTruth:
     )
 
 
-def truth_table(paths: Iterable[str | os.PathLike[str]]) -> Observations:
+def truth_table(paths: Iterable[PathLike]) -> Observations:
     """The table that perfect centroids and a perfect identification of these frames would give.
 
     Raises

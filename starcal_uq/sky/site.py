@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from starcal_uq.core.errors import SiteError
 from starcal_uq.core.toml import Key, Section, read_section, write_section
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 
 # By which a place turns among the stars in an hour.
 HOUR_DEG = 15.041067
@@ -159,7 +158,7 @@ class Site:
         return cls(**_SECTION.check(table, "site"))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Site:
+    def load(cls, path: PathLike) -> Site:
         """From a TOML file with a [site] table.
 
         Raises
@@ -172,7 +171,7 @@ class Site:
             **_SECTION.check(read_section(path, "site", SiteError), f"{path}, section [site]")
         )
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+    def save(self, path: PathLike, force: bool = False) -> None:
         """Write a TOML file without loss of digits.
 
         Raises

@@ -20,10 +20,10 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
 from starcal_uq.core.errors import CameraError, PriorError, StudyError
-from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, shown
+from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.settings import KEYS, SEED, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.inference.priors import PRIORS
 from starcal_uq.studies.axes import AXES, EXCLUSIVE, FLAT, base_settings, camera_of
 

@@ -17,16 +17,9 @@ from starcal_uq.camera.distortion import PARAMETERS
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StudyError
-from starcal_uq.core.files import (
-    PathLike,
-    atomic_path,
-    check_hdf5,
-    new_folder,
-    reading,
-    write_netcdf,
-)
+from starcal_uq.core.files import atomic_path, check_hdf5, new_folder, reading, write_netcdf
 from starcal_uq.core.manifest import read_manifest
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import BoolArray, FloatArray, PathLike
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
 from starcal_uq.studies.findings import Statistic, Sweep, cross

@@ -11,8 +11,8 @@ import numpy as np
 
 from starcal_uq.core import store
 from starcal_uq.core.errors import StudyError
-from starcal_uq.core.files import PathLike, read_parquet, reading
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.files import read_parquet, reading
+from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.studies.result import TEXTS, VARIABLES
 
 if TYPE_CHECKING:

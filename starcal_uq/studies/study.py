@@ -17,13 +17,13 @@ from starcal_uq.camera.distortion import PARAMETERS, model_names, parameter_name
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.errors import StarcalError, StudyError
-from starcal_uq.core.files import PathLike, atomic_write_text
+from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.manifest import NEW, alone, making, read_manifest
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import held, take_over
-from starcal_uq.core.tasks import ByPlace, Progress, one_thread, run_tasks
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.tasks import ByPlace, one_thread, run_tasks
+from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells

@@ -4,7 +4,6 @@ files.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,7 @@ import numpy as np
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import ensure_new, write_csv
 from starcal_uq.core.formatting import percent
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike
 from starcal_uq.estimation.consensus import MIN_STARS
 from starcal_uq.estimation.outliers import StarResiduals, star_threshold
 
@@ -151,7 +150,7 @@ class Screening(Shown):
         """The rejected rows."""
         return self.rejected.copy()
 
-    def save_rejected(self, path: str | os.PathLike[str], force: bool = False) -> None:
+    def save_rejected(self, path: PathLike, force: bool = False) -> None:
         """Write the rejected rows as CSV; a header alone says that nothing was rejected.
 
         Raises

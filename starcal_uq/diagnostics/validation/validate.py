@@ -25,12 +25,11 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
-from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import Truth, bounded
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import Progress, one_thread, run_tasks
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.tasks import one_thread, run_tasks
+from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.diagnostics.validation.replicates import (
     MARGINAL,
     LikelihoodMaker,

@@ -23,8 +23,7 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CalibrationError, DistortionError
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import Progress
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, Progress
 from starcal_uq.identification.search import LEAST_SIGMA_PX
 from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.field.frames import FieldFrames, FieldIdentification, true_pixels

@@ -12,11 +12,11 @@ import numpy as np
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.files import PathLike, atomic_write_text
+from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.store import Kept
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, PathLike, Progress
 from starcal_uq.paper.commands import Bar, write_tables
 from starcal_uq.paper.field.attitudes import (
     Repetition,
@@ -49,7 +49,6 @@ from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.neighbours import without_disturbed
 
 if TYPE_CHECKING:
-    from starcal_uq.core.tasks import Progress
     from starcal_uq.observations.table import Observations
     from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.sky.catalogue import StarCatalogue

@@ -18,10 +18,8 @@ from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.files import PathLike
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import Progress
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, Progress
 from starcal_uq.identification.proposers import Proposer, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.search import FrameTable, Search, field_geometry

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.files import reading
-from starcal_uq.core.types import AnyDict, IntArray
+from starcal_uq.core.types import AnyDict, IntArray, PathLike
 from starcal_uq.observations.checks import check_columns, check_mapping, raise_problems
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import (
@@ -64,7 +63,7 @@ class FrameStream:
 
 
 def stream_frames(
-    path: str | os.PathLike[str],
+    path: PathLike,
     camera: Camera | None = None,
     columns: Mapping[str, str] | None = None,
     *,

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.recursive.filter import Recursion
@@ -44,7 +43,7 @@ class State:
     recursion: Recursion | None
 
 
-def write_state(state: State, path: str | os.PathLike[str]) -> None:
+def write_state(state: State, path: PathLike) -> None:
     """Write a state, all or nothing."""
     arrays: Arrays = {}
     header = {"kind": _KIND, "version": _VERSION, **to_plain(state, arrays)}
@@ -52,7 +51,7 @@ def write_state(state: State, path: str | os.PathLike[str]) -> None:
         np.savez(stream, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
 
 
-def read_state(path: str | os.PathLike[str]) -> State:
+def read_state(path: PathLike) -> State:
     """Inverse of `write_state`; `RunFolderError` for a file that is missing, truncated, or no such
     state.
     """

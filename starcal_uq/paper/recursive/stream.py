@@ -5,7 +5,6 @@ between.
 from __future__ import annotations
 
 import hashlib
-import os
 from dataclasses import dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import reading
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, noise_px, raise_unless_good
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -340,7 +339,7 @@ class RecursiveCalibration:
             raise_unless_good(calibration.status, calibration.remedy)
         return calibration
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: PathLike) -> None:
         """Write the state to a file (``.npz``), atomically; `load` goes on from it as if nothing
         had happened.
 
@@ -365,7 +364,7 @@ class RecursiveCalibration:
         write_state(state, path)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> RecursiveCalibration:
+    def load(cls, path: PathLike) -> RecursiveCalibration:
         """Inverse of `save`.
 
         Raises

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, atomic_write_text, cell_text
 from starcal_uq.core.status import Level
+from starcal_uq.core.types import PathLike
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import template_environment
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _RED, _AMBER, _GREEN, _HEAD = "FFFDE6DB", "FFFDF1D6", "FFE3F4EE", "FFDFE4E9"
 
 
-def write_tex(budget: Budget, path: str | os.PathLike[str]) -> None:
+def write_tex(budget: Budget, path: PathLike) -> None:
     """A document that compiles by itself, with booktabs tables to take out."""
     import jinja2
 
@@ -62,7 +62,7 @@ def section_html(budget: Budget) -> str:
     return template.render(**budget_context(budget), images=_images(budget))
 
 
-def write_html(budget: Budget, path: str | os.PathLike[str]) -> None:
+def write_html(budget: Budget, path: PathLike) -> None:
     """A page that needs no network and no other file."""
     provenance = budget.provenance
     text = (
@@ -79,7 +79,7 @@ def write_html(budget: Budget, path: str | os.PathLike[str]) -> None:
     atomic_write_text(path, text + "\n")
 
 
-def write_xlsx(budget: Budget, path: str | os.PathLike[str]) -> None:
+def write_xlsx(budget: Budget, path: PathLike) -> None:
     """A workbook with the sheets Contributors, Totals, Requirements (if any) and Notes; numbers are
     numbers.
     """
@@ -335,7 +335,7 @@ def _format(value: float) -> str:
     )
 
 
-_WRITERS: dict[str, Callable[[Budget, str | os.PathLike[str]], None]] = {
+_WRITERS: dict[str, Callable[[Budget, PathLike], None]] = {
     ".csv": Budget.save,
     ".xlsx": write_xlsx,
     ".tex": write_tex,
@@ -344,7 +344,7 @@ _WRITERS: dict[str, Callable[[Budget, str | os.PathLike[str]], None]] = {
 FORMATS = tuple(_WRITERS)
 
 
-def write_budget(budget: Budget, path: str | os.PathLike[str]) -> Path:
+def write_budget(budget: Budget, path: PathLike) -> Path:
     """Write the budget, atomically; overwritten. The ending names the format.
 
     ``.csv`` holds everything to the last digit and is what `Budget.load` reads; the others are for

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_csv
 from starcal_uq.core.formatting import fixed, p_words, percent, plus_minus, pretty_unit, significant
 from starcal_uq.core.manifest import making
+from starcal_uq.core.types import PathLike
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import template_environment
@@ -35,7 +35,7 @@ _BADGES = {
 _PAGE = "comparison.html"
 
 
-def write_comparison(comparison: CameraComparison, folder: str | os.PathLike[str]) -> Path:
+def write_comparison(comparison: CameraComparison, folder: PathLike) -> Path:
     """Write the page, the tables, the figure and a lossless file into a folder, in place of those
     of before.
 

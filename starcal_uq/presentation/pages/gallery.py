@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
@@ -20,6 +19,7 @@ from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.formatting import MINUS, count, fixed, plural, significant
 from starcal_uq.core.provenance import installed_version
+from starcal_uq.core.types import PathLike
 from starcal_uq.pipeline.inspection import (
     FAINTER,
     IDENTIFIED,
@@ -90,7 +90,7 @@ def frames_html(frames: Frames) -> str:
     return gallery(frames.telling(_NOTEBOOK))
 
 
-def write_frames(frames: Frames, to: str | os.PathLike[str]) -> Path:
+def write_frames(frames: Frames, to: PathLike) -> Path:
     """Write the frames as one HTML file."""
     page = template_environment().get_template("frames.html.j2")
     atomic_write_text(

@@ -13,8 +13,8 @@ from typing import Any
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.tasks import Progress
 from starcal_uq.core.temporary import TemporaryFolder
+from starcal_uq.core.types import Progress
 
 # File of the run that a part needs, heading, sentence, and cells.
 _PARTS = (

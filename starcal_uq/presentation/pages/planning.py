@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_fol
 from starcal_uq.core.formatting import count, fixed, significant
 from starcal_uq.core.manifest import making
 from starcal_uq.core.records import to_plain
+from starcal_uq.core.types import PathLike
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.plan import Plan
@@ -62,7 +62,7 @@ _GROUPS = (
 
 def write_plan(
     plan: Plan,
-    folder: str | os.PathLike[str],
+    folder: PathLike,
     choice: FrameChoice | None = None,
     check: ForecastCheck | None = None,
 ) -> Path:

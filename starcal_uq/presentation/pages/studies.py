@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder
 from starcal_uq.core.formatting import count, plural
+from starcal_uq.core.types import PathLike
 from starcal_uq.presentation.figures.studies import (
     plot_coverage,
     plot_inflation,
@@ -92,7 +92,7 @@ _CAPTIONS = {
 _SIMULATED = " Crosses: the posterior's correlation, median and range over seeds."
 
 
-def write_study(study: Study, folder: str | os.PathLike[str]) -> Path:
+def write_study(study: Study, folder: PathLike) -> Path:
     """Write the figures into a folder, then ``report.html`` (self-contained), in place of those of
     before.
     """

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 from starcal_uq.budgeting.result import Budget
 from starcal_uq.comparison.result import CameraComparison
+from starcal_uq.core.types import PathLike
 from starcal_uq.pipeline.inspection import Frames
 from starcal_uq.planning.plan import Plan
 from starcal_uq.presentation.pages.budgeting import write_budget
@@ -20,7 +20,7 @@ from starcal_uq.studies.result import Study
 
 def write_page(
     what: Plan | CameraComparison | Budget | Study | Frames,
-    to: str | os.PathLike[str],
+    to: PathLike,
     **options: Any,
 ) -> Path:
     """Write a result for people to read.

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from starcal_uq.core.beside import Beside
-from starcal_uq.core.tasks import Progress
+from starcal_uq.core.types import Progress
 from starcal_uq.pipeline.inspection import Frames
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
