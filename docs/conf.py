@@ -91,7 +91,7 @@ def write_schemas(_app: object) -> None:
         lines += [
             f"## {name}",
             "",
-            f"{'Any command' if name == 'error' else what}, version {version}. {part.__doc__}",
+            f"{'Any command' if name == 'error' else what}, version {version}. {part.text}",
             "",
         ]
         lines += ["| Key | Type | Unit | |", "|---|---|---|---|"]

@@ -35,9 +35,10 @@ def schema_command(
     from starcal_uq.cli.schemas import SCHEMAS, json_schema
 
     chosen = SCHEMAS if name is None else {name: SCHEMAS[name]}
-    rows = [(each, str(version), part.__doc__ or "") for each, (version, part) in chosen.items()]
+    rows = [(each, version, part.text) for each, (version, part) in chosen.items()]
     if name is None:
-        print_table(TextTable(("schema", "version", "what it holds"), tuple(rows), align="lrl"))
+        cells = tuple((each, str(version), text) for each, version, text in rows)
+        print_table(TextTable(("schema", "version", "what it holds"), cells, align="lrl"))
     else:
         say(json.dumps(json_schema(name), indent=1))
     return Answer(

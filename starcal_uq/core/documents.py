@@ -1,4 +1,4 @@
-"""JSON documents: how an object of one is declared, by its keys or by a record, and how a result
+"""JSON documents: how an object of one is declared, in words or by a record, and how a result
 becomes one.
 
 NaN and infinity are null: not known, not determined, or not assessed.
@@ -6,85 +6,170 @@ NaN and infinity are null: not known, not determined, or not assessed.
 
 from __future__ import annotations
 
+import json
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from functools import cache
-from importlib import import_module
 from inspect import getdoc
-from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from os import PathLike
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    create_model,
-    model_validator,
-)
-from pydantic_core import CoreSchema
 
+from starcal_uq.core.records import to_plain
 from starcal_uq.core.types import AnyDict, unaliased
 
-Number = float | None
 PREFIX = "starcal-uq/"
+# Endings of keys that tell the unit.
+_UNITS = {
+    "arcsec": "arcsec",
+    "px": "px",
+    "mm": "mm",
+    "deg": "deg",
+    "percent": "%",
+    "seconds": "s",
+    "milliseconds": "ms",
+}
+_TYPES: Mapping[str, tuple[type, ...]] = {
+    "string": (str,),
+    "integer": (int, np.integer),
+    "boolean": (bool, np.bool_),
+    "number": (int, float, np.number),
+}
+_WORDS = {str: "string", int: "integer", bool: "boolean", float: "number", np.float64: "number"}
 
 
-def says(text: str, unit: str = "") -> Any:
-    """What a key holds; its unit where the name does not end in it."""
-    return Field(description=text, json_schema_extra={"unit": unit} if unit else None)
+@dataclass(frozen=True)
+class Part:
+    """An object of a document.
 
-
-def plain(value: Any) -> Any:
-    """Numbers, texts, lists and mappings for JSON; a result among them is left to the part that
-    takes it.
+    Attributes
+    ----------
+    name, text : str
+        Name of the object, and what it is.
+    keys : mapping of str to dict
+        JSON Schema of what stands under each key.
+    take : callable, optional
+        What stands under keys that are no attributes of a result.
     """
-    if isinstance(value, np.generic | np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Enum):
-        return plain(value.value)
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return plain(value.to_dict("records")) if hasattr(value, "iterrows") else value
+
+    name: str
+    text: str
+    keys: Mapping[str, AnyDict]
+    take: Callable[[Any], Mapping[str, Any]] | None = None
+
+    def of(self, result: Any, find: Callable[[str], Part]) -> AnyDict:
+        """The object that holds a result; `find` gives the parts that it refers to by their
+        names.
+        """
+        own = result if isinstance(result, Mapping) else {}
+        if self.take is not None and not own:
+            own = self.take(result)
+        return {
+            key: _fitted(
+                kind,
+                own[key] if key in own else getattr(result, key),
+                find,
+                f"{self.name}.{key}",
+            )
+            for key, kind in self.keys.items()
+        }
+
+    @property
+    def schema(self) -> AnyDict:
+        """Its JSON Schema."""
+        return {
+            "description": self.text,
+            "properties": dict(self.keys),
+            "required": list(self.keys),
+            "title": self.name,
+            "type": "object",
+        }
 
 
-class Part(BaseModel):
-    """An object of a document."""
-
-    # Names such as model_... are free, and what no call needs is not built.
-    model_config = ConfigDict(defer_build=True, protected_namespaces=())
-
-    @model_validator(mode="before")
-    @classmethod
-    def _taken(cls, value: Any) -> Any:
-        taken = value if isinstance(value, Mapping) else cls.take(value)
-        return {key: plain(item) for key, item in taken.items()}
-
-    @classmethod
-    def take(cls, result: Any) -> Mapping[str, Any]:
-        """What a result holds, by key."""
-        return {key: getattr(result, key) for key in cls.model_fields}
+def key(name: str, words: str, text: str, unit: str = "") -> AnyDict:
+    """The schema of a key of a kind, such as "list of Frame or null", and what it holds; the unit
+    where its name does not end in it.
+    """
+    schema = _schema(words) | {"description": text}
+    unit = unit or _UNITS.get(name.rsplit("_", 1)[-1], "")
+    if unit:
+        schema["unit"] = unit
+    return dict(sorted(schema.items()))
 
 
-def document(name: str, version: int, part: type[Part], results: Any, status: int) -> AnyDict:
+def _schema(words: str) -> AnyDict:
+    if words.endswith(" or null"):
+        return {"anyOf": [_schema(words.removesuffix(" or null")), {"type": "null"}]}
+    for start, place, kind in (
+        ("list of ", "items", "array"),
+        ("object of ", "additionalProperties", "object"),
+    ):
+        if words.startswith(start):
+            return {place: _schema(words.removeprefix(start)), "type": kind}
+    if words == "number":
+        return {"anyOf": [{"type": "number"}, {"type": "null"}]}
+    if words == "object":
+        return {"additionalProperties": True, "type": "object"}
+    if "|" in words:
+        return {"enum": words.split("|"), "type": "string"}
+    return {"type": words} if words in _TYPES else {"$ref": f"#/$defs/{words}"}
+
+
+def _fitted(kind: AnyDict, value: Any, find: Callable[[str], Part], name: str) -> Any:
+    """A value as its kind of JSON has it; TypeError for another kind."""
+    if "anyOf" in kind:
+        missing = value is None or (isinstance(value, float) and not math.isfinite(value))
+        return None if missing else _fitted(kind["anyOf"][0], value, find, name)
+    if "$ref" in kind:
+        return find(referred(kind)).of(value, find)
+    if "items" in kind:
+        if hasattr(value, "iterrows"):
+            value = value.to_dict("records")
+        return [_fitted(kind["items"], item, find, name) for item in value]
+    if kind["type"] == "object":
+        inner = kind["additionalProperties"]
+        if inner is True:
+            return json.loads(json.dumps(value, default=to_plain), parse_constant=lambda _: None)
+        return {str(each): _fitted(inner, item, find, name) for each, item in value.items()}
+    value = value.value if isinstance(value, Enum) else value
+    value = str(value) if isinstance(value, PathLike) else value
+    if not isinstance(value, _TYPES[kind["type"]]):
+        raise TypeError(f"{name} is {type(value).__name__}, not {kind['type']}")
+    plain: Any = value.item() if isinstance(value, np.generic) else value
+    return float(plain) if kind["type"] == "number" else plain
+
+
+def referred(kind: AnyDict) -> str:
+    """The name of the part that a key, or a list of it, is made of; empty where there is none."""
+    if "$ref" in kind:
+        return str(kind["$ref"].rpartition("/")[2])
+    return "".join(map(referred, filter(None, [kind.get("items"), *kind.get("anyOf", ())])))
+
+
+def document(
+    name: str,
+    version: int,
+    part: Part,
+    results: Any,
+    status: int,
+    find: Callable[[str], Part] | None = None,
+) -> AnyDict:
     """The document of a schema, its name and version first."""
     head = {"schema": PREFIX + name, "version": version, "exit_status": status}
-    return head | part.model_validate(results).model_dump()
+    return head | part.of(results, find or RECORDS.__getitem__)
+
+
+# Parts of records by their names.
+RECORDS: dict[str, Part] = {}
 
 
 @cache
-def part_of(record: type) -> type[Part]:
+def part_of(record: type) -> Part:
     """The part with the fields of a record of ours, whose docstring says what they are.
 
     Properties are in it that its class variable ``DOCUMENTED`` names.
@@ -95,53 +180,36 @@ def part_of(record: type) -> type[Part]:
     ):
         said |= dict.fromkeys(names.split(", "), " ".join(text.split()).removesuffix("."))
     hints = get_type_hints(record)
-    keys: AnyDict = {}
     for name in getattr(record, "DOCUMENTED", ()):
         getter = getattr(record, name).fget
-        text = (getdoc(getter) or "").partition("\n")[0].removesuffix(".")
-        keys[name] = (_kind(get_type_hints(getter)["return"]), says(text))
-    keys |= {
-        field.name: (_kind(hints[field.name]), says(said[field.name])) for field in fields(record)
-    }
-    return create_model(
-        record.__name__, __base__=Part, __doc__=(getdoc(record) or "").partition("\n")[0], **keys
-    )
+        said[name] = _first_line(getter).removesuffix(".")
+        hints[name] = get_type_hints(getter)["return"]
+    names = [*getattr(record, "DOCUMENTED", ()), *(field.name for field in fields(record))]
+    keys = {name: key(name, _words(hints[name]), said[name]) for name in names}
+    part = RECORDS[record.__name__] = Part(record.__name__, _first_line(record), keys)
+    return part
 
 
-def _kind(hint: Any) -> Any:
-    """The type in JSON of an annotation of a record."""
+def _first_line(documented: Any) -> str:
+    return (getdoc(documented) or "").partition("\n")[0]
+
+
+def _words(hint: Any) -> str:
+    """The kind of JSON of an annotation of a record, in words."""
     hint = unaliased(hint)
     origin, args = get_origin(hint), get_args(hint)
-    if hint is float or hint is np.float64:
-        return Number
-    if origin in (Union, UnionType):
-        return Union[tuple(_kind(arg) for arg in args)]  # noqa: UP007
+    if hint in _WORDS:
+        return _WORDS[hint]
+    if NoneType in args:
+        return f"{_words(args[0])} or null"
     if origin is np.ndarray:
-        return list[Number]
+        return "list of number"
     if origin in (tuple, list):
-        return list[_kind(args[0])]  # type: ignore[misc]
+        return f"list of {_words(args[0])}"
+    if origin is Literal:
+        return "|".join(args)
     if isinstance(hint, type) and issubclass(hint, Enum):
-        return Literal[tuple(member.value for member in hint)]
-    return part_of(hint) if is_dataclass(hint) and isinstance(hint, type) else hint
-
-
-class Of:
-    """A part made of a record, given as ``module:Class``, and more keys; loaded when it is asked
-    for.
-    """
-
-    def __init__(self, record: str, **more: tuple[Any, str]) -> None:
-        self._record, self._more = record, more
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        module, name = self._record.split(":")
-        part = part_of(getattr(import_module(f"starcal_uq.{module}"), name))
-        if self._more:
-            keys: AnyDict = {key: (kind, says(text)) for key, (kind, text) in self._more.items()}
-            part = create_model(name, __base__=part, __doc__=part.__doc__, **keys)
-        origin = get_origin(source)
-        return handler.generate_schema(
-            list[part] if origin is list else part | None if origin in (Union, UnionType) else part  # type: ignore[valid-type]
-        )
+        return "|".join(member.value for member in hint)
+    if is_dataclass(hint) and isinstance(hint, type):
+        return part_of(hint).name
+    raise TypeError(f"no document holds {hint}")
