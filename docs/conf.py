@@ -189,7 +189,9 @@ def write_reference(_app: object) -> None:
             )
             of_file = isinstance(public, type) and issubclass(public, Saved)
             files = "\n\n   .. automethod:: save\n   .. automethod:: load" if of_file else ""
-            directive = f".. auto{kind}:: {module}.{name}{files}"
+            # What it holds is declared apart from its steps.
+            held = "\n   :inherited-members:" if name == "Run" else ""
+            directive = f".. auto{kind}:: {module}.{name}{held}{files}"
             text = f"# {prefix}{name}\n\n```{{eval-rst}}\n{directive}\n```\n{drawn_by(public)}"
             (place / f"{page}.md").write_text(text, encoding="utf-8")
             told = (public.__doc__ or "").strip().partition("\n\n")[0] if kind != "data" else ""

@@ -5,4 +5,4 @@ from .folder import RunFolder as RunFolder
 from .merge import merge_runs as merge_runs
 from .priors import load_priors as load_priors
 from .priors import prior_from_run as prior_from_run
-from .run import MissionSky as MissionSky
+from .steps.mission import MissionSky as MissionSky

@@ -112,7 +112,7 @@ def _store(path: Path) -> Any:
 
 
 def _frames(path: Path) -> Any:
-    from starcal_uq.runs.run import _frames_of
+    from starcal_uq.runs.steps.misfit import _frames_of
 
     return _frames_of(path)
 

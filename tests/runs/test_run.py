@@ -29,7 +29,7 @@ READERS: tuple[tuple[type, str], ...] = (
 )
 # Modules that hold a function, and its name.
 FUNCTIONS = (
-    ("starcal_uq.runs.run", "load_observations"),
+    ("starcal_uq.runs.stored", "load_observations"),
     ("starcal_uq.diagnostics.verdict.judge", "judge"),
     ("starcal_uq.propagation.coupling", "coupling"),
 )

@@ -1,0 +1,94 @@
+"""The attitude error budget of a run."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starcal_uq.core.records import write_json
+from starcal_uq.core.settings import bounded
+from starcal_uq.core.types import PathLike
+from starcal_uq.runs.stored import StoredRun, writing
+
+if TYPE_CHECKING:
+    from starcal_uq.budgeting.file import BudgetFile
+    from starcal_uq.budgeting.result import Budget
+
+
+@bounded
+@writing
+def budget(
+    run: StoredRun,
+    /,
+    *,
+    file: BudgetFile | PathLike | None = None,
+    confidence: float | None = None,
+    seed: int = 0,
+    force: bool = False,
+) -> Budget:
+    """Make the attitude error budget and write it.
+
+    The attitude errors are those of ``attitude.csv``, with the misfit found if the run was
+    diagnosed. A report stays, and is older than the budget until it is made again; the verdict
+    has the new requirements at once.
+
+    Parameters
+    ----------
+    file, confidence, seed
+        As for `starcal_uq.budget`.
+    force : bool
+        Whether a budget that was made with another file goes. It is kept as ``budget-1.csv``,
+        or the next free number, otherwise.
+
+    Raises
+    ------
+    RunFolderError
+        If a part is missing, or the data are not those of the run.
+    BudgetError
+        If the file is wrong.
+    """
+    from starcal_uq.budgeting.budget import budget
+    from starcal_uq.budgeting.file import BudgetFile, load_budget_file
+
+    stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
+    posterior, attitude = run.posterior, run.attitude
+    made = budget(
+        posterior,
+        run.observations,
+        attitude,
+        file=stated,
+        confidence=confidence,
+        seed=seed,
+    )
+    with run._step("budget", seed, {"file": file, "confidence": confidence}) as files:
+        made.save(files.budget)
+        if not force and run.has("budget") and not _of_one_file(made, run.error_budget):
+            shutil.copyfile(
+                run.folder.budget, files.path / _free_name(run.folder.path, "budget-{}.csv")
+            )
+        if run.has("verdict"):
+            write_json(replace(run.results, budget=made).verdict.to_dict(), files.verdict)
+    run.error_budget = made
+    if run.folder.is_older("report"):
+        run._tell(
+            f"report.html is older than the budget; run `starcal-uq report {run.path}` to "
+            "make it again."
+        )
+    return made
+
+
+def _free_name(folder: Path, name: str) -> str:
+    """The first name of numbered ones that no file of the folder has."""
+    numbered = (name.format(number) for number in itertools.count(1))
+    return next(one for one in numbered if not (folder / one).exists())
+
+
+def _of_one_file(one: Budget, other: Budget) -> bool:
+    """Whether the second of two budgets holds no file of the user's that the first does not
+    hold.
+    """
+    first, second = (made.provenance["settings"].get("file", "") for made in (one, other))
+    return not second or Path(first).resolve() == Path(second).resolve()
