@@ -1,47 +1,37 @@
-"""From observations to a calibration: three stages, then refinement on the attitude-marginalised
-likelihood.
-"""
+"""From observations to a calibration: the fit, its fallbacks and what excludes what."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import get_args
+from typing import Unpack, get_args
 
 import numpy as np
 
 from starcal_uq.calibration.fallback import fit_determined
-from starcal_uq.calibration.methods import MethodOptions, offered
+from starcal_uq.calibration.methods import offered
 from starcal_uq.calibration.plausibility import explained
 from starcal_uq.camera import compiled
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.cluster import Scheduler, cluster
-from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.settings import Method, RecursiveMethod, Solver, bounded
+from starcal_uq.core.settings import RecursiveMethod, bounded
 from starcal_uq.core.tasks import one_thread, processors
 from starcal_uq.core.types import Progress
-from starcal_uq.estimation.assemble import (
-    check_count,
-    raise_unless_good,
-    with_star_errors,
-)
+from starcal_uq.estimation.assemble import raise_unless_good, with_star_errors
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
-from starcal_uq.estimation.fit import ITERATIONS, gaussian_fit, noise_model_fit, robust_fit
-from starcal_uq.estimation.noise_model import NOISES, weighed
+from starcal_uq.estimation.fit import fit_composed
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.partitioned import calibrate_partitions
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.settings import METHODS as METHODS
+from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
 from starcal_uq.likelihood.loops import kernels
-from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.student import parse_dof
-from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 
-METHODS = get_args(Method)
 RECURSIVE_METHODS = get_args(RecursiveMethod)
-LIKELIHOODS = ("marginal", "student_t")
-SOLVERS = get_args(Solver)
+OWN_METHODS = ("efficient", "three_stage")
 # Starting processes takes two seconds.
 _STARS_WORTH_PROCESSES = 1_000_000
 
@@ -52,21 +42,13 @@ _STARS_WORTH_PROCESSES = 1_000_000
 def calibrate(
     obs: Observations | PartitionedObservations | Iterable[Observations],
     camera: Camera,
+    settings: EstimationSettings | None = None,
     *,
-    model: str | None = None,
-    method: str = "efficient",
-    solver: str = "lm",
-    max_iterations: int = ITERATIONS,
     throw: bool = True,
-    likelihood: str = "marginal",
-    dof: float | str | None = None,
-    recursion: MethodOptions | None = None,
-    noise: str = "common",
-    duplicates: str = "refuse",
-    star_errors: bool = False,
     scheduler: Scheduler = None,
     workers: int | None = None,
     progress: Progress | None = None,
+    **options: Unpack[EstimationOptions],
 ) -> Calibration:
     """Estimate optics and distortion from identified stars.
 
@@ -77,11 +59,38 @@ def calibrate(
         ones may exceed memory: a sample of their frames goes through the stages, then all of them
         are refined on, pass by pass; the result has residuals and attitudes of that sample. The
         recursive methods also take a stream: any iterable of Observations of one or several frames,
-        such as `starcal_uq.paper.stream_frames`. They keep none of them, so that the result has no residuals and
-        attitudes.
+        such as `starcal_uq.paper.stream_frames`. They keep none of them, so that the result has no
+        residuals and attitudes.
     camera : Camera
         Start values; its `distortion` names the model. The coefficients start from zero, as in the
         paper.
+    settings : EstimationSettings, optional
+        The settings; keywords change some of them.
+    throw : bool
+        Raise when the estimate is not good; otherwise `Calibration.status` says so, as long as
+        there is an estimate.
+    scheduler : str or distributed.Client, optional
+        Dask scheduler, whose workers read partitioned observations; processes of this machine
+        otherwise.
+    workers : int, optional
+        Number of these processes: as many as processors by default; 0 stays in this one.
+    progress : callable, optional
+        Called with (partitions done, partitions) in every pass over partitioned observations.
+
+    Returns
+    -------
+    Calibration
+        With estimate, covariance, residuals, attitudes and the trajectory of every stage.
+
+    Raises
+    ------
+    CalibrationError
+        When there are too few stars, or, with `throw`, when the status is not CONVERGED.
+    RepeatedFramesError
+        When frames hold the same measurement, and `duplicates` is ``refuse``.
+
+    Other Parameters
+    ----------------
     model : str, optional
         Distortion model in place of the camera's. A model asked for here is fitted or refused. By
         default it is that of `camera`, and where the data do not determine it (methods
@@ -106,159 +115,108 @@ def calibrate(
         distortion monotonic. The refinement always uses the first; the recursive methods use none.
     max_iterations : int
         Limit for each stage.
-    throw : bool
-        Raise when the estimate is not good; otherwise `Calibration.status` says so, as long as
-        there is an estimate.
-    likelihood : {"marginal", "student_t"}
-        Likelihood that the refinement maximises: Gaussian noise, or a Student t per star for tables
-        with wrong identifications. With ``student_t`` the stages see only stars whose angles agree
-        with those of their frame, the refinement sees all that can be in the field, `covariance` is
-        the sandwich one, `information` the observed one, `sigma` the scale of the t, `chi2` is
-        summed with the stars' weights, and `compressed` is the Gaussian likelihood of the
-        reweighted stars.
+    likelihood : {"marginal", "student_t"} or starcal_uq.likelihood.Likelihood
+        Likelihood that the refinement maximises, composed or by name: Gaussian noise, or a Student
+        t per star for tables with wrong identifications. With ``student_t`` the stages see only
+        stars whose angles agree with those of their frame, the refinement sees all that can be in
+        the field, `covariance` is the sandwich one, `information` the observed one, `sigma` the
+        scale of the t, `chi2` is summed with the stars' weights, and `compressed` is the Gaussian
+        likelihood of the reweighted stars.
     dof : float or "free", optional
         Degrees of freedom of ``student_t``, 2 to 200, by default 4; "free" estimates them, with the
         gamma prior of Juarez & Steel (2010) on what exceeds 2.
-    recursion : RecursionOptions, optional
-        Options of ``samaan`` and ``griffith`` (`starcal_uq.paper.RecursionOptions`).
     noise : {"common", "model"}
         One noise for all stars (or one factor on what they state), or a variance that is fitted as
         a function of radius, magnitude, frame and axis, as far as the residuals ask for it:
         `Calibration.noise_model`. Everything that takes the result then weighs the stars by it, and
         `sigma` is a factor on it. It needs the ``efficient`` method and the ``marginal``
         likelihood.
-    duplicates : {"refuse", "drop", "keep"}
-        What to do with frames that hold the same measurement as an earlier one, whatever their
-        numbers, order and stars (`starcal_uq.estimation.repeated_frames`): they would count twice.
-        ``drop`` leaves them out, there and in all that takes the table with the result (`frame_ids`
-        are those that stay); ``keep`` does not ask, nor are streams asked.
     star_errors : bool
         Take into account that a star's direction errs alike in every frame (catalogue, blend,
         colour): the size of such errors is estimated, beyond what the column ``direction_mas`` of
         the table states, and they are marginalised in estimate, covariance and `compressed`. For
         ``efficient`` with ``marginal``.
-    scheduler : str or distributed.Client, optional
-        Dask scheduler, whose workers read partitioned observations; processes of this machine
-        otherwise.
-    workers : int, optional
-        Number of these processes: as many as processors by default; 0 stays in this one.
-    progress : callable, optional
-        Called with (partitions done, partitions) in every pass over partitioned observations.
-
-    Returns
-    -------
-    Calibration
-        With estimate, covariance, residuals, attitudes and the trajectory of every stage.
-
-    Raises
-    ------
-    CalibrationError
-        When there are too few stars, or, with `throw`, when the status is not CONVERGED.
-    RepeatedFramesError
-        When frames hold the same measurement, and `duplicates` is ``refuse``.
+    recursion : RecursionOptions, optional
+        Options of ``samaan`` and ``griffith`` (`starcal_uq.paper.RecursionOptions`).
+    duplicates : {"refuse", "drop", "keep"}
+        What to do with frames that hold the same measurement as an earlier one, whatever their
+        numbers, order and stars (`starcal_uq.estimation.repeated_frames`): they would count twice.
+        ``drop`` leaves them out, there and in all that takes the table with the result (`frame_ids`
+        are those that stay); ``keep`` does not ask, nor are streams asked.
     """
-    check_duplicates(duplicates)
-    nominal = camera
-    camera = camera if model is None else camera.replace(distortion=model)
-    if method not in METHODS:
-        raise CalibrationError(f"method {method!r} is unknown: use one of {', '.join(METHODS)}.")
-    if solver not in SOLVERS:
-        raise CalibrationError(f"solver {solver!r} is unknown: use one of {', '.join(SOLVERS)}.")
-    if likelihood not in LIKELIHOODS:
-        raise CalibrationError(
-            f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}."
-        )
-    nu = parse_dof(dof, CalibrationError)
-    if noise not in NOISES:
-        raise CalibrationError(f"noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
-    refuse_conflicts(
-        method=method,
-        likelihood=likelihood,
-        dof=dof,
-        recursion=recursion,
-        noise=noise,
-        star_errors=star_errors,
-        duplicates=duplicates,
-        scheduler=scheduler,
-        workers=workers,
-        partitioned=isinstance(obs, PartitionedObservations),
-    )
-    if isinstance(obs, PartitionedObservations) and method not in RECURSIVE_METHODS:
+    settings = (EstimationSettings() if settings is None else settings).changed(**options)
+    partitioned = isinstance(obs, PartitionedObservations)
+    check_duplicates(settings.duplicates)
+    settings.refuse_conflicts(scheduler=scheduler, workers=workers, partitioned=partitioned)
+    calibration = _estimate(obs, camera, settings, throw, scheduler, workers, progress)
+    if throw:
+        raise_unless_good(calibration.status, calibration.remedy, calibration)
+    repeating = repeating_frames(calibration, settings.duplicates)
+    if not len(repeating) or not isinstance(obs, Observations):
+        return calibration
+    kept = obs.select_frames(np.setdiff1d(obs.frame_ids, repeating))
+    rest = calibrate(kept, camera, settings, throw=throw, duplicates="keep")
+    return replace(rest, provenance={**rest.provenance, "dropped_frames": repeating.tolist()})
+
+
+def _estimate(
+    obs: Observations | PartitionedObservations | Iterable[Observations],
+    camera: Camera,
+    settings: EstimationSettings,
+    throw: bool,
+    scheduler: Scheduler,
+    workers: int | None,
+    progress: Progress | None,
+) -> Calibration:
+    """The calibration of all frames, whether it ended well or not."""
+    asked = camera if settings.model is None else camera.replace(distortion=settings.model)
+    if isinstance(obs, PartitionedObservations) and settings.method not in RECURSIVE_METHODS:
         sample = obs.sample()
         # What is compiled is compiled here, before other processes ask for it.
-        with compiled.using(kernels(camera.distortion, obs.n_stars)):
-            start = calibrate(
-                sample,
-                camera,
-                model=camera.distortion,
-                solver=solver,
-                max_iterations=max_iterations,
-                duplicates=duplicates,
-            )
+        with compiled.using(kernels(asked.distortion, obs.n_stars)):
+            start = calibrate(sample, asked, settings, model=asked.distortion)
         with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
-            calibration = calibrate_partitions(
+            return calibrate_partitions(
                 obs,
                 sample,
                 start,
                 processes,
-                max_iterations=max_iterations,
-                duplicates=duplicates,
+                max_iterations=settings.max_iterations,
+                duplicates=settings.duplicates,
                 progress=progress,
             )
-    elif method in RECURSIVE_METHODS:
-        calibration = offered(method)(obs, camera, recursion, solver, max_iterations)
-    elif not isinstance(obs, Observations):
+    if settings.method not in OWN_METHODS:
+        if settings.method not in RECURSIVE_METHODS:
+            obs = _in_memory(obs, settings.method)
+        estimate = offered(settings.method)
+        return estimate(obs, asked, settings.recursion, settings.solver, settings.max_iterations)
+    obs = _in_memory(obs, settings.method)
+    if obs.stated_px is not None and settings.composed.noise == "common":
+        # Weights of another calibration's noise model are what this table states.
+        obs = replace(obs, stated_px=None, noise_axes=None)
+    table = obs
+    calibration = fit_determined(
+        table,
+        asked,
+        lambda start: fit_composed(table, start, settings),
+        sheet=camera.distortion,
+        asked=settings.model is not None,
+        throw=throw,
+    )
+    if settings.composed.star_errors and calibration.status.ok:
+        return with_star_errors(weighed(obs, calibration), calibration)
+    return calibration
+
+
+def _in_memory(
+    obs: Observations | PartitionedObservations | Iterable[Observations], method: str
+) -> Observations:
+    if not isinstance(obs, Observations):
         raise CalibrationError(
             f"method {method!r} needs all frames at once, as Observations: load them, or use "
             "samaan or griffith."
         )
-    elif method == "least_squares":
-        calibration = offered(method)(obs, camera, None, solver, max_iterations)
-    else:
-        # Weights of another calibration's noise model are what this table states.
-        obs = (
-            replace(obs, stated_px=None, noise_axes=None)
-            if obs.stated_px is not None and noise == "common"
-            else obs
-        )
-        frames = StarFrames.from_observations(obs)
-
-        def fitted(start: Camera) -> Calibration:
-            gaussian = MarginalLikelihood(frames, start.distortion)
-            check_count(gaussian, start)
-            if noise == "model":
-                return noise_model_fit(obs.unweighted, start, method, solver, max_iterations)
-            if likelihood == "student_t":
-                return robust_fit(obs, start, frames, solver, max_iterations, nu)
-            return gaussian_fit(obs, start, gaussian, method, solver, max_iterations)
-
-        sheet = nominal.distortion
-        calibration = fit_determined(
-            obs, camera, fitted, sheet=sheet, asked=model is not None, throw=throw
-        )
-        if star_errors and calibration.status.ok:
-            calibration = with_star_errors(weighed(obs, calibration), calibration)
-    if throw:
-        raise_unless_good(calibration.status, calibration.remedy, calibration)
-    repeating = repeating_frames(calibration, duplicates)
-    if not len(repeating) or not isinstance(obs, Observations):
-        return calibration
-    rest = calibrate(
-        obs.select_frames(np.setdiff1d(obs.frame_ids, repeating)),
-        nominal,
-        model=model,
-        method=method,
-        solver=solver,
-        max_iterations=max_iterations,
-        throw=throw,
-        likelihood=likelihood,
-        dof=dof,
-        recursion=recursion,
-        noise=noise,
-        star_errors=star_errors,
-        duplicates="keep",
-    )
-    return replace(rest, provenance={**rest.provenance, "dropped_frames": repeating.tolist()})
+    return obs
 
 
 def _enough(workers: int | None, obs: PartitionedObservations) -> int | None:

@@ -13,15 +13,9 @@ from starcal_uq.core.errors import CalibrationError
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.result import Calibration
+    from starcal_uq.estimation.settings import MethodOptions
 
 GROUP = "starcal_uq.methods"
-
-
-class MethodOptions(Protocol):
-    """Options of a method."""
-
-    def check(self, method: str) -> None:
-        """Refuse what makes no sense for a method, by a `CalibrationError` with the remedy."""
 
 
 class Offered(Protocol):

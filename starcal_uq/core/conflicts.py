@@ -48,9 +48,7 @@ class Rule:
 RULES = (
     Rule("likelihood", ("student_t",), "method", (None, "efficient")),
     Rule("noise", ("model",), "method", (None, "efficient")),
-    Rule("noise", ("model",), "likelihood", (None, "marginal")),
     Rule("star_errors", (True,), "method", (None, "efficient")),
-    Rule("star_errors", (True,), "likelihood", (None, "marginal")),
     Rule("accept_inflation", (True,), "method", (None, "efficient", *_IN_MEMORY)),
     Rule("dof", (), "likelihood", ("student_t",)),
     Rule("recursion", (), "method", _RECURSIVE),

@@ -178,8 +178,10 @@ KEYS = {
 
 def bounded(function: Callable[P, R]) -> Callable[P, R]:
     """A function that refuses, with `SettingError`, settings outside the limits of their names."""
-    names = tuple(inspect.signature(function).parameters)
-    limits = {name: LIMITS[name] for name in names if name in LIMITS}
+    parameters = inspect.signature(function).parameters
+    names = tuple(parameters)
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    limits = {name: limit for name, limit in LIMITS.items() if takes_any or name in names}
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:

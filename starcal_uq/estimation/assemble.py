@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,14 +16,11 @@ from starcal_uq.attitude.rotations import (
     rotation_to_quaternion,
 )
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import sigma_parameter
-from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.result import Calibration
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.result import Calibration, KeptFrames, check_camera
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.undetermined import (
     EXPLAINED,
@@ -38,7 +35,6 @@ from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
 from starcal_uq.likelihood.solvers import is_singular
 from starcal_uq.likelihood.star_errors import StarLikelihood, StarModel
 from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
-from starcal_uq.observations.repeats import Fingerprints
 
 if TYPE_CHECKING:
     from starcal_uq.observations.frames import StarFrames
@@ -66,7 +62,7 @@ def assemble(
     pair_theta: FloatArray,
     pair_covariance: FloatArray,
     *,
-    settings: dict[str, Any] | None = None,
+    settings: AnyDict | None = None,
 ) -> Calibration:
     """Everything that a calibration tells about the end of its last stage.
 
@@ -117,37 +113,26 @@ def assemble(
         theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     e = np.empty((2, likelihood.frames.n_stars))
     sums, attitudes = likelihood.sums(theta, e)
-    camera = nominal.with_theta(theta)
-    residuals = likelihood.frames.in_pixels(e).T
-    record: dict[str, Any] = {"method": method, "solver": solver, "distortion": nominal.distortion}
-    return Calibration(
-        camera=camera,
-        nominal=nominal,
-        method=method,
-        solver=solver,
+    made: AnyDict = {"method": method, "solver": solver, "distortion": nominal.distortion}
+    return Calibration.of(
+        nominal,
+        KeptFrames.of(obs, likelihood.frames, attitudes.rotations, e, nominal),
+        made | (settings or {}),
         theta=theta,
-        covariance=efficient * np.outer(factors, factors) if refined else pair_covariance,
         sigma=sigma,
-        sigma_std=sigma / float(np.sqrt(2.0 * dof)),
-        sigma_name=sigma_parameter(likelihood.frames.weight is not None).name,
-        stages=tuple(stages),
-        status=status,
-        undetermined=names,
-        frame_ids=obs.frame_ids,
-        quaternions=rotation_to_quaternion(attitudes.rotations),
-        residuals_px=residuals,
-        chi2=sums.normal.cost,
         dof=dof,
+        status=status,
+        record={"kernels": likelihood.kernels} | coma_record(nominal, factors),
+        covariance=efficient * np.outer(factors, factors) if refined else pair_covariance,
+        stages=tuple(stages),
+        undetermined=names,
+        chi2=sums.normal.cost,
         information=information,
         rotation_per_theta=np.mean(attitudes.response, axis=2),
         attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
         pair_theta=pair_theta,
         pair_covariance=pair_covariance,
         compressed=compressed,
-        provenance=provenance(None, record | (settings or {}), obs.data_hash)
-        | {"kernels": likelihood.kernels}
-        | coma_record(nominal, factors),
-        fingerprints=Fingerprints.of(obs, residuals, nominal.centre_px),
     )
 
 
@@ -219,16 +204,14 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
     # does not average.
     own = errors.total_px**2 * (1.0 if weight is None else float(np.mean(weight**2)))
     settings = cal.provenance.get("settings", {}) | {"star_errors": True}
-    camera = cal.nominal.with_theta(theta)
-    return replace(
-        cal,
-        camera=camera,
-        theta=theta,
-        covariance=covariance * np.outer(factors, factors),
-        sigma=sigma,
+    return cal.moved(
+        theta,
+        sigma,
+        cal.dof,
+        cal.status,
         sigma_std=sigma / float(np.sqrt(2.0 * found.dof)),
+        covariance=covariance * np.outer(factors, factors),
         stages=(*cal.stages, stage),
-        status=check_camera(camera, cal.status),
         quaternions=rotation_to_quaternion(exp_rotation(turned) @ state.rotations),
         residuals_px=likelihood.frames.in_pixels(rest[0]).T,
         chi2=found.sum_of_squares,
@@ -273,22 +256,6 @@ def check_noise(noise: float, camera: Camera, status: Status) -> Status:
     return (
         Status.INCONSISTENT if status.ok and noise > IMPLAUSIBLE_NOISE * camera.width_px else status
     )
-
-
-def check_camera(camera: Camera, status: Status) -> Status:
-    """`status`, unless the principal point left the detector or the distortion folds over inside
-    the field.
-    """
-    if not status.ok:
-        return status
-    if not camera.contains(camera.theta[:2]):
-        return Status.OUTSIDE_DETECTOR
-    if (
-        fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px)
-        <= camera.corner_radius_px
-    ):
-        return Status.FOLDED
-    return status
 
 
 def check_count(likelihood: MarginalLikelihood, camera: Camera) -> None:

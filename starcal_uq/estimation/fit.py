@@ -6,18 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_quaternion
+from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, sigma_parameter
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.assemble import (
     IMPLAUSIBLE_NOISE,
     assemble,
-    check_camera,
     check_count,
     check_noise,
     failed,
@@ -25,9 +23,10 @@ from starcal_uq.estimation.assemble import (
     noise_px,
     raise_unless_good,
 )
-from starcal_uq.estimation.noise_model import fit_noise
-from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.noise_model import NoiseModel, Refit, fit_noise
+from starcal_uq.estimation.result import Calibration, KeptFrames, check_camera
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
+from starcal_uq.estimation.settings import ITERATIONS, EstimationSettings
 from starcal_uq.estimation.stages import (
     PAIR_TOLERANCE,
     REFINEMENT_TOLERANCE,
@@ -47,14 +46,12 @@ from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.likelihood.solvers import Last, is_singular
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
-from starcal_uq.observations.repeats import Fingerprints
 from starcal_uq.observations.splits import one_of_each
 from starcal_uq.observations.table import Observations
 
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong
 # distortion.
 _FAR = 0.05
-ITERATIONS = 200
 # From the nominal optics positions take some fifteen.
 _DIRECT_ITERATIONS = 60
 # Frames and stars of a sample that is near enough to the minimum of all, and the relative gain of
@@ -66,22 +63,54 @@ _SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-4
 _LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.006
 
 
-def gaussian_fit(
-    obs: Observations,
-    camera: Camera,
-    likelihood: MarginalLikelihood,
-    method: str,
-    solver: str,
-    max_iterations: int,
-) -> Calibration:
+def fit_composed(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
+    """Calibrate with a nominal camera by the noise and the tails of a composed likelihood.
+
+    Weights that the table has from another result's noise model are what its stars state.
+    CalibrationError when there is no estimate.
+    """
+    check_count(MarginalLikelihood(obs, camera.distortion), camera)
+    fitted = _gaussian_fit if settings.composed.tails is None else _robust_fit
+    if settings.composed.noise == "common":
+        return fitted(obs, camera, settings)
+    obs = obs.unweighted
+    calibration = fitted(obs, camera, settings)
+    if not calibration.status.ok:
+        return calibration
+    model, weighted = _with_noise_model(obs, camera, calibration, settings)
+    found = weighted.provenance
+    made = {**found["settings"], "noise": "model"}
+    record = {**found, "settings": made, "noise_model": model.record()}
+    return replace(weighted, provenance=record)
+
+
+def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
+    likelihood = MarginalLikelihood(obs, camera.distortion)
     pairs = PairObjective(likelihood.frames, camera.distortion)
     last = _gain(likelihood, _LAST_STEP)
     stages, status = _stages(
-        pairs, camera, likelihood, method, solver, max_iterations, last, "left"
+        pairs,
+        camera,
+        likelihood,
+        settings.method,
+        settings.solver,
+        settings.max_iterations,
+        last,
+        "left",
     )
     pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
     covariance = _pair_covariance(pairs, likelihood, pair_theta)
-    return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance)
+    return assemble(
+        obs,
+        camera,
+        settings.method,
+        settings.solver,
+        likelihood,
+        stages,
+        status,
+        pair_theta,
+        covariance,
+    )
 
 
 def _pair_covariance(
@@ -228,46 +257,70 @@ def _far(stage: Stage, camera: Camera) -> bool:
     return float(np.max(np.abs(stage.theta[:2] - camera.theta[:2]))) > _FAR * camera.width_px
 
 
-def noise_model_fit(
-    obs: Observations, camera: Camera, method: str, solver: str, max_iterations: int
-) -> Calibration:
-    """Calibrate, fit how the noise varies, and refine with the weights that follow; even noise
-    changes nothing.
+def _with_noise_model(
+    obs: Observations, camera: Camera, calibration: Calibration, settings: EstimationSettings
+) -> tuple[NoiseModel, Calibration]:
+    """How the noise varies, and the calibration with the weights that follow; even noise changes
+    nothing.
     """
-    calibration = gaussian_fit(
-        obs, camera, MarginalLikelihood(obs, camera.distortion), method, solver, max_iterations
-    )
-    if calibration.status.ok:
-        model, theta = fit_noise(obs, calibration.camera, max_iterations=max_iterations)
+    solver, max_iterations = settings.solver, settings.max_iterations
+    if settings.composed.tails is not None:
+        model = _noise_of_tails(obs, calibration, max_iterations)
         if model.varies:
-            obs = obs.weighted(model.sigma_px(obs), model.axes)
-            likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
-            likelihood.use_rotations(likelihood.start_rotations(theta))
-            # The estimate from interstar angles has no weights; its covariance and the refinement
-            # do.
-            stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]
-            pair_theta = calibration.pair_theta
-            covariance = _pair_covariance(
-                PairObjective(likelihood.frames, camera.distortion), likelihood, pair_theta
-            )
-            status = stages[-1].status
-            calibration = assemble(
-                obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance
-            )
-        settings = {**calibration.provenance["settings"], "noise": "model"}
-        record = {**calibration.provenance, "settings": settings, "noise_model": model.record()}
-        calibration = replace(calibration, provenance=record)
-    return calibration
+            weighted = obs.weighted(model.sigma_px(obs), model.axes)
+            calibration = _robust_fit(weighted, camera, settings)
+        return model, calibration
+    model, theta = fit_noise(obs, calibration.camera, max_iterations=max_iterations)
+    if model.varies:
+        obs = obs.weighted(model.sigma_px(obs), model.axes)
+        likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
+        likelihood.use_rotations(likelihood.start_rotations(theta))
+        # The estimate from interstar angles has no weights; its covariance and the refinement do.
+        stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]
+        pair_theta = calibration.pair_theta
+        covariance = _pair_covariance(
+            PairObjective(likelihood.frames, camera.distortion), likelihood, pair_theta
+        )
+        status = stages[-1].status
+        calibration = assemble(
+            obs,
+            camera,
+            calibration.method,
+            solver,
+            likelihood,
+            stages,
+            status,
+            pair_theta,
+            covariance,
+        )
+    return model, calibration
 
 
-def robust_fit(
-    obs: Observations,
-    camera: Camera,
-    frames: StarFrames,
-    solver: str,
-    max_iterations: int,
-    nu: float | None,
-) -> Calibration:
+def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) -> NoiseModel:
+    """The noise model of stars whose residuals have tails: the scale of the t, as it varies."""
+    nu = cal.provenance["settings"]["dof"]
+
+    def refit(frames: StarFrames, theta: FloatArray, turn: int) -> Refit | None:
+        found = refine(
+            frames,
+            cal.camera.distortion,
+            theta,
+            quaternion_to_rotation(cal.quaternions),
+            None if nu == "free" else nu,
+            max_iterations,
+        )
+        if not found.stage.status.ok:
+            return None
+        return Refit(found.stage.theta, found.state.weight, found.nu)
+
+    return fit_noise(obs, cal.camera, max_iterations=max_iterations, refit=refit)[0]
+
+
+def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
+    solver, max_iterations = settings.solver, settings.max_iterations
+    tails = settings.composed.tails
+    assert tails is not None
+    nu, frames = tails.dof, StarFrames.from_observations(obs, axes=True)
     model = camera.distortion
 
     def fit(trusted: StarFrames, all_parameters: bool) -> list[Stage]:
@@ -310,50 +363,38 @@ def robust_fit(
     ):
         reason = status if not status.ok else Status.SINGULAR
         raise failed(MarginalLikelihood(start.frames, model), theta, camera, reason)
-    result = camera.with_theta(theta)
-    status = check_camera(result, status)
+    status = check_camera(camera.with_theta(theta), status)
     gaussian, matrix = (
         MarginalLikelihood(start.frames, model),
         scaled_inverse(found.covariance) * sigma**2,
     )
     names, factors = undetermined(gaussian, theta, matrix, sigma, camera, status)
-    if names:
-        status = Status.SINGULAR
-    settings: dict[str, object] = {"method": "efficient", "solver": solver, "distortion": model}
-    settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
-    record = provenance(None, settings, obs.data_hash) | coma_record(camera, factors)
-    residuals = frames.in_pixels(state.e).T
-    record["student_t"] = {
+    made: AnyDict = {"method": "efficient", "solver": solver, "distortion": model}
+    student: AnyDict = {
         "dof": found.nu,
         "dof_std": found.nu_std,
         "stars_out_of_field": int(np.sum(~state.seen)),
     }
-    return Calibration(
-        camera=result,
-        nominal=camera,
-        method="efficient",
-        solver=solver,
+    return Calibration.of(
+        camera,
+        KeptFrames.of(obs, frames, state.rotations, state.e, camera),
+        made | {"likelihood": "student_t", "dof": "free" if nu is None else nu},
         theta=theta,
-        covariance=found.covariance * np.outer(factors, factors),
         sigma=sigma,
-        sigma_std=found.sigma_std,
-        sigma_name=sigma_parameter(frames.weight is not None).name,
-        stages=(*start.stages, found.stage),
-        status=status,
-        undetermined=names,
-        frame_ids=obs.frame_ids,
-        quaternions=rotation_to_quaternion(state.rotations),
-        residuals_px=residuals,
-        chi2=float(np.sum(state.weight * state.e**2)),
         dof=state.dof - len(theta),
+        status=Status.SINGULAR if names else status,
+        record=coma_record(camera, factors) | {"student_t": student},
+        covariance=found.covariance * np.outer(factors, factors),
+        sigma_std=found.sigma_std,
+        stages=(*start.stages, found.stage),
+        undetermined=names,
+        chi2=float(np.sum(state.weight * state.e**2)),
         information=information.matrix,
         rotation_per_theta=information.rotation_per_theta,
         attitude_noise=information.attitude_noise,
         pair_theta=pair_theta,
         pair_covariance=_pair_covariance(PairObjective(start.frames, model), gaussian, pair_theta),
         compressed=compress_reweighted(found),
-        provenance=record,
-        fingerprints=Fingerprints.of(obs, residuals, camera.centre_px),
     )
 
 

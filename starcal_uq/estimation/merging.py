@@ -28,7 +28,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.duplicates import check_duplicates, fingerprints_of
-from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.result import Calibration, KeptFrames
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import Optimum, combined, optimum, scaled, total
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -140,23 +140,23 @@ def merge(
         cal.attitude_noise * (u / cal.sigma) ** 2
         for cal, u in zip(calibrations, units, strict=True)
     ]
-    return Calibration(
-        camera=calibrations[0].nominal.with_theta(theta),
-        nominal=calibrations[0].nominal,
-        method="merged",
-        solver="newton",
+    marked = None
+    if not unchecked:
+        marked = Fingerprints.joined([mark for mark in marks if mark is not None])
+    record = _provenance(calibrations, observations, names, noise, found, shifts, runs)
+    return Calibration.of(
+        calibrations[0].nominal,
+        KeptFrames(frame_ids, quaternions, residuals, marked, noise == "own", None),
+        {"method": "merged", "solver": "newton"},
         theta=theta,
-        covariance=best.covariance,
         sigma=best.sigma,
-        sigma_std=best.sigma / float(np.sqrt(2.0 * best.dof)),
+        dof=best.dof,
+        status=Status.CONVERGED,
+        record=record,
+        covariance=best.covariance,
         sigma_name=sigma_name,
         stages=(stage,),
-        status=Status.CONVERGED,
-        frame_ids=frame_ids,
-        quaternions=quaternions,
-        residuals_px=residuals,
         chi2=float(best.compressed.sum_of_squares(best.compressed.whiten(theta))[0]),
-        dof=best.dof,
         information=best.information,
         rotation_per_theta=np.average(
             [cal.rotation_per_theta for cal in calibrations], axis=0, weights=frames
@@ -165,10 +165,6 @@ def merge(
         pair_theta=pair_theta,
         pair_covariance=pair_covariance,
         compressed=best.compressed,
-        provenance=_provenance(calibrations, observations, names, noise, found, shifts, runs),
-        fingerprints=Fingerprints.joined([mark for mark in marks if mark is not None])
-        if not unchecked
-        else None,
     )
 
 

@@ -18,7 +18,7 @@ stars (Schwarz's criterion), so that even noise is left as it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
@@ -50,6 +50,8 @@ _NEWTON_STEPS, _LONGEST_STEP, _STEP_SETTLED = 50, 2.0, 1e-8
 _FRAME_LOG_DOF, _FRAME_LOG_DOF_START = (0.0, 9.0), 3.0
 # Correlations beyond leave the noise no second axis.
 _MOST_CORRELATED = 0.99
+# Relative precision of a star that has no say.
+_NO_SAY = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,13 +387,29 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     )
 
 
+class Refit(NamedTuple):
+    """An estimate whose residuals have tails."""
+
+    theta: FloatArray  # (p,): px units
+    weight: FloatArray  # (N,): precision of each star relative to its scale; 0 where it has no say
+    dof: float  # Degrees of freedom of the tails
+
+
 def fit_noise(
-    obs: Observations, camera: Camera, *, rounds: int = _ROUNDS, max_iterations: int = 200
+    obs: Observations,
+    camera: Camera,
+    *,
+    rounds: int = _ROUNDS,
+    max_iterations: int = 200,
+    refit: Callable[[StarFrames, FloatArray, int], Refit | None] | None = None,
 ) -> tuple[NoiseModel, FloatArray]:
     """Fit the noise model around an estimate, weights and estimate in turn until they settle.
 
     `obs`: identified stars; a noise that they state is multiplied.
-    `rounds`: largest number of fits; with 1 the estimate stays where it is.
+    `rounds`: largest number of fits; with 1 the estimate stays where it is. `refit`: the estimate
+    with tails for stars of given weights, from theta (p,) in a turn; None where it is not found.
+    The model is then that of their scale: given its precision, a star is Gaussian, and the mean of
+    its weighted square is that of the scale.
     Returns the model, and the estimate (p,) with its weights.
     """
     obs, theta = obs.unweighted, camera.theta
@@ -399,17 +417,26 @@ def fit_noise(
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
     variance, before = np.ones(obs.n_stars), np.ones(obs.n_stars)
     fit, model = _Fit((), np.zeros(1), np.zeros(1), None, np.ones(obs.n_frames)), None
+    precision, informed = np.ones(obs.n_stars), np.ones(obs.n_stars, dtype=np.bool_)
     for turn in range(rounds):
         weight = 1.0 / (stated * np.sqrt(variance))
         frames = replace(plain, weight=weight, axes=None if model is None else model.axes)
+        if refit is not None:
+            again = refit(frames, theta, turn)
+            if again is None:
+                break
+            theta, informed = again.theta, again.weight > _NO_SAY
+            precision = np.sqrt(np.where(informed, again.weight, _NO_SAY))
+            frames = replace(frames, weight=weight * precision)
         likelihood = MarginalLikelihood(frames, camera.distortion)
-        if turn > 0:
+        if turn > 0 and refit is None:
             likelihood.use_rotations(likelihood.start_rotations(theta))
             stage = refinement_stage(likelihood, theta, max_iterations)
             if not stage.status.ok:
                 break
             theta = stage.theta
         squares, share = star_squares(likelihood, theta)
+        share = np.where(informed, share, _NO_SAY)
         stars = _Stars.of(obs, camera.with_theta(theta), squares * variance, share)
         # The first residuals come from wrong weights: terms are chosen again.
         fit = (
@@ -419,7 +446,7 @@ def fit_noise(
         )
         variance = fit.variance(stars)
         alike = MarginalLikelihood(
-            replace(plain, weight=1.0 / (stated * np.sqrt(variance))), camera.distortion
+            replace(plain, weight=precision / (stated * np.sqrt(variance))), camera.distortion
         )
         found = _model(obs, camera.with_theta(theta), stars, fit, axis_noise(alike, theta))
         settled = model is not None and abs(found.axis_ratio / model.axis_ratio - 1.0) < _SETTLED
@@ -427,7 +454,8 @@ def fit_noise(
         if not model.varies or (settled and np.max(np.abs(variance / before - 1.0)) < _SETTLED):
             break
         before = variance
-    assert model is not None
+    if model is None:
+        raise CalibrationError("how the noise varies cannot be fitted: leave noise='model' out.")
     return model, theta
 
 

@@ -28,7 +28,7 @@ from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, IntArray, Progress
-from starcal_uq.estimation.assemble import check_camera, check_noise
+from starcal_uq.estimation.assemble import check_noise
 from starcal_uq.estimation.duplicates import repeated
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.residual_map import (
@@ -320,19 +320,16 @@ def calibrate_partitions(
         # By which another folder that has some of the files is known.
         "data_sha256": sorted(seen.hashes),
     }
-    return replace(
-        start,
-        camera=camera,
-        theta=theta,
+    return start.moved(
+        theta,
+        sigma,
+        dof,
+        status,
         covariance=best.covariance,
-        sigma=sigma,
-        sigma_std=sigma / float(np.sqrt(2.0 * dof)),
         stages=(*start.stages[:-1], sampled, stage),
-        status=check_camera(camera, status),
         quaternions=rotation_to_quaternion(state.rotations),
         residuals_px=residuals,
         chi2=float(np.sum(rest.sums.chi2)),
-        dof=dof,
         information=best.information,
         rotation_per_theta=rest.response / n_frames,
         attitude_noise=rest.inverse / n_frames * sigma**2,

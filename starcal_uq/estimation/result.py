@@ -5,18 +5,21 @@ loss.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import parameters
+from starcal_uq.camera.distortion import parameters, sigma_parameter
+from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.manifest import digest
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from starcal_uq.estimation.noise_model import NoiseModel
+    from starcal_uq.observations.frames import StarFrames
     from starcal_uq.observations.table import Observations
 
 # Fields whose arrays grow with the data or the iterations: they stand in an archive beside the
@@ -86,6 +90,52 @@ _DOCUMENT = (
 _ARCHIVE = "archive_sha256"
 # What the document says of a stage; its last estimate is there for readers.
 _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
+
+
+@dataclass(frozen=True)
+class KeptFrames:
+    """Frames of a calibration at its estimate: what it keeps of the data, star by star."""
+
+    frame_ids: IntArray  # (K,)
+    quaternions: FloatArray  # (K, 4): scalar-last R_cam_icrs
+    residuals_px: FloatArray  # (N, 2): observed minus predicted
+    fingerprints: Fingerprints | None
+    per_star: bool  # Whether the stars state their noise
+    data_hash: str | None
+
+    @classmethod
+    def of(
+        cls,
+        obs: Observations,
+        frames: StarFrames,
+        rotations: FloatArray,
+        whitened: FloatArray,
+        camera: Camera,
+    ) -> KeptFrames:
+        """All frames of a table: `rotations` (K, 3, 3), residuals `whitened` (2, N); the detector of
+        `camera`.
+        """
+        residuals = frames.in_pixels(whitened).T
+        return cls(
+            frame_ids=obs.frame_ids,
+            quaternions=rotation_to_quaternion(rotations),
+            residuals_px=residuals,
+            fingerprints=Fingerprints.of(obs, residuals, camera.centre_px),
+            per_star=frames.weight is not None,
+            data_hash=obs.data_hash,
+        )
+
+    @classmethod
+    def none(cls, per_star: bool, data_hash: str | None) -> KeptFrames:
+        """Nothing of a stream of frames."""
+        return cls(
+            frame_ids=np.zeros(0, dtype=np.int64),
+            quaternions=np.zeros((0, 4)),
+            residuals_px=np.zeros((0, 2)),
+            fingerprints=None,
+            per_star=per_star,
+            data_hash=data_hash,
+        )
 
 
 @dataclass(frozen=True)
@@ -202,6 +252,43 @@ class Calibration(Shown):
         **{"pair_theta": ("p",), "pair_covariance": ("p", "p")},
     }
     FINITE: ClassVar[tuple[str, ...]] = ("theta", "covariance", "sigma", "sigma_std", "information")
+
+    @classmethod
+    def of(
+        cls,
+        nominal: Camera,
+        kept: KeptFrames,
+        settings: AnyDict,
+        *,
+        theta: FloatArray,
+        sigma: float,
+        dof: int,
+        status: Status,
+        record: AnyDict | None = None,
+        **found: Any,
+    ) -> Calibration:
+        """The calibration of an estimate; what follows from others is filled in here.
+
+        `nominal`: the start. `settings` hold ``method`` and ``solver``. `record`: what else the
+        provenance holds. `found`: further fields.
+        """
+        derived: AnyDict = {
+            "sigma_name": sigma_parameter(kept.per_star).name,
+            "frame_ids": kept.frame_ids,
+            "quaternions": kept.quaternions,
+            "residuals_px": kept.residuals_px,
+            "fingerprints": kept.fingerprints,
+            "provenance": provenance(None, settings, kept.data_hash) | (record or {}),
+        }
+        at = _at(nominal, theta, sigma, dof, status)
+        made = {"nominal": nominal, "method": settings["method"], "solver": settings["solver"]}
+        return cls(**(made | derived | at | found))
+
+    def moved(
+        self, theta: FloatArray, sigma: float, dof: int, status: Status, **found: Any
+    ) -> Calibration:
+        """The calibration with another estimate, noise and outcome, and further fields."""
+        return replace(self, **(_at(self.nominal, theta, sigma, dof, status) | found))
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -416,3 +503,32 @@ class Calibration(Shown):
             if not is_positive(found.information, strictly=not found.undetermined):
                 raise ValueError("its information matrix is not positive definite")
             return found
+
+
+def _at(nominal: Camera, theta: FloatArray, sigma: float, dof: int, status: Status) -> AnyDict:
+    """Fields that follow from an estimate and its noise."""
+    camera = nominal.with_theta(theta)
+    return {
+        "camera": camera,
+        "theta": theta,
+        "sigma": sigma,
+        "sigma_std": sigma / float(np.sqrt(2.0 * dof)),
+        "dof": dof,
+        "status": check_camera(camera, status),
+    }
+
+
+def check_camera(camera: Camera, status: Status) -> Status:
+    """`status`, unless the principal point left the detector or the distortion folds over inside
+    the field.
+    """
+    if not status.ok:
+        return status
+    if not camera.contains(camera.theta[:2]):
+        return Status.OUTSIDE_DETECTOR
+    if (
+        fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px)
+        <= camera.corner_radius_px
+    ):
+        return Status.FOLDED
+    return status

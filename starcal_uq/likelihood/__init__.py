@@ -1,1 +1,5 @@
 """Likelihoods of identified stars, their sums, and the solvers that maximise them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -221,9 +221,8 @@ class StudentLikelihood:
         seen = np.tile(self._seen, n) & np.isfinite(e).all(axis=0)
         if not seen.all():
             e[:, ~seen], a[..., ~seen] = 0.0, 0.0
-        if frames.weight is not None:
-            e *= frames.weight
-            a *= frames.weight
+        frames.whiten(e)
+        frames.whiten(a)
         square = _dot(e, e)
         scaled = square / scale**2
         weight = (freedom + 2.0) / (freedom + scaled)
@@ -278,7 +277,8 @@ class StudentLikelihood:
             self.frames.n_stars, theta, state.b, forward_root(self.model_name, theta, state.b)
         )
         h[..., ~state.seen] = 0.0
-        return h if self.frames.weight is None else h * self.frames.weight
+        self.frames.whiten(h)
+        return h
 
     def information(self, theta: FloatArray, state: StudentState, sigma: float) -> Information:
         """Score and observed information of theta with the attitudes eliminated."""

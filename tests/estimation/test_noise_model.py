@@ -115,7 +115,6 @@ def test_settings_that_do_not_go_together_are_refused_in_a_sentence():
     for options, words in (
         ({"noise": "uneven"}, "noise 'uneven' is unknown"),
         ({"noise": "model", "method": "three_stage"}, "method='efficient'"),
-        ({"noise": "model", "likelihood": "student_t"}, "likelihood='marginal'"),
     ):
         with pytest.raises(sc.errors.CalibrationError, match=words):
             sc.calibrate(obs, camera, **options)

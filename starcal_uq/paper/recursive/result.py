@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.assemble import check_camera
-from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.result import Calibration, KeptFrames
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import CompressedLikelihood
 from starcal_uq.likelihood.solvers import is_singular
@@ -235,32 +232,24 @@ def stream_calibration(
             Status.SINGULAR,
         )
     sigma = float(np.sqrt(max(chi2, 0.0) / dof))
-    camera = nominal.with_theta(theta)
     frames = recursion.n_frames
-    return Calibration(
-        camera=camera,
-        nominal=nominal,
-        method=method,
-        solver="filter",
+    return Calibration.of(
+        nominal,
+        KeptFrames.none(per_star, data_hash),
+        {"method": method, "solver": "filter"} | settings,
         theta=theta,
-        covariance=estimate.covariance,
         sigma=sigma,
-        sigma_std=sigma / float(np.sqrt(2.0 * dof)),
-        sigma_name=sigma_parameter(per_star).name,
-        stages=tuple(stages),
-        status=check_camera(camera, status),
-        frame_ids=np.zeros(0, dtype=np.int64),
-        quaternions=np.zeros((0, 4)),
-        residuals_px=np.zeros((0, 2)),
-        chi2=chi2,
         dof=dof,
+        status=status,
+        covariance=estimate.covariance,
+        stages=tuple(stages),
+        chi2=chi2,
         information=matrix / np.outer(scale, scale) / sigma**2,
         rotation_per_theta=recursion.response / frames / scale,
         attitude_noise=recursion.noise / frames * sigma**2,
         pair_theta=theta,
         pair_covariance=estimate.covariance,
         compressed=_quadratic(recursion, theta, chi2, gradient, sigma, dof + p),
-        provenance=provenance(None, settings, data_hash),
     )
 
 
