@@ -125,7 +125,7 @@ def settle_noise(obs: Observations, cal: Calibration) -> Observations:
 
 def with_noise_floor(obs: Observations, floor: NoiseFloor) -> Observations:
     """The observations with the floor in every star's noise, where it is needed;
-    ``meta["noise_floor_px"]`` says it.
+    ``origin.noise_floor_px`` says it.
 
     A factor on the stated noise that is more than one is left to the calibration; a smaller one,
     which a floor above all noise stated leaves unknown, is taken up here, so that the noise is the
@@ -136,8 +136,8 @@ def with_noise_floor(obs: Observations, floor: NoiseFloor) -> Observations:
     raised: FloatArray = np.hypot(obs.sigma_px, floor.floor_px / floor.scale) * min(
         floor.scale, 1.0
     )
-    found = {"noise_floor_px": floor.floor_px, "noise_scale": floor.scale}
-    return replace(obs, sigma_px=raised, meta={**obs.meta, **found})
+    raised_obs = replace(obs, sigma_px=raised)
+    return raised_obs.with_origin(noise_floor_px=floor.floor_px, noise_scale=floor.scale)
 
 
 def _cost(squares: FloatArray, variance: FloatArray) -> float:

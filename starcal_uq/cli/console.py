@@ -199,23 +199,20 @@ def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera)
             "Declare --directions apparent, or --directions catalogue with a time_utc column."
         )
         tell(words)
-    floor = obs.meta.get("noise_floor_px")
+    origin = obs.origin
+    floor = origin.noise_floor_px
     if floor:
         words = (
             f"note: even bright stars scatter by {significant(floor)} px; this was added to the "
             "noise of every star."
         )
         tell(words)
-    low = obs.meta.get("low_stars", 0)
-    if low:
-        words = (
-            f"note: {plural(int(low), 'star')} left out, because they stood lower than 10 degrees."
-        )
+    if low := origin.low_stars:
+        words = f"note: {plural(low, 'star')} left out, because they stood lower than 10 degrees."
         tell(words)
-    if "frame_names" in obs.meta:
-        tell(f"note: frames were numbered as they come: {obs.meta['frame_names']}.")
-    ignored = obs.meta.get("ignored_columns")
-    if ignored:
+    if origin.frame_names is not None:
+        tell(f"note: frames were numbered as they come: {origin.frame_names}.")
+    if ignored := origin.ignored_columns:
         tell(f"note: columns not used: {', '.join(ignored)}")
 
 

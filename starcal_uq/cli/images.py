@@ -241,7 +241,7 @@ def identify_command(
                 "the stars do not determine the camera, so they were identified once: give more "
                 "frames."
             )
-        kind = obs.meta["directions"]
+        kind = obs.origin.directions
         if out.suffix == ".csv" and obs.directions_declared:
             note(
                 f"{out} does not say that its directions are {kind}: calibrate it with "
@@ -368,7 +368,7 @@ def _say_epoch(centroids: Centroids, epoch: float | None) -> None:
 
 
 def _say_disturbed(obs: Observations) -> None:
-    if left_out := obs.meta.get("disturbed_stars", 0):
+    if left_out := obs.origin.disturbed_stars:
         tell(
             f"{plural(left_out, 'star')} left out, because the light of a neighbour displaces them."
         )

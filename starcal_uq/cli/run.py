@@ -219,7 +219,7 @@ def _calibrate(
             )
     except (IdentificationError, CalibrationError) as error:
         # Where no image could be measured there is nothing to be looked at.
-        if seen and seen[-1][0].meta.get("optics"):
+        if seen and seen[-1][0].origin.optics:
             page = _keep_failed(run, inputs, camera, *seen[-1])
             error.args = (f"{error} Every frame, with its detections and its reason: {page}",)
         raise

@@ -64,8 +64,6 @@ _STEPS, _STEP_RAD, _LONGEST_RAD, _SETTLED = 24, 1e-3, 0.2, 0.1
 _DISTANCES_DEG, _AROUND, _TANGENTS, _ROUNDS = np.arange(5.0, 81.0, 7.5), 16, (0.4, 1.0, 2.0), 6
 # A share of a shape's square that is not there, where all of the rest is absorbed.
 _ABSORBED = 1e-8
-# No observer of these sees through air.
-_NO_AIR = ("space", "rendered")
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ def air_test(
         None where the camera was in space, or where from no place all stars were above the horizon
         and frames by themselves hold no scale and shape.
     """
-    if obs.meta.get("observer") in _NO_AIR:
+    if obs.origin.without_air:
         return None
     stars = star_test(obs, cal) if stars is None else stars
     obs, cal = of_heard(weighed(obs, cal), cal)

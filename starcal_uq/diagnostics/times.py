@@ -252,7 +252,7 @@ def _causes(rest: Remainder) -> Iterator[_Moved]:
         spread = np.repeat(velocities / LIGHT_SPEED_KM_S, frames.sizes, axis=1)
         return _Moved(cause, np.einsum("gni,ixn->gxn", spread, basis), later)
 
-    apparent = obs.meta.get("directions") == "apparent"
+    apparent = obs.origin.apparent
     first = obs.frame_starts[:-1]
     stated = np.full(len(first), "") if obs.time_utc is None else obs.time_utc[first]
     timed = bool((stated != "").all())
@@ -266,8 +266,8 @@ def _causes(rest: Remainder) -> Iterator[_Moved]:
         yield aberrated("aberration twice", -now, nothing[: len(now)])
     if apparent and timed:
         yield aberrated("date", velocities - now, _DATES)
-    if "site" in obs.meta and apparent and timed:
-        yield from _other_hours(rest, Site.from_dict(obs.meta["site"]), stated)
+    if obs.origin.site is not None and apparent and timed:
+        yield from _other_hours(rest, Site.from_dict(obs.origin.site), stated)
     yield _Moved("epoch", seen(_proper_motion(obs))[None], np.zeros(1))
 
 

@@ -201,7 +201,7 @@ class NoiseModel:
         """
         stated = obs.unweighted.sigma_px
         sigma = self.at(obs.x_px, obs.y_px, obs.mag)
-        if len(self.frame_ids) and "frames" not in obs.meta:
+        if len(self.frame_ids) and obs.origin.frames is None:
             place = np.clip(np.searchsorted(self.frame_ids, obs.frame), 0, len(self.frame_ids) - 1)
             own = np.where(
                 self.frame_ids[place] == obs.frame, self.frame_factors[place], self.frame_mean

@@ -56,6 +56,7 @@ from starcal_uq.identification.search import (
     flipped,
     has_radial,
 )
+from starcal_uq.observations.origin import CentroidsOrigin, Origin
 from starcal_uq.observations.table import Observations
 from starcal_uq.sky.catalogue import StarCatalogue
 
@@ -490,7 +491,7 @@ def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
     """The camera as its images describe it, and whether they say its focal length; their size must
     be stated.
     """
-    said = getattr(centroids, "meta", {}).get("optics", {})
+    said = CentroidsOrigin.of(getattr(centroids, "meta", {})).optics
     if not said:
         raise IdentificationError(
             "the centroids do not say the size of their images: give a camera, or measure the "
@@ -681,6 +682,12 @@ def _result(
             )
         )
     times = [table.time_utc[k] for k, m in zip(solved, matches, strict=True) for _ in range(len(m))]
+    origin = Origin.identified(
+        stars.source,
+        directions="apparent" if stars.apparent else "catalogue",
+        epoch=float(stars.epoch),
+        max_mag=float(stars.mag.max()),
+    )
     observations = Observations(
         frame=np.repeat([field.ids[k] for k in solved], [len(m) for m in matches]).astype(np.int64),
         x_px=xy[:, 0],
@@ -691,13 +698,7 @@ def _result(
         star_id=stars.star_id[star],
         mag=stars.mag[star],
         time_utc=np.array([str(t) for t in times]) if times and all(times) else None,
-        meta={
-            "source": f"identified in {stars.source}",
-            "directions": "apparent" if stars.apparent else "catalogue",
-            "epoch": float(stars.epoch),
-            "max_mag": float(stars.mag.max()),
-            "parity": parity,
-        },
+        meta={**origin.plain(), "parity": parity},
     )
     # Not every table says which frames were left out.
     problems = getattr(table, "problem", [""] * len(records))

@@ -10,6 +10,7 @@ import csv
 import json
 import os
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ from starcal_uq.core.files import (
     table_ending,
 )
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, StrArray
+from starcal_uq.observations.origin import CentroidsOrigin
 from starcal_uq.observations.rows import FrameRows, locked
 
 if TYPE_CHECKING:
@@ -151,6 +153,11 @@ class Centroids(FrameRows, Shown):
             )
         object.__setattr__(self, "messages", tuple(self.messages))
         object.__setattr__(self, "meta", dict(self.meta))
+
+    @cached_property
+    def origin(self) -> CentroidsOrigin:
+        """The facts in `meta` that decide how the table is treated."""
+        return CentroidsOrigin.of(self.meta)
 
     @property
     def n_frames(self) -> int:

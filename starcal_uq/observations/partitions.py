@@ -29,6 +29,7 @@ from starcal_uq.observations.files import (
     read_table,
     say_column,
 )
+from starcal_uq.observations.origin import Sourced
 from starcal_uq.observations.table import Observations, joined_columns
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ class PartitionReader:
 
 
 @dataclass(frozen=True)
-class PartitionedObservations:
+class PartitionedObservations(Sourced):
     """Observations in a folder of files, which are read when they are needed; see
     `open_partitions`.
 
@@ -148,11 +149,6 @@ class PartitionedObservations:
         are made of.
         """
         return joined_hash([observations.data_hash for observations in self])
-
-    @property
-    def directions_declared(self) -> bool:
-        """Whether the files say if their directions are apparent or straight from a catalogue."""
-        return bool(self.meta["directions"] != "undeclared")
 
     def prepared(
         self, function: Callable[[Observations], Observations], **entries: Any

@@ -131,7 +131,7 @@ def stated_noise(obs: Observations) -> FloatArray | None:
     """
     if obs.sigma_px is None:
         return None
-    floor, scale = obs.meta.get("noise_floor_px", 0.0), obs.meta.get("noise_scale", 1.0)
+    floor, scale = obs.origin.noise_floor_px or 0.0, obs.origin.noise_scale or 1.0
     variance = (obs.sigma_px / min(scale, 1.0)) ** 2 - (floor / scale) ** 2
     return np.asarray(np.sqrt(np.maximum(variance, 1e-4 * obs.sigma_px**2)))
 

@@ -22,6 +22,7 @@ from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, StrAr
 from starcal_uq.observations.checks import check_columns, raise_problems
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import astropy_table, read_table, write_table
+from starcal_uq.observations.origin import Sourced
 from starcal_uq.observations.rows import FrameRows, locked
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ _DTYPES: dict[str, type] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Observations(FrameRows, Shown):
+class Observations(FrameRows, Sourced, Shown):
     """Stars measured in pixels, with their directions; one row per star and frame, sorted by frame.
 
     Rows given in another order are sorted by frame; within a frame they keep their order. The
@@ -51,7 +52,7 @@ class Observations(FrameRows, Shown):
     x_px, y_px : array, shape (N,)
         Centroid, pixels; (0, 0) is the centre of the first pixel, y grows downwards.
     ra_deg, dec_deg : array, shape (N,)
-        Direction in ICRS axes, degrees; ``meta["directions"]`` says whether aberration is in it.
+        Direction in ICRS axes, degrees; `origin` says whether aberration is in it.
     sigma_px : array, shape (N,), or None
         Centroid noise per axis, pixels.
     star_id : array of str, shape (N,), or None
@@ -66,9 +67,8 @@ class Observations(FrameRows, Shown):
     temperature_c : array, shape (N,), or None
         Temperature of the optics, Celsius; NaN where unknown.
     meta : dict
-        Plain values about the table: ``directions`` ("apparent", "catalogue" or "undeclared"),
-        ``observer_velocity_km_s`` (three numbers or None), ``source``, ``ignored_columns``,
-        ``seed`` and more.
+        Plain values about the table, as they stand in files: your own, and the facts of `origin`,
+        such as ``directions`` ("apparent", "catalogue" or "undeclared") and ``source``.
     stated_px : array, shape (N,), or None
         Noise that the stars state, px, NaN where they state none, of a table whose `sigma_px` comes
         from a fitted noise model (see `weighted`); None for all other tables.
@@ -121,13 +121,7 @@ class Observations(FrameRows, Shown):
             # apart.
             absent = COLUMNS[name].gaps and n > 0 and _all_missing(values)
             object.__setattr__(self, name, None if absent else locked(values))
-        directions = self.meta.get("directions", "undeclared")
-        if directions not in ("apparent", "catalogue", "undeclared"):
-            raise ObservationError(
-                f"observations: meta directions is {directions!r}; use apparent, catalogue or "
-                "undeclared."
-            )
-        object.__setattr__(self, "meta", {**self.meta, "directions": directions})
+        object.__setattr__(self, "meta", {**self.meta, "directions": self.origin.directions})
 
     @property
     def columns(self) -> dict[str, Any]:
@@ -151,11 +145,6 @@ class Observations(FrameRows, Shown):
         ra, dec = np.radians(self.ra_deg), np.radians(self.dec_deg)
         level = np.cos(dec)
         return locked(np.column_stack([level * np.cos(ra), level * np.sin(ra), np.sin(dec)]))
-
-    @property
-    def directions_declared(self) -> bool:
-        """Whether the table says if its directions are apparent or straight from a catalogue."""
-        return bool(self.meta["directions"] != "undeclared")
 
     @cached_property
     def data_hash(self) -> str:
@@ -355,7 +344,7 @@ def load_observations(
     columns
         Names in the file of columns that are called otherwise, such as ``{"ra_deg":
         "ra_apparent_deg"}``. Columns that are not needed are ignored and listed in
-        ``meta["ignored_columns"]``.
+        ``origin.ignored_columns``.
 
     Raises
     ------
@@ -378,7 +367,7 @@ def load_observations(
     joined: AnyDict = {
         name: np.concatenate([table.columns[name] for table in tables]) for name in common
     }
-    kinds = {str(table.meta["directions"]) for table in tables}
+    kinds = {table.origin.directions for table in tables}
     meta = {**tables[0].meta, "source": [str(one) for one in path]}
     meta["directions"] = kinds.pop() if len(kinds) == 1 else "undeclared"
     return Observations(**{**joined, "frame": np.concatenate(frames)}, meta=meta)

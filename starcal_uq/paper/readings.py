@@ -255,7 +255,7 @@ def alternatives(scene: Scene, printed: Estimates) -> dict[str, Estimates]:
             ("plain filter", RecursionOptions(iterations=1)),
             (
                 "process noise",
-                RecursionOptions(process_noise=_PROCESS_NOISE_PX, sigma_px=obs.meta["sigma_px"]),
+                RecursionOptions(process_noise=_PROCESS_NOISE_PX, sigma_px=obs.origin.sigma_px),
             ),
         )
     }

@@ -46,10 +46,10 @@ class _Group:
 def other_cameras(centroids: Centroids) -> tuple[OtherCamera, ...]:
     """The frames that were left out as those of other cameras, by size and by focal length."""
     by_size: dict[str, list[int]] = {}
-    for number, (width, height) in centroids.meta.get("other_sizes", {}).items():
+    for number, (width, height) in (centroids.origin.other_sizes or {}).items():
         by_size.setdefault(f"{width} x {height} px", []).append(int(number))
     others = [OtherCamera(words, tuple(frames)) for words, frames in by_size.items()]
-    for focal_px, frames in centroids.meta.get("other_focals", []):
+    for focal_px, frames in centroids.origin.other_focals or ():
         others.append(OtherCamera(f"f = {focal_px:.4g} px", tuple(frames)))
     return tuple(others)
 
@@ -101,9 +101,8 @@ def of_one_camera(
     ]
     kept = centroids.select(~np.isin(centroids.frame, list(odd)))
     focals = [[group.focal_px, list(group.frames)] for group in others]
-    return replace(
-        kept, problem=np.array(problem, dtype=np.str_), meta={**kept.meta, "other_focals": focals}
-    )
+    kept = replace(kept, problem=np.array(problem, dtype=np.str_))
+    return kept.with_meta(other_focals=focals)
 
 
 def _groups(

@@ -285,13 +285,12 @@ def observations_from_centroids(
     def prepare(obs: Observations) -> Observations:
         nonlocal site, stated
         obs = without_disturbed(obs, neighbours, first.nominal, psf_sigma_px)
-        rendered = bool(centroids.meta.get("rendered"))
-        if in_space or rendered:
-            obs = obs.with_meta(observer="space" if in_space else "rendered")
+        if in_space or centroids.origin.rendered:
+            obs = obs.with_origin(observer="space" if in_space else "rendered")
         timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
         if not motion or (directions is None and not timed):
-            return obs.with_meta(directions=directions or "undeclared")
-        obs = obs.with_meta(directions="catalogue")
+            return obs.with_origin(directions=directions or "undeclared")
+        obs = obs.with_origin(directions="catalogue")
         if stated is not None:
             # What a header says of the place is believed as long as the stars are above its
             # horizon.
@@ -305,12 +304,12 @@ def observations_from_centroids(
                     said,
                     (
                         "was used for refraction; "
-                        f"{plural(int(low.meta['low_stars']), 'low star')} "
+                        f"{plural(low.origin.low_stars or 0, 'low star')} "
                         "left out."
                     ),
                 )
             if tell is not None:
-                keys = centroids.meta["place"]["keys"]
+                keys = (centroids.origin.place or {})["keys"]
                 tell(
                     f"note: The site in the headers ({keys}: {said}) {words} Another: --site "
                     "SITE, none: --in-space."
@@ -348,7 +347,7 @@ def stated_site(centroids: Centroids) -> Site | None:
     """The site that the headers of the images state, where all frames with stars have times."""
     from starcal_uq.sky.site import Site
 
-    place = centroids.meta.get("place")
+    place = centroids.origin.place
     used = (centroids.problem == "") & (centroids.stars_per_frame > 0)
     if not place or (centroids.time_utc[used] == "").any():
         return None
@@ -378,10 +377,9 @@ def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
 
 def of_one_size(centroids: Centroids) -> Centroids:
     """The frames of the size that most images have; the others are left out, with their reason."""
-    sizes = centroids.meta.get("other_sizes", {})
-    if not sizes:
+    sizes, common = centroids.origin.other_sizes, centroids.origin.optics
+    if not sizes or common is None:
         return centroids
-    common = centroids.meta["optics"]
     most = f"most are {common['width_px']} x {common['height_px']} px"
     problem = [
         f"the image is {sizes[str(k)][0]} x {sizes[str(k)][1]} px and {most}"

@@ -312,7 +312,8 @@ class Frames(Shown):
     @cached_property
     def searched_mag(self) -> float:
         """Magnitude (Gaia G) to which stars were searched for."""
-        stated = self.matched.meta.get("max_mag", self.record.max_mag)
+        own = self.matched.origin.max_mag
+        stated = self.record.max_mag if own is None else own
         mags = self.matched.mag if self.matched.mag is not None else np.empty(0)
         return float(stated) if stated is not None else float(np.max(mags, initial=-np.inf))
 
@@ -324,18 +325,15 @@ class Frames(Shown):
         if not np.isfinite(self.searched_mag) or self.used.star_id is None:
             return None
         limit = max(self.searched_mag, min(self.searched_mag + FAINTER_NEIGHBOURS, FAINTEST))
-        return _stars(limit, float(self.matched.meta.get("epoch", 2016.0)))
+        return _stars(limit, self.matched.origin.epoch or 2016.0)
 
     def _apparent(self, directions: FloatArray, row: ImageRow) -> FloatArray:
         """Catalogue directions as the run took them for this frame."""
-        meta = self.used.meta
-        if (
-            meta.get("directions") != "apparent"
-            or "observer_velocity_km_s" not in meta
-            or not row.time_utc
-        ):
+        origin = self.used.origin
+        made = origin.apparent and origin.observer_velocity_km_s is not None
+        if not made or not row.time_utc:
             return directions
-        site = Site.from_dict(meta["site"]) if "site" in meta else None
+        site = None if origin.site is None else Site.from_dict(origin.site)
         return apparent_directions(directions, row.time_utc, site=site)
 
     def _frame(self, row: ImageRow) -> InspectedFrame:

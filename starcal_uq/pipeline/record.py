@@ -119,10 +119,10 @@ def record_images(
     for identification, obs, calibration in () if calibrated is None else calibrated.rounds:
         rounds.append(_recorded(identification, obs, calibration, before))
         before = identification
-    disturbed = 0 if calibrated is None else calibrated.observations.meta.get("disturbed_stars", 0)
+    disturbed = 0 if calibrated is None else calibrated.observations.origin.disturbed_stars or 0
     places = tuple(os.path.abspath(source) for source in sources)
     parity, limit = (
-        ("normal", None) if last is None else (last.parity, last.observations.meta.get("max_mag"))
+        ("normal", None) if last is None else (last.parity, last.observations.origin.max_mag)
     )
     return ImageRecord(
         tuple(rounds), tuple(rows), int(disturbed), parity, places, limit, other_cameras(centroids)

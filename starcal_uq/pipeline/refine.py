@@ -166,7 +166,7 @@ def _again(
     flipped = first.parity == "mirrored"
     table = mirrored(centroids, known.camera.width_px) if flipped else centroids
     moved = table
-    if to_catalogue is not None and obs.meta["directions"] == "apparent":
+    if to_catalogue is not None and obs.origin.apparent:
         moved = undisplaced(table, obs, known.camera, to_catalogue)
     found = identify(moved, known.camera, stars, calibration=known, **options)
     # What follows is said against the data sheet.

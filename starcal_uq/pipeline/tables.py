@@ -66,9 +66,9 @@ def partitions_from_folder(
     """
     obs = open_partitions(path, camera, columns)
     if directions is not None:
-        obs = obs.with_meta(directions=directions)
+        obs = obs.with_origin(directions=directions)
     if in_space:
-        obs = obs.with_meta(observer="space")
+        obs = obs.with_origin(observer="space")
     if time_utc is not None:
         _refuse_timed(path, map(obs.prepared(lambda table: table).reader.load, obs.parts))
     prepare = partial(
@@ -80,18 +80,22 @@ def partitions_from_folder(
         in_space=in_space,
         time_utc=time_utc,
     )
-    made = (
-        obs.meta["directions"] == "catalogue"
-        or observer_velocity_km_s is not None
-        or site is not None
-    )
-    if obs.meta["directions"] == "apparent":
+    if obs.origin.apparent:
         # Nothing is left to be done to them but to refuse what contradicts it.
         prepare(obs.reader.load(obs.parts[0]))
-        made = False
-    if not made and time_utc is None:
-        return obs
-    return obs.prepared(prepare, **({"directions": "apparent"} if made else {}))
+    elif _catalogued(obs, observer_velocity_km_s, site):
+        return obs.prepared(prepare, directions="apparent")
+    return obs if time_utc is None else obs.prepared(prepare)
+
+
+def _catalogued(
+    obs: Observations | PartitionedObservations,
+    observer_velocity_km_s: Sequence[float] | None,
+    site: Site | None,
+) -> bool:
+    """Whether the directions are a catalogue's, as the table or what is known of the observer says."""
+    observed = observer_velocity_km_s is not None or site is not None
+    return observed or obs.origin.directions == "catalogue"
 
 
 def _refuse_timed(path: Path, tables: Iterable[Observations]) -> None:
@@ -117,13 +121,13 @@ def _apparent(
         there = np.full(len(obs), "") if obs.time_utc is None else obs.time_utc
         obs = replace(obs, time_utc=np.where(there == "", utc_text(time_utc), there))
     if directions is not None:
-        obs = obs.with_meta(directions=directions)
+        obs = obs.with_origin(directions=directions)
     # A table that says nothing of its directions is taken to hold a catalogue's.
-    declared = obs.meta.get("directions")
+    declared = obs.origin.directions
     check_sky(directions if declared == "undeclared" else declared, site, in_space)
     if in_space:
-        obs = obs.with_meta(observer="space")
-    if obs.meta.get("directions") == "apparent":
+        obs = obs.with_origin(observer="space")
+    if obs.origin.apparent:
         if observer_velocity_km_s is not None:
             raise ObservationError(
                 f"{path}: the directions are declared apparent already, so that an observer "
@@ -131,11 +135,7 @@ def _apparent(
                 "twice: leave out --observer-velocity, or declare --directions catalogue."
             )
         return obs
-    if (
-        obs.meta.get("directions") == "catalogue"
-        or observer_velocity_km_s is not None
-        or site is not None
-    ):
+    if _catalogued(obs, observer_velocity_km_s, site):
         from starcal_uq.sky.apparent import make_apparent, without_low_stars
 
         try:

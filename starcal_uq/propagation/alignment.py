@@ -48,7 +48,7 @@ def alignment_frames(
                 "a number of alignment frames belongs to a random sky: leave it out."
             )
         frames = obs if isinstance(alignment, str) else alignment
-        told = str(frames.meta.get("frames") or "")
+        told = str(frames.origin.frames or "")
         return (
             frames,
             (

@@ -173,7 +173,7 @@ def propagate(
         rest_rms_per_frame_arcsec=np.sqrt(rest_variance) * ARCSEC,
         nea_per_frame_arcsec=np.sqrt(_diagonal(nea)) * ARCSEC,
         interaction_arcsec=_rms(interaction.reshape(-1, 3) ** 2) * ARCSEC,
-        frames=str(obs.meta.get("frames", OBSERVED)),
+        frames=str(obs.origin.frames or OBSERVED),
         seen=obs,
         total_arcsec=np.sqrt(whole_variance) * ARCSEC,
         analytic_total_arcsec=_rms(spread(frames.response, post.covariance)) * ARCSEC,

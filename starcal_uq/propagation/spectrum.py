@@ -118,13 +118,13 @@ def error_spectrum(
         step_s=step,
         gap_share=1.0 - len(index) / size,
         n_draws=len(draws),
-        frames=str(obs.meta.get("frames", OBSERVED)),
+        frames=str(obs.origin.frames or OBSERVED),
     )
 
 
 def _series(obs: Observations, times_s: FloatArray | None) -> tuple[FloatArray, IntArray]:
     """Instants (K,) of the uniform series, and the place in it of every frame."""
-    given = obs.meta.get("frame_times_s") if times_s is None else times_s
+    given = obs.origin.frame_times_s if times_s is None else times_s
     if given is None:
         raise AttitudeProfileError(
             "these frames carry no times: pass times_s, one for each frame, or frames of "

@@ -127,7 +127,7 @@ def join_observations(
     `keep_shared`; so are tables of which only some state their noise, and directions of different
     kinds.
     """
-    kinds = {table.meta["directions"] for table in tables}
+    kinds = {table.origin.directions for table in tables}
     if len(kinds) > 1:
         raise CalibrationError(
             f"the runs' directions are of different kinds ({', '.join(sorted(kinds))}), so that "
@@ -157,13 +157,13 @@ def join_observations(
         }
         for name, shift, table in zip(names, shifts, tables, strict=True)
     ]
+    first = tables[0].origin
     meta: AnyDict = {
-        "directions": tables[0].meta["directions"],
+        "directions": first.directions,
         "source": f"merged from {', '.join(names)}",
     }
-    truths = [table.meta.get("truth") for table in tables]
-    if truths[0] is not None and all(truth == truths[0] for truth in truths):
-        meta["truth"] = truths[0]
+    if first.truth is not None and all(table.origin.truth == first.truth for table in tables):
+        meta["truth"] = first.truth
     return Observations(**columns, meta={**meta, "merged": parts})
 
 

@@ -251,7 +251,7 @@ class StoredRun:
     @property
     def truth(self) -> Camera | None:
         """The camera of a simulation: the one given, or that of the observations."""
-        simulated = self.observations.meta.get("truth")
+        simulated = self.observations.origin.truth
         if self._truth is not None or simulated is None:
             return self._truth
         return Camera.from_dict(simulated)

@@ -15,6 +15,7 @@ from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CatalogueError, SettingError, StarcalError
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
+from starcal_uq.observations.origin import SIMULATED, Origin
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def simulate(
     -------
     Observations
         Directions are those of the catalogue as given, so that they are exactly what the camera saw
-        (``meta["directions"] = "apparent"``).
+        (``origin.directions`` is "apparent").
 
     Raises
     ------
@@ -152,13 +153,7 @@ def simulate(
 
 def simulated_meta(camera: Camera, sigma_px: float, seed: int) -> AnyDict:
     """What a simulated table says of itself."""
-    return {
-        "source": "simulated",
-        "directions": "apparent",
-        "seed": seed,
-        "sigma_px": sigma_px,
-        "truth": camera.to_dict(),
-    }
+    return Origin(SIMULATED, "apparent", seed, sigma_px, camera.to_dict()).plain()
 
 
 def observed(

@@ -114,7 +114,7 @@ def profile_frames(
     Returns
     -------
     Observations
-        Frame numbers count the instants from 0; ``meta["frame_times_s"]`` holds the times of the
+        Frame numbers count the instants from 0; ``origin.frame_times_s`` holds the times of the
         frames that are there.
 
     Raises
@@ -200,7 +200,7 @@ def _with_noise(frames: Observations, like: Observations) -> Observations:
         )
     else:
         sigma, rule = noise_by_magnitude(like, frames.mag), "median stated noise by magnitude"
-    return dataclasses.replace(frames, sigma_px=sigma, meta={**frames.meta, "noise": rule})
+    return dataclasses.replace(frames, sigma_px=sigma).with_meta(noise=rule)
 
 
 def noise_by_magnitude(like: Observations, mag: FloatArray) -> FloatArray:

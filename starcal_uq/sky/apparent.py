@@ -25,7 +25,7 @@ from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import julian_days
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
 from starcal_uq.sky.refraction import (
     LEAST_ALTITUDE_DEG,
@@ -47,7 +47,6 @@ SUN_DISTANCE_AU = 1.0
 # Faster than this relative to the Earth's centre, an observer is in space: the ground moves at 0.46
 # km/s.
 _IN_SPACE_KM_S = 1.0
-_NO_AIR = ("space", "rendered")
 _STARS_PER_FRAME = 4
 # Hours by which a zone's time differs from UTC at most.
 _ZONES = 14
@@ -208,10 +207,10 @@ def make_apparent(
     Returns
     -------
     Observations
-        Rows as before; `meta["directions"]` is "apparent", `meta["observer_velocity_km_s"]` is the
-        mean of the barycentric velocities that were applied, one for each row; `meta["observer"]`
+        Rows as before; `origin.directions` is "apparent", `origin.observer_velocity_km_s` is the
+        mean of the barycentric velocities that were applied, one for each row; `origin.observer`
         is "ground" with a site, "space" with a velocity above 1 km/s or where it said so, else
-        "unknown". With a site, `meta["site"]` holds it and `meta["atmosphere"]` the air that was
+        "unknown". With a site, `origin.site` holds it and `origin.atmosphere` the air that was
         taken and what it does.
 
     Raises
@@ -222,7 +221,7 @@ def make_apparent(
     CatalogueError
         The velocity is not usable.
     """
-    if obs.meta.get("directions") == "apparent":
+    if obs.origin.apparent:
         raise ObservationError(
             "The directions of these observations are apparent already; aberration would be "
             "applied twice, "
@@ -237,15 +236,15 @@ def make_apparent(
         own = check_velocity(observer_velocity_km_s, len(obs))
         velocity = velocity + own
     directions = unit_vectors(obs.ra_deg, obs.dec_deg)
-    meta: dict[str, Any] = {"directions": "apparent"}
+    facts: AnyDict = {"directions": "apparent"}
     if site is None:
         seen = aberrate(directions, velocity)
         moving = (
             observer_velocity_km_s is not None
             and float(np.linalg.norm(own, axis=-1).max()) > _IN_SPACE_KM_S
         )
-        known = obs.meta.get("observer")
-        meta["observer"] = "space" if moving else known if known in _NO_AIR else "unknown"
+        known = obs.origin.observer if obs.origin.without_air else "unknown"
+        facts["observer"] = "space" if moving else known
     else:
         altitude = _altitudes(obs, site, directions, velocity)
         low = altitude < LEAST_ALTITUDE_DEG
@@ -261,14 +260,14 @@ def make_apparent(
         velocity = velocity + moved
         constants = refraction_constants(site)
         seen = refract(aberrate(directions, velocity), zenith, constants)
-        meta |= {
+        facts |= {
             "observer": "ground",
             "site": site.to_dict(),
             "atmosphere": _atmosphere(site, constants, altitude),
         }
     ra, dec = ra_dec_deg(seen)
-    meta["observer_velocity_km_s"] = [float(component) for component in velocity.mean(axis=0)]
-    return replace(obs, ra_deg=ra, dec_deg=dec, meta={**obs.meta, **meta})
+    facts["observer_velocity_km_s"] = velocity.mean(axis=0).tolist()
+    return replace(obs, ra_deg=ra, dec_deg=dec).with_origin(**facts)
 
 
 def without_low_stars(
@@ -288,7 +287,7 @@ def without_low_stars(
     Returns
     -------
     Observations
-        The other rows; `meta["low_stars"]` says how many were left out.
+        The other rows; `origin.low_stars` says how many were left out.
 
     Raises
     ------
@@ -305,7 +304,7 @@ def without_low_stars(
             f"at the site ({site}), "
             "below which refraction is not known well enough: take images of higher stars."
         )
-    return kept.with_meta(low_stars=obs.n_stars - kept.n_stars)
+    return kept.with_origin(low_stars=obs.n_stars - kept.n_stars)
 
 
 def _earth_velocity(obs: Observations) -> FloatArray:

@@ -57,9 +57,9 @@ def disturbed_stars(
 def without_disturbed(
     obs: Observations, stars: StarCatalogue, camera: Camera, psf_sigma_px: float = 1.0
 ) -> Observations:
-    """The other stars, in frames that keep at least four; ``meta["disturbed_stars"]`` says how many
+    """The other stars, in frames that keep at least four; ``origin.disturbed_stars`` says how many
     were left out.
     """
     kept = obs.select(~disturbed_stars(obs, stars, camera, psf_sigma_px))
     kept = kept.select_frames(kept.frame_ids[kept.stars_per_frame >= _LEAST_STARS])
-    return kept.with_meta(disturbed_stars=obs.n_stars - kept.n_stars)
+    return kept.with_origin(disturbed_stars=obs.n_stars - kept.n_stars)

@@ -385,9 +385,9 @@ def _epochs(source: _Source, file_epoch: float | None) -> FloatArray:
             what = f"{epochs[bad[0]]:g} is not a Julian year between 1800 and 2200"
             raise source.fail("epoch", int(bad[0]), what, "write years, or give file_epoch")
         return epochs
-    for key in source.table.meta:
+    for key, value in source.table.meta.items():
         if key.lower() == "epoch":
-            text = str(source.table.meta[key]).strip().lstrip("Jj")
+            text = str(value).strip().lstrip("Jj")
             if re.fullmatch(r"\d{4}(\.\d*)?", text):
                 return np.full(n, check_epoch(float(text)))
     raise CatalogueError(

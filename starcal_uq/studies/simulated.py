@@ -30,6 +30,7 @@ from starcal_uq.inference.target import (
 )
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, scaled_inverse
+from starcal_uq.observations.origin import SIMULATED, Origin
 from starcal_uq.observations.table import Observations
 from starcal_uq.sky.positions import ra_dec_deg
 from starcal_uq.studies.cells import (
@@ -272,7 +273,7 @@ def observe(
         star_id=stars.star_id[geometry.star],
         mag=geometry.mag,
         direction_mas=np.full(len(xy), error) if error > 0.0 else None,
-        meta={"source": "simulated", "directions": "apparent"},
+        meta=Origin(SIMULATED, "apparent").plain(),
     )
 
 

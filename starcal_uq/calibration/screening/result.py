@@ -61,7 +61,7 @@ class Screening(Shown):
     kept : (N,) bool array
         Rows that the calibration uses.
     observations : Observations
-        Rows that were kept; ``meta["screening"]`` says what they were taken from.
+        Rows that were kept; ``origin.screening`` says what they were taken from.
     rejected : DataFrame
         The other rows, one line each: ``row`` (from 0, in the observations given), ``frame``,
         ``star_id``, ``x_px``, ``y_px``, ``residual_px`` (measurement minus prediction of the other

@@ -228,7 +228,7 @@ def screen(
     taste, taste_p = residuals.taste(rates.shrinkage)
     return Screening(
         kept=use,
-        observations=kept.with_meta(
+        observations=kept.with_origin(
             screening={
                 "rejected": n_rejected,
                 "of": obs.n_stars,

@@ -48,7 +48,7 @@ def _systematic(obs: Observations, cal: Calibration) -> str:
             f"The model: residuals keep a pattern of {significant(arcsec)} arcsec, which more "
             "frames will not remove."
         )
-    if obs.meta.get("directions") != "apparent":
+    if not obs.origin.apparent:
         return (
             "Knowledge of the directions: until they are known to be apparent, f is conditional "
             "on that."

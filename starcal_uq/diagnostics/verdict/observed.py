@@ -71,7 +71,7 @@ def directions(
     """Is annual aberration in the directions, and refraction where there is air? `rests` is what f
     rests on.
     """
-    declared = str(obs.meta.get("directions", "undeclared"))
+    declared = obs.origin.directions
     name, bound = "Catalogue directions", "apparent"
     seen = air(obs)
     wrong = [] if times is None else [_time_words(obs, times)]
@@ -123,17 +123,17 @@ def directions(
         )
     if declared == "apparent":
         sentence = "The directions are declared as apparent: aberration is in them."
-        if obs.meta.get("observer") == "space":
+        if obs.origin.observer == "space":
             sentence = "Aberration is in the directions; the camera was in space."
         if seen == "corrected":
             sentence = (
-                f"Aberration and refraction at the site ({Site.from_dict(obs.meta['site'])}) are "
+                f"Aberration and refraction at the site ({Site.from_dict(obs.origin.site or {})}) are "
                 "in the directions."
             )
         sentence = f"{sentence} {rests}".rstrip()
         return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, bound, sentence)
     sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
-    time = _time_of(obs) if _from_images(obs) else ""
+    time = _time_of(obs) if obs.origin.from_images else ""
     remedy = f"{_command(obs)}{time or ' --directions apparent'}"
     if seen == "unknown":
         sentence, remedy = (
@@ -147,8 +147,8 @@ def rests_on_aberration(obs: Observations, found: UnseenAberration | None) -> st
     """That f is conditional on aberration being in the directions once, where no residual can show
     that.
     """
-    made = obs.meta.get("source") == "simulated" or obs.meta.get("observer") == "rendered"
-    if found is None or made or obs.meta.get("directions") != "apparent":
+    made = obs.origin.simulated or obs.origin.observer == "rendered"
+    if found is None or made or not obs.origin.apparent:
         return ""
     size = f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)"
     return (
@@ -168,7 +168,7 @@ def air_words(obs: Observations, found: AirTest) -> str:
         f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)."
     )
     if not np.isfinite(found.latitude_deg):
-        times = f"--time, or {TIMES_IN_NAMES if _from_images(obs) else 'column time_utc'}"
+        times = f"--time, or {TIMES_IN_NAMES if obs.origin.from_images else 'column time_utc'}"
         return f"{first} The frames have no times: state the site (--site) and the times ({times})."
     place = Site(found.latitude_deg, found.longitude_deg)
     errors = (significant(error) for error in (found.latitude_std_deg, found.longitude_std_deg))
@@ -214,7 +214,7 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]
         )
     if found.cause == "no aberration":
         sentence = f"The residuals hold annual aberration that the directions do not: {effect}."
-        kind = "" if _from_images(obs) and obs.time_utc is None else " --directions catalogue"
+        kind = "" if obs.origin.from_images and obs.time_utc is None else " --directions catalogue"
         return "no aberration", sentence, f"{_command(obs)}{kind}{_time_of(obs)}", ""
     if found.cause == "aberration twice":
         sentence = f"The directions hold annual aberration twice: {effect}."
@@ -248,10 +248,6 @@ def wrong_time(obs: Observations, cal: Calibration) -> str | None:
     )
 
 
-def _from_images(obs: Observations) -> bool:
-    return str(obs.meta.get("source", "")).startswith("identified in ")
-
-
 def _time_of(obs: Observations) -> str:
     """The option that gives a time to what has none."""
     return " --time UTC" if obs.time_utc is None or not bool((obs.time_utc != "").all()) else ""
@@ -261,7 +257,7 @@ def _command(obs: Observations) -> str:
     """The command that makes the directions of these stars: of images they are made while they are
     identified.
     """
-    return FROM_IMAGES if _from_images(obs) else CALIBRATE
+    return FROM_IMAGES if obs.origin.from_images else CALIBRATE
 
 
 def _with_site(obs: Observations, found: AirTest | None = None) -> str:
@@ -376,7 +372,7 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
 
 def screening(obs: Observations) -> Check | None:
     """Did screening find stars to blame, or the model?"""
-    record = obs.meta.get("screening")
+    record = obs.origin.screening
     if not isinstance(record, dict) or "blame" not in record:
         return None
     value = f"{plural(int(record['rejected']), 'star')} of {int(record['of'])} rejected"
@@ -436,7 +432,7 @@ def _stated_unit(obs: Observations, cal: Calibration) -> tuple[str, str] | None:
     stated, in_px = obs.sigma_px, "Give the noise in px, or leave the column out."
     if stated is None:
         return None
-    if floor := obs.meta.get("noise_floor_px"):  # The column is not the user's.
+    if floor := obs.origin.noise_floor_px:  # The column is not the user's.
         less = (
             f"Less scatter than the stars state: the {significant(floor)} px that were added to "
             "each are too many."
@@ -582,12 +578,11 @@ def air(obs: Observations | PartitionedObservations) -> Air:
 
     Directions that the user declared as apparent are what the camera saw, with all there is to it.
     """
-    if obs.meta.get("observer") == "ground":
+    origin = obs.origin
+    if origin.observer == "ground":
         return "corrected"
-    if obs.meta.get("observer") in ("space", "rendered") or obs.meta.get("source") == "simulated":
-        return "none"
-    declared = obs.meta.get("directions") == "apparent" and obs.meta.get("observer") != "unknown"
-    return "none" if declared else "unknown"
+    declared = origin.apparent and origin.observer != "unknown"
+    return "none" if origin.without_air or origin.simulated or declared else "unknown"
 
 
 def conditional_words(cal: Calibration) -> str:
@@ -607,7 +602,7 @@ def conditional_words(cal: Calibration) -> str:
 
 def corrected_words(obs: Observations, cal: Calibration) -> str:
     """Which air was taken at which site, and what it does to f."""
-    site, atmosphere = Site.from_dict(obs.meta["site"]), obs.meta["atmosphere"]
+    site, atmosphere = Site.from_dict(obs.origin.site or {}), obs.origin.atmosphere or {}
     size = float(atmosphere["shrinking"]) * cal.camera.focal_px
     sigma = float(cal.sigmas[2])
     assumed = " and ".join(site.assumed)

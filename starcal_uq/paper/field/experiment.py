@@ -231,7 +231,7 @@ def _campaign(
 
     def prepare(obs: Observations) -> Observations:
         # Rendered stars are where the catalogue has them.
-        return without_disturbed(obs.with_meta(directions="apparent"), stars, nominal, width_px)
+        return without_disturbed(obs.with_origin(directions="apparent"), stars, nominal, width_px)
 
     found = identify_and_calibrate(
         frames.centroids, nominal, stars, prepare=prepare, identification=_FIRST_TOLERANCES

@@ -211,7 +211,7 @@ def methods_paragraph(results: Results) -> str:
     camera, record = cal.camera, cal.provenance if post is None else post.provenance
     versions: Mapping[str, Any] = record.get("versions", {})
     settings: Mapping[str, Any] = record.get("settings", {})
-    kind = "simulated " if obs.meta.get("source") == "simulated" else ""
+    kind = "simulated " if obs.origin.simulated else ""
     noise = "fitted with the camera" if cal.fitted_noise is not None else "a free parameter"
     parts = [
         f"The camera ({detector_words(camera)}, distortion model "

@@ -67,7 +67,7 @@ def data_sentence(results: Results) -> str:
         if low == high
         else f"{low} to {high} stars each, median {np.median(per_frame):g}"
     )
-    source = {"simulated": "Simulated data: "}.get(str(obs.meta.get("source", "")), "")
+    source = "Simulated data: " if obs.origin.simulated else ""
     stars = f"{plural(obs.n_stars, 'star')} in {plural(obs.n_frames, 'frame')} ({each})"
     if cal.partitions is not None:
         files = plural(len(cal.partitions.n_stars), "file")
@@ -91,7 +91,7 @@ def data_sentence(results: Results) -> str:
 
 
 def _directions(obs: Observations) -> str:
-    declared = str(obs.meta["directions"])
+    declared = obs.origin.directions
     if declared == "apparent" and air(obs) == "corrected":
         return "apparent directions (aberration and refraction included)"
     if declared == "apparent" and air(obs) == "unknown":
@@ -114,7 +114,7 @@ def _noise_words(results: Results) -> str:
             f"fitted: {cal.fitted_noise}; the data ask for {significant(cal.sigma, 3)} times that"
         )
     if cal.sigma_name == "sigma_scale":
-        floor = results.observations.meta.get("noise_floor_px")
+        floor = results.observations.origin.noise_floor_px
         more = (
             (
                 f", with {significant(float(floor))} px per axis added that even bright stars show "
@@ -257,7 +257,7 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = [
         ("Data, SHA-256", results.calibration.data_hash_of(results.observations))
     ]
-    source = results.observations.meta.get("source")
+    source = results.observations.origin.source
     if source:
         rows.append(("Source of the data", str(source)))
     if results.camera_changed:

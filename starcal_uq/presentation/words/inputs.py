@@ -72,15 +72,15 @@ def camera_table(camera: Camera) -> TextTable:
 
 def observations_text(obs: Observations) -> str:
     """How much there is, and what its directions are."""
-    return f"{obs.n_stars} stars in {obs.n_frames} frames, directions {obs.meta['directions']}."
+    return f"{obs.n_stars} stars in {obs.n_frames} frames, directions {obs.origin.directions}."
 
 
 def example_text(example: ExampleData) -> str:
     """What there is, and whose it is."""
     obs = example.observations
     return (
-        f"{example.name}: {obs.n_stars} stars in {obs.n_frames} frames; {obs.meta['attribution']}, "
-        f"{obs.meta['licence']}. Site: {example.site}."
+        f"{example.name}: {obs.n_stars} stars in {obs.n_frames} frames; {obs.origin.attribution}, "
+        f"{obs.origin.licence}. Site: {example.site}."
     )
 
 

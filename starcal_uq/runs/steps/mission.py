@@ -80,7 +80,7 @@ class MissionSky:
         frames = profile_frames(
             stars, camera, profile, self.rate_hz, min_stars=self.min_stars or 3, noise_like=like
         )
-        return frames.with_meta(messages=[*profile.messages])
+        return frames.with_origin(messages=[*profile.messages])
 
 
 @bounded
@@ -131,9 +131,9 @@ def propagate(
     frames = run.observations if sky is None else sky.frames(posterior, run.observations, seed)
     aligning: Observations | str = str(alignment)
     if aligning == OBSERVED:
-        aligning = run.observations.with_meta(frames=attitude_error.OBSERVED)
+        aligning = run.observations.with_origin(frames=attitude_error.OBSERVED)
     elif aligning != RANDOM:
-        aligning = load_observations(alignment).with_meta(frames=str(alignment))
+        aligning = load_observations(alignment).with_origin(frames=str(alignment))
     error = propagate(
         posterior,
         frames,
@@ -144,7 +144,7 @@ def propagate(
     )
     fields = field_map(posterior, run.observations)
     spectrum = None
-    told = [str(message) for message in frames.meta.get("messages", ())]
+    told = [str(message) for message in frames.origin.messages or ()]
     if sky is not None and sky.profile is not None:
         from starcal_uq.propagation.spectrum import MIN_SPECTRUM_FRAMES, error_spectrum
 
