@@ -3,22 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import say, show_calibration
 from starcal_uq.cli.options import (
-    LEAST_SIGMA_PX,
-    CameraFile,
-    Columns,
-    Force,
-    NewRun,
-    number,
     parse_columns,
-    read_path,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.settings import Limit
@@ -28,60 +18,17 @@ _WALK_PX = Limit(0.0, 1e6, whole=False)
 
 
 def filter_command(
-    observations: Annotated[
-        Path,
-        typer.Argument(
-            metavar="OBS",
-            help="Stars in pixels, the frames in order: CSV, Parquet, or a folder of them.",
-            parser=read_path,
-        ),
-    ],
-    camera: CameraFile,
-    out: NewRun,
-    method: Annotated[
-        settings.RecursiveMethod,
-        typer.Option(
-            help=(
-                "griffith (recursive least squares) or samaan (Kalman filter, distortion "
-                "afterwards)."
-            )
-        ),
-    ] = "griffith",
-    parameters: Annotated[
-        settings.Filtered,
-        typer.Option(
-            help=(
-                "optics (x0, y0, f; the distortion is ignored, as in the source) or all "
-                "(griffith only)."
-            )
-        ),
-    ] = "all",
-    pair_covariance: Annotated[
-        settings.PairCovariance,
-        typer.Option(
-            help=(
-                "full, or diagonal: pairs that share a star taken as independent, as filters "
-                "used to."
-            )
-        ),
-    ] = "full",
-    forgetting: Annotated[
-        float,
-        number(
-            _FORGETTING,
-            "Weight of all earlier frames against the next, above 0 and up to 1 (griffith).",
-        ),
-    ] = 1.0,
-    process_noise: Annotated[
-        float | None,
-        number(_WALK_PX, "Random walk of the optics, px per frame; needs --sigma (samaan)."),
-    ] = None,
-    sigma: Annotated[
-        float | None,
-        number("sigma_px", "Stated centroid noise, px per axis.", least=LEAST_SIGMA_PX),
-    ] = None,
-    column: Columns = None,
-    force: Force = False,
+    observations: Path,
+    camera: Path,
+    out: Path,
+    method: settings.RecursiveMethod = "griffith",
+    parameters: settings.Filtered = "all",
+    pair_covariance: settings.PairCovariance = "full",
+    forgetting: float = 1.0,
+    process_noise: float | None = None,
+    sigma: float | None = None,
+    column: list[str] | None = None,
+    force: bool = False,
 ) -> Answer:
     """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an
     interrupted call goes on.

@@ -5,31 +5,18 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import note, print_table, progress_bar, say, tell, warn_undeclared
 from starcal_uq.cli.options import (
-    BayerMosaic,
-    Engine,
-    Force,
-    OptionalCamera,
-    TimeUtc,
-    check_names,
     check_same_sensor,
-    checked,
-    number,
-    read_file,
-    read_path,
-    write_file,
 )
 from starcal_uq.cli.settings import ImageSettings, PlaceSettings, SkySettings
+from starcal_uq.core import settings
 from starcal_uq.core.files import UNFINISHED, ensure_new, table_ending
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.settings import EPOCH, MAGNITUDES
 from starcal_uq.observations.files import WRITTEN
 
 if TYPE_CHECKING:
@@ -41,66 +28,20 @@ if TYPE_CHECKING:
 
 
 def centroid_command(
-    images: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="IMAGES...",
-            help="FITS, TIFF, PNG, JPEG, BMP or raw files, or folders of them.",
-            parser=read_path,
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="CENTROIDS",
-            help="Table to write (.csv, .ecsv, .parquet).",
-            parser=write_file,
-        ),
-    ],
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            "--camera", help="Camera (TOML): images of another size are left out.", parser=read_file
-        ),
-    ] = None,
-    gain: Annotated[
-        float | None,
-        number("gain_e_per_count", "Electrons per count, where the files do not say it."),
-    ] = None,
-    read_noise: Annotated[
-        float | None, number("read_noise_e", "Read noise, electrons per pixel (needs the gain).")
-    ] = None,
-    saturation: Annotated[
-        float | None, number("saturation", "Counts at which a pixel is saturated.")
-    ] = None,
-    threshold: Annotated[
-        float, number("threshold_sigma", "Detection threshold, standard deviations.")
-    ] = 5.0,
-    psf_sigma: Annotated[
-        float | None, number("psf_sigma_px", "Width of the star images, px; measured by default.")
-    ] = None,
-    max_stars: Annotated[
-        int | None, number("max_stars", "Keep the brightest so many per frame.")
-    ] = None,
-    pixel_phase: Annotated[
-        bool,
-        typer.Option(
-            help=(
-                "Take out errors that repeat with the place within a pixel, where images show them."
-            )
-        ),
-    ] = True,
-    time: TimeUtc = None,
-    bayer: BayerMosaic = None,
-    workers: Annotated[
-        int | None,
-        number(
-            "workers", "Processes; as many as processors from a hundred images on, 0 for this one."
-        ),
-    ] = None,
-    force: Force = False,
+    images: list[Path],
+    out: Path,
+    camera: Path | None = None,
+    gain: float | None = None,
+    read_noise: float | None = None,
+    saturation: float | None = None,
+    threshold: float = 5.0,
+    psf_sigma: float | None = None,
+    max_stars: int | None = None,
+    pixel_phase: bool = True,
+    time: str | None = None,
+    bayer: settings.Bayer | None = None,
+    workers: int | None = None,
+    force: bool = False,
 ) -> Answer:
     """Find the stars in images, with a covariance for each; a frame that cannot be used is named
     and left out.
@@ -143,56 +84,18 @@ def centroid_command(
 
 
 def identify_command(
-    centroids: Annotated[
-        Path,
-        typer.Argument(
-            metavar="CENTROIDS", help="Table made by `starcal-uq centroid`.", parser=read_file
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="OBS",
-            help=f"Table to write ({', '.join(WRITTEN)}).",
-            parser=write_file,
-        ),
-    ],
-    camera: OptionalCamera = None,
-    max_mag: Annotated[
-        float | None,
-        number(MAGNITUDES, "Magnitude limit, Gaia G; as deep as the frames need by default."),
-    ] = None,
-    epoch: Annotated[
-        float | None,
-        number(EPOCH, "Julian year of the star positions; the images' own by default."),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            help="Run folder of this camera: its uncertainty takes the tolerances' place.",
-            parser=read_path,
-        ),
-    ] = None,
-    focal_tolerance: Annotated[
-        float, number("focal_tolerance", "Relative error of the nominal focal length.")
-    ] = 0.03,
-    centre_tolerance: Annotated[
-        float | None,
-        number(
-            "centre_tolerance_px",
-            (
-                "Error of the nominal principal point, px; by default 2 % of the width, but not "
-                "more "
-                "than 20."
-            ),
-        ),
-    ] = None,
-    engine: Engine = "pyramid",
+    centroids: Path,
+    out: Path,
+    camera: Path | None = None,
+    max_mag: float | None = None,
+    epoch: float | None = None,
+    calibration: Path | None = None,
+    focal_tolerance: float = 0.03,
+    centre_tolerance: float | None = None,
+    engine: settings.Engine = "pyramid",
     *,
     place: PlaceSettings,
-    force: Force = False,
+    force: bool = False,
 ) -> Answer:
     """Identify the stars of every frame without knowing where the camera pointed; frames that do
     not fit are named.
@@ -262,42 +165,12 @@ def identify_command(
 
 
 def inspect_command(
-    run: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN",
-            help="Run folder made by `starcal-uq run IMAGES... -o RUN`.",
-            parser=read_path,
-        ),
-    ],
-    frames: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[FRAME]...",
-            help="Numbers or names of frames; by default those that tell most.",
-            callback=checked(check_names),
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="PAGE",
-            help="Page to write (.html); RUN/frames.html by default.",
-            parser=write_file,
-        ),
-    ] = None,
-    most: Annotated[int, number("gallery_frames", "Frames at most, where none is named.")] = 24,
-    images: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="PATH",
-            help="Images, or a folder of them, where they have moved; repeatable.",
-            parser=read_path,
-        ),
-    ] = None,
-    force: Force = False,
+    run: Path,
+    frames: list[str] | None = None,
+    out: Path | None = None,
+    most: int = 24,
+    images: list[Path] | None = None,
+    force: bool = False,
 ) -> Answer:
     """Look at the frames of a run: their stars identified, rejected, expected and missed, and what
     to do next.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -11,26 +11,13 @@ import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import STYLES, note, print_table, progress_bar, say, tell
 from starcal_uq.cli.options import (
-    LEAST_SIGMA_PX,
-    CameraFile,
-    Epoch,
-    Force,
-    MaxMag,
-    RunPath,
-    Seed,
     check_same_sensor,
-    checked,
-    number,
     parse_labels,
-    read_file,
-    read_path,
-    write_file,
-    write_path,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
 from starcal_uq.core.manifest import refuse_others
-from starcal_uq.core.settings import ARCSEC, MAGNITUDES, PROBABILITY, Limit
+from starcal_uq.core.settings import MAGNITUDES, Limit
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -57,39 +44,13 @@ def check_output(out: Path | None, command: str, force: bool) -> None:
 
 
 def budget_command(
-    run: RunPath,
-    file: Annotated[
-        Path | None,
-        typer.Option(
-            "--budget",
-            metavar="TOML",
-            help="Contributors that the data cannot know, and requirements.",
-            parser=read_file,
-        ),
-    ] = None,
-    out: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="FILE",
-            help="Also write .csv, .xlsx, .tex or .html; repeatable.",
-            parser=write_file,
-        ),
-    ] = None,
-    template: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="TOML",
-            help="Write a starter file that lists what is not assessed, and stop.",
-            parser=write_file,
-        ),
-    ] = None,
-    confidence: Annotated[
-        float | None, number(PROBABILITY, "Confidence of the totals; that of the file, or 0.997.")
-    ] = None,
-    seed: Seed = 0,
-    force: Force = False,
+    run: Path,
+    file: Path | None = None,
+    out: list[Path] | None = None,
+    template: Path | None = None,
+    confidence: float | None = None,
+    seed: int = 0,
+    force: bool = False,
 ) -> Answer:
     """Attitude error budget in the terms of ECSS; status 1 when a requirement is violated."""
     from starcal_uq.presentation.pages.budgeting import FORMATS
@@ -150,46 +111,14 @@ def tell_violations(found: Budget) -> None:
 
 
 def compare_command(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN_A RUN_B", help="Two run folders; one, with --split.", parser=read_path
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="DIR",
-            help="Folder for the page, tables and figure.",
-            parser=write_path,
-        ),
-    ] = None,
-    split: Annotated[
-        settings.Split | None,
-        typer.Option(help="Compare two parts of one run's frames: odd-even, halves, or random."),
-    ] = None,
-    labels: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A,B",
-            help="What to call them; the names of the folders by default.",
-            callback=checked(parse_labels),
-        ),
-    ] = None,
-    same_data: Annotated[
-        bool | None,
-        typer.Option(
-            "--same-data/--other-data",
-            help="Whether both rest on the same frames, if files cannot tell.",
-        ),
-    ] = None,
-    level: Annotated[
-        float, number(PROBABILITY, "Probability of a verdict 'differ' when nothing does.")
-    ] = 0.01,
-    seed: Seed = 0,
-    force: Force = False,
+    runs: list[Path],
+    out: Path | None = None,
+    split: settings.Split | None = None,
+    labels: str | None = None,
+    same_data: bool | None = None,
+    level: float = 0.01,
+    seed: int = 0,
+    force: bool = False,
 ) -> Answer:
     """Do two calibrations differ by more than chance? The rotation between them is taken out and
     stated.
@@ -227,91 +156,23 @@ def compare_command(
 
 
 def plan_command(
-    camera: CameraFile,
-    target: Annotated[
-        float | None,
-        number(
-            ARCSEC, "Two-axis error across the boresight to keep.", "--target-arcsec", metavar="T"
-        ),
-    ] = None,
-    confidence: Annotated[
-        float, number(PROBABILITY, "Probability of keeping it (0.997, not 99.7).")
-    ] = 0.997,
-    scope: Annotated[
-        settings.Scope,
-        typer.Option(
-            help="Part of the error the target is for: common, rest, calibration, or total."
-        ),
-    ] = "common",
-    sigma: Annotated[
-        float | None,
-        number(
-            "sigma_px",
-            "Centroid noise, px per axis; 0.05, or that of the run of --after, by default.",
-            least=LEAST_SIGMA_PX,
-        ),
-    ] = None,
-    max_mag: MaxMag = 6.0,
-    min_stars: Annotated[
-        int, number("min_stars", "Frames with fewer stars are not used.", least=3)
-    ] = 10,
-    frames: Annotated[
-        list[int] | None,
-        number(
-            "n_frames",
-            (
-                "Size of a campaign to forecast; repeatable (10, 30, 100, 300, 1000 and 3000 by "
-                "default)."
-            ),
-        ),
-    ] = None,
-    choose: Annotated[
-        int | None, number(_CHOSEN, "Also choose the N frames that help most.", metavar="N")
-    ] = None,
-    criterion: Annotated[
-        settings.Criterion,
-        typer.Option(help="What the choice is for: A (attitude error) or D (parameters)."),
-    ] = "A",
-    after: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="RUN",
-            help="Count the data of this run first, and take its calibrated camera.",
-            parser=read_path,
-        ),
-    ] = None,
-    distortion_percent: Annotated[
-        tuple[float, float] | None,
-        number(
-            _PERCENT,
-            "Distortion that a sheet with zero coefficients leaves open: displacement of the "
-            "corner, per cent, "
-            "barrel negative; from an f-theta lens to as much pincushion by default.",
-            metavar="LOW HIGH",
-        ),
-    ] = None,
-    check: Annotated[
-        int | None,
-        number(
-            "n_campaigns",
-            "Also simulate N campaigns of each size and compare.",
-            least=10,
-            metavar="N",
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="DIR",
-            help="Folder for the page, tables and figures.",
-            parser=write_path,
-        ),
-    ] = None,
-    epoch: Epoch = 2026.9,
-    seed: Seed = 0,
-    force: Force = False,
+    camera: Path,
+    target: float | None = None,
+    confidence: float = 0.997,
+    scope: settings.Scope = "common",
+    sigma: float | None = None,
+    max_mag: float = 6.0,
+    min_stars: int = 10,
+    frames: list[int] | None = None,
+    choose: int | None = None,
+    criterion: settings.Criterion = "A",
+    after: Path | None = None,
+    distortion_percent: tuple[float, float] | None = None,
+    check: int | None = None,
+    out: Path | None = None,
+    epoch: float = 2026.9,
+    seed: int = 0,
+    force: bool = False,
 ) -> Answer:
     """What a calibration of this camera will give, and the frames it needs, before any data."""
     from starcal_uq.planning.forecast import N_FRAMES

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Callable
+import tomllib
+from collections.abc import Callable, Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
@@ -14,31 +16,13 @@ import typer
 from starcal_uq.core import settings
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import shown
-from starcal_uq.core.settings import EPOCH, LIMITS, MAGNITUDES, Limit
+from starcal_uq.core.settings import KEYS, LIMITS, Limit
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
-# Gaia G; no star is brighter than the first, and the embedded catalogue ends at the last.
-# A noise that is given, and not simulated, is above zero.
-LEAST_SIGMA_PX = 1e-6
 _VELOCITY = Limit(-1e5, 1e5, whole=False)
 _LONGEST_LABELS, _LONGEST_ADDRESS = 200, 500
-
-
-def number(
-    limit: str | Limit,
-    text: str,
-    *names: str,
-    least: float | None = None,
-    metavar: str | None = None,
-) -> Any:
-    """Option of a number within limits, of a parameter of Python or of its own; a command may ask
-    for more.
-    """
-    limit = LIMITS[limit] if isinstance(limit, str) else limit
-    low = limit.low if least is None else least
-    return typer.Option(*names, min=low, max=limit.high, help=text, metavar=metavar)
 
 
 def _refuse(value: object, problem: str) -> typer.BadParameter:
@@ -228,6 +212,13 @@ def check_word_or_file(text: str) -> None:
         read_file(Path(text))
 
 
+def _check_schema(name: str) -> None:
+    from starcal_uq.cli.schemas import SCHEMAS
+
+    if name not in SCHEMAS:
+        raise typer.BadParameter(f"{shown(name)} is unknown: use one of {', '.join(SCHEMAS)}.")
+
+
 def checked(parse: Callable[[Any], object]) -> Callable[[Any], Any]:
     """Callback that lets a value pass which can be parsed; the command parses it."""
 
@@ -239,136 +230,50 @@ def checked(parse: Callable[[Any], object]) -> Callable[[Any], Any]:
     return check
 
 
-ObsFile = Annotated[
-    Path,
-    typer.Argument(
-        metavar="OBS",
-        help="Stars in pixels: CSV, ECSV, Parquet or a FITS binary table with columns frame, "
-        "x_px, y_px, ra_deg, "
-        "dec_deg and optionally sigma_px, star_id, mag, direction_mas, time_utc, temperature_c; "
-        "a .corr file of "
-        "astrometry.net, or matches (.json); or a folder of Parquet files of whole frames, which "
-        "may exceed memory.",
-        parser=read_path,
-    ),
-]
-CameraFile = Annotated[
-    Path,
-    typer.Argument(
-        metavar="CAMERA",
-        help="Nominal camera (TOML with a [camera] table): the start, and the prior's centre.",
-        parser=read_file,
-    ),
-]
-OptionalCamera = Annotated[
-    Path | None,
-    typer.Argument(
-        metavar="[CAMERA]",
-        help=(
-            "Nominal camera (TOML with a [camera] table); without one, the stars tell the focal "
-            "length."
-        ),
-        parser=read_file,
-    ),
-]
-RunPath = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RUN", help="Run folder of `starcal-uq calibrate` or `run`.", parser=read_path
-    ),
-]
-NewRun = Annotated[
-    Path,
-    typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.", parser=write_path),
-]
-Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
-Json = Annotated[
-    bool, typer.Option("--json", help="Answer with one JSON document: see `starcal-uq schema`.")
-]
-Seed = Annotated[int, number("seed", "Seed; the same seed repeats the result bit for bit.")]
-Columns = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--column",
-        metavar="NAME=IN_FILE",
-        help='A column that is called otherwise, or in another unit: `--column "ra_deg=RA [h] * '
-        '15"`, '
-        '`--column "x_px=X - 1"`; repeatable.',
-        callback=checked(parse_columns),
-    ),
-]
-TimeUtc = Annotated[
-    str | None,
-    typer.Option(
-        "--time",
-        metavar="UTC",
-        help="Middle of the exposure of images, or rows of a table, that do not say it; goes "
-        "before a time in an "
-        "image's name.",
-        callback=checked(_check_time),
-    ),
-]
-BayerMosaic = Annotated[
-    settings.Bayer | None,
-    typer.Option(
-        "--bayer",
-        help="Colours of the first 2 x 2 pixels, row by row, where each pixel sees one colour and "
-        "the files do "
-        "not say it: RGGB, BGGR, GRBG or GBRG; none for none.",
-    ),
-]
-Engine = Annotated[
-    settings.Engine,
-    typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name)."),
-]
-SchedulerAddress = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Dask scheduler whose workers do it; local processes otherwise.",
-        callback=checked(_check_text),
-    ),
-]
-FileWorkers = Annotated[
-    int | None,
-    number(
-        "workers",
-        "Local processes for a folder of partitions; one for each processor by default.",
-        "--workers",
-    ),
-]
-Workers = Annotated[
-    int | None, number("workers", "Processes; as many as processors by default.", least=1)
-]
-Duplicates = Annotated[
-    settings.Duplicates,
-    typer.Option(
-        help="Frames that hold the same measurement as an earlier one: refuse, drop (leave them "
-        "out), or keep (they "
-        "are exposures of their own)."
-    ),
-]
-Alignment = Annotated[
-    str,
-    typer.Option(
-        metavar="random|observed|FILE",
-        help=(
-            "Frames on which alignment is calibrated in flight: random sky, those of the "
-            "calibration, or a table."
-        ),
-        callback=checked(check_word_or_file),
-    ),
-]
-AlignmentFrames = Annotated[
-    int | None,
-    number(
-        "alignment_frames", "Number of alignment frames of random sky; 100 by default.", metavar="N"
-    ),
-]
-Draws = Annotated[int, number("n_draws", "Posterior draws that go through QUEST.", least=50)]
-Epoch = Annotated[float, number(EPOCH, "Julian year of the star positions.")]
-MaxMag = Annotated[float, number(MAGNITUDES, "Magnitude limit, Gaia G.")]
+_PATHS: Mapping[str, Callable[[str | Path], Path]] = {
+    "read": read_path,
+    "read file": read_file,
+    "write": write_path,
+    "write file": write_file,
+}
+_CHECKS: Mapping[str, Callable[[Any], object]] = {
+    "address": _check_text,
+    "columns": parse_columns,
+    "degrees of freedom": parse_dof,
+    "frames": parse_frames,
+    "labels": parse_labels,
+    "names": check_names,
+    "schema": _check_schema,
+    "start": parse_start,
+    "time": _check_time,
+    "velocity": parse_velocity,
+    "word or file": check_word_or_file,
+}
+_DECLARED = tomllib.loads((files("starcal_uq.cli") / "options.toml").read_text("utf-8"))
+
+
+def declared(owner: str, name: str, kind: Any, panel: str | None = None) -> Any:
+    """The type of a parameter of a command, or of a record, as Typer takes it; `panel` is where it
+    stands in the help.
+    """
+    told = _DECLARED.get(owner, {}).get(name) or _DECLARED["shared"][name]
+    low, high = told.get("range", (None, None))
+    if "limit" in told:
+        limit = (KEYS | LIMITS)[told["limit"]]
+        low, high = told.get("least", limit.low), limit.high
+    settings = {
+        "help": told.get("help"),
+        "metavar": told.get("metavar"),
+        "min": low,
+        "max": high,
+        "parser": _PATHS.get(told.get("path")),
+        "callback": checked(_CHECKS[told["check"]]) if "check" in told else None,
+        "rich_help_panel": panel,
+    }
+    if told.get("argument"):
+        return Annotated[kind, typer.Argument(**settings)]
+    names = told.get("names", [f"--{name.replace('_', '-')}"])
+    return Annotated[kind, typer.Option(*names, **settings)]
 
 
 def check_same_sensor(calibrated: Camera, run: Path, sheet: Camera, path: Path) -> None:

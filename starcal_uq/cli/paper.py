@@ -3,50 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import progress_bar, say, show_table
-from starcal_uq.cli.options import Force, Seed, Workers, number, write_path
 from starcal_uq.core import settings
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-Out = Annotated[
-    Path,
-    typer.Option(
-        "-o",
-        "--out",
-        metavar="DIR",
-        help="Folder for report, tables and figures.",
-        parser=write_path,
-    ),
-]
-
-
 def reproduce_command(
-    out: Out,
-    replicates: Annotated[
-        int,
-        number("n_replicates", "Repetitions of the experiment, each with its own seed.", least=8),
-    ] = 200,
-    frames: Annotated[int, number("n_frames", "Frames in each.", least=20)] = 1000,
-    convention: Annotated[
-        settings.Convention,
-        typer.Option(
-            help="eq14 (ideal to distorted, as everybody's models) or eq6 (distorted to ideal)."
-        ),
-    ] = "eq14",
-    study: Annotated[
-        bool, typer.Option(help="Also study the interaction of optics and distortion.")
-    ] = True,
-    workers: Workers = None,
-    seed: Seed = 2017,
-    force: Force = False,
+    out: Path,
+    replicates: int = 200,
+    frames: int = 1000,
+    convention: settings.Convention = "eq14",
+    study: bool = True,
+    workers: int | None = None,
+    seed: int = 2017,
+    force: bool = False,
 ) -> Answer:
     """Run Ye & Yang 2017 again: each of its numbers beside ours, with the uncertainty that they
     lack.
@@ -73,22 +48,13 @@ def reproduce_command(
 
 
 def reproduce_field_command(
-    out: Out,
-    frames: Annotated[
-        int, number("n_frames", "Frames identified and solved; as many calibrate.", least=20)
-    ] = 200,
-    reading: Annotated[
-        settings.FieldReading,
-        typer.Option(
-            help="window (the middle of a larger detector, 10.8 degrees) or full (all of it)."
-        ),
-    ] = "window",
-    replicates: Annotated[
-        int, number("n_replicates", "Repetitions behind the ranges of the errors.", least=20)
-    ] = 100,
-    workers: Workers = None,
-    seed: Seed = 2017,
-    force: Force = False,
+    out: Path,
+    frames: int = 200,
+    reading: settings.FieldReading = "window",
+    replicates: int = 100,
+    workers: int | None = None,
+    seed: int = 2017,
+    force: bool = False,
 ) -> Answer:
     """The paper's Table 3 from rendered frames: identification and attitude with four cameras, and
     why they differ.

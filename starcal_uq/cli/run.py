@@ -6,7 +6,7 @@ import shlex
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -23,18 +23,6 @@ from starcal_uq.cli.console import (
 )
 from starcal_uq.cli.images import load_images
 from starcal_uq.cli.mission import tell_violations
-from starcal_uq.cli.options import (
-    Alignment,
-    AlignmentFrames,
-    Draws,
-    Force,
-    NewRun,
-    Seed,
-    number,
-    read_file,
-    read_path,
-    write_path,
-)
 from starcal_uq.cli.settings import (
     EstimationSettings,
     ImageSettings,
@@ -69,15 +57,10 @@ _FAILED_FRAMES = 24
 
 
 def demo(
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out", "-o", metavar="DIR", help="Folder for the results.", parser=write_path
-        ),
-    ] = Path("starcal-demo"),
-    frames: Annotated[int, number("n_frames", "Number of frames.", least=20)] = 1000,
-    seed: Seed = 2017,
-    force: Force = False,
+    out: Path = Path("starcal-demo"),
+    frames: int = 1000,
+    seed: int = 2017,
+    force: bool = False,
 ) -> Answer:
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
     from starcal_uq.presentation.report.drawing import Ahead
@@ -101,36 +84,17 @@ def demo(
 
 
 def run_command(
-    inputs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="OBS|IMAGES... [CAMERA]",
-            help="A table of identified stars (CSV, ECSV, Parquet, a FITS binary table and "
-            "others, see `calibrate`) "
-            "or a folder of partitions, or images (FITS, TIFF, PNG, "
-            "JPEG) or folders of them, whose stars are then found and identified; then the "
-            "nominal camera (TOML with a "
-            "[camera] table), which images can do without: the stars tell the focal length.",
-            parser=read_path,
-        ),
-    ],
-    out: NewRun,
+    inputs: list[Path],
+    out: Path,
     estimation: EstimationSettings,
     sky: SkySettings,
     images: ImageSettings,
     sampling: SamplingSettings,
-    draws: Draws = 300,
-    alignment: Alignment = "random",
-    alignment_frames: AlignmentFrames = None,
-    budget: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="TOML",
-            help="Contributors that the data cannot know, and requirements: see `budget`.",
-            parser=read_file,
-        ),
-    ] = None,
-    force: Force = False,
+    draws: int = 300,
+    alignment: str = "random",
+    alignment_frames: int | None = None,
+    budget: Path | None = None,
+    force: bool = False,
 ) -> Answer:
     """Calibrate, sample, couple, propagate, budget and report: all from stars or images to
     RUN/report.html.

@@ -3,33 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
-
-import typer
 
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import print_table, say
-from starcal_uq.cli.options import checked
-from starcal_uq.core.files import shown
 from starcal_uq.presentation.tables import TextTable
 
 
-def _check_name(name: str) -> None:
-    from starcal_uq.cli.schemas import SCHEMAS
-
-    if name not in SCHEMAS:
-        raise typer.BadParameter(f"{shown(name)} is unknown: use one of {', '.join(SCHEMAS)}.")
-
-
 def schema_command(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[NAME]",
-            help="A command; verdict (RUN/verdict.json), or error; all that there are by default.",
-            callback=checked(_check_name),
-        ),
-    ] = None,
+    name: str | None = None,
 ) -> Answer:
     """The JSON Schema of what a command prints with `--json`."""
     from starcal_uq.cli.schemas import SCHEMAS, json_schema

@@ -5,11 +5,10 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from dataclasses import asdict, astuple, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import typer
 
@@ -17,26 +16,12 @@ import starcal_uq as sc
 from starcal_uq.cli.answers import Answer, deliver
 from starcal_uq.cli.console import quiet
 from starcal_uq.cli.options import (
-    LEAST_SIGMA_PX,
-    BayerMosaic,
-    Columns,
-    Duplicates,
-    FileWorkers,
-    Json,
-    SchedulerAddress,
-    Seed,
-    TimeUtc,
-    checked,
-    number,
+    declared,
     parse_dof,
-    parse_frames,
     parse_start,
-    parse_velocity,
-    read_file,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.conflicts import conflict, typed
-from starcal_uq.core.settings import EPOCH, KEYS, MAGNITUDES
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -48,78 +33,21 @@ if TYPE_CHECKING:
 class EstimationSettings:
     """How a camera is estimated."""
 
-    model: Annotated[
-        settings.ModelName | None,
-        typer.Option(
-            help="Distortion model, fitted or refused; by default that of CAMERA, or the richest "
-            "simpler one that the "
-            "data determine."
-        ),
-    ] = None
-    method: Annotated[
-        settings.Method,
-        typer.Option(
-            help="efficient (three stages, then the attitude-marginalised likelihood), "
-            "three_stage (Ye & Yang 2017), "
-            "or a baseline: least_squares, samaan (Kalman filter), griffith (recursive least "
-            "squares)."
-        ),
-    ] = "efficient"
-    solver: Annotated[
-        settings.Solver,
-        typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds)."),
-    ] = "lm"
-    screen: Annotated[
-        bool,
-        typer.Option("--screen", help="Leave out wrong identifications first; they are listed."),
-    ] = False
-    robust: Annotated[
-        bool,
-        typer.Option(
-            "--robust", help="Refine with Student-t tails, which wrong identifications hardly move."
-        ),
-    ] = False
+    model: settings.ModelName | None = None
+    method: settings.Method = "efficient"
+    solver: settings.Solver = "lm"
+    screen: bool = False
+    robust: bool = False
 
-    star_errors: Annotated[
-        bool,
-        typer.Option(
-            "--star-errors",
-            help="Estimate and marginalise errors that a star brings into every frame.",
-        ),
-    ] = False
-    noise: Annotated[
-        settings.NoiseKind,
-        typer.Option(
-            help="common (one noise for all stars), or model (fitted against radius, magnitude, "
-            "frame and axis, as far "
-            "as the residuals ask for it)."
-        ),
-    ] = "common"
-    start: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME=VALUE,...",
-            help="Start from these in place of CAMERA's: focal_mm (or focal_px), x0_px, y0_px.",
-            callback=checked(parse_start),
-        ),
-    ] = None
-    pixel_um: Annotated[
-        float | None,
-        number(KEYS["pixel_um"], "Pixel pitch, um, where neither CAMERA nor the images state it."),
-    ] = None
-    max_iterations: Annotated[
-        int | None, number("max_iterations", "Limit for each stage; 200 by default.")
-    ] = None
-    accept_inflation: Annotated[
-        bool,
-        typer.Option(
-            "--accept-inflation",
-            help="Multiply sigma by how much more the frames scatter than their noise says.",
-        ),
-    ] = False
-    duplicates: Duplicates = "refuse"
-    scheduler: SchedulerAddress = None
-    workers: FileWorkers = None
+    star_errors: bool = False
+    noise: settings.NoiseKind = "common"
+    start: str | None = None
+    pixel_um: float | None = None
+    max_iterations: int | None = None
+    accept_inflation: bool = False
+    duplicates: settings.Duplicates = "refuse"
+    scheduler: str | None = None
+    workers: int | None = None
 
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
@@ -165,31 +93,9 @@ class EstimationSettings:
 class PlaceSettings:
     """What the directions are, and where the observer was."""
 
-    directions: Annotated[
-        settings.Directions | None,
-        typer.Option(
-            help="What ra_deg and dec_deg are: apparent (as seen by the moving sensor), catalogue "
-            "(aberration is then "
-            "applied at time_utc), or undeclared.",
-        ),
-    ] = None
-    site: Annotated[
-        Path | None,
-        typer.Option(
-            "--site",
-            metavar="SITE",
-            help="Where on the ground the camera stood (TOML with a [site] table): refraction and "
-            "daily aberration are "
-            "applied.",
-            parser=read_file,
-        ),
-    ] = None
-    in_space: Annotated[
-        bool,
-        typer.Option(
-            "--in-space", help="The camera was above the air; refraction does not matter."
-        ),
-    ] = False
+    directions: settings.Directions | None = None
+    site: Path | None = None
+    in_space: bool = False
 
     def options(self) -> AnyDict:
         """Keyword arguments that tables and images share: `observations_from_table`,
@@ -206,111 +112,38 @@ class PlaceSettings:
 class SkySettings(PlaceSettings):
     """The table, its directions, and how the observer moved."""
 
-    time: TimeUtc = None
-    column: Columns = None
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            "--only-frames",
-            metavar="LIST",
-            help="Frames of the table to take, such as 0-4,7.",
-            callback=checked(parse_frames),
-        ),
-    ] = None
-    observer_velocity: Annotated[
-        str | None,
-        typer.Option(
-            "--observer-velocity",
-            metavar="VX,VY,VZ",
-            help="Velocity relative to the Earth's centre, km/s, ICRS axes.",
-            callback=checked(parse_velocity),
-        ),
-    ] = None
+    time: str | None = None
+    column: list[str] | None = None
+    frames: str | None = None
+    observer_velocity: str | None = None
 
 
 @dataclass(frozen=True)
 class ImageSettings:
     """What belongs to images alone. None where nothing was said."""
 
-    max_mag: Annotated[
-        float | None,
-        number(MAGNITUDES, "Magnitude limit, Gaia G; as the frames need it by default."),
-    ] = None
-    epoch: Annotated[
-        float | None,
-        number(EPOCH, "Julian year of the star positions; the images' own by default."),
-    ] = None
-    focal_tolerance: Annotated[
-        float | None,
-        number("focal_tolerance", "Relative error of the nominal focal length; 0.03 by default."),
-    ] = None
-    gain: Annotated[
-        float | None, number("gain_e_per_count", "Electrons per count, where they do not say it.")
-    ] = None
-    bayer: BayerMosaic = None
-    engine: Annotated[
-        settings.Engine | None,
-        typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name)."),
-    ] = None
+    max_mag: float | None = None
+    epoch: float | None = None
+    focal_tolerance: float | None = None
+    gain: float | None = None
+    bayer: settings.Bayer | None = None
+    engine: settings.Engine | None = None
 
 
 @dataclass(frozen=True)
 class SamplingSettings:
     """How a posterior is sampled."""
 
-    seed: Seed = 0
-    sigma: Annotated[
-        float | None,
-        number(
-            "sigma_px",
-            "Centroid noise in px per axis, if it is known; sampled otherwise.",
-            least=LEAST_SIGMA_PX,
-        ),
-    ] = None
-    priors: Annotated[
-        Path | None,
-        typer.Option(
-            "--priors",
-            help="TOML file with a [priors] table; wide defaults otherwise.",
-            parser=read_file,
-        ),
-    ] = None
-    ensembles: Annotated[
-        int, number("n_ensembles", "Separately seeded ensembles of walkers.", least=2)
-    ] = 4
-    walkers: Annotated[int, number("n_walkers", "Walkers in each ensemble.", least=14)] = 64
-    steps: Annotated[int, number("n_steps", "Steps kept of each walker.", least=20)] = 200
-    likelihood: Annotated[
-        settings.LikelihoodName | None,
-        typer.Option(
-            help="marginal (Gaussian, attitudes marginalised), pairs (interstar angles, Godambe's "
-            "curvature), "
-            "student_t (heavy tails, for wrong identifications), or pairs_naive (to see what "
-            "goes wrong); by default "
-            "that of the calibration."
-        ),
-    ] = None
-    evaluation: Annotated[
-        settings.Evaluation,
-        typer.Option(help="auto (compressed, checked against exact), compressed, or exact."),
-    ] = "auto"
-    moves: Annotated[
-        settings.Moves,
-        typer.Option(
-            help="mixture, or stretch (emcee's own, for a posterior far from a Gaussian one)."
-        ),
-    ] = "mixture"
-    dof: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NUMBER|free",
-            help=(
-                "Degrees of freedom of student_t: free samples them; by default those of the "
-                "calibration, or 4."
-            ),
-            callback=checked(parse_dof),
-        ),
-    ] = None
+    seed: int = 0
+    sigma: float | None = None
+    priors: Path | None = None
+    ensembles: int = 4
+    walkers: int = 64
+    steps: int = 200
+    likelihood: settings.LikelihoodName | None = None
+    evaluation: settings.Evaluation = "auto"
+    moves: settings.Moves = "mixture"
+    dof: str | None = None
 
     def options(self, run: Run) -> AnyDict:
         """Keyword arguments of `Run.sample`."""
@@ -440,11 +273,13 @@ def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]
     return {"command": name, "settings": told, "inputs": identity(files)}
 
 
-def _under(record: Any, hint: Any) -> Any:
-    """The type of an option that stands in the help under the words of its record."""
-    option = copy(hint.__metadata__[0])
-    option.rich_help_panel = str(record.__doc__).partition(".")[0]
-    return Annotated[hint.__origin__, option]
+def _option(
+    owner: str, name: str, kind: Any, default: Any, panel: str | None = None
+) -> inspect.Parameter:
+    annotation = declared(owner, name, kind, panel)
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+    )
 
 
 def unfolded(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
@@ -455,23 +290,16 @@ def unfolded(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
     records: dict[str, Any] = {}
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         record = parameter.annotation
-        if not is_dataclass(record):
-            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY))
+        if not (isinstance(record, type) and is_dataclass(record)):
+            parameters.append(_option(name, parameter.name, record, parameter.default))
             continue
-        hints = get_type_hints(record, include_extras=True)
+        hints, panel = get_type_hints(record), str(record.__doc__).partition(".")[0]
         records[parameter.name] = record
         parameters += [
-            inspect.Parameter(
-                f.name,
-                parameter.KEYWORD_ONLY,
-                default=f.default,
-                annotation=_under(record, hints[f.name]),
-            )
+            _option(record.__name__, f.name, hints[f.name], f.default, panel)
             for f in fields(record)
         ]
-    parameters.append(
-        inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Json)
-    )
+    parameters.append(_option(name, "json", bool, False))
 
     @wraps(command)
     def run(json: bool, **given: Any) -> None:

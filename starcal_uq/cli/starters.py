@@ -5,53 +5,21 @@ everything on.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import say
-from starcal_uq.cli.options import Force, write_path
 from starcal_uq.core import settings
 
 
 def new_command(
-    what: Annotated[
-        settings.Starter,
-        typer.Argument(metavar="camera|site|budget|study|example", help="Kind of file."),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="TOML|DIR",
-            help="File to write, WHAT.toml by default; of an example its folder, esa by default.",
-            parser=write_path,
-        ),
-    ] = None,
-    template: Annotated[
-        settings.StudyTemplate | None,
-        typer.Option(
-            metavar="NAME",
-            help=(
-                "Of a study: fov-distortion (the default), frames-stars, magnitude-noise or "
-                "distortion-models."
-            ),
-        ),
-    ] = None,
-    near: Annotated[
-        tuple[float, float] | None,
-        typer.Option(
-            "--near",
-            min=-180.0,
-            max=360.0,
-            metavar="LATITUDE LONGITUDE",
-            help="Of a site: where it is, degrees, north and east.",
-        ),
-    ] = None,
-    force: Force = False,
+    what: settings.Starter,
+    out: Path | None = None,
+    template: settings.StudyTemplate | None = None,
+    near: tuple[float, float] | None = None,
+    force: bool = False,
 ) -> Answer:
     """Write a starter file with comments (camera, site, budget, study), or real data to try
     everything on.

@@ -4,64 +4,27 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import note, print_table, progress_bar, say, show_calibration
-from starcal_uq.cli.options import (
-    LEAST_SIGMA_PX,
-    CameraFile,
-    Duplicates,
-    Force,
-    MaxMag,
-    NewRun,
-    RunPath,
-    Seed,
-    Workers,
-    number,
-    read_path,
-    write_path,
-)
 from starcal_uq.core import settings
 from starcal_uq.core.files import atomic_write_bytes, write_csv
 from starcal_uq.core.manifest import making
 
 
 def validate_command(
-    camera: CameraFile,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="DIR",
-            help="Folder for figure and table, in which an interrupted command goes on; without "
-            "one, nothing is "
-            "written.",
-            parser=write_path,
-        ),
-    ] = None,
-    replicates: Annotated[
-        int, number("n_replicates", "Data sets to simulate, calibrate and sample.", least=20)
-    ] = 1000,
-    frames: Annotated[int, number("n_frames", "Frames in each.", least=2)] = 50,
-    min_stars: Annotated[int, number("min_stars", "Least stars in a frame.", least=3)] = 10,
-    sigma: Annotated[
-        float, number("sigma_px", "Centroid noise, px per axis.", least=LEAST_SIGMA_PX)
-    ] = 0.05,
-    max_mag: MaxMag = 6.0,
-    truth: Annotated[
-        settings.Truth,
-        typer.Option(
-            help="fixed (this camera every time) or prior (drawn from narrow priors around it)."
-        ),
-    ] = "fixed",
-    workers: Workers = None,
-    seed: Seed = 0,
-    force: Force = False,
+    camera: Path,
+    out: Path | None = None,
+    replicates: int = 1000,
+    frames: int = 50,
+    min_stars: int = 10,
+    sigma: float = 0.05,
+    max_mag: float = 6.0,
+    truth: settings.Truth = "fixed",
+    workers: int | None = None,
+    seed: int = 0,
+    force: bool = False,
 ) -> Answer:
     """Show that the intervals are right for this sensor and this volume of data, by
     simulation-based calibration.
@@ -109,10 +72,10 @@ def validate_command(
 
 
 def diagnose_command(
-    run: RunPath,
-    starts: Annotated[int, number("n_starts", "Fits from other starts.")] = 5,
-    seed: Seed = 0,
-    force: Force = False,
+    run: Path,
+    starts: int = 5,
+    seed: int = 0,
+    force: bool = False,
 ) -> Answer:
     """Question the model: misfit, jackknife, other distortion models, predictive checks, other
     starts.
@@ -144,27 +107,12 @@ def diagnose_command(
 
 
 def merge_command(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(metavar="RUN...", help="Run folders of the same camera.", parser=read_path),
-    ],
-    out: NewRun,
-    noise: Annotated[
-        settings.MergedNoise,
-        typer.Option(
-            help="common (one noise for all runs), own (each run keeps its estimated noise), or "
-            "auto (own where the "
-            "runs' noises differ)."
-        ),
-    ] = "auto",
-    allow_inconsistent: Annotated[
-        bool,
-        typer.Option(
-            "--allow-inconsistent", help="Merge even where the runs disagree on the camera."
-        ),
-    ] = False,
-    duplicates: Duplicates = "refuse",
-    force: Force = False,
+    runs: list[Path],
+    out: Path,
+    noise: settings.MergedNoise = "auto",
+    allow_inconsistent: bool = False,
+    duplicates: settings.Duplicates = "refuse",
+    force: bool = False,
 ) -> Answer:
     """Combine the likelihoods of several runs into one, without going back to the stars; tests that
     they agree.

@@ -8,7 +8,7 @@ import shlex
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -29,29 +29,9 @@ from starcal_uq.cli.console import (
     warn_undeclared,
 )
 from starcal_uq.cli.options import (
-    Alignment,
-    AlignmentFrames,
-    CameraFile,
-    Draws,
-    Epoch,
-    FileWorkers,
-    Force,
-    MaxMag,
-    NewRun,
-    ObsFile,
-    RunPath,
-    SchedulerAddress,
-    Seed,
-    check_word_or_file,
-    checked,
-    number,
     parse_columns,
     parse_frames,
     parse_velocity,
-    read_file,
-    read_path,
-    write_file,
-    write_path,
 )
 from starcal_uq.cli.settings import (
     EstimationSettings,
@@ -63,7 +43,6 @@ from starcal_uq.cli.settings import (
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new, table_ending
-from starcal_uq.core.settings import EPOCH, MAGNITUDES
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -100,55 +79,20 @@ def load_table(
 
 
 def simulate_command(
-    camera: CameraFile,
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="OBS",
-            help="Table to write (.csv, .ecsv, .parquet, .fits), or folder of partitions.",
-            parser=write_path,
-        ),
-    ],
-    frames: Annotated[int, number("n_frames", "Number of frames, at random attitudes.")] = 1000,
-    sigma: Annotated[float, number("sigma_px", "Centroid noise, px per axis.")] = 0.05,
-    max_mag: MaxMag = 6.0,
-    min_stars: Annotated[
-        int, number("min_stars", "Attitudes with fewer stars are drawn again.", least=3)
-    ] = 10,
-    epoch: Epoch = 2026.9,
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Also render the frames as FITS images into this folder.",
-            parser=write_path,
-        ),
-    ] = None,
-    sensor: Annotated[
-        Path | None,
-        typer.Option(
-            help=(
-                "Detector of the images (TOML with a [sensor] table); a small tracker's by default."
-            ),
-            parser=read_file,
-        ),
-    ] = None,
-    partition_frames: Annotated[
-        int | None,
-        number(
-            "partition_frames",
-            "Write OBS as a folder of Parquet files of N frames each (10000 is a good size), "
-            "which may exceed "
-            "memory; an interrupted command goes on.",
-            metavar="N",
-        ),
-    ] = None,
-    scheduler: SchedulerAddress = None,
-    workers: FileWorkers = None,
-    seed: Seed = 0,
-    force: Force = False,
+    camera: Path,
+    out: Path,
+    frames: int = 1000,
+    sigma: float = 0.05,
+    max_mag: float = 6.0,
+    min_stars: int = 10,
+    epoch: float = 2026.9,
+    images: Path | None = None,
+    sensor: Path | None = None,
+    partition_frames: int | None = None,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    seed: int = 0,
+    force: bool = False,
 ) -> Answer:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor
     saw them.
@@ -217,12 +161,12 @@ def simulate_command(
 
 
 def calibrate_command(
-    observations: ObsFile,
-    camera: CameraFile,
-    out: NewRun,
+    observations: Path,
+    camera: Path,
+    out: Path,
     estimation: EstimationSettings,
     sky: SkySettings,
-    force: Force = False,
+    force: bool = False,
 ) -> Answer:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
     run = sc.Run(out, tell=note)
@@ -252,7 +196,7 @@ def calibrate_command(
     return Answer({"run": out, "calibration": (calibration, run.truth), "screening": run.screening})
 
 
-def sample_command(run: RunPath, sampling: SamplingSettings, force: Force = False) -> Answer:
+def sample_command(run: Path, sampling: SamplingSettings, force: bool = False) -> Answer:
     """Sample the posterior with emcee from the calibration; an interrupted command goes on where it
     stopped.
     """
@@ -272,7 +216,7 @@ def sample_run(run: Run, sampling: SamplingSettings, *, force: bool) -> Posterio
     return posterior
 
 
-def coupling_command(run: RunPath, force: Force = False) -> Answer:
+def coupling_command(run: Path, force: bool = False) -> Answer:
     """Correlations, variance inflation, weak directions and the principal point's near-gauge with
     the boresight.
     """
@@ -282,43 +226,20 @@ def coupling_command(run: RunPath, force: Force = False) -> Answer:
 
 
 def propagate_command(
-    run: RunPath,
-    attitudes: Annotated[
-        str,
-        typer.Option(
-            metavar="observed|random|FILE",
-            help="Frames: those of the calibration, random ones of the mission, or an attitude "
-            "profile "
-            "(time_s or time_utc, and qx, qy, qz, qw).",
-            callback=checked(check_word_or_file),
-        ),
-    ] = "observed",
-    max_mag: Annotated[
-        float, number(MAGNITUDES, "Mission: magnitude limit in flight, Gaia G.")
-    ] = 6.0,
-    epoch: Annotated[float, number(EPOCH, "Mission: Julian year of the star positions.")] = 2026.9,
-    frames: Annotated[
-        int, number("n_frames", "Mission: number of random attitudes.", least=10)
-    ] = 1000,
-    min_stars: Annotated[
-        int | None,
-        number("min_stars", "Mission: frames with fewer stars give no attitude (5; profile: 3)."),
-    ] = None,
-    rate: Annotated[
-        float | None, number("rate_hz", "Profile: frames per second; its own instants by default.")
-    ] = None,
-    scalar: Annotated[
-        settings.Scalar | None,
-        typer.Option(help="Profile: first or last, where its columns are numbered (q0 to q3)."),
-    ] = None,
-    sense: Annotated[
-        settings.Sense, typer.Option(help="Profile: icrs_to_camera (b = R r) or camera_to_icrs.")
-    ] = "icrs_to_camera",
-    alignment: Alignment = "random",
-    alignment_frames: AlignmentFrames = None,
-    draws: Draws = 300,
-    seed: Seed = 0,
-    force: Force = False,
+    run: Path,
+    attitudes: str = "observed",
+    max_mag: float = 6.0,
+    epoch: float = 2026.9,
+    frames: int = 1000,
+    min_stars: int | None = None,
+    rate: float | None = None,
+    scalar: settings.Scalar | None = None,
+    sense: settings.Sense = "icrs_to_camera",
+    alignment: str = "random",
+    alignment_frames: int | None = None,
+    draws: int = 300,
+    seed: int = 0,
+    force: bool = False,
 ) -> Answer:
     """Attitude error that the calibration contributes, through QUEST: common rotation, the rest,
     and centroid noise.
@@ -358,26 +279,11 @@ def propagate_command(
 
 
 def report_command(
-    run: RunPath,
-    notebook: Annotated[
-        bool,
-        typer.Option(
-            "--notebook", help="Write an executed Jupyter notebook, RUN/report.ipynb, in its place."
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", metavar="FILE", help="Another notebook to write.", parser=write_file
-        ),
-    ] = None,
-    format: Annotated[
-        settings.ReportFormat,
-        typer.Option(
-            help="pdf writes RUN/report.pdf as well, by an installed browser or WeasyPrint."
-        ),
-    ] = "html",
-    force: Force = False,
+    run: Path,
+    notebook: bool = False,
+    out: Path | None = None,
+    format: settings.ReportFormat = "html",
+    force: bool = False,
 ) -> Answer:
     """Write RUN/report.html, one self-contained file, from whatever the run holds; as PDF too, or a
     notebook.
@@ -405,34 +311,10 @@ def report_command(
 
 
 def export_command(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN|CAMERA", help="Run folder, or a camera file.", parser=read_path
-        ),
-    ],
-    to: Annotated[
-        settings.ExportFormat,
-        typer.Option(
-            "--to",
-            help="The camera for opencv, ros, kalibr, mrcal, tetra3rs, tetra3, as a sip FITS "
-            "header or asdf; "
-            "covariance (JSON); draws as csv or netcdf, or with all of ArviZ's groups as arviz; "
-            "the table of "
-            "parameters in latex or markdown.",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="FILE",
-            help="File to write; named by default.",
-            parser=write_file,
-        ),
-    ] = None,
-    force: Force = False,
+    source: Path,
+    to: settings.ExportFormat,
+    out: Path | None = None,
+    force: bool = False,
 ) -> Answer:
     """Write the calibrated camera, or what is known of it, for another program; say how near that
     comes.

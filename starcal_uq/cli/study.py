@@ -3,42 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import INTERRUPTED, Answer
 from starcal_uq.cli.console import note, print_table, progress_bar, say
-from starcal_uq.cli.options import Force, SchedulerAddress, number, read_file, write_path
 
 
 def study_command(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="STUDY",
-            help="What is varied (TOML); `starcal-uq new study` writes one to start from.",
-            parser=read_file,
-        ),
-    ] = Path("study.toml"),
-    out: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="DIR",
-            help="Folder for cells, results and report; a study goes on in it.",
-            parser=write_path,
-        ),
-    ] = Path("study"),
-    workers: Annotated[
-        int | None,
-        number("workers", "Processes; as many as processors by default, 0 for this one."),
-    ] = None,
-    scheduler: SchedulerAddress = None,
-    seed: Annotated[int | None, number("seed", "Root seed, instead of that of STUDY.")] = None,
-    force: Force = False,
+    file: Path = Path("study.toml"),
+    out: Path = Path("study"),
+    workers: int | None = None,
+    scheduler: str | None = None,
+    seed: int | None = None,
+    force: bool = False,
 ) -> Answer:
     """Vary camera, sky, noise and observation: what couples, what decouples it, and what it does to
     attitudes.

@@ -170,6 +170,8 @@ KEYS = {
     "target_arcsec": ARCSEC,
     "target_sigma": Limit(1e-9, 1e6, whole=False),
     "epoch": EPOCH,
+    "probability": PROBABILITY,
+    "magnitude": MAGNITUDES,
     "geometries": Limit(20, 10**5),
     "draws": Limit(100, 10**6),
     "values": Limit(1, 10**6),

@@ -477,13 +477,16 @@ def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
             eval(remedy, names | stars)
 
 
+def texts():
+    """All texts of the package; those of the help stand in a table beside the modules."""
+    for _, tree in trees():
+        yield from sentences(tree)
+    for path in (PACKAGE / "cli").glob("*.toml"):
+        yield path.read_text(encoding="utf-8").replace("\\\n", "")
+
+
 def named(pattern):
-    return {
-        match
-        for _, tree in trees()
-        for text in sentences(tree)
-        for match in re.findall(pattern, text)
-    }
+    return {match for text in texts() for match in re.findall(pattern, text)}
 
 
 def test_every_command_in_a_sentence_can_be_executed(execute, root):
