@@ -25,7 +25,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -190,11 +190,11 @@ def difference(
 
 def compare_files(before: Facts, after: Facts, tolerance: float) -> Iterator[tuple[bool, str]]:
     """Lines that say what differs, each with whether it counts."""
-    for mine, theirs in ((before.arrays, after.arrays), (before.words, after.words)):
-        for name in sorted(mine.keys() - (after.arrays.keys() | after.words.keys())):
-            yield True, f"vanished: {name}"
-        for name in sorted(theirs.keys() - (before.arrays.keys() | before.words.keys())):
-            yield True, f"appeared: {name}"
+    names = [facts.arrays.keys() | facts.words.keys() for facts in (before, after)]
+    for name in alone(names[0], names[1]):
+        yield True, f"vanished: {name}"
+    for name in alone(names[1], names[0]):
+        yield True, f"appeared: {name}"
     both = [name for name in before.arrays if name in after.arrays]
     found = (
         difference(name, before.arrays[name], after.arrays[name], before.sigmas.get(name))
@@ -210,6 +210,18 @@ def compare_files(before: Facts, after: Facts, tolerance: float) -> Iterator[tup
         if name in after.words and before.words[name] != after.words[name]:
             for line in changed(before.words[name], after.words[name]):
                 yield True, line if name == "lines" else f"{name}: {line}"
+
+
+def alone(names: Set[str], others: Set[str]) -> list[str]:
+    """Keys that `others` lack; of a part of a document that lacks as a whole, its key."""
+
+    def above(key: str) -> list[str]:
+        parts = key.split("/")
+        return ["/".join(parts[: n + 1]) for n in range(len(parts))]
+
+    known = {part for key in others for part in above(key)}
+    found = {next(p for p in above(key) if p not in known or p == key) for key in names - others}
+    return sorted(found)
 
 
 def changed(before: list[str], after: list[str]) -> Iterator[str]:
@@ -247,31 +259,42 @@ def _cut(line: str, start: int, width: int = 240) -> str:
     )
 
 
-def compare(before: Path, after: Path, tolerance: float, only: list[str], most: int) -> int:
+@dataclass(frozen=True)
+class Settings:
+    """What differs, and how much of it is printed."""
+
+    tolerance: float = 0.0
+    most: int = 20
+    replaced: Sequence[tuple[str, str]] = ()
+
+
+def compare(before: Path, after: Path, only: list[str], settings: Settings) -> int:
     """Print what differs between two folders that `make` wrote."""
     known = [
         {path.parent.name for path in folder.glob(f"*/{RECORD}")} for folder in (before, after)
     ]
     names = [name for name in sorted(known[0] & known[1]) if not only or name in only]
     for name in sorted(known[0] ^ known[1]):
+        if only and name not in only:
+            continue
         print(f"{name}: not compared, made in one of the folders alone")
     if not names:
         print("Nothing to compare.")
         return 1
     counted = 0
     for name in names:
-        counted += compare_job(before / name, after / name, tolerance, most)
-    print(f"{counted} differences beyond {tolerance:g} in {len(names)} jobs")
+        counted += compare_job(before / name, after / name, settings)
+    print(f"{counted} differences beyond {settings.tolerance:g} in {len(names)} jobs")
     return int(counted > 0)
 
 
-def compare_job(before: Path, after: Path, tolerance: float, most: int) -> int:
+def compare_job(before: Path, after: Path, settings: Settings) -> int:
     """Print what differs in a job; the number of differences beyond the tolerance."""
-    records = [json.loads((folder / RECORD).read_text("utf-8")) for folder in (before, after)]
-    cleaners = [Cleaner(record) for record in records]
+    folders, most = (before, after), settings.most
+    records = [json.loads((folder / RECORD).read_text("utf-8")) for folder in folders]
+    cleaners = [Cleaner(record, settings.replaced) for record in records]
     files = [
-        {str(p.relative_to(f)) for p in f.rglob("*") if p.is_file()} - {RECORD}
-        for f in (before, after)
+        {str(p.relative_to(f)) for p in f.rglob("*") if p.is_file()} - {RECORD} for f in folders
     ]
     counted, lines = 0, []
     for name in sorted(files[0] | files[1]):
@@ -281,26 +304,19 @@ def compare_job(before: Path, after: Path, tolerance: float, most: int) -> int:
             continue
         if (before / name).read_bytes() == (after / name).read_bytes():
             continue
-        found = list(
-            compare_files(
-                *(read(f / name, c) for f, c in zip((before, after), cleaners, strict=True)),
-                tolerance,
-            )
-        )
+        facts = [read(f / name, clean) for f, clean in zip(folders, cleaners, strict=True)]
+        found = list(compare_files(*facts, settings.tolerance))
+        if not found:
+            continue
         counted += sum(counts for counts, _ in found)
-        if found:
-            lines += [
-                f"  {name}",
-                *(
-                    f"    {text}{'' if counts else ' (within tolerance)'}"
-                    for counts, text in found[:most]
-                ),
-            ]
-            lines += [f"    ... and {len(found) - most} more"] if len(found) > most else []
+        lines.append(f"  {name}")
+        for counts, text in found[:most]:
+            lines.append(f"    {text}{'' if counts else ' (within tolerance)'}")
+        if len(found) > most:
+            lines.append(f"    ... and {len(found) - most} more")
     spent = " -> ".join(f"{record['seconds']:.1f} s" for record in records)
-    print(
-        f"{before.name}: {f'{counted} differences' if counted else 'the same'}, {len(files[0])} files, {spent}"
-    )
+    verdict = f"{counted} differences" if counted else "the same"
+    print(f"{before.name}: {verdict}, {len(files[0])} files, {spent}")
     print("".join(f"{line}\n" for line in lines), end="", flush=True)
     return counted
 
@@ -329,13 +345,22 @@ def main(arguments: list[str] | None = None) -> int:
         "--tolerance", type=float, default=0.0, help="in sigmas, or of the largest value (0: bits)"
     )
     comparing.add_argument("--most", type=int, default=20, help="lines printed of a file")
+    comparing.add_argument(
+        "--replace",
+        action="append",
+        default=[],
+        metavar="OLD=NEW",
+        help="words that were changed on purpose; repeatable",
+    )
     for command in (making, comparing):
         command.add_argument(
             "--only", nargs="+", default=[], metavar="NAME", choices=[job.name for job in JOBS]
         )
     given = parser.parse_args(arguments)
     if given.command == "compare":
-        return compare(given.before, given.after, given.tolerance, given.only, given.most)
+        replaced = [tuple(pair.split("=", 1)) for pair in given.replace]
+        settings = Settings(given.tolerance, given.most, replaced)
+        return compare(given.before, given.after, given.only, settings)
     return make(
         given.folder,
         [job for job in JOBS if not given.only or job.name in given.only],
@@ -345,7 +370,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    # A pipe into `head` may end early.
     sys.stdout = io.TextIOWrapper(
         sys.stdout.buffer, encoding="utf-8", errors="replace", line_buffering=True
     )

@@ -11,8 +11,9 @@ import hashlib
 import json
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,17 @@ VOLATILE = (
         "<spent>",
     ),
     Volatile("addresses of objects", r"\bat 0x[0-9a-f]+", "at <address>"),
-    Volatile("seconds that a step took", key=r"(^|/)seconds$"),
+    Volatile(
+        "times of an identification, on a page",
+        r"(?<=Identified in</dt><dd>)[\d.,]+ (ms|s|min)",
+        "<spent>",
+    ),
+    Volatile(
+        "times of an identification, in a terminal",
+        r"( identified +\d+ +\d+ +\S+ +)[\d.,]+(?= *$)",
+        r"\1<spent>",
+    ),
+    Volatile("seconds that a step took", key=r"(^|/)(milli)?seconds$"),
     Volatile("versions of packages", key=r"(^|/)versions(/|$)"),
     Volatile(
         "size and hash of files, which are compared themselves", key=r"^files/.*/(bytes|sha256)$"
@@ -54,9 +65,13 @@ VOLATILE = (
 
 
 class Cleaner:
-    """Text and keys of a job without what is volatile."""
+    """Text and keys of a job without what is volatile.
 
-    def __init__(self, record: dict[str, Any]):
+    `replaced` are pairs of old and new words, of differences that are meant.
+    """
+
+    def __init__(self, record: dict[str, Any], replaced: Sequence[tuple[str, str]] = ()):
+        self.replaced = replaced
         self.work = str(record.get("work", ""))
         self.first, self.last = (
             str(record.get("started", ""))[:10],
@@ -66,19 +81,21 @@ class Cleaner:
 
     def text(self, text: str) -> str:
         """`text` with placeholders."""
+        for old, new in self.replaced:
+            text = text.replace(old, new)
         if self.work:
             text = text.replace(self.work, "<work>").replace(Path(self.work).name, "<work>")
         for volatile in VOLATILE:
             if volatile.pattern:
-                text = re.sub(
-                    volatile.pattern, lambda found, put=volatile.put: self._put(found[0], put), text
-                )
+                put = partial(self._put, volatile.put)
+                text = re.sub(volatile.pattern, put, text, flags=re.MULTILINE)
         return text
 
-    def _put(self, found: str, put: str) -> str:
+    def _put(self, put: str, found: re.Match[str]) -> str:
         # Times of the data are facts.
-        dated = put in ("<now>", "<today>")
-        return put if not dated or self.first <= found[:10] <= self.last else found
+        if put in ("<now>", "<today>") and not self.first <= found[0][:10] <= self.last:
+            return found[0]
+        return found.expand(put)
 
     def leaves_out(self, key: str) -> bool:
         """Whether a key of a document is volatile."""
@@ -128,7 +145,8 @@ def table(names: list[str], columns: list[Any], clean: Cleaner) -> Facts:
     """Columns, with the sigma of those that have one in the table."""
     facts = Facts()
     for name, values in zip(names, columns, strict=True):
-        facts.add(name, values)
+        if not clean.leaves_out(name):
+            facts.add(name, values)
     for name in facts.arrays:
         beside = (f"sigma_{name}", f"{name}_sigma", *(SPREADS if name in ESTIMATES else ()))
         found = [facts.arrays[other] for other in beside if other in facts.arrays]

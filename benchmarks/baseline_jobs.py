@@ -142,11 +142,17 @@ def signature(thing):
         return "callable"
 def names(module):
     return [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
-found = {{"starcal_uq": {{name: described(getattr(sc, name)) for name in names(sc)}}}}
+# A name that moves to another wing is the same name.
+found = {{}}
+def take(where, module):
+    for name in names(module):
+        thing = getattr(module, name)
+        entry = found.setdefault(name, {{"what": described(thing), "wings": []}})
+        entry["wings"].append(where)
+take("starcal_uq", sc)
 for wing in pkgutil.iter_modules(sc.__path__):
     if wing.ispkg and not wing.name.startswith("_") and wing.name != "cli":
-        module = importlib.import_module(f"starcal_uq.{{wing.name}}")
-        found[wing.name] = {{name: described(getattr(module, name)) for name in names(module)}}
+        take(wing.name, importlib.import_module(f"starcal_uq.{{wing.name}}"))
 json.dump(found, open("names.json", "w"), indent=1, sort_keys=True, default=str)
 """
 # The help of each command, and the options in it.

@@ -88,6 +88,21 @@ def test_the_last_bit_of_an_array_is_seen_and_a_tolerance_may_allow_it(made, cap
     assert "(within tolerance)" in capsys.readouterr().out
 
 
+def test_words_that_were_changed_on_purpose_can_be_named(made):
+    folders = [
+        str(made("before")),
+        str(made("after", **{"figure.svg": DRAWING.replace("focal", "other")})),
+    ]
+    assert baseline.main(["compare", *folders]) == 1
+    assert baseline.main(["compare", *folders, "--replace", "focal length=other length"]) == 0
+
+
+def test_a_part_of_a_document_that_vanished_is_one_line():
+    before, after = {"a/b/c", "a/b/d", "a/e", "f"}, {"a/e/1", "g"}
+    assert baseline.alone(before, after) == ["a/b", "a/e", "f"]
+    assert baseline.alone(after, before) == ["a/e/1", "g"]
+
+
 def test_folders_without_a_common_job_are_no_success(tmp_path):
     assert baseline.main(["compare", str(tmp_path), str(tmp_path)]) == 1
 
