@@ -31,7 +31,7 @@ NOTES = "mine"
 
 # What takes the time, and is of no concern here: how results are written is.
 HEAVY = {
-    "estimation.calibrate": "calibrate",
+    "calibration.calibrate": "calibrate",
     "inference.sample": "sample",
     "propagation.propagate": "propagate",
     "propagation.field": "field_map",
