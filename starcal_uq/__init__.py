@@ -7,11 +7,12 @@ this package offers stands, with its types, in ``__init__.pyi`` beside this file
 every wing.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import lazy_loader
 
 from starcal_uq.core.display import View, register
+from starcal_uq.core.remedy import Remedy, register_commands
 
 __version__ = "0.1.0"
 
@@ -25,3 +26,12 @@ def _views() -> Mapping[type, View]:
 
 
 register(_views)
+
+
+def _commands() -> Callable[[Remedy], str]:
+    from starcal_uq.cli.remedies import command
+
+    return command
+
+
+register_commands(_commands)

@@ -344,3 +344,19 @@ def test_files_do_not_import_each_other_in_circles() -> None:
     )
     sorter.prepare()  # raises CycleError with the circle in its message
     assert sorter.is_active()
+
+
+def test_only_the_command_line_spells_commands(root):
+    """Below it, remedies are an action and its arguments; the name of the distribution stands
+    once.
+    """
+    package = root / "starcal_uq"
+    files = [path for path in package.rglob("*") if path.suffix in (".py", ".j2", ".toml", ".css")]
+    below = [path for path in files if "cli" not in path.relative_to(package).parts]
+    found = {
+        str(path.relative_to(package)): path.read_text(encoding="utf-8").count("starcal-uq")
+        for path in below
+    }
+    assert {name: n for name, n in found.items() if n} == {"core/provenance.py": 1}
+    # Control: the command line has them.
+    assert len(files) > len(below) > 300

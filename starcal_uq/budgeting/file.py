@@ -29,6 +29,7 @@ from starcal_uq.budgeting.shapes import HALF_WIDTHS, RAYLEIGH_MEAN
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_write_text, ensure_new
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import PROBABILITY
 from starcal_uq.core.toml import Key, Section, read_toml
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike
@@ -206,7 +207,8 @@ def load_budget_file(path: PathLike) -> BudgetFile:
         If it cannot be read, or a key is unknown, missing or wrong; the sentence names file, table
         and key.
     """
-    missing = "check the path, or write a starter with `starcal-uq budget RUN --template FILE`"
+    starter = Remedy("budget", (RUN,), {"template": "FILE"})
+    missing = f"check the path, or write a starter with `{starter.words}`"
     content = read_toml(path, "budget", BudgetError, missing)
     for key in content:
         if key not in ("budget", "contributor", "requirement", "frame"):

@@ -24,6 +24,7 @@ from starcal_uq.budgeting.rows import (
 )
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import join_words, plural
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import FloatArray
 from starcal_uq.propagation.attitude_error import (
     CONTRIBUTORS,
@@ -104,7 +105,7 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
         return (
             f"The model was not tested: the calibration rows hold {IF_MODEL_HOLDS}, and what "
             "they are "
-            f"{WITH_MISFIT_FOUND} is not assessed (run `starcal-uq diagnose RUN`).",
+            f"{WITH_MISFIT_FOUND} is not assessed ({Remedy('diagnose', (RUN,))}).",
         )
     rows = [
         name for name, why in ((COMMON, found.common_reasons), (REST, found.rest_reasons)) if why

@@ -20,6 +20,7 @@ from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, cell_content, cell_text, reading
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Level
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
@@ -342,7 +343,7 @@ class Budget(Shown):
             If the file is missing or is not a budget.
         """
         with reading(
-            path, "an error budget", "run `starcal-uq budget RUN --force` to write it again"
+            path, "an error budget", Remedy("budget", (RUN,), {"force": True}, "to write it again")
         ):
             with open(path, newline="", encoding="utf-8") as file:
                 records = [

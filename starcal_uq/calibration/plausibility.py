@@ -22,6 +22,7 @@ from starcal_uq.calibration.cameras import frame_focals
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.formatting import significant
+from starcal_uq.core.remedy import CAMERA, OBS, RUN, Remedy
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.consensus import consensus, focal_ratio, measured_directions
@@ -390,10 +391,8 @@ def _as_it_is(plain: _Fit, camera: Camera, status: Status, screened: bool) -> st
         told = f"about {100.0 * wrong:.0f} % of the stars do not fit the others of their frame"
         if screened or wrong > 0.6:
             return f"{told}: identify them again"
-        return (
-            f"{told}: leave out wrong identifications (`starcal-uq calibrate OBS CAMERA -o RUN "
-            "--screen`)"
-        )
+        screened_out = Remedy("calibrate", (OBS, CAMERA), {"out": RUN, "screening": True})
+        return f"{told}: leave out wrong identifications (`{screened_out.words}`)"
     quiet = plain.scatter_px < _QUIET * _tolerance_px(camera)
     if quiet or status in (Status.SINGULAR, Status.FOLDED, Status.OUTSIDE_DETECTOR):
         return None

@@ -1,6 +1,6 @@
 """Loops over stars compiled by Numba, where it is installed, and kept on disk.
 
-The extra ``starcal-uq[compiled]`` installs it. Which path runs is decided by one switch, the
+The extra ``compiled`` installs it. Which path runs is decided by one switch, the
 environment variable ``STARCAL_UQ_KERNELS`` (`use` sets it): ``numpy``, ``numba``, or ``auto`` (the
 default), which compiles nothing for a job that would be done before the compiler is. Both give the
 same to rounding; provenance says which one ran.
@@ -26,7 +26,7 @@ from typing import Any
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path
-from starcal_uq.core.provenance import installed_version
+from starcal_uq.core.provenance import NAME, installed_version
 
 SWITCH = "STARCAL_UQ_KERNELS"
 CHOICES = ("auto", "numpy", "numba")
@@ -91,7 +91,7 @@ def cache_folder() -> Path:
         base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
     else:
         base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "starcal-uq"
+    return Path(base) / NAME
 
 
 def _folder(source: str) -> Path:

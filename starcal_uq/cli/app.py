@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import gc
 import os
-import shlex
 import signal
 import sys
 import threading
@@ -51,7 +50,9 @@ def _main() -> None:
 
     from starcal_uq.cli.answers import begin
     from starcal_uq.cli.commands import app, usage_sentence
+    from starcal_uq.cli.remedies import as_given
     from starcal_uq.core.errors import StarcalError
+    from starcal_uq.core.remedy import spoken
     from starcal_uq.core.tasks import caught_signal, interrupt
 
     begin()
@@ -61,7 +62,8 @@ def _main() -> None:
     # them every 700 new ones for what could be thrown away takes a twentieth of the time.
     gc.set_threshold(50_000, 20, 50)
     try:
-        code = app(standalone_mode=False)
+        with spoken(as_given):
+            code = app(standalone_mode=False)
         if code == 128 + signal.SIGINT:
             # What Typer makes of it.
             raise KeyboardInterrupt
@@ -80,7 +82,7 @@ def _main() -> None:
         if isinstance(error, TyperException):
             _fail(usage_sentence(error), 2)
         if isinstance(error, StarcalError):
-            _fail(_own_words(str(error)), 2)
+            _fail(str(error), 2)
         if isinstance(error, MemoryError):
             _fail("there is not enough memory for this: ask for fewer draws, frames or samples.", 2)
         if isinstance(error, OSError):
@@ -98,17 +100,6 @@ def _main() -> None:
             "and the command."
         )
         _fail(f"{type(error).__name__}: {words}", FAULT)
-
-
-def _own_words(sentence: str) -> str:
-    """A sentence whose command for a calibration is the one that was given, and what it asks
-    for.
-    """
-    from starcal_uq.core.status import CALIBRATE
-
-    given = shlex.join(["starcal-uq", *sys.argv[1:]])
-    made = sys.argv[1:2] in (["calibrate"], ["run"])
-    return sentence.replace(CALIBRATE.removesuffix(" --force"), given) if made else sentence
 
 
 def _catch(handler: Callable[[int, Any], None] | signal.Handlers) -> dict[signal.Signals, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import read_json, to_plain, write_json
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Shapes
 
 if TYPE_CHECKING:
@@ -262,5 +263,5 @@ class CameraComparison(Shown):
         path = Path(path)
         if path.is_dir():
             path = path / "comparison.json"
-        remedy = "run `starcal-uq compare RUN_A RUN_B -o DIR` to write it"
+        remedy = Remedy("compare", ("RUN_A", "RUN_B"), {"out": "DIR"}, "to write it")
         return read_json(cls, path, "a comparison of cameras", remedy)

@@ -6,9 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 from starcal_uq.core.errors import CalibrationError
 
+# Options as they are typed, each with its values in the order given; None where it stands alone.
+Options: TypeAlias = dict[str, tuple[str | None, ...]]
 _RECURSIVE = ("samaan", "griffith")
 _IN_MEMORY = ("three_stage", "least_squares")
 _COMPOSITE = ("pairs", "pairs_naive")
@@ -88,30 +91,62 @@ _FLAGS: dict[str, tuple[str, object]] = {
 }
 
 
-def takes_value(option: str) -> bool:
-    """Whether an option of a run is followed by a value."""
-    return option not in _FLAGS
+def parsed(words: Sequence[str]) -> tuple[list[str], Options]:
+    """Command and files of a command line, and its options."""
+    places: list[str] = []
+    options: Options = {}
+    rest = iter(words)
+    for word in rest:
+        if not word.startswith("--"):
+            places.append(word)
+            continue
+        name, equals, value = word.partition("=")
+        given = value if equals else None if name in _FLAGS else next(rest, None)
+        options[name] = (*options.get(name, ()), given)
+    return places, options
 
 
-def named(options: Mapping[str, Sequence[str | None]]) -> dict[str, object]:
-    """Options as they are typed by the names that the rules have for them."""
-    found: dict[str, object] = {}
+def arguments_of(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:
+    """Options as they are typed by the names that the rules have for them; a tuple where one is
+    given several times.
+    """
+    found: dict[str, Any] = {}
     for option, values in options.items():
-        name, value = _FLAGS.get(
-            option, (_TYPED.get(option, option[2:].replace("-", "_")), values[-1])
-        )
+        value: Any = values[0] if len(values) == 1 else tuple(values)
+        name = _TYPED.get(option, option[2:].replace("-", "_"))
+        name, value = _FLAGS.get(option, (name, value))
         found[name] = value
-    found.setdefault("sampled", found.get("likelihood"))
     return found
+
+
+def named(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:
+    """Options as they are typed for `conflict`: draws are of the likelihood of the estimate."""
+    arguments = arguments_of(options)
+    return {"sampled": arguments.get("likelihood")} | arguments
+
+
+def words_of(arguments: Mapping[str, Any]) -> list[str]:
+    """Options, by the names that the rules have for them, as the words that are typed."""
+    words: list[str] = []
+    for name, given in arguments.items():
+        for value in given if type(given) is tuple else (given,):
+            words += _words(name, value)
+    return words
+
+
+def _words(name: str, value: Any) -> list[str]:
+    for option, meaning in _FLAGS.items():
+        if meaning == (name, value):
+            return [option]
+    if isinstance(value, Mapping):
+        value = ",".join(f"{key}={number:.6g}" for key, number in value.items())
+    options = {meaning: option for option, meaning in _TYPED.items()}
+    return [options.get(name, "--" + name.replace("_", "-")), str(value)]
 
 
 def typed(name: str, value: object) -> str:
     """An option, by the name that the rules have for it, as it is typed."""
-    flag = next((option for option, meaning in _FLAGS.items() if meaning == (name, value)), None)
-    if flag is not None:
-        return flag
-    options = {meaning: option for option, meaning in _TYPED.items()}
-    return f"{options.get(name, '--' + name.replace('_', '-'))} {value}"
+    return " ".join(_words(name, value))
 
 
 def conflict(settings: Mapping[str, object]) -> Rule | None:

@@ -20,10 +20,11 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from starcal_uq.core.provenance import NAME
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.types import AnyDict, unaliased
 
-PREFIX = "starcal-uq/"
+PREFIX = f"{NAME}/"
 # Endings of keys that tell the unit.
 _UNITS = {
     "arcsec": "arcsec",
@@ -172,7 +173,8 @@ RECORDS: dict[str, Part] = {}
 def part_of(record: type) -> Part:
     """The part with the fields of a record of ours, whose docstring says what they are.
 
-    Properties are in it that its class variable ``DOCUMENTED`` names.
+    Properties are in it that its class variable ``DOCUMENTED`` names, and those that stand for a
+    field by ``WRITTEN_AS``.
     """
     said: dict[str, str] = {}
     for names, text in re.findall(
@@ -180,11 +182,13 @@ def part_of(record: type) -> Part:
     ):
         said |= dict.fromkeys(names.split(", "), " ".join(text.split()).removesuffix("."))
     hints = get_type_hints(record)
-    for name in getattr(record, "DOCUMENTED", ()):
+    written = getattr(record, "WRITTEN_AS", {})
+    names = [written.get(field.name, field.name) for field in fields(record)]
+    names = [*getattr(record, "DOCUMENTED", ()), *names]
+    for name in set(names) - hints.keys():
         getter = getattr(record, name).fget
-        said[name] = _first_line(getter).removesuffix(".")
+        said[name] = _first_paragraph(getter).removesuffix(".")
         hints[name] = get_type_hints(getter)["return"]
-    names = [*getattr(record, "DOCUMENTED", ()), *(field.name for field in fields(record))]
     keys = {name: key(name, _words(hints[name]), said[name]) for name in names}
     part = RECORDS[record.__name__] = Part(record.__name__, _first_line(record), keys)
     return part
@@ -192,6 +196,10 @@ def part_of(record: type) -> Part:
 
 def _first_line(documented: Any) -> str:
     return (getdoc(documented) or "").partition("\n")[0]
+
+
+def _first_paragraph(documented: Any) -> str:
+    return " ".join((getdoc(documented) or "").partition("\n\n")[0].split())
 
 
 def _words(hint: Any) -> str:

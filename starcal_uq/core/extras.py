@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from starcal_uq.core.errors import MissingExtraError
+from starcal_uq.core.provenance import NAME
 
 
 @contextmanager
@@ -21,5 +22,5 @@ def extra(name: str, what: str, instead: str = "") -> Iterator[None]:
         library = (error.name or str(error)).partition(".")[0]
         otherwise = f", or {instead}" if instead else ""
         raise MissingExtraError(
-            f'{what} need {library}: run `pip install "starcal-uq[{name}]"`{otherwise}.'
+            f'{what} need {library}: run `pip install "{NAME}[{name}]"`{otherwise}.'
         ) from None

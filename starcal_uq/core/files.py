@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import MissingExtraError, ObservationError, RunFolderError, StarcalError
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import PathLike
 
 if TYPE_CHECKING:
@@ -445,7 +446,7 @@ def reason_of(error: Exception) -> str:
 
 @contextmanager
 def reading(
-    path: PathLike, what: str, remedy: str, error: type[StarcalError] = RunFolderError
+    path: PathLike, what: str, remedy: str | Remedy, error: type[StarcalError] = RunFolderError
 ) -> Iterator[None]:
     """For a block that makes a result of a file: whatever goes wrong there becomes one error, of
     one sentence.

@@ -30,6 +30,7 @@ from starcal_uq.core.files import (
 )
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read_json, write_json
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.store import finished
 from starcal_uq.core.temporary import lock
 from starcal_uq.core.types import AnyDict, PathLike
@@ -168,7 +169,7 @@ def digest(path: Path) -> str:
     return _digests[key]
 
 
-def check_file(path: Path, entry: Entry | None, remedy: str) -> None:
+def check_file(path: Path, entry: Entry | None, remedy: str | Remedy) -> None:
     """Refuse a file that is not the one that the run has written; the remedy is an order."""
     if entry is None:
         raise RunFolderError(

@@ -11,7 +11,9 @@ from typing import Any
 
 from starcal_uq.core.types import AnyDict
 
-_VERSIONED = ("starcal-uq", "numpy", "scipy", "casadi", "emcee", "arviz")
+# The name of this distribution: of its packages, its folders, its documents.
+NAME = "starcal-uq"
+_VERSIONED = (NAME, "numpy", "scipy", "casadi", "emcee", "arviz")
 
 
 @lru_cache(maxsize=32)

@@ -23,6 +23,7 @@ from typing import IO, Any, ClassVar, Literal, TypeVar, Union, get_args, get_ori
 import numpy as np
 
 from starcal_uq.core.files import atomic_path, atomic_write_text, check_size, reading, shown
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import AnyDict, PathLike, unaliased
 
 Record = TypeVar("Record")
@@ -281,7 +282,7 @@ def write_json(record: Any, path: PathLike) -> None:
     atomic_write_text(path, json.dumps(to_plain(record), indent=1) + "\n")
 
 
-def read_json(cls: type[Record], path: PathLike, what: str, remedy: str) -> Record:
+def read_json(cls: type[Record], path: PathLike, what: str, remedy: str | Remedy) -> Record:
     """Read what `write_json` wrote; `what` and `remedy` as for `starcal_uq.core.files.reading`."""
     with reading(path, what, remedy), open(path, encoding="utf-8") as file:
         return from_plain(cls, json.load(file))
@@ -302,7 +303,7 @@ def write(record: Any, path: PathLike, kind: str) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def read(cls: type[Record], path: PathLike, kind: str, what: str, remedy: str) -> Record:
+def read(cls: type[Record], path: PathLike, kind: str, what: str, remedy: str | Remedy) -> Record:
     """Inverse of `write`; `what` and `remedy` as for `starcal_uq.core.files.reading`."""
     with reading(path, what, remedy):
         arrays = read_arrays(path)
@@ -319,7 +320,7 @@ class Saved:
     """
 
     KIND: ClassVar[str | None] = None
-    FILE: ClassVar[tuple[str, str]]
+    FILE: ClassVar[tuple[str, str | Remedy]]
 
     def save(self, path: PathLike) -> None:
         """Write everything to one file, atomically and without loss; overwritten."""

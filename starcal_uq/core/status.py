@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import ClassVar
 
-# Commands that remedies give; `Check.remedy` says what their words in capitals stand for.
-CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
-PLAN = "starcal-uq plan CAMERA --after RUN --choose 10"
-MORE = "Take more frames: the command names those that help most."
+from starcal_uq.core.remedy import Remedies
 
 
 class Status(Enum):
@@ -107,16 +104,15 @@ class Check:
         What was asked for, with its unit.
     sentence : str
         Meaning, in plain words.
-    remedy : str
-        Command or Python call that may mend it, several joined by " or "; empty where it passed or
-        nothing of the kind helps. OBS, CAMERA, SITE and RUN stand for the user's files, ``obs``,
-        ``camera`` and ``cal`` for results.
+    remedies : tuple of Remedy
+        What may mend it; empty where it passed or nothing of the kind helps.
     advice : str
         What to do with the instrument or the data, an order: before the command, or where none
         helps; else empty. Of a check that did not pass, remedy and advice are never both empty.
     """
 
     DOCUMENTED: ClassVar = ("key",)
+    WRITTEN_AS: ClassVar = {"remedies": "remedy"}
 
     name: str
     question: Question
@@ -124,15 +120,22 @@ class Check:
     value: str
     bound: str
     sentence: str
-    remedy: str = ""
+    remedies: Remedies = ()
     advice: str = ""
 
     @property
-    def remedies(self) -> tuple[str, ...]:
-        """The commands and calls of the remedy, each by itself; a name of a file may hold any
-        word.
+    def ways(self) -> tuple[tuple[str, bool], ...]:
+        """The commands and calls of the remedies, and whether each is a call in Python."""
+        both = [way for one in self.remedies for way in ((one.command, False), (one.call, True))]
+        return tuple(way for way in both if way[0])
+
+    @property
+    def remedy(self) -> str:
+        """Command or Python call that may mend it, several joined by " or "; empty where it passed
+        or nothing of the kind helps. OBS, CAMERA, SITE and RUN stand for the user's files, ``obs``,
+        ``camera`` and ``cal`` for results.
         """
-        return tuple(filter(None, re.split(r" or (?=starcal-uq |sc\.)", self.remedy)))
+        return " or ".join(text for text, _ in self.ways)
 
     @property
     def key(self) -> str:
@@ -150,11 +153,6 @@ class Check:
         remedy = f"Remedy: {self.remedy}" if self.remedy else ""
         said = " ".join(filter(None, (self.sentence, self.advice, remedy)))
         return f"{self.level.value}: {self.name}, {self.value} (asked for: {self.bound}). {said}"
-
-
-def model_remedy(name: str) -> str:
-    """How to calibrate with a distortion model."""
-    return f"{CALIBRATE} --model {name} or sc.calibrate(obs, camera, model={name!r})"
 
 
 def worst(checks: Iterable[Check]) -> Level:

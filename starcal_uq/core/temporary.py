@@ -8,9 +8,10 @@ import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 
+from starcal_uq.core.provenance import NAME
 from starcal_uq.core.types import PathLike
 
-_PREFIX, _LOCK = "starcal-uq-", ".starcal-uq-lock"
+_PREFIX, _LOCK = f"{NAME}-", f".{NAME}-lock"
 _NAME = re.compile(rf"{_PREFIX}[a-z0-9_]{{8}}")
 
 

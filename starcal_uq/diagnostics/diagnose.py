@@ -19,6 +19,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import Saved
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, Progress
@@ -135,7 +136,7 @@ class Diagnosis(Shown, Saved):
     times: TimeTest | None = None
     aberration: UnseenAberration | None = None
 
-    FILE = "a diagnosis", "run `starcal-uq diagnose RUN --force` to write it again"
+    FILE = "a diagnosis", Remedy("diagnose", (RUN,), {"force": True}, "to write it again")
 
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""

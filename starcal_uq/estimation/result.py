@@ -21,6 +21,7 @@ from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.manifest import digest
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.estimation.residual_map import PartitionSums
@@ -483,7 +484,7 @@ class Calibration(Shown):
             When a file is missing or not a calibration, when the two are not of one calibration, or
             when the information matrix is not positive definite.
         """
-        path, remedy = Path(path), "run `starcal-uq calibrate` again"
+        path, remedy = Path(path), Remedy("calibrate", purpose="again")
         beside = path.with_suffix(".npz")
         with reading(path, "a calibration", remedy):
             document = json.loads(path.read_text(encoding="utf-8"))

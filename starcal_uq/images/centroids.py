@@ -28,6 +28,7 @@ from starcal_uq.core.files import (
     reading,
     table_ending,
 )
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, StrArray
 from starcal_uq.observations.origin import CentroidsOrigin
 from starcal_uq.observations.rows import FrameRows, locked
@@ -278,9 +279,8 @@ class Centroids(FrameRows, Shown):
             columns, text = read(path)
             if text is None:
                 raise ObservationError(
-                    f"{path}: the list of frames is missing; give a table that `starcal-uq "
-                    "centroid` or "
-                    "Centroids.save wrote."
+                    f"{path}: the list of frames is missing; give a table that "
+                    f"`{Remedy('centroid').words}` or Centroids.save wrote."
                 )
             if missing := [name for name in COLUMNS if name not in columns]:
                 raise ObservationError(

@@ -17,6 +17,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ImageError, MissingExtraError
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.provenance import NAME
 from starcal_uq.core.settings import Bayer, bounded
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import one_thread, processors, run_tasks
@@ -219,7 +220,7 @@ class _Measure:
         entry.update(
             background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px
         )
-        entry["rendered"] = str(image.header.get("CREATOR", "")).startswith("starcal-uq")
+        entry["rendered"] = str(image.header.get("CREATOR", "")).startswith(NAME)
         entry["optics"] = optics_of(image.header, image.width_px, image.height_px)
         entry["place"] = place_of(image.header)
         messages = [*image.messages, *(f"{name}: {text}" for text in found.messages)]

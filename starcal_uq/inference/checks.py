@@ -24,13 +24,11 @@ from starcal_uq.core.formatting import (
     plural,
     significant,
 )
+from starcal_uq.core.remedy import MORE, PLAN, RUN, Remedies, Remedy, with_model
 from starcal_uq.core.status import (
-    MORE,
-    PLAN,
     Check,
     Level,
     Question,
-    model_remedy,
     pass_or_fail,
     pass_or_warn,
 )
@@ -73,16 +71,16 @@ _BOUNDS_SHARE = 1e-3
 _FOLD_DRAWS = 40
 _PRIOR_SHARE = 0.5
 _PRIOR_PULL = 3.0
-# Options of `starcal_uq.sample` that a remedy repeats: name on the command line, and default.
-_OPTIONS: dict[str, tuple[str, Any]] = {
-    "sigma": ("--sigma", "sampled"),
-    "n_ensembles": ("--ensembles", 4),
-    "n_walkers": ("--walkers", 64),
-    "n_steps": ("--steps", 200),
-    "moves": ("--moves", "mixture"),
-    "likelihood": ("--likelihood", "marginal"),
-    "evaluation": ("--evaluation", "auto"),
-    "dof": ("--dof", DEFAULT_DOF),
+# Arguments of `starcal_uq.sample` that a remedy repeats, and their defaults.
+_DEFAULTS: dict[str, Any] = {
+    "sigma": "sampled",
+    "n_ensembles": 4,
+    "n_walkers": 64,
+    "n_steps": 200,
+    "moves": "mixture",
+    "likelihood": "marginal",
+    "evaluation": "auto",
+    "dof": DEFAULT_DOF,
 }
 
 
@@ -329,10 +327,10 @@ def _acceptance(post: Posterior) -> Check:
         )
     )
     value = f"{fixed(float(np.min(rates)), 2)} to {fixed(float(np.max(rates)), 2)}"
-    remedy = "" if good else resample(post, moves="stretch", n_steps=10 * post.n_steps)
+    remedies = () if good else resample(post, moves="stretch", n_steps=10 * post.n_steps)
     level = pass_or_fail(good)
     return Check(
-        "Acceptance", Question.CONVERGED, level, value, f"{low:g} to {high:g}", sentence, remedy
+        "Acceptance", Question.CONVERGED, level, value, f"{low:g} to {high:g}", sentence, remedies
     )
 
 
@@ -375,8 +373,8 @@ def _digits(post: Posterior) -> Check:
         )
     )
     value = f"{fixed(largest, 2)} units of the last digit ({worst})"
-    remedy = "" if good else _longer(post, largest**2)
-    return Check("Digits", Question.CONVERGED, pass_or_warn(good), value, "≤ 1", sentence, remedy)
+    remedies = () if good else _longer(post, largest**2)
+    return Check("Digits", Question.CONVERGED, pass_or_warn(good), value, "≤ 1", sentence, remedies)
 
 
 def _degrees_of_freedom(post: Posterior) -> Check | None:
@@ -414,7 +412,7 @@ def _bounds(post: Posterior) -> Check:
         [(post.mean[:2] + 0.5) / sd[:2], (edges - post.mean[:2]) / sd[:2], post.mean[2:3] / sd[2:3]]
     )
     good = outside <= _BOUNDS_SHARE and folded == 0.0
-    remedy, advice = "" if good else PLAN, ""
+    remedies, advice = () if good else PLAN, ""
     if good:
         sentence = (
             "No draw has its principal point off the detector, f below zero or a distortion that "
@@ -425,7 +423,7 @@ def _bounds(post: Posterior) -> Check:
             "The distortion of some draws folds over within the field: the data do not determine "
             "it."
         )
-        remedy = _simpler(post)
+        remedies = _simpler(post)
     else:
         sentence = (
             f"{percent(outside)} of the draws have their principal point off the detector or f "
@@ -435,7 +433,7 @@ def _bounds(post: Posterior) -> Check:
     value = f"nearest bound {significant(float(np.min(room)))} sigma away"
     bound = f"≤ {percent(_BOUNDS_SHARE, 1)} of draws outside"
     return Check(
-        "Bounds", Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy, advice
+        "Bounds", Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedies, advice
     )
 
 
@@ -470,10 +468,14 @@ def _independent(post: Posterior) -> Check:
         f"{fixed(d.psis_khat, 2)}"
     )
     bound = f"{fixed(tolerance, 3)} sigma, {percent(tolerance)}, {KHAT_BOUND:g}"
-    remedy = "" if light and agree else _longer(post) if light else _simpler(post)
+    remedies: Remedies = ()
+    if not light:
+        remedies = _simpler(post)
+    elif not agree:
+        remedies = _longer(post)
     level = pass_or_fail(light and agree)
     return Check(
-        "Independent posterior", Question.TRUSTWORTHY, level, value, bound, sentence, remedy
+        "Independent posterior", Question.TRUSTWORTHY, level, value, bound, sentence, remedies
     )
 
 
@@ -487,7 +489,8 @@ def _evaluation(post: Posterior) -> Check | None:
     )
     if not compressed and not compared:
         return None
-    level, remedy, advice = Level.PASS, "", ""
+    level, advice = Level.PASS, ""
+    remedies: Remedies = ()
     value = (
         f"{significant(compression.max_difference)} nat, k-hat {fixed(compression.khat, 2)}"
         if compared
@@ -504,7 +507,8 @@ def _evaluation(post: Posterior) -> Check | None:
             "The compressed likelihood was not compared with the exact one: the observations "
             "were not at hand."
         )
-        remedy, advice = "sc.sample(obs, cal)", "Sample where the observations are at hand."
+        remedies = (Remedy("sample", (RUN,), form="call"),)
+        advice = "Sample where the observations are at hand."
     elif compression.good:
         sentence = "The fast likelihood equals the exact one wherever the posterior is."
         n_frames, of_frames = d.compressed_frames
@@ -516,10 +520,12 @@ def _evaluation(post: Posterior) -> Check | None:
                 "counted in."
             )
     else:
-        level, remedy = Level.FAIL, resample(post, evaluation="exact")
+        level, remedies = Level.FAIL, resample(post, evaluation="exact")
         sentence = "The fast likelihood departs from the exact one: sample the exact one."
     bound = f"≤ {COMPRESSED_BOUND:g} nat, ≤ {KHAT_BOUND:g}"
-    return Check("Likelihood", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
+    return Check(
+        "Likelihood", Question.TRUSTWORTHY, level, value, bound, sentence, remedies, advice
+    )
 
 
 def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
@@ -533,10 +539,8 @@ def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
         if good
         else "Pairs of stars were taken as independent, which they are not."
     )
-    sentence, remedy = (
-        " ".join([sentence, *notes]),
-        "" if good else resample(post, likelihood="pairs"),
-    )
+    sentence = " ".join([sentence, *notes])
+    remedies = () if good else resample(post, likelihood="pairs")
     level = pass_or_fail(good)
     return Check(
         "Kind of likelihood",
@@ -545,7 +549,7 @@ def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
         kind,
         "not 'pairs_naive'",
         sentence,
-        remedy,
+        remedies,
     )
 
 
@@ -557,10 +561,11 @@ def _priors(post: Posterior) -> Check:
     pull = np.abs(post.draws.mean(axis=0)[: len(names)] - prior_mean) / prior_sd
     limited, pulled = _names(post, share > _PRIOR_SHARE), _names(post, pull > _PRIOR_PULL)
     largest = int(np.argmax(share))
-    remedy = advice = ""
+    remedies: Remedies = ()
+    advice = ""
     if limited:
         sentence = f"The prior, not the data, decides {join_words(limited)}."
-        remedy, advice = PLAN, MORE
+        remedies, advice = PLAN, MORE
     elif pulled:
         furthest = fixed(float(np.max(pull)), 1)
         sentence = (
@@ -580,17 +585,17 @@ def _priors(post: Posterior) -> Check:
         value,
         bound,
         sentence,
-        remedy,
+        remedies,
         advice,
     )
 
 
-def _simpler(post: Posterior) -> str:
+def _simpler(post: Posterior) -> Remedies:
     """Fewer coefficients for the data to determine; frames that determine them where there are
     none.
     """
     name = next_simpler(post.camera.distortion)
-    return f"{model_remedy(name)} or {PLAN}" if name else PLAN
+    return with_model(name) + PLAN if name else PLAN
 
 
 def _names(post: Posterior, which: BoolArray) -> list[str]:
@@ -616,36 +621,25 @@ def _sampling(
     sentence: str,
     longer: float = 1.0,
 ) -> Check:
-    remedy = "" if good else _longer(post, longer)
-    return Check(name, Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy)
+    remedies = () if good else _longer(post, longer)
+    return Check(name, Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedies)
 
 
-def _longer(post: Posterior, factor: float = 1.0) -> str:
+def _longer(post: Posterior, factor: float = 1.0) -> Remedies:
     """Sampling again with `factor` times as many steps and some in reserve, but 2 to 20 times as
     many.
     """
     return resample(post, n_steps=post.n_steps * min(max(2, math.ceil(1.2 * factor)), 20))
 
 
-def resample(post: Posterior, **changes: Any) -> str:
+def resample(post: Posterior, **changes: Any) -> Remedies:
     """Sampling again with some settings changed: a command and a call; of a likelihood of the
     user's, the call.
     """
-    settings: Mapping[str, Any] = {**post.provenance.get("settings", {}), **changes}
-    kept = {
-        name: settings[name]
-        for name in _OPTIONS
-        if settings.get(name, _OPTIONS[name][1]) != _OPTIONS[name][1]
-    }
-    words = {name: repr(value) for name, value in kept.items()}
-    if kept.get("likelihood", "marginal") not in LIKELIHOODS:
-        # An object that was passed is evaluated as it is, and no command takes it.
-        words["likelihood"] = "likelihood"
-        words.pop("evaluation", None)
-    call = f"sc.sample(obs, cal{''.join(f', {name}={word}' for name, word in words.items())})"
-    if words.get("likelihood") == "likelihood":
-        return call
-    return (
-        "starcal-uq sample RUN "
-        f"--force{''.join(f' {_OPTIONS[name][0]} {kept[name]}' for name in words)} or {call}"
-    )
+    settings: Mapping[str, Any] = _DEFAULTS | post.provenance.get("settings", {}) | changes
+    kept = {name: settings[name] for name, usual in _DEFAULTS.items() if settings[name] != usual}
+    if settings["likelihood"] in LIKELIHOODS:
+        return (Remedy("sample", (RUN,), {"force": True, **kept}),)
+    # An object that was passed is evaluated as it is, and no command takes it.
+    kept.pop("evaluation", None)
+    return (Remedy("sample", (RUN,), kept | {"likelihood": None}, form="call"),)

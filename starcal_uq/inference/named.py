@@ -19,8 +19,9 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.remedy import calibrated
 from starcal_uq.core.settings import Evaluation, LikelihoodName
-from starcal_uq.core.status import CALIBRATE, Check, Level, Question
+from starcal_uq.core.status import Check, Level, Question
 from starcal_uq.core.types import FloatArray
 from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
 from starcal_uq.likelihood.student import DOF_RANGE, log_excess_prior, parse_dof
@@ -146,7 +147,7 @@ def find_source(
         cal.method,
         "one that fits the distortion",
         sentence,
-        f"{CALIBRATE} or sc.calibrate(obs, camera)",
+        calibrated(),
     )
     return replace(source, checks=(check,))
 

@@ -20,6 +20,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import check_hdf5, ensure_new, reading, write_netcdf
 from starcal_uq.core.records import Arrays, from_plain, to_plain
+from starcal_uq.core.remedy import RUN, Remedy, read_remedies
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Check, Level, worst
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Shapes
@@ -498,11 +499,10 @@ class Posterior(Shown):
         """
         import h5netcdf
 
-        remedy = "run `starcal-uq sample RUN --force` again"
+        remedy = Remedy("sample", (RUN,), {"force": True}, "again")
         if not Path(path).is_file():
-            raise RunFolderError(
-                f"{path}: there is no such file; run `starcal-uq sample RUN` first."
-            )
+            first = Remedy("sample", (RUN,), purpose="first")
+            raise RunFolderError(f"{path}: there is no such file; {first}.")
         with reading(path, "a posterior of this version", remedy):
             check_hdf5(path)
             with h5netcdf.File(path, "r") as file:
@@ -514,6 +514,10 @@ class Posterior(Shown):
                     for name in _ARRAYS
                     if name in file.variables
                 }
+            for check in record["diagnostics"]["checks"]:
+                # Files of earlier versions have them as text.
+                if "remedy" in check:
+                    check["remedies"] = to_plain(read_remedies(check["remedy"]))
             made = from_plain(cls, record, arrays)
             if made.n_ensembles * made.n_walkers * made.n_steps != len(made.draws):
                 raise ValueError("it holds another number of draws than it says")

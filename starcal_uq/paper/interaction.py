@@ -33,6 +33,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import SamplingError, StarcalError
 from starcal_uq.core.files import cell_content, reading, write_csv
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import run_tasks
@@ -207,7 +208,8 @@ class InteractionStudy(Shown):
         """
         import pandas as pd
 
-        with reading(path, "an interaction study", "run `starcal-uq reproduce` to write it again"):
+        remedy = Remedy("reproduce", purpose="to write it again")
+        with reading(path, "an interaction study", remedy):
             # As text first: the fast parser of numbers loses the last digit.
             text = pd.read_csv(path, dtype=str, keep_default_na=False)
             missing = sorted({*_TEXT, "bias", "spread"} - set(text.columns))

@@ -22,6 +22,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import Saved
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import run_tasks
@@ -185,7 +186,7 @@ class Replicates(Shown, Saved):
     provenance: AnyDict
 
     KIND = "starcal_uq replicates 1"
-    FILE = "a set of replicates", "run `starcal-uq reproduce` to write it"
+    FILE = "a set of replicates", Remedy("reproduce", purpose="to write it")
     SHAPES: ClassVar[Shapes] = {
         **{"methods": ("m",), "failures": ("m",), "replicate": ("n",), "crlb": ("n", "p")},
         **dict.fromkeys(("estimates", "claimed", "classical"), ("m", "n", "p")),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import Saved
+from starcal_uq.core.remedy import RUN, SOME_IMAGES, Remedy
 from starcal_uq.core.types import PathLike
 from starcal_uq.pipeline.cameras import OtherCamera, other_cameras
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
@@ -75,7 +76,7 @@ class ImageRecord(Shown, Saved):
     # Frames of other cameras, which were left out.
     others: tuple[OtherCamera, ...] = ()
 
-    FILE = "a record of images", "run `starcal-uq run IMAGES... -o RUN` again"
+    FILE = "a record of images", Remedy("run", (SOME_IMAGES,), {"out": RUN}, "again")
 
     @property
     def left_out(self) -> tuple[ImageRow, ...]:

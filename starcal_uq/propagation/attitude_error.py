@@ -22,6 +22,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
 from starcal_uq.core.formatting import count, join_words, plural, significant
 from starcal_uq.core.records import from_plain, to_plain
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import BoolArray, FloatArray, PathLike
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
@@ -466,7 +467,7 @@ class AttitudeError(Shown):
         with reading(
             path,
             "a table of attitude errors",
-            "run `starcal-uq propagate RUN --force` to write it again",
+            Remedy("propagate", (RUN,), {"force": True}, "to write it again"),
         ):
             with open(path, newline="", encoding="utf-8") as file:
                 rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}

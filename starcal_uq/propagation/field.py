@@ -35,6 +35,7 @@ from starcal_uq.camera.projection import unproject, unproject_jacobian
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import Saved
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import FloatArray, Shapes
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class FieldMap(Shown, Saved):
     equivalent_covariance_px2: FloatArray | None = None
 
     KIND = ""
-    FILE = "a field map", "run `starcal-uq propagate RUN --force` to write it again"
+    FILE = "a field map", Remedy("propagate", (RUN,), {"force": True}, "to write it again")
     SHAPES: ClassVar[Shapes] = {
         **{"x_px": ("x",), "y_px": ("y",), "star_x_px": ("n",), "star_y_px": ("n",)},
         **dict.fromkeys(("sigma_absolute_arcsec", "sigma_compensated_arcsec"), ("y", "x")),

@@ -15,6 +15,7 @@ from starcal_uq.camera.exchange import CAMERA_FORMATS, Exported, export_camera
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_write_text, ensure_new, write_csv
 from starcal_uq.core.formatting import join_words
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.groups import write_arviz
@@ -84,8 +85,8 @@ def export(
         raise RunFolderError(f"a camera alone has no {to}: name the folder of a run.")
     if to in _OF_DRAWS and not isinstance(what, Posterior):
         raise RunFolderError(
-            f"{name}: has no draws for {to}; run `starcal-uq sample RUN` first, or export "
-            "covariance."
+            f"{name}: has no draws for {to}; {Remedy('sample', (RUN,), purpose='first')}, or "
+            "export covariance."
         )
     ensure_new(place, force)
     if to == "arviz":

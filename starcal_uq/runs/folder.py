@@ -15,7 +15,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from starcal_uq.core.conflicts import parsed
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import STEP, as_plain, check_new_folder, flushed_together, new_folder
 from starcal_uq.core.manifest import (
@@ -34,19 +36,19 @@ from starcal_uq.core.manifest import (
     sweep,
     write_manifest,
 )
+from starcal_uq.core.remedy import CAMERA, OBS, RUN, Remedy
 from starcal_uq.core.status import Level, Question
 from starcal_uq.core.types import AnyDict, PathLike
 
-_CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN"
-
 
 class _File:
-    """A file of a run folder: its name, the command that makes it, and the step that it
-    belongs to.
-    """
+    """A file of a run folder: its name, the step that it belongs to, and what makes it."""
 
-    def __init__(self, name: str, command: str) -> None:
-        self.name, self.command, self.step = name, command, command.split()[1]
+    def __init__(self, name: str, step: str, **arguments: Any) -> None:
+        self.name, self.step = name, step
+        self.remedy = Remedy(step, (RUN,), arguments)
+        if step == "calibrate":
+            self.remedy = Remedy(step, (OBS, CAMERA), {"out": RUN, **arguments})
 
     def __get__(self, folder: RunFolder | None, _: type) -> Path:
         return Path(self.name) if folder is None else folder.path / self.name
@@ -154,27 +156,27 @@ class RunFolder:
 
     path: Path
 
-    observations = _File("observations.parquet", _CALIBRATE)
-    camera = _File("camera.toml", _CALIBRATE)
-    calibrated = _File("calibrated.toml", _CALIBRATE)
-    calibration = _File("calibration.json", _CALIBRATE)
-    arrays = _File("calibration.npz", _CALIBRATE)
-    posterior = _File("posterior.nc", "starcal-uq sample RUN")
-    coupling = _File("coupling.csv", "starcal-uq coupling RUN")
-    attitude = _File("attitude.csv", "starcal-uq propagate RUN")
-    mission = _File("mission_frames.parquet", "starcal-uq propagate RUN --attitudes random")
-    alignment = _File("alignment_frames.parquet", "starcal-uq propagate RUN")
-    field_map = _File("field_map.npz", "starcal-uq propagate RUN")
-    spectrum = _File("error_spectrum.npz", "starcal-uq propagate RUN --attitudes PROFILE")
-    budget = _File("budget.csv", "starcal-uq budget RUN")
-    diagnosis = _File("diagnosis.json", "starcal-uq diagnose RUN")
-    rejected = _File("rejected.csv", f"{_CALIBRATE} --screen")
-    verdict = _File("verdict.json", "starcal-uq report RUN")
-    figures = _File("figures", "starcal-uq report RUN")
-    report = _File("report.html", "starcal-uq report RUN")
-    inspection = _File("frames.html", "starcal-uq inspect RUN")
-    pdf = _File("report.pdf", "starcal-uq report RUN --format pdf")
-    notebook = _File("report.ipynb", "starcal-uq report RUN --notebook")
+    observations = _File("observations.parquet", "calibrate")
+    camera = _File("camera.toml", "calibrate")
+    calibrated = _File("calibrated.toml", "calibrate")
+    calibration = _File("calibration.json", "calibrate")
+    arrays = _File("calibration.npz", "calibrate")
+    posterior = _File("posterior.nc", "sample")
+    coupling = _File("coupling.csv", "coupling")
+    attitude = _File("attitude.csv", "propagate")
+    mission = _File("mission_frames.parquet", "propagate", attitudes="random")
+    alignment = _File("alignment_frames.parquet", "propagate")
+    field_map = _File("field_map.npz", "propagate")
+    spectrum = _File("error_spectrum.npz", "propagate", attitudes="PROFILE")
+    budget = _File("budget.csv", "budget")
+    diagnosis = _File("diagnosis.json", "diagnose")
+    rejected = _File("rejected.csv", "calibrate", screening=True)
+    verdict = _File("verdict.json", "report")
+    figures = _File("figures", "report")
+    report = _File("report.html", "report")
+    inspection = _File("frames.html", "inspect")
+    pdf = _File("report.pdf", "report", format="pdf")
+    notebook = _File("report.ipynb", "report", notebook=True)
 
     def __init__(self, path: PathLike) -> None:
         object.__setattr__(self, "path", Path(path))
@@ -210,23 +212,19 @@ class RunFolder:
             )
         if not os.path.isdir(self.path):
             raise RunFolderError(
-                f"{self.path}: the run folder does not exist; check the path, or run "
-                f"`{file.command}` first."
+                f"{self.path}: the run folder does not exist; check the path, or "
+                f"{replace(file.remedy, purpose='first')}."
             )
         # Read first: it may have files to put in their places.
         manifest = read_manifest(self.path)
         path = self.path / file.name
         if not os.path.exists(path):
-            raise RunFolderError(
-                f"{self.path}: the run folder has no {file.name}; run `{file.command}` first."
-            )
+            first = replace(file.remedy, purpose="first")
+            raise RunFolderError(f"{self.path}: the run folder has no {file.name}; {first}.")
         # Folders of versions before this one have no record.
         if manifest is not None:
-            check_file(
-                path,
-                manifest.files.get(file.name),
-                f"run `{file.command} --force` to make it again",
-            )
+            again = replace(file.remedy.having(force=True), purpose="to make it again")
+            check_file(path, manifest.files.get(file.name), again)
         return path
 
     @property
@@ -391,8 +389,6 @@ class RunFolder:
         """Options and outcomes of the runs of the same data that stood here, up to one with the
         options of this one.
         """
-        from starcal_uq.diagnostics.verdict.remedies import parsed
-
         if not old.complete or not old.words or _data_of(old.command) != _data_of(command):
             return ()
         levels = []
@@ -438,8 +434,8 @@ def _unmake(folder: Path) -> None:
 def _gone(names: list[str], folder: Path) -> str:
     """What goes, and how to make it again."""
     shown = [name for name in names if not name.startswith("figures/")]
-    commands = dict.fromkeys(file.command for file in FILES.values() if file.name in shown)
-    again = ", ".join(f"`{command.replace('RUN', str(folder), 1)}`" for command in commands)
+    remedies = [file.remedy.at({RUN: str(folder)}) for file in FILES.values() if file.name in shown]
+    again = ", ".join(dict.fromkeys(f"`{remedy.words}`" for remedy in remedies))
     return (
         f"{', '.join(shown)}: removed, because it rested on what is replaced; run {again} to "
         "make it again."

@@ -9,6 +9,7 @@ import pandas as pd
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.files import reading
+from starcal_uq.core.remedy import RUN, SOME_IMAGES, Remedy
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.identification.engine import sheet_of
 from starcal_uq.images.centroids import Centroids
@@ -32,9 +33,8 @@ def calibrated_frames(
         If a file is missing or damaged.
     """
     path = folder.path / IDENTIFICATION
-    with reading(
-        path, "a table of identified frames", "run `starcal-uq run IMAGES... -o RUN` again"
-    ):
+    again = Remedy("run", (SOME_IMAGES,), {"out": RUN}, "again")
+    with reading(path, "a table of identified frames", again):
         table = pd.read_csv(path)
         seconds = dict(
             zip(table["frame"].tolist(), (1e-3 * table["milliseconds"]).tolist(), strict=True)
@@ -42,7 +42,7 @@ def calibrated_frames(
     reasons = {}
     if folder.rejected.exists():
         path = folder.rejected
-        with reading(path, "a table of rejected stars", "run `starcal-uq calibrate` again"):
+        with reading(path, "a table of rejected stars", Remedy("calibrate", purpose="again")):
             table = pd.read_csv(path)
             stars = zip(table["frame"], table["star_id"], strict=True)
             reasons = dict(zip(stars, table["reason"], strict=True))

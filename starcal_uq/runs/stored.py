@@ -17,6 +17,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import RunFolderError, StarcalError
 from starcal_uq.core.manifest import entry_of
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.remedy import RUN, SOME_IMAGES, Remedy
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.result import Calibration
@@ -163,7 +164,8 @@ class StoredRun:
         if calibration.data_hash_of(table) != calibration.provenance.get("data_sha256"):
             raise RunFolderError(
                 f"{self.path}: the calibration was made from other observations than "
-                f"{self.folder.observations.name} holds; run `starcal-uq calibrate` again."
+                f"{self.folder.observations.name} holds; "
+                f"{Remedy('calibrate', purpose='again')}."
             )
         return weighed(table, calibration)
 
@@ -239,7 +241,7 @@ class StoredRun:
         if record is None:
             raise RunFolderError(
                 f"{self.path}: has no {IMAGES}, because the run did not start from images; to "
-                "look at some, run `starcal-uq run IMAGES... -o RUN`."
+                f"look at some, {Remedy('run', (SOME_IMAGES,), {'out': RUN})}."
             )
         return calibrated_frames(self.path, self.folder, record, obs, self.calibration)
 
@@ -277,7 +279,7 @@ class StoredRun:
             ("budget", "The error budget", budget),
         )
         return tuple(
-            Missing(what, f"starcal-uq {command} {self.path}")
+            Missing(what, Remedy(command, (str(self.path),)))
             for command, what, there in parts
             if not there
         )

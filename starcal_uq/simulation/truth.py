@@ -18,7 +18,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import ImageError, SensorError, StarcalError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_bytes, ensure_new
-from starcal_uq.core.provenance import installed_version
+from starcal_uq.core.provenance import NAME, installed_version
 from starcal_uq.core.types import FloatArray, PathLike, StrArray
 from starcal_uq.images.image import Image
 from starcal_uq.observations.table import Observations
@@ -253,7 +253,7 @@ def _cards(truth: FrameTruth) -> list[tuple[str, Any, str]]:
         ("SATURATE", sensor.saturation_counts, "[adu] a pixel with this or more is saturated"),
         (
             "CREATOR",
-            f"starcal-uq {installed_version('starcal-uq')}",
+            f"{NAME} {installed_version(NAME)}",
             "program that rendered the frame",
         ),
         ("NUMPY", np.__version__, "version of NumPy, which draws the noise"),

@@ -21,6 +21,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
 from starcal_uq.core.errors import CameraError, PriorError, StudyError
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import KEYS, SEED, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict, PathLike
@@ -147,7 +148,7 @@ class StudyDefinition:
         StudyError
             If the file cannot be read or makes no sense; the message names file, key and remedy.
         """
-        remedy = "write one with `starcal-uq new study`"
+        remedy = f"write one with `{Remedy('new study').words}`"
         return cls.from_dict(
             read_toml(path, "study", StudyError, remedy), str(path), Path(path).parent
         )
@@ -392,7 +393,8 @@ def template(name: str) -> str:
     """
     if name not in TEMPLATES:
         raise StudyError(f"template {name!r} is unknown: use one of {', '.join(TEMPLATES)}.")
-    return (files("starcal_uq.studies") / "templates" / f"{name}.toml").read_text("utf-8")
+    text = (files("starcal_uq.studies") / "templates" / f"{name}.toml").read_text("utf-8")
+    return text.replace("{command}", Remedy("study", ("STUDY.toml",), {"out": "DIR"}).command)
 
 
 def write_study_template(name: str, path: PathLike, force: bool = False) -> None:

@@ -19,6 +19,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.files import atomic_path, check_hdf5, new_folder, reading, write_netcdf
 from starcal_uq.core.manifest import read_manifest
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import BoolArray, FloatArray, PathLike
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
@@ -396,7 +397,7 @@ class Study(Shown):
             # Puts results in their places whose writer was stopped.
             read_manifest(file)
             file = file / NETCDF
-        with reading(file, "a study", "run `starcal-uq study` again"):
+        with reading(file, "a study", Remedy("study", purpose="again")):
             check_hdf5(file)
             with xr.open_dataset(file, engine="h5netcdf", phony_dims="access") as opened:
                 data = opened.load()

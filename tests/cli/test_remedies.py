@@ -19,6 +19,7 @@ import typer
 import starcal_uq as sc
 from starcal_uq.calibration.cameras import MixedCameras
 from starcal_uq.cli.commands import app
+from starcal_uq.core import remedy
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.diagnose import MultiStart
 from starcal_uq.diagnostics.times import TimeTest
@@ -304,6 +305,7 @@ EXAMPLES = {
 COMMANDS = {
     "budget RUN": "",
     "budget RUN --template FILE": "",
+    "budget RUN --template budget.toml": "",
     "calibrate": "OBS CAMERA -o RUN --force",
     "calibrate OBS CAMERA -o RUN": "--force",
     "calibrate OBS CAMERA -o RUN --screen": "--force",
@@ -325,11 +327,13 @@ ELSEWHERE = {
     "diagnose RUN --force": "tests/cli/test_cli_statistics.py",
     "inspect RUN": "tests/cli/test_cli_images.py",
     "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
+    "report": "tests/presentation/test_report.py",
     "report RUN --format pdf": "tests/presentation/test_report.py",
     "report RUN --notebook": "tests/presentation/test_report.py",
     "schema": "tests/cli/test_schemas.py",
     "reproduce": "tests/cli/test_cli_paper.py",
     "run IMAGES... -o RUN": "tests/cli/test_cli_images.py",
+    "study STUDY.toml -o DIR": "tests/cli/test_cli_study.py",
     "study": "tests/cli/test_cli_study.py",
     "new study": "tests/cli/test_cli_study.py",
     "validate CAMERA": "tests/cli/test_cli_statistics.py",
@@ -349,7 +353,6 @@ ARGUMENTS = {
         "sc.calibrate(obs, camera, method='griffith', recursion=sc.paper.RecursionOptions({}))"
     ),
     "solver='ipopt'": "sc.calibrate(obs, camera, {})",
-    "solver='minpack'": "sc.calibrate(obs, camera, {})",
 }
 
 
@@ -421,9 +424,9 @@ def remedies(small):
             # data.
             assert check.remedies or check.advice, f"{name} gives nothing to try: {check}"
             assert not check.advice or re.fullmatch(r"[A-Z].*\.", check.advice), check.advice
-            typed = any(remedy.startswith("starcal-uq ") for remedy in check.remedies)
+            typed = any(remedy.command for remedy in check.remedies)
             assert typed or check.advice, f"{name} gives nothing to type: {check.remedy}"
-            found |= dict.fromkeys(check.remedies)
+            found |= dict.fromkeys(words for words, _ in check.ways)
     return list(found)
 
 
@@ -462,8 +465,8 @@ def execute(small, cli, tmp_path):
 def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
     assert len(remedies) > 20
     names = {"sc": sc, "obs": small.obs, "camera": small.camera, "cal": small.cal}
-    for remedy in remedies:
-        program, _, command = remedy.partition(" ")
+    for tried in remedies:
+        program, _, command = tried.partition(" ")
         if program == "starcal-uq":
             words = command.split()
             more = {"sample": "--ensembles 2 --walkers 14 --steps 20", "plan": "--frames 10"}.get(
@@ -472,9 +475,9 @@ def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
             # It takes long; a test of its own executes it.
             execute(command, more, parse=words[0] == "validate")
         else:
-            assert remedy.startswith("sc."), remedy
-            stars = {"obs": small.patch, "camera": small.sheet} if "star_errors" in remedy else {}
-            eval(remedy, names | stars)
+            assert tried.startswith("sc."), tried
+            stars = {"obs": small.patch, "camera": small.sheet} if "star_errors" in tried else {}
+            eval(tried, names | stars)
 
 
 def texts():
@@ -489,10 +492,43 @@ def named(pattern):
     return {match for text in texts() for match in re.findall(pattern, text)}
 
 
+# Where remedies are made of others, and those of checks and frames, whose tests execute them.
+OF_THEIR_OWN = (
+    "core.remedy",
+    "diagnostics.verdict.",
+    "inference.checks",
+    "presentation.words.images",
+    "runs.folder",
+)
+CAPITALS = {
+    name: getattr(remedy, name) for name in ("OBS", "CAMERA", "RUN", "SOME_IMAGES", "Remedy")
+}
+
+
+def written():
+    """The remedies that sentences name, RUN for each file that is known while it runs alone."""
+    for module, tree in trees():
+        if module.startswith(OF_THEIR_OWN):
+            continue
+        for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call)):
+            if getattr(call.func, "id", "") != "Remedy" or not isinstance(
+                call.args[0], ast.Constant
+            ):
+                continue
+            for files in (arg for arg in call.args if isinstance(arg, ast.Tuple)):
+                files.elts = [
+                    file if isinstance(file, (ast.Constant, ast.Name)) else ast.Constant("RUN")
+                    for file in files.elts
+                ]
+            expression = ast.fix_missing_locations(ast.Expression(call))
+            yield eval(compile(expression, module, "eval"), dict(CAPITALS))
+
+
 def test_every_command_in_a_sentence_can_be_executed(execute, root):
     commands = {re.sub(r"\{\}", "RUN", command) for command in named(r"`starcal-uq ([^`]*)`")}
+    commands |= {one.command.removeprefix("starcal-uq ") for one in written()}
     # Those that make the files of a run.
-    commands |= {file.command.removeprefix("starcal-uq ") for file in FILES.values()}
+    commands |= {file.remedy.command.removeprefix("starcal-uq ") for file in FILES.values()}
     assert commands == COMMANDS.keys() | ELSEWHERE.keys()
     for command, more in COMMANDS.items():
         execute(command, more)

@@ -14,9 +14,10 @@ from rich.console import Console
 import starcal_uq as sc
 from starcal_uq.cli import console
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.core.status import CALIBRATE, Check, Level, Question, worst
+from starcal_uq.core.remedy import RUN, SITE, Near, Remedy, calibrated, identified
+from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.diagnostics.verdict.judge import judge
-from starcal_uq.diagnostics.verdict.observed import FROM_IMAGES, SCREEN
+from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN
 from starcal_uq.diagnostics.verdict.remedies import Place, Tried
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.page import context
@@ -124,7 +125,7 @@ def test_checks_are_data():
         "1.2",
         "< 1.01",
         "Ensembles disagree.",
-        "sc.sample(obs, cal)",
+        (Remedy("sample", (RUN,), form="call"),),
     )
     assert from_plain(Check, json.loads(json.dumps(to_plain(check)))) == check
     assert str(check).startswith("fail: R-hat, 1.2 (asked for: < 1.01). ")
@@ -147,30 +148,28 @@ def test_numbers_are_judged_with_their_monte_carlo_error(short):
 
 
 def test_what_a_run_was_made_with_is_no_remedy():
-    both = (
-        f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model') or {CALIBRATE} "
-        "--robust"
-    )
-    asked = Check("A", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Uneven.", both)
+    asked = Check("A", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Uneven.", NOISE + ROBUST)
     words = ("run", "obs.csv", "camera.toml", "--noise")
-    found = Place("r", (*words, "model")).exact(asked)
-    # Student-t tails and a noise model exclude each other.
+    plain = ("--method", "least_squares")
+    found = Place("r", (*words, "model", *plain)).exact(asked)
+    # Plain least squares has neither Student-t tails nor a noise model.
     assert (
         found.remedy == ""
         and "made with --noise model already" in found.advice
         and "--robust" in found.advice
     )
-    alone = Place("r", ("run", "obs.csv", "camera.toml", "--robust")).exact(asked)
+    alone = Place("r", ("run", "obs.csv", "camera.toml", "--robust", *plain)).exact(asked)
     assert alone.remedy == "" and alone.advice.endswith("the run was made with --robust already.")
-    tried = (Tried({"--noise": ("model",)}, 1, 0),)
+    tried = (Tried({"noise": "model"}, 1, 0),)
     fresh = Place("r", ("run", "obs.csv", "camera.toml"), tried=tried).exact(asked)
-    assert fresh.remedies == ("starcal-uq run obs.csv camera.toml --robust -o r --force",)
+    assert fresh.remedy == "starcal-uq run obs.csv camera.toml --robust -o r --force"
     # Another value of the option takes its place; no option at all is something else.
-    first, *rest = Place("r", (*words, "common")).exact(asked).remedies
+    first, *rest = Place("r", (*words, "common")).exact(asked).ways
     assert (
-        first == "starcal-uq run obs.csv camera.toml --noise model -o r --force" and len(rest) == 2
+        first[0] == "starcal-uq run obs.csv camera.toml --noise model -o r --force"
+        and len(rest) == 2
     )
-    whole = dataclasses.replace(asked, remedy=CALIBRATE)
+    whole = dataclasses.replace(asked, remedies=calibrated("command"))
     assert Place("r", (*words, "model")).exact(whole).remedy.endswith("--noise model -o r --force")
 
 
@@ -182,7 +181,7 @@ def test_remedies_name_the_files_of_the_run():
     made = Place(
         "/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--noise", "model")
     ).exact(check)
-    assert made.remedies == (
+    assert tuple(words for words, _ in made.ways) == (
         (
             "starcal-uq run /data/obs.csv /data/camera.toml --noise model --screen -o '/a b/run' "
             "--force"
@@ -191,14 +190,14 @@ def test_remedies_name_the_files_of_the_run():
     )
     steps = Place("/run or that").exact(check)
     files = "'/run or that/observations.parquet' '/run or that/camera.toml' -o '/run or that-2'"
-    assert steps.remedies[0] == f"starcal-uq run {files} --screen --force"
+    assert steps.remedies[0].command == f"starcal-uq run {files} --screen --force"
     assert (
-        Place("r").command("starcal-uq sample RUN --force --steps 400")
+        Place("r").of(Remedy("sample", (RUN,), {"force": True, "n_steps": 400})).command
         == "starcal-uq sample r --force --steps 400"
     )
-    images = Place("r", ("run", "/data/images", "--screen")).command(
-        f"{FROM_IMAGES} --site SITE:52.2,7.4"
-    )
+    near = Near(52.2, 7.4)
+    (asked,) = identified(site=near)
+    images = Place("r", ("run", "/data/images", "--screen")).of(asked).command
     new = "starcal-uq new site --near 52.2 7.4 -o r-site.toml --force"
     assert (
         images == f"{new} && starcal-uq run /data/images --screen --site r-site.toml -o r --force"
@@ -207,15 +206,15 @@ def test_remedies_name_the_files_of_the_run():
     made = (
         "starcal-uq run obs.csv camera.toml --directions catalogue --site r-site.toml -o r --force"
     )
-    assert apparent.command(f"{CALIBRATE} --site SITE:52.2,7.4") == f"{new} && {made}"
+    (asked,) = calibrated("command", site=near)
+    assert apparent.of(asked).command == f"{new} && {made}"
     # Where nothing tells the place, there is no command to copy.
-    assert (
-        apparent.exact(dataclasses.replace(check, remedy=f"{CALIBRATE} --site SITE")).remedy == ""
-    )
+    unknown = dataclasses.replace(check, remedies=calibrated("command", site=SITE))
+    assert apparent.exact(unknown).remedy == ""
     # Without stars there is nothing to calibrate on.
     assert (
         Place("r", observations=False)
         .exact(check)
         .remedies[0]
-        .startswith("starcal-uq calibrate OBS CAMERA -o r")
+        .command.startswith("starcal-uq calibrate OBS CAMERA -o r")
     )

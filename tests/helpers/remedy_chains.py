@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 import starcal_uq as sc
-from starcal_uq.core.conflicts import conflict, named
-from starcal_uq.diagnostics.verdict.remedies import parsed
+from starcal_uq.core.conflicts import conflict, named, parsed
 from tests.helpers.ground_scenes import NOMINAL, ground_frames
 from tests.helpers.outside import campaign
 

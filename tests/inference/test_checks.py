@@ -8,7 +8,8 @@ import re
 import numpy as np
 import pytest
 
-from starcal_uq.core.status import Level
+from starcal_uq.core.remedy import PLAN, read_remedies, with_model
+from starcal_uq.core.status import Check, Level, Question
 from starcal_uq.inference import checks
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.posterior import Derived, Posterior
@@ -173,17 +174,23 @@ def test_a_likelihood_that_is_known_to_be_wrong(post: Posterior) -> None:
 
 
 def test_sampling_again_keeps_the_settings(post: Posterior) -> None:
-    default = checks.resample(post, n_steps=900)
+    (default,) = checks.resample(post, n_steps=900)
     assert (
-        default
+        f"{default.command} or {default.call}"
         == "starcal-uq sample RUN --force --walkers 16 --steps 900 --evaluation compressed or "
         + ("sc.sample(obs, cal, n_walkers=16, n_steps=900, evaluation='compressed')")
     )
     # An object of one's own is evaluated as it is, and no command takes it.
-    assert (
-        checks.resample(post, likelihood="gaussian")
-        == "sc.sample(obs, cal, n_walkers=16, n_steps=60, likelihood=likelihood)"
-    )
+    (own,) = checks.resample(post, likelihood="gaussian")
+    assert own.call == "sc.sample(obs, cal, n_walkers=16, n_steps=60, likelihood=likelihood)"
+    assert own.command == ""
+
+
+def test_remedies_that_were_written_as_text_are_read(post: Posterior) -> None:
+    own = checks.resample(post, likelihood="gaussian")
+    for remedies in (checks.resample(post, n_steps=900), own, with_model("k1") + PLAN, PLAN, ()):
+        bad = Check("A", Question.CONVERGED, Level.FAIL, "1", "0", "Bad.", remedies)
+        assert read_remedies(bad.remedy) == remedies
 
 
 def moved(post: Posterior, column: int, draws: np.ndarray) -> Posterior:

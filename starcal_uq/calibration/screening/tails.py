@@ -17,6 +17,7 @@ import numpy as np
 
 from starcal_uq.calibration.screening.result import MARGINAL
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.likelihood.student import DOF_RANGE
 
@@ -184,6 +185,5 @@ def blame_words(
         remedy = "Their residuals follow the place on the detector: fit another distortion"
     return (
         f"the model is wrong, not the stars: {' and '.join(found)}. They are kept{tails}. "
-        f"{remedy} (--model; "
-        "`starcal-uq diagnose RUN` compares them)."
+        f"{remedy} (--model; `{Remedy('diagnose', (RUN,)).words}` compares them)."
     )

@@ -11,6 +11,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import Saved
+from starcal_uq.core.remedy import CAMERA, Remedy
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
 from starcal_uq.inference.priors import Priors
@@ -102,7 +103,7 @@ class Validation(Shown, Saved):
     provenance: AnyDict
 
     KIND = "starcal_uq validation 1"
-    FILE = "a validation", "run `starcal-uq validate CAMERA` to write it"
+    FILE = "a validation", Remedy("validate", (CAMERA,), purpose="to write it")
     SHAPES: ClassVar[Shapes] = {
         **{"quantities": ("q",), "units": ("q",), "truth": ("n", "p+1")},
         **dict.fromkeys(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.formatting import percent
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Check, Question, pass_or_fail, pass_or_warn
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ def same_data(post: Posterior, data_hash: str) -> Check:
     )
     value = f"SHA-256 {str(post.provenance.get('data_sha256'))[:12]}…"
     bound = f"{data_hash[:12]}…"
-    remedy = "" if good else "starcal-uq sample RUN --force or sc.sample(obs, cal)"
+    remedies = () if good else (Remedy("sample", (RUN,), {"force": True}),)
     return Check(
         "Data of the posterior",
         Question.CONVERGED,
@@ -38,7 +39,7 @@ def same_data(post: Posterior, data_hash: str) -> Check:
         value,
         bound,
         sentence,
-        remedy,
+        remedies,
     )
 
 
@@ -57,7 +58,8 @@ def propagation(error: AttitudeError) -> Check:
         )
     )
     value = f"sigmas within {percent(largest)}"
-    remedy = "" if good else f"starcal-uq propagate RUN --force --draws {4 * error.n_draws}"
+    more = {"force": True, "n_draws": 4 * error.n_draws}
+    remedies = () if good else (Remedy("propagate", (RUN,), more, form="command"),)
     level = pass_or_warn(good)
     return Check(
         "Propagation to attitude",
@@ -66,7 +68,7 @@ def propagation(error: AttitudeError) -> Check:
         value,
         f"≤ {percent(bound)}",
         sentence,
-        remedy,
+        remedies,
     )
 
 

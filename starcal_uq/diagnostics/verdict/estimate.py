@@ -9,14 +9,12 @@ import numpy as np
 from starcal_uq.calibration.fallback import fallback_words
 from starcal_uq.camera.distortion import get_model, next_simpler
 from starcal_uq.core.formatting import count, fixed, join_words, p_words, plural, significant
+from starcal_uq.core.remedy import CAMERA, PLAN, Remedies, Remedy, calibrated, with_model
 from starcal_uq.core.status import (
-    CALIBRATE,
-    PLAN,
     Check,
     Level,
     Question,
     Status,
-    model_remedy,
     pass_or_fail,
     pass_or_warn,
 )
@@ -61,18 +59,14 @@ if TYPE_CHECKING:
 # OUTLIER_P) add up to less, whatever the data.
 MISFIT_P, JACKKNIFE_P, STAR_P = ALPHA, 0.01, 0.01
 MISFIT_FAIL_P, STAR_FAIL_P, ESTIMATORS_P, TRUTH_P = 1e-4, 1e-3, 3e-4, 3e-4
-_IPOPT = f"{CALIBRATE} --solver ipopt or sc.calibrate(obs, camera, solver='ipopt')"
 _REMEDIES = {
-    Status.MAX_ITERATIONS: f"{CALIBRATE} --max-iterations 1000 or sc.calibrate(obs, camera, max_iterations=1000)",
-    Status.OUTSIDE_DETECTOR: _IPOPT,
-    Status.FOLDED: _IPOPT,
+    Status.MAX_ITERATIONS: calibrated(max_iterations=1000),
+    Status.OUTSIDE_DETECTOR: calibrated(solver="ipopt"),
+    Status.FOLDED: calibrated(solver="ipopt"),
     Status.INCONSISTENT: SCREEN,
-    Status.STALLED: f"{CALIBRATE} --solver minpack or sc.calibrate(obs, camera, solver='minpack')",
+    Status.STALLED: calibrated(solver="minpack"),
 }
-_INFLATE = (
-    f"{CALIBRATE} --accept-inflation or sc.diagnostics.accept_inflation(cal, "
-    "sc.diagnostics.jackknife_frames(obs, cal))"
-)
+_INFLATE = calibrated(accept_inflation=True)
 
 
 def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
@@ -87,19 +81,19 @@ def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
     else:
         sentence = "The estimate is not an optimum."
     simpler = next_simpler(cal.camera.distortion)
-    remedies = {
-        Status.SINGULAR: f"{model_remedy(simpler)} or {PLAN}" if simpler else PLAN,
+    known = {
+        Status.SINGULAR: with_model(simpler) + PLAN if simpler else PLAN,
         **_REMEDIES,
     }
     level = pass_or_fail(cal.status.ok)
-    remedy = "" if cal.solver == "filter" else remedies.get(cal.status, "")
+    remedies = () if cal.solver == "filter" else known.get(cal.status, ())
     advice = "" if cal.status.ok else f"{cal.remedy[0].upper()}{cal.remedy[1:]}."
     if post is not None and cal.undetermined:
         # Sampling refuses priors that do not determine what the data leave open.
         level, said = Level.WARN, what_is_open(cal.undetermined)
         sentence = f"{said[0].upper()}{said[1:]}: there the posterior is that of the priors."
     return Check(
-        "Estimation", Question.CONVERGED, level, words, "converged", sentence, remedy, advice
+        "Estimation", Question.CONVERGED, level, words, "converged", sentence, remedies, advice
     )
 
 
@@ -147,7 +141,7 @@ def estimators_agree(cal: Calibration) -> Check | None:
     )
     level = pass_or_fail(good)
     value = f"{fixed(largest, 1)} sigma ({name})"
-    remedy = "" if good else SCREEN
+    remedies = () if good else SCREEN
     return Check(
         "Two estimators",
         Question.CONVERGED,
@@ -155,7 +149,7 @@ def estimators_agree(cal: Calibration) -> Check | None:
         value,
         f"< {fixed(limit, 1)} sigma",
         sentence,
-        remedy,
+        remedies,
     )
 
 
@@ -178,12 +172,9 @@ def against_truth(cal: Calibration, truth: Camera, post: Posterior | None = None
         else f"{name} is further from the truth than its sigma allows: the uncertainties are wrong."
     )
     value = f"largest |z| {fixed(largest, 1)} ({name})"
-    level, bound, remedy = (
-        pass_or_fail(good),
-        f"< {fixed(limit, 1)}",
-        "" if good else "starcal-uq validate CAMERA",
-    )
-    return Check("Known truth", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+    level, bound = pass_or_fail(good), f"< {fixed(limit, 1)}"
+    remedies = () if good else (Remedy("validate", (CAMERA,), form="command"),)
+    return Check("Known truth", Question.TRUSTWORTHY, level, value, bound, sentence, remedies)
 
 
 def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> FloatArray:
@@ -234,10 +225,16 @@ def model_checks(
 
 def one_camera(found: MixedCameras) -> Check:
     """Do the frames' own focal lengths ask for several cameras?"""
-    remedy = f"{CALIBRATE} --only-frames {found.frames}"
+    remedies = calibrated("command", frames=found.frames)
     sentence = f"{found.words[0].upper()}{found.words[1:]}."
     return Check(
-        "One camera", Question.TRUSTWORTHY, Level.FAIL, f"{found.n} cameras", "1", sentence, remedy
+        "One camera",
+        Question.TRUSTWORTHY,
+        Level.FAIL,
+        f"{found.n} cameras",
+        "1",
+        sentence,
+        remedies,
     )
 
 
@@ -279,10 +276,11 @@ def misfit(
     )
     level = effect.level if min(patterns) < MISFIT_FAIL_P else Level.WARN
     # A lens can follow what keeps its place in the field, and no option here what does not.
-    remedy, advice = "", _NOT_OF_THE_LENS.get(rejected[0].against, _OF_FRAMES)
+    remedies: Remedies = ()
+    advice = _NOT_OF_THE_LENS.get(rejected[0].against, _OF_FRAMES)
     if any(t.against in IN_FIELD for t in rejected):
-        remedy, advice = lens_remedy(cal.camera.distortion, better)
-    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
+        remedies, advice = lens_remedy(cal.camera.distortion, better)
+    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedies, advice)
 
 
 def _hardly_told(test: MisfitTest) -> str:
@@ -380,7 +378,8 @@ def jackknife(found: Jackknife, inflated: bool = False, post: Posterior | None =
     value = f"ratios {fixed(low, 2)} to {fixed(high, 2)} ({found.parameter_names[worst]})"
     chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(bad))[1]
     bound = f"≤ {fixed(max(float(chance[worst]), JACKKNIFE_RATIO), 2)}"
-    remedy, formal = "", inflated and post is not None and post.inflation is None
+    remedies: Remedies = ()
+    formal = inflated and post is not None and post.inflation is None
     if np.any(bad):
         names = [name for name, flag in zip(found.parameter_names, bad, strict=True) if flag]
         accepted = (
@@ -394,18 +393,19 @@ def jackknife(found: Jackknife, inflated: bool = False, post: Posterior | None =
             "something makes stars of "
             f"a frame err together. {accepted} sigma by up to {fixed(high, 2)}{draws}."
         )
-        remedy = _INFLATE
-        if inflated:
-            remedy = _resample(post) if formal and post is not None else ""
+        if not inflated:
+            remedies = _INFLATE
+        elif formal and post is not None:
+            remedies = _resample(post)
     else:
         sentence = "Frames scatter as the formal errors say."
-    level = pass_or_warn(not remedy)
+    level = pass_or_warn(not remedies)
     return Check(
-        "Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy
+        "Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedies
     )
 
 
-def _resample(post: Posterior) -> str:
+def _resample(post: Posterior) -> Remedies:
     """Sampling again; by the default likelihood where it was an object of the user's, which is used
     as it is.
     """
@@ -416,7 +416,7 @@ def _resample(post: Posterior) -> str:
     )
 
 
-STAR_REMEDY = f"{CALIBRATE} --star-errors or sc.calibrate(obs, camera, star_errors=True)"
+STAR_REMEDY = calibrated(star_errors=True)
 
 
 def stars(found: StarTest) -> Check:
@@ -502,15 +502,16 @@ def comparison(models: ModelComparison, attitude: AttitudeError | None = None) -
             f"{fixed(mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat from "
             f"{models.scores[0].model!r}"
         )
-    level, remedy, sentence = Level.PASS, "", models_sentence(models)
+    level, sentence = Level.PASS, models_sentence(models)
+    remedies: Remedies = ()
     if mine is not None and mine.rejected:
         # A gain of one nat is what a displacement gives whose square is two units of the noise.
         bent = on_directions(-2.0 * mine.difference, mine.n_parameters)
         effect = largest([bent, *on_attitudes(attitude)])
-        level, remedy = effect.level, model_remedy(models.better)
+        level, remedies = effect.level, with_model(models.better)
         sentence = f"{sentence} {effect}"
     return Check(
-        "Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", sentence, remedy
+        "Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", sentence, remedies
     )
 
 
@@ -572,8 +573,8 @@ def predictive(found: PredictiveCheck) -> Check:
             "Data made by the model have the same spread, tails and patterns as the measured ones."
         )
     name = "Posterior predictive check"
-    level, remedy = pass_or_warn(not extreme), ROBUST if extreme else ""
-    return Check(name, Question.TRUSTWORTHY, level, value, "0.001 to 0.999", sentence, remedy)
+    level, remedies = pass_or_warn(not extreme), ROBUST if extreme else ()
+    return Check(name, Question.TRUSTWORTHY, level, value, "0.001 to 0.999", sentence, remedies)
 
 
 def starts(found: MultiStart) -> Check:
@@ -581,15 +582,14 @@ def starts(found: MultiStart) -> Check:
     value = f"{found.same} of {found.n} starts"
     if found.n_frames < found.of_frames:
         value += f", {count(found.n_frames)} of {plural(found.of_frames, 'frame')}"
-    remedy = advice = ""
+    remedies: Remedies = ()
+    advice = ""
     if found.better:
         level, sentence = Level.FAIL, "A start elsewhere reached a better optimum."
         advice = "Calibrate again from there, or from a camera file that is nearer to the lens."
         if found.start:
-            pairs = zip((f"focal_{found.focal_unit}", "x0_px", "y0_px"), found.start, strict=True)
-            start = ",".join(f"{name}={value:.6g}" for name, value in pairs)
-            call = f"sc.calibrate(obs, camera.replace({start.replace(',', ', ')}))"
-            remedy = f"{CALIBRATE} --start {start} or {call}"
+            names = (f"focal_{found.focal_unit}", "x0_px", "y0_px")
+            remedies = calibrated(start=dict(zip(names, found.start, strict=True)))
     elif found.same < found.n:
         stuck = found.n - found.same
         level = Level.WARN
@@ -597,10 +597,8 @@ def starts(found: MultiStart) -> Check:
             f"{plural(stuck, 'start')} did not reach this optimum, and no start reached a better "
             "one."
         )
-        remedy, advice = (
-            SCREEN,
-            "Accept it if the focal length of the camera file is surely good to 5 %.",
-        )
+        remedies = SCREEN
+        advice = "Accept it if the focal length of the camera file is surely good to 5 %."
     else:
         level, sentence = (
             Level.PASS,
@@ -613,6 +611,6 @@ def starts(found: MultiStart) -> Check:
         value,
         "all at the same optimum",
         sentence,
-        remedy,
+        remedies,
         advice,
     )

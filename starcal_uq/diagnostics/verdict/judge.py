@@ -7,13 +7,13 @@ warning means that they may be used by someone who has read it.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import join_words, plural
+from starcal_uq.core.remedy import Remedies, Remedy
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
@@ -43,24 +43,32 @@ class Verdict(Shown):
         In reading order.
     headline : str
         The verdict in one sentence.
-    commands : tuple of str
-        What to try, in this order, each a command; at most three. Empty where no command helps.
+    to_try : tuple of Remedy
+        What to try, in this order; at most three.
     ended : str
         That no model here explains the data, and which data would tell; empty where something is
         left to try.
     """
 
     DOCUMENTED: ClassVar = ("level",)
+    WRITTEN_AS: ClassVar = {"to_try": "commands"}
 
     checks: tuple[Check, ...]
     headline: str
-    commands: tuple[str, ...] = ()
+    to_try: Remedies = ()
     ended: str = ""
 
     @property
     def level(self) -> Level:
         """The worst outcome of the checks."""
         return worst(self.checks)
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """What to try, in this order, each a command; at most three. Empty where no command
+        helps.
+        """
+        return tuple(remedy.command for remedy in self.to_try)
 
     def to_dict(self) -> AnyDict:
         """The verdict as ``verdict.json`` holds it; `VERSION` rises when a key goes or changes its
@@ -141,42 +149,50 @@ def judge(
     found = tuple(
         check if place is None else place.exact(check) for check in checks if check is not None
     )
-    commands, ended = _way_on(found, place)
-    return Verdict(found, _headline(found, post is not None, rests), commands, ended)
+    to_try, ended = _way_on(found, place)
+    return Verdict(found, _headline(found, post is not None, rests), to_try, ended)
 
 
-def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[tuple[str, ...], str]:
-    """The commands to try, those of the first cause first, or that there is none that helps."""
+def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[Remedies, str]:
+    """The remedies to try, those of the first cause first, or that there is none that helps."""
     doubts = [check for check in checks if check.question is not Question.REQUIRED]
-    every: list[str] = []
+    every: list[Remedy] = []
     for cause, some in by_cause(doubts).items():
-        every += [one for check in some for one in check.remedies if one.startswith("starcal-uq ")]
+        every += [one for check in some for one in check.remedies if one.form != "call"]
         if some[0].level is Level.FAIL and (every or cause == INPUT):
             # What comes after it in the order may be its consequence.
             break
-    commands = _largest(every)[:MOST_COMMANDS]
+    to_try = _largest(every)[:MOST_COMMANDS]
     tried = () if place is None else place.tried
     if worst(doubts) is not Level.FAIL or (
-        commands and not (place is not None and place.exhausted(doubts))
+        to_try and not (place is not None and place.exhausted(doubts))
     ):
-        return commands, ""
+        return to_try, ""
     steps = f" (tried: {'; '.join(one.text for one in tried)})" if tried else ""
     return (), f"No model here explains this{steps}. What would tell: {telling(doubts)}."
 
 
-def _largest(commands: Sequence[str]) -> tuple[str, ...]:
-    """Commands without repeats; of those that differ in whole numbers alone, such as steps, that
+def _largest(remedies: Sequence[Remedy]) -> Remedies:
+    """Remedies without repeats; of those that differ in whole numbers alone, such as steps, that
     with the largest.
     """
-    found: dict[str, str] = {}
-    for command in commands:
-        form = re.sub(r"(?<= )\d+(?= |$)", "N", command)
-        found[form] = max(found.get(form, command), command, key=_whole_numbers)
+    found: dict[str, Remedy] = {}
+    for remedy in remedies:
+        steps = remedy.steps or (remedy,)
+        form = repr([(step.action, step.files, _texts(step.arguments)) for step in steps])
+        found[form] = max(found.get(form, remedy), remedy, key=_whole_numbers)
     return tuple(found.values())
 
 
-def _whole_numbers(command: str) -> list[int]:
-    return [int(word) for word in command.split() if word.isdigit()]
+def _texts(arguments: AnyDict) -> AnyDict:
+    """The arguments with their whole numbers left open."""
+    return {name: "N" if str(value).isdigit() else value for name, value in arguments.items()}
+
+
+def _whole_numbers(remedy: Remedy) -> list[int]:
+    steps = remedy.steps or (remedy,)
+    values = [str(value) for step in steps for value in step.arguments.values()]
+    return [int(value) for value in values if value.isdigit()]
 
 
 def _named(checks: Sequence[Check], level: Level) -> str:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import fixed, percent, plural, significant
-from starcal_uq.core.status import (
-    CALIBRATE,
+from starcal_uq.core.remedy import (
     MORE,
     PLAN,
+    SITE,
+    UTC,
+    Near,
+    Remedies,
+    calibrated,
+    identified,
+    with_model,
+)
+from starcal_uq.core.status import (
     Check,
     Level,
     Question,
-    model_remedy,
     pass_or_warn,
 )
 from starcal_uq.core.times import TIMES_IN_NAMES
@@ -46,19 +53,16 @@ _SAME_UNIT = 1.3
 MIN_FRAMES = 5
 # What a wrong time may move parameters by and the numbers be used.
 _SMALL_SIGMA = 1.0
-# Commands and calls that checks give as remedies.
-SCREEN = f"{CALIBRATE} --screen or sc.calibration.screen(obs, camera)"
+# Remedies that several checks give.
+SCREEN = calibrated(screening=True)
 _RICHEST = "brown_tangential"
 _NO_MODEL = (
     "Count the pattern as an error of the directions, as the attitude error with the misfit "
     "found does: no distortion "
     "model here follows it."
 )
-FROM_IMAGES = "starcal-uq run IMAGES... CAMERA -o RUN --force"
-ROBUST, NOISE = (
-    f"{CALIBRATE} --robust",
-    f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model')",
-)
+ROBUST = calibrated("command", likelihood="student_t")
+NOISE = calibrated(noise="model")
 
 
 def directions(
@@ -91,7 +95,7 @@ def directions(
         )
     if wrong:
         values, sentences, remedies, orders = zip(*wrong, strict=True)
-        remedy, advice = next(filter(None, remedies), ""), " ".join(filter(None, orders))
+        first, advice = next(filter(None, remedies), ()), " ".join(filter(None, orders))
         small = times is not None and len(wrong) == 1 and times.moves_sigma < _SMALL_SIGMA
         level = Level.WARN if small else Level.FAIL
         return Check(
@@ -101,7 +105,7 @@ def directions(
             "; ".join(values),
             bound,
             " ".join(sentences),
-            remedy,
+            first,
             advice,
         )
     if declared == "apparent" and seen == "unknown":
@@ -133,14 +137,12 @@ def directions(
         sentence = f"{sentence} {rests}".rstrip()
         return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, bound, sentence)
     sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
-    time = _time_of(obs) if obs.origin.from_images else ""
-    remedy = f"{_command(obs)}{time or ' --directions apparent'}"
+    time = _time_of(obs) if obs.origin.from_images else {}
+    remedies = _again(obs, **(time or {"directions": "apparent"}))
     if seen == "unknown":
-        sentence, remedy = (
-            f"{sentence} {_unsure(cal, found)} {REMEDY}",
-            f"{remedy} or {_about_air(obs)}",
-        )
-    return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedy)
+        sentence = f"{sentence} {_unsure(cal, found)} {REMEDY}"
+        remedies += _about_air(obs)
+    return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedies)
 
 
 def rests_on_aberration(obs: Observations, found: UnseenAberration | None) -> str:
@@ -195,8 +197,8 @@ def _unsure(cal: Calibration, found: AirTest | None) -> str:
     )
 
 
-def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]:
-    """Value, sentence, remedy and advice of a time, or an epoch, that is not that of the stars."""
+def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, Remedies, str]:
+    """Value, sentence, remedies and advice of a time, or an epoch, that is not that of the stars."""
     effect = f"it moves {found.moves} by {significant(found.moves_sigma)} sigma"
     unit = {"epoch": "years", "date": "days", "hour": "hours"}.get(found.cause, "")
     later = f"{significant(abs(found.later))} ± {significant(found.later_std)} {unit}"
@@ -209,16 +211,17 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]
         return (
             f"epoch {later}",
             sentence,
-            "",
+            (),
             "Correct the times, or give directions of the epoch of the images.",
         )
     if found.cause == "no aberration":
         sentence = f"The residuals hold annual aberration that the directions do not: {effect}."
-        kind = "" if obs.origin.from_images and obs.time_utc is None else " --directions catalogue"
-        return "no aberration", sentence, f"{_command(obs)}{kind}{_time_of(obs)}", ""
+        unknown = obs.origin.from_images and obs.time_utc is None
+        kind = {} if unknown else {"directions": "catalogue"}
+        return "no aberration", sentence, _again(obs, **kind, **_time_of(obs)), ""
     if found.cause == "aberration twice":
         sentence = f"The directions hold annual aberration twice: {effect}."
-        return "aberration twice", sentence, f"{_command(obs)} --directions apparent", ""
+        return "aberration twice", sentence, _again(obs, directions="apparent"), ""
     what, other = "Annual aberration", ""
     if found.cause == "hour":
         east = HOUR_DEG * found.later
@@ -227,7 +230,7 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]
             f", or a site {significant(abs(east))}° further {'east' if east > 0.0 else 'west'}",
         )
     sentence = f"{what} in the residuals is that of times {later} than stated{other}: {effect}."
-    return f"times {later}", sentence, "", "Correct the times, which are UTC (column time_utc)."
+    return f"times {later}", sentence, (), "Correct the times, which are UTC (column time_utc)."
 
 
 def wrong_time(obs: Observations, cal: Calibration) -> str | None:
@@ -242,39 +245,34 @@ def wrong_time(obs: Observations, cal: Calibration) -> str | None:
         return None
     if found is None or not np.isfinite(found.moves_sigma):
         return None
-    _, sentence, remedy, advice = _time_words(obs, found)
-    return sentence[0].lower() + " ".join(
-        filter(None, (sentence[1:], advice, f"Use `{remedy}`." if remedy else ""))
-    )
+    _, sentence, remedies, advice = _time_words(obs, found)
+    order = f"Use `{remedies[0].words}`." if remedies else ""
+    return sentence[0].lower() + " ".join(filter(None, (sentence[1:], advice, order)))
 
 
-def _time_of(obs: Observations) -> str:
+def _time_of(obs: Observations) -> dict[str, str]:
     """The option that gives a time to what has none."""
-    return " --time UTC" if obs.time_utc is None or not bool((obs.time_utc != "").all()) else ""
+    timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
+    return {} if timed else {"time": UTC}
 
 
-def _command(obs: Observations) -> str:
-    """The command that makes the directions of these stars: of images they are made while they are
+def _again(obs: Observations, **options: Any) -> Remedies:
+    """What makes the directions of these stars: of images they are made while they are
     identified.
     """
-    return FROM_IMAGES if obs.origin.from_images else CALIBRATE
+    return identified(**options) if obs.origin.from_images else calibrated("command", **options)
 
 
-def _with_site(obs: Observations, found: AirTest | None = None) -> str:
-    """The command with a site: the one that the residuals point to, where they do, else one that is
-    not known.
-    """
-    known = found is not None and bool(np.isfinite(found.latitude_deg))
-    near = (
-        f":{found.latitude_deg:.1f},{found.longitude_deg:.1f}"
-        if found is not None and known
-        else ""
-    )
-    return f"{_command(obs)} --site SITE{near}{_time_of(obs)}"
+def _with_site(obs: Observations, found: AirTest | None = None) -> Remedies:
+    """A site: the one that the residuals point to, where they do, else one that is not known."""
+    site: str | Near = SITE
+    if found is not None and np.isfinite(found.latitude_deg):
+        site = Near(found.latitude_deg, found.longitude_deg)
+    return _again(obs, site=site, **_time_of(obs))
 
 
-def _about_air(obs: Observations) -> str:
-    return f"{_with_site(obs)} or {_command(obs)} --in-space"
+def _about_air(obs: Observations) -> Remedies:
+    return _with_site(obs) + _again(obs, in_space=True)
 
 
 def aberration_words(cal: Calibration) -> str:
@@ -317,13 +315,16 @@ def residual_pattern(obs: Observations, cal: Calibration, better: str | None = N
     value = f"p = {significant(p_value)}" + (
         f", pattern {significant(pattern)} px" if pattern > 0.0 else ""
     )
-    remedy, advice = ("", "") if level is Level.PASS else lens_remedy(cal.camera.distortion, better)
+    remedies: Remedies = ()
+    advice = ""
+    if level is not Level.PASS:
+        remedies, advice = lens_remedy(cal.camera.distortion, better)
     name, bound = "Pattern in the residuals", f"p ≥ {PATTERN_P:g}"
-    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
+    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedies, advice)
 
 
-def lens_remedy(fitted: str, better: str | None = None) -> tuple[str, str]:
-    """Command and advice where the residuals hold a pattern of the field.
+def lens_remedy(fitted: str, better: str | None = None) -> tuple[Remedies, str]:
+    """Remedies and advice where the residuals hold a pattern of the field.
 
     `better` is the model that a comparison prefers, empty if none; without a comparison, one with
     further terms.
@@ -331,7 +332,7 @@ def lens_remedy(fitted: str, better: str | None = None) -> tuple[str, str]:
     has_all = {coefficient.name for coefficient in get_model(_RICHEST).coefficients}
     further = {coefficient.name for coefficient in get_model(fitted).coefficients} < has_all
     model = better if better is not None else _RICHEST if further else ""
-    return (model_remedy(model), "") if model else ("", _NO_MODEL)
+    return (with_model(model), "") if model else ((), _NO_MODEL)
 
 
 def outliers(obs: Observations, cal: Calibration) -> Check:
@@ -364,9 +365,9 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     )
     value = f"{plural(found, 'star')} beyond {OUTLIER_SIGMA:g} sigma"
     bound = f"about {significant(expected)} expected"
-    remedy = "" if good else SCREEN
+    remedies = () if good else SCREEN
     return Check(
-        "Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy
+        "Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedies
     )
 
 
@@ -376,10 +377,16 @@ def screening(obs: Observations) -> Check | None:
     if not isinstance(record, dict) or "blame" not in record:
         return None
     value = f"{plural(int(record['rejected']), 'star')} of {int(record['of'])} rejected"
-    sentence, remedy = str(record["blame"]), f"{CALIBRATE} --noise model"
+    sentence, remedies = str(record["blame"]), calibrated("command", noise="model")
     sentence = sentence[0].upper() + sentence[1:]
     return Check(
-        "Screening", Question.TRUSTWORTHY, Level.WARN, value, "wrong stars alone", sentence, remedy
+        "Screening",
+        Question.TRUSTWORTHY,
+        Level.WARN,
+        value,
+        "wrong stars alone",
+        sentence,
+        remedies,
     )
 
 
@@ -391,7 +398,8 @@ def noise(obs: Observations, cal: Calibration) -> Check:
     good = low <= cal.sigma <= high
     if fitted is not None and not fitted.multiplies:
         good = PLAUSIBLE_NOISE_PX[0] <= cal.sigma * fitted.level_px <= PLAUSIBLE_NOISE_PX[1]
-    unit, remedy, advice = "" if scaled else " px", "", ""
+    unit, advice = "" if scaled else " px", ""
+    remedies: Remedies = ()
     value = f"{significant(cal.sigma, 3)}{unit}"
     if good:
         sentence = (
@@ -404,16 +412,17 @@ def noise(obs: Observations, cal: Calibration) -> Check:
             "Far more scatter than centroids have: identifications, camera file or distortion "
             "model may be wrong."
         )
-        remedy = SCREEN
+        remedies = SCREEN
     elif scaled:
-        sentence, remedy = "Less scatter than is stated: the stated noise is too large.", NOISE
+        sentence = "Less scatter than is stated: the stated noise is too large."
+        remedies = NOISE
     else:
         sentence = "Less scatter than centroids have: the data are not measurements."
         advice = (
             "Give centroids as they were measured, not positions that were computed or smoothed."
         )
     if not good and scaled and fitted is None and (unlike := _stated_unit(obs, cal)):
-        (sentence, advice), remedy = unlike, ""
+        (sentence, advice), remedies = unlike, ()
     name = (
         f"Factor on the {'stated' if fitted is None else 'fitted'} noise"
         if scaled
@@ -421,7 +430,7 @@ def noise(obs: Observations, cal: Calibration) -> Check:
     )
     bound = f"{low:g} to {high:g}{unit}"
     return Check(
-        name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy, advice
+        name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedies, advice
     )
 
 
@@ -508,7 +517,7 @@ def terms(cal: Calibration) -> Check | None:
         else f"All stars together ask for the terms of the distortion model {name!r}."
     )
     value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
-    remedy = "" if good else f"{CALIBRATE} --model {name}"
+    remedies = () if good else calibrated("command", model=name)
     return Check(
         "Terms of the distortion",
         Question.TRUSTWORTHY,
@@ -516,7 +525,7 @@ def terms(cal: Calibration) -> Check | None:
         value,
         bound,
         sentence,
-        remedy,
+        remedies,
     )
 
 
@@ -527,7 +536,7 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
     n_frames = obs.n_frames if cal.partitions is None else cal.n_frames
     value = f"{percent(share, 3)} of the field, {plural(n_frames, 'frame')}"
     bound = f"≥ {percent(COVERED_SHARE)}, ≥ {MIN_FRAMES} frames"
-    remedy, advice = PLAN, MORE
+    remedies, advice = PLAN, MORE
     if share < COVERED_SHARE:
         level, sentence = (
             Level.WARN,
@@ -543,9 +552,16 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
             Level.PASS,
             "Stars covered the field, so that no part of it is extrapolated.",
         )
-        remedy = advice = ""
+        remedies, advice = (), ""
     return Check(
-        "Coverage of the field", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice
+        "Coverage of the field",
+        Question.TRUSTWORTHY,
+        level,
+        value,
+        bound,
+        sentence,
+        remedies,
+        advice,
     )
 
 

@@ -8,23 +8,20 @@ same folder was made with already is no remedy.
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from starcal_uq.core.conflicts import conflict, named, takes_value
+from starcal_uq.core.conflicts import arguments_of, conflict, parsed, words_of
 from starcal_uq.core.formatting import join_words
-from starcal_uq.core.status import CALIBRATE, Check, Level
-from starcal_uq.diagnostics.verdict.observed import FROM_IMAGES
+from starcal_uq.core.remedy import CAMERA, OBS, RUN, SITE, SOME_IMAGES, UTC, Near, Remedies, Remedy
+from starcal_uq.core.status import Check, Level
+from starcal_uq.core.types import AnyDict
 
-_STARTS = (CALIBRATE, FROM_IMAGES)
 MOST_COMMANDS = 3
 # Runs after which a chain that did not get better ends.
 _PATIENCE = 2
-# Options by name, each with its values in the order given; None where it stands alone.
-Options = dict[str, tuple[str | None, ...]]
 # What a cause of doubt is called, in the order in which to look for them, and which data tell it
 # from the others.
 INPUT, LENS, NOISE, NUMERICS = "the input", "the lens", "the noise", "the computation"
@@ -63,15 +60,15 @@ _CAUSES = {
     "factor_on_the_fitted_noise": NOISE,
 }
 _OF_OPTIONS = {
-    INPUT: {"--site", "--in-space", "--directions", "--time", "--only-frames", "--screen"},
-    LENS: {"--model"},
-    NOISE: {"--noise", "--robust", "--star-errors", "--accept-inflation"},
+    INPUT: {"site", "in_space", "directions", "time", "frames", "screening"},
+    LENS: {"model"},
+    NOISE: {"noise", "likelihood", "star_errors", "accept_inflation"},
 }
 # Options that a new one makes meaningless: a place on the ground and one in space, directions made
 # and declared.
 _ENDS = {
-    "--site": ("--in-space", "--observer-velocity"),
-    "--in-space": ("--site",),
+    "site": ("in_space", "observer_velocity"),
+    "in_space": ("site",),
 }
 
 
@@ -81,20 +78,20 @@ class Tried:
     not pass.
     """
 
-    options: Options
+    options: dict[str, Any]
     failed: int
     warned: int
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> Tried:
         """From the record of a run."""
-        options = {name: tuple(values) for name, values in record["options"].items()}
+        options = arguments_of(record["options"])
         return cls(options, int(record["failed"]), int(record["warned"]))
 
     @property
     def text(self) -> str:
         """The options as they are typed."""
-        return shlex.join(written(self.options)) or "no option"
+        return shlex.join(words_of(self.options)) or "no option"
 
 
 def cause_of(check: Check) -> str:
@@ -103,7 +100,8 @@ def cause_of(check: Check) -> str:
     """
     if check.key in _CAUSES:
         return _CAUSES[check.key]
-    asked = set(check.remedy.split())
+    steps = [step for one in check.remedies for step in one.steps or (one,)]
+    asked = {name for step in steps for name in step.arguments}
     return next((cause for cause, options in _OF_OPTIONS.items() if options & asked), NUMERICS)
 
 
@@ -119,44 +117,15 @@ def by_cause(checks: Sequence[Check]) -> dict[str, list[Check]]:
     return {cause: found[cause] for cause in present}
 
 
-def parsed(words: Sequence[str]) -> tuple[list[str], Options]:
-    """Command and files of a command line, and its options."""
-    places: list[str] = []
-    options: Options = {}
-    rest = iter(words)
-    for word in rest:
-        if not word.startswith("--"):
-            places.append(word)
-            continue
-        name, equals, value = word.partition("=")
-        given = value if equals else next(rest, None) if takes_value(name) else None
-        options[name] = (*options.get(name, ()), given)
-    return places, options
-
-
-def written(options: Options) -> list[str]:
-    """Options as words."""
-    return [
-        word
-        for name, values in options.items()
-        for value in values
-        for word in (name, value)
-        if word is not None
-    ]
-
-
-def changed(given: Options, asked: Options) -> Options:
+def changed(given: AnyDict, asked: AnyDict) -> AnyDict:
     """The options that are given, with those that are asked for in the place of what they
     replace.
     """
-    left = {
-        name: values
-        for name, values in given.items()
-        if not any(name in _ENDS.get(one, ()) for one in asked)
-    }
-    if "--site" in asked and left.get("--directions", ("catalogue",))[-1] != "catalogue":
+    ended = {name for one in asked for name in _ENDS.get(one, ())}
+    left = {name: value for name, value in given.items() if name not in ended}
+    if "site" in asked and "directions" in left:
         # Directions are made apparent at a site, and must not be declared so.
-        left = left | {"--directions": ("catalogue",)}
+        left["directions"] = "catalogue"
     return left | asked
 
 
@@ -173,106 +142,75 @@ class Place:
     partitioned: bool = False  # Whether the data are a folder of files
 
     @property
-    def made(self) -> tuple[list[str], Options]:
+    def made(self) -> tuple[tuple[str, ...], dict[str, Any]]:
         """Files and options of the command that made the run."""
         places, options = parsed(self.words)
-        return places[1:], options
+        return tuple(places[1:]), arguments_of(options)
 
     def exact(self, check: Check) -> Check:
         """A check whose commands name the files of this run; those that cannot help it are left
         out.
         """
-        kept: list[str] = []
-        reasons: list[str] = []
-        followed = True
-        for one in check.remedies:
-            if one.startswith("sc."):
-                kept += [one] if followed else []
-                continue
-            refused = self.refused(one)
-            followed = not refused
-            kept += [self.command(one)] if followed else []
-            reasons += [refused] if refused else []
+        reasons = {one: self.refused(one) for one in check.remedies}
+        kept = tuple(self.of(one) for one, reason in reasons.items() if not reason)
         advice = check.advice
-        if check.remedy and not kept and not advice:
-            advice = (
-                "Look for the cause in the instrument or the data: "
-                f"{join_words(list(dict.fromkeys(reasons)))}."
-            )
-        remedy = " or ".join(kept)
-        return check if remedy == check.remedy else replace(check, remedy=remedy, advice=advice)
+        if check.remedies and not kept and not advice:
+            said = join_words(list(dict.fromkeys(filter(None, reasons.values()))))
+            advice = f"Look for the cause in the instrument or the data: {said}."
+        return replace(check, remedies=kept, advice=advice)
 
-    def refused(self, text: str) -> str:
-        """Why a command for a calibration is of no use here: it was given, tried, or is against
-        options of this run.
+    def refused(self, remedy: Remedy) -> str:
+        """Why a calibration is of no use here: it was given, tried, or is against options of this
+        run.
         """
-        asked = self._asked(text)
+        asked = _asked(remedy)
         if not asked:
             return ""
-        words = shlex.join(written(asked))
-        if "UTC" in written(asked):
+        words = shlex.join(words_of(asked))
+        if UTC in asked.values():
             return "the times are not known"
-        if asked.get("--site") == ("SITE",):
+        if asked.get("site") == SITE:
             return "the site is not known"
         _, given = self.made
-        if all(given.get(name) == values for name, values in asked.items()):
+        if all(given.get(name) == value for name, value in asked.items()):
             return f"the run was made with {words} already"
         options = changed(given, asked)
         if any(options == one.options for one in self.tried):
             return f"{words} was tried already"
-        if rule := conflict(named(options) | {"partitioned": self.partitioned}):
+        settings = {"sampled": options.get("likelihood")} | options
+        if rule := conflict(settings | {"partitioned": self.partitioned}):
             return (
                 f"the run was made with options that {words} excludes ({rule.name}, {rule.other})"
             )
         return ""
 
-    def _asked(self, text: str) -> Options:
-        start = next((words for words in _STARTS if text.startswith(words)), "")
-        return parsed(shlex.split(text.removeprefix(start)))[1] if start else {}
-
-    def _near(self, asked: Options) -> tuple[Options, str]:
-        """Options with a file for a site that the residuals point to, and the command that writes
-        it, before them.
-        """
-        place = re.fullmatch(r"SITE:(.+),(.+)", str(asked.get("--site", ("",))[-1]))
-        if place is None:
-            return asked, ""
-        file = f"{self.run}-site.toml"
-        new = shlex.join(
-            ["starcal-uq", "new", "site", "--near", place[1], place[2], "-o", file, "--force"]
-        )
-        return asked | {"--site": (file,)}, f"{new} && "
-
-    def command(self, text: str) -> str:
-        """A command with the files of this run in place of OBS, CAMERA, SITE and RUN; a call in
-        Python as it is.
-        """
-        if not text.startswith("starcal-uq"):
-            return text
-        start = next((words for words in _STARTS if text.startswith(words)), "")
-        if start and self.words[:1] in (("run",), ("calibrate",)):
+    def of(self, remedy: Remedy) -> Remedy:
+        """A remedy with the files of this run in place of OBS, CAMERA, SITE and RUN."""
+        known = {RUN: self.run}
+        if not {OBS, SOME_IMAGES} & set(remedy.files):
+            known[CAMERA] = f"{self.run}/camera.toml"
+        steps: tuple[Remedy, ...] = (remedy.at(known),)
+        if OBS not in remedy.files and SOME_IMAGES not in remedy.files:
+            return replace(remedy, steps=steps)
+        asked = _asked(remedy)
+        first: Remedies = ()
+        if isinstance(near := remedy.arguments.get("site"), Near):
+            # A file for the site that the residuals point to.
+            file = f"{self.run}-site.toml"
+            first = (Remedy("new site", (), {"near": near, "out": file, "force": True}),)
+            asked["site"] = file
+        if self.words[:1] in (("run",), ("calibrate",)):
             # Everything that was asked for then, and this. What was calibrated alone is kept beside
             # the run.
             files, given = self.made
-            asked, first = self._near(self._asked(text))
-            options = written(changed(given, asked))
-            folder = [self.run] if self.words[0] == "run" else [f"{self.run}-2"]
-            text = (
-                f"{first}starcal-uq {shlex.join(['run', *files, *options, '-o', *folder])} --force"
-            )
-        elif start == CALIBRATE and self.observations:
-            files = [
-                f"{self.run}/observations.parquet",
-                f"{self.run}/camera.toml",
-                "-o",
-                f"{self.run}-2",
-            ]
-            asked, first = self._near(self._asked(text))
-            text = f"{first}starcal-uq run {shlex.join([*files, *written(asked)])} --force"
-        words, known = text.split(" "), {"RUN": shlex.quote(self.run)}
-        if not {"OBS", "IMAGES..."} & set(words):
-            known["CAMERA"] = shlex.quote(f"{self.run}/camera.toml")
-        return " ".join(known.get(word, word) for word in words)
+            out = self.run if self.words[0] == "run" else f"{self.run}-2"
+            steps = (Remedy("run", files, changed(given, asked) | {"out": out, "force": True}),)
+        elif OBS in remedy.files and self.observations:
+            files = (f"{self.run}/observations.parquet", f"{self.run}/camera.toml")
+            steps = (Remedy("run", files, {"out": f"{self.run}-2", **asked, "force": True}),)
+        else:
+            first = ()
+        return replace(remedy, steps=(*first, *steps))
 
     def exhausted(self, checks: Sequence[Check]) -> bool:
         """Whether the last runs of this folder did not get better, so that the next would not
@@ -280,6 +218,13 @@ class Place:
         """
         counts = [(one.failed, one.warned) for one in self.tried] + [counted(checks)]
         return len(counts) > _PATIENCE and min(counts[-_PATIENCE:]) >= counts[-1 - _PATIENCE]
+
+
+def _asked(remedy: Remedy) -> dict[str, Any]:
+    """The options that a calibration is to have, as they are typed."""
+    if not {OBS, SOME_IMAGES} & set(remedy.files):
+        return {}
+    return arguments_of(parsed(words_of(remedy.options))[1])
 
 
 def counted(checks: Sequence[Check]) -> tuple[int, int]:

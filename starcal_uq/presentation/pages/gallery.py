@@ -9,7 +9,6 @@ import io
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +17,8 @@ from starcal_uq.core.errors import ImageError, MissingExtraError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.formatting import MINUS, count, fixed, plural, significant
-from starcal_uq.core.provenance import installed_version
+from starcal_uq.core.provenance import NAME, installed_version
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import PathLike
 from starcal_uq.pipeline.inspection import (
     FAINTER,
@@ -77,7 +77,7 @@ def gallery(frames: Frames) -> str:
         "factor": count(round(factor)) if factor >= 1.0 else significant(factor),
         "radius": significant(_radius(frames) / factor, 1),
         "arrows": bool(len(frames.residuals_px)),
-        "command": quote(frames.run),
+        "inspect": Remedy("inspect", (frames.run,)).command,
         "without": sum(frame.path is None for frame in shown),
         "large": frames.large,
         "partial": len(frames) < (frames.n_run or len(frames)),
@@ -380,4 +380,4 @@ def _markup(html: str) -> Markup:
 
 
 def _version() -> str:
-    return installed_version("starcal-uq") or ""
+    return installed_version(NAME) or ""

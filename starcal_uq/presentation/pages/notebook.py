@@ -13,6 +13,7 @@ from typing import Any
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.extras import extra
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.temporary import TemporaryFolder
 from starcal_uq.core.types import Progress
 
@@ -85,9 +86,10 @@ def write_cells(name: str, parts: Collection[str], folder: str) -> Iterator[tupl
 
     `parts` are names of the files that the run holds, such as ``posterior``.
     """
+    written = Remedy("report", (RUN,), {"notebook": True})
     yield (
         "markdown",
-        f"# Calibration `{name}`\n\nWritten by `starcal-uq report RUN --notebook`. The folder "
+        f"# Calibration `{name}`\n\nWritten by `{written.command}`. The folder "
         "below is all that it "
         "depends on: name another run there, and run all cells.",
     )
@@ -165,7 +167,7 @@ def executed(
                 raise
             said = f"{error.ename}: {error.evalue}".splitlines()[0]
             raise RunFolderError(
-                f"a cell of the notebook failed ({said}): try `starcal-uq report RUN`."
+                f"a cell of the notebook failed ({said}): try `{Remedy('report', (RUN,)).words}`."
             ) from None
         finally:
             for number, handler in handlers.items():

@@ -7,6 +7,7 @@ from typing import Any
 
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.formatting import count, join_words
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.presentation.html import template_environment
@@ -77,7 +78,8 @@ def context(results: Results) -> dict[str, Any]:
         "glance_caption": summary.glance_caption(results),
         "methods_paragraph": summary.methods_paragraph(results),
         "citations": [line.format(version=version) for line in summary.CITATIONS],
-        "diagnose": results.command("starcal-uq diagnose RUN"),
+        "diagnose": results.command(Remedy("diagnose", (RUN,))),
+        "report_command": Remedy("report").command,
         "template_command": _template_command(results),
         "verdict": verdict,
         "marks": _MARKS,
@@ -101,7 +103,7 @@ def context(results: Results) -> dict[str, Any]:
         else one_number_sentence(results.attitude),
         "misfit_attitude_sentence": ""
         if results.attitude is None
-        else results.located(misfit_sentence(results.attitude)),
+        else misfit_sentence(results.attitude, results.place),
         "attitude_sentence": words.attitude_sentence(results),
         "corner_sentence": ""
         if results.distortion_curve is None
@@ -141,7 +143,7 @@ def _template_command(results: Results) -> str:
     """The command that writes a file for what of the budget is not assessed."""
     if results.budget is None or not results.budget.not_assessed:
         return ""
-    return results.command("starcal-uq budget RUN --template budget.toml")
+    return results.command(Remedy("budget", (RUN,), {"template": "budget.toml"}))
 
 
 def _distortion(results: Results) -> dict[str, Any]:

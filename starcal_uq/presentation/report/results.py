@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.table import Observations
 from starcal_uq.presentation.words.budgeting import requirement_checks
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Missing:
-    """A part that the report lacks, in words, and the command that makes it."""
+    """A part that the report lacks, in words, and what makes it."""
 
     what: str
-    command: str
+    remedy: Remedy
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +67,9 @@ class Results(Shown):
         required = requirement_checks(self.budget)
         return judge(*known, diagnosis=self.diagnosis, place=self.place, requirements=required)
 
-    def command(self, text: str) -> str:
+    def command(self, remedy: Remedy) -> str:
         """A command with the files of this run in place of its words in capitals."""
-        return text if self.place is None else self.place.command(text)
-
-    def located(self, text: str) -> str:
-        """A sentence whose commands name the files of this run."""
-        return re.sub(r"`(.*?)`", lambda found: f"`{self.command(found[1])}`", text)
+        return (remedy if self.place is None else self.place.of(remedy)).command
 
     @cached_property
     def distortion_curve(self) -> DistortionCurve | None:

@@ -42,7 +42,8 @@ def run_text(results: Results) -> str:
     if error is not None:
         lines.append(one_number_sentence(error))
     lines += [
-        f"{missing.what}: not there yet (`{missing.command}`)." for missing in results.missing
+        f"{missing.what}: not there yet (`{missing.remedy.command}`)."
+        for missing in results.missing
     ]
     return "\n".join(lines)
 

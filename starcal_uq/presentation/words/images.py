@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from shlex import quote
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import count, plural, superscript
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.identification.result import STATUSES, FoundOptics, FrameStatus, Identification
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.pipeline.images import FAINTEST
@@ -194,43 +194,39 @@ class Step:
     """What to do next about a frame, in words, and the command that does it."""
 
     words: str
-    command: str
+    remedy: Remedy
 
 
 def next_step(frame: InspectedFrame, frames: Frames) -> Step | None:
     """What to do about a frame without a part in the calibration; None for others."""
     if frame.n(IDENTIFIED):
         return None
-    image = quote(str(frame.path) if frame.path is not None else frame.row.image)
-    run, outcome = quote(frames.run), frame.row.outcome
+    image = str(frame.path) if frame.path is not None else frame.row.image
+    run, outcome = frames.run, frame.row.outcome
     # Much fainter ones are not detected, and take longer to be told apart.
-    deeper = (
-        f"--max-mag {min(np.ceil(frames.searched_mag + 1.0), FAINTEST):g}"
-        if frames.searched_mag > 0.0
-        else ""
-    )
-    camera = f"{run}/camera.toml" if frames.known else ""
-    again = f"starcal-uq identify {run}/centroids.parquet {camera} -o found.csv".replace("  ", " ")
-    again += f" --calibration {run}" if frames.calibrated else ""
-    centroid = f"starcal-uq centroid {image} {f'--camera {camera} ' if camera else ''}-o stars.csv"
+    faintest = min(np.ceil(frames.searched_mag + 1.0), FAINTEST)
+    deeper = {"max_mag": f"{faintest:g}"} if frames.searched_mag > 0.0 else {}
+    camera = (f"{run}/camera.toml",) if frames.known else ()
+    found = {"out": "found.csv"} | ({"calibration": run} if frames.calibrated else {})
+    again = Remedy("identify", (f"{run}/centroids.parquet", *camera), found)
+    lens = {"camera": camera[0]} if camera else {}
+    centroid = Remedy("centroid", (image,), lens | {"out": "stars.csv"})
     if other := next(
         (other for other in frames.record.others if frame.row.frame in other.frames), None
     ):
-        paths = [
-            quote(str(frames.paths[number])) for number in other.frames if number in frames.paths
-        ]
-        command = f"starcal-uq run {' '.join(paths)} -o {quote(frames.run + '-other')}"
+        paths = [str(frames.paths[number]) for number in other.frames if number in frames.paths]
         return Step(
-            "another camera took it: calibrate the frames of that camera by themselves.", command
+            "another camera took it: calibrate the frames of that camera by themselves.",
+            Remedy("run", tuple(paths), {"out": f"{run}-other"}),
         )
     if outcome == "identified":
-        images = " ".join(quote(str(source)) for source in frames.images) or "IMAGES"
-        command = (
-            f"starcal-uq run {images} {camera} -o {quote(frames.run + '-deeper')} {deeper}".rstrip()
+        images = tuple(str(source) for source in frames.images) or ("IMAGES",)
+        return Step(
+            "too few of its stars can be calibrated; search among fainter ones.",
+            Remedy("run", images + camera, {"out": f"{run}-deeper", **deeper}),
         )
-        return Step("too few of its stars can be calibrated; search among fainter ones.", command)
     if outcome == "too few stars":
-        return Step("look for fainter stars, or expose longer.", f"{centroid} --threshold 3.5")
+        return Step("look for fainter stars, or expose longer.", centroid.having(threshold=3.5))
     if outcome == "ambiguous":
         return Step("identify it with what the other frames have told about the camera.", again)
     if outcome in ("not identified", "not searched"):
@@ -238,5 +234,5 @@ def next_step(frame: InspectedFrame, frames: Frames) -> Step | None:
             "if it shows stars, and no clouds, trees or other field of view, search among "
             "fainter ones."
         )
-        return Step(words, f"{again} {deeper}".rstrip())
+        return Step(words, again.having(**deeper))
     return Step("hear the whole reason.", centroid)

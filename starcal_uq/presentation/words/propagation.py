@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,7 @@ from starcal_uq.core.formatting import (
     pretty_unit,
     significant,
 )
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import (
@@ -34,6 +36,9 @@ from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
 from starcal_uq.propagation.field import FieldMap
 from starcal_uq.propagation.spectrum import ErrorSpectrum
+
+if TYPE_CHECKING:
+    from starcal_uq.diagnostics.verdict.remedies import Place
 
 # Ratios of standard deviations that are this close to one agree.
 _AGREE = 0.02
@@ -90,12 +95,13 @@ def one_number_sentence(error: AttitudeError) -> str:
     )
 
 
-def misfit_sentence(error: AttitudeError) -> str:
-    """What the tests of the model added, or the command that makes them."""
+def misfit_sentence(error: AttitudeError, place: Place | None = None) -> str:
+    """What the tests of the model added, or the command that makes them for the run."""
     if error.misfit is None:
+        tests = Remedy("diagnose", (RUN,))
         return (
             f"What the errors are {WITH_MISFIT_FOUND} is {NOT_ASSESSED}: the model was not tested "
-            "(`starcal-uq diagnose RUN`)."
+            f"(`{(tests if place is None else place.of(tests)).command}`)."
         )
     return " ".join(filter(None, (_found_sentence(error.misfit), choice_words(error))))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_uq.core.records import write_json
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import PathLike
 from starcal_uq.runs.stored import StoredRun, writing
@@ -73,10 +74,8 @@ def budget(
             write_json(replace(run.results, budget=made).verdict.to_dict(), files.verdict)
     run.error_budget = made
     if run.folder.is_older("report"):
-        run._tell(
-            f"report.html is older than the budget; run `starcal-uq report {run.path}` to "
-            "make it again."
-        )
+        again = Remedy("report", (str(run.path),), purpose="to make it again")
+        run._tell(f"report.html is older than the budget; {again}.")
     return made
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.files import read_parquet, reading, write_csv
+from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.observations.files import arrow_values
 from starcal_uq.observations.table import Observations
 from starcal_uq.runs.folder import DIAGNOSIS_TABLES
@@ -75,9 +76,8 @@ def _frames_of(path: Path) -> Observations:
     """Frames that a run keeps for itself; random places of a drawn sky may coincide, which no
     measured table may.
     """
-    with reading(
-        path, "a table of frames", "run `starcal-uq propagate RUN --force` to write it again"
-    ):
+    again = Remedy("propagate", (RUN,), {"force": True}, "to write it again")
+    with reading(path, "a table of frames", again):
         table = read_parquet(path)
         return Observations(
             **{name: arrow_values(table.column(name)) for name in table.column_names}

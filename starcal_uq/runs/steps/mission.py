@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import PathLike
 from starcal_uq.observations.table import Observations, load_observations
@@ -120,8 +121,7 @@ def propagate(
     if not run._keeps_observations and not run.has("observations"):
         raise RunFolderError(
             f"{run.path}: holds no observations, so that there are no frames to propagate "
-            "to: calibrate a table "
-            "that fits into memory with `starcal-uq calibrate`."
+            f"to: calibrate a table that fits into memory with `{Remedy('calibrate').words}`."
         )
     from starcal_uq.propagation import attitude_error
     from starcal_uq.propagation.alignment import OBSERVED, RANDOM
