@@ -14,12 +14,11 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.temporary import TemporaryFolder
@@ -28,10 +27,10 @@ from starcal_uq.core.types import Progress
 if TYPE_CHECKING:
     from starcal_uq.core.store import Kept
 
-Item = TypeVar("Item")
 T = TypeVar("T")
 # Numbers of the tasks and their results.
 Numbered = list[tuple[int, T]]
+Keep = Callable[[Numbered[T]], None]
 _WAIT_S = 0.2
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _shared: list[Callable[[int], Any]] = []
@@ -63,16 +62,14 @@ def run_tasks(
     comes later. `kept`: results of an earlier call, which are not computed again, and to which each
     new one is added.
     """
-    known: dict[int, T] = {} if kept is None else kept.results(n_tasks)
-    results: Numbered[T] = list(known.items())
-    todo = [number for number in range(n_tasks) if number not in known]
-    task = ByPlace(task, todo) if known else task
-    workers = min(processors() if workers is None else workers, -(-len(todo) // chunk))
+    results: dict[int, T] = {} if kept is None else kept.results(n_tasks)
+    todo = [number for number in range(n_tasks) if number not in results]
+    chunks = [todo[first : first + chunk] for first in range(0, len(todo), chunk)]
+    workers = min(processors() if workers is None else workers, len(chunks))
     interrupted = False
 
     def keep(some: Numbered[T]) -> None:
-        some = [(todo[place], result) for place, result in some]
-        results.extend(some)
+        results.update(some)
         if kept is not None:
             kept.keep(some)
         if each is not None:
@@ -84,28 +81,16 @@ def run_tasks(
     try:
         if workers == 0:
             with interrupt_between_steps() as check:
-                for index in range(len(todo)):
-                    keep([(index, task(index))])
+                for number in todo:
+                    keep([(number, task(number))])
                     check()
         else:
-            _spread(task, len(todo), workers, chunk, caller, keep)
+            _spread(task, chunks, workers, caller, keep)
     except KeyboardInterrupt:
         if not results:
             raise
         interrupted = True
-    results.sort(key=lambda numbered: numbered[0])
-    return [result for _, result in results], interrupted
-
-
-@dataclass(frozen=True)
-class ByPlace(Generic[Item, T]):
-    """A task for some items, by their places."""
-
-    task: Callable[[Item], T]
-    items: list[Item]
-
-    def __call__(self, place: int) -> T:
-        return self.task(self.items[place])
+    return [results[number] for number in sorted(results)], interrupted
 
 
 def processors() -> int:
@@ -117,74 +102,63 @@ def processors() -> int:
 
 def _spread(
     task: Callable[[int], T],
-    n_tasks: int,
+    chunks: list[list[int]],
     workers: int,
-    chunk: int,
     caller: str,
-    keep: Callable[[Numbered[T]], None],
+    keep: Keep[T],
 ) -> None:
     try:
         content = pickle.dumps(task)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise SamplingError(
             f"the settings cannot be sent to other processes ({error}): give functions that a "
-            "module defines at its "
-            "top level, or use workers=0."
+            "module defines at its top level, or use workers=0."
         ) from error
-    chunks = [range(first, min(first + chunk, n_tasks)) for first in range(0, n_tasks, chunk)]
     with TemporaryFolder() as folder:
         # A file, because a process that dies while it starts would leave this one waiting at a pipe
         # that is full.
         path = Path(folder) / "task.pickle"
         path.write_bytes(content)
-        _submit(path, chunks, workers, caller, keep)
+        # Forked processes would inherit the locks of threads that they do not have.
+        pool = ProcessPoolExecutor(
+            workers, get_context("spawn"), initializer=_start, initargs=(path,)
+        )
+        try:
+            _follow(pool, chunks, keep)
+        except BrokenProcessPool as error:
+            raise SamplingError(
+                f"the worker processes ended unexpectedly: in a script, call {caller} below "
+                '`if __name__ == "__main__":`; if memory ran out, use fewer workers, or workers=0.'
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
-def _submit(
-    path: Path, chunks: list[range], workers: int, caller: str, keep: Callable[[Numbered[T]], None]
-) -> None:
-    # Forked processes would inherit the locks of threads that they do not have.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start, initargs=(path,))
-    try:
-        with interrupt_between_steps() as check, one_thread():
-            # Processes start while they are given work, and take along what is blocked.
-            with _blocked():
-                pending: set[Future[Numbered[T]]] = {
-                    pool.submit(_run, numbers) for numbers in chunks
-                }
-            try:
-                while pending:
-                    check()
-                    for future in wait(pending, _WAIT_S, FIRST_COMPLETED).done:
-                        pending.discard(future)
-                        keep(future.result())
-            except BrokenProcessPool:
-                # SIGTERM may have gone to all processes, and have come to this one last.
-                time.sleep(_WAIT_S)
+def _follow(pool: ProcessPoolExecutor, chunks: list[list[int]], keep: Keep[T]) -> None:
+    """Keep results as they come; after Ctrl-C what waits is dropped, and what was under way is
+    kept.
+    """
+    with interrupt_between_steps() as check, one_thread():
+        # Processes start while they are given work, and take along what is blocked.
+        with _blocked():
+            pending: set[Future[Numbered[T]]] = {pool.submit(_run, numbers) for numbers in chunks}
+        try:
+            while pending:
                 check()
-                raise
-            except KeyboardInterrupt:
-                _keep_running(pool, pending, keep)
-                raise
-    except BrokenProcessPool as error:
-        raise SamplingError(
-            f"the worker processes ended unexpectedly: in a script, call {caller} below "
-            '`if __name__ == "__main__":`; if memory ran out, use fewer workers, or workers=0.'
-        ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _keep_running(
-    pool: ProcessPoolExecutor,
-    pending: set[Future[Numbered[T]]],
-    keep: Callable[[Numbered[T]], None],
-) -> None:
-    """Drop what waits, and keep what was under way."""
-    pool.shutdown(cancel_futures=True)
-    for future in pending:
-        if not future.cancelled() and future.exception() is None:
-            keep(future.result())
+                for future in wait(pending, _WAIT_S, FIRST_COMPLETED).done:
+                    pending.discard(future)
+                    keep(future.result())
+        except BrokenProcessPool:
+            # SIGTERM may have gone to all processes, and have come to this one last.
+            time.sleep(_WAIT_S)
+            check()
+            raise
+        except KeyboardInterrupt:
+            pool.shutdown(cancel_futures=True)
+            for future in pending:
+                if not future.cancelled() and future.exception() is None:
+                    keep(future.result())
+            raise
 
 
 @lru_cache(maxsize=1)
@@ -255,7 +229,7 @@ def _blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _run(numbers: range) -> Numbered[Any]:
+def _run(numbers: list[int]) -> Numbered[Any]:
     return [(number, _shared[0](number)) for number in numbers]
 
 

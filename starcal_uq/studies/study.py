@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from starcal_uq.core.manifest import NEW, alone, making, read_manifest
 from starcal_uq.core.provenance import NAME, provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import held, take_over
-from starcal_uq.core.tasks import ByPlace, one_thread, run_tasks
+from starcal_uq.core.tasks import one_thread, run_tasks
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
@@ -292,11 +293,16 @@ def run_batches(
         return False
     # A process takes seconds to start: what is done sooner is done here.
     workers = 0 if workers is None and len(batches) < _FEW_BATCHES else workers
-    task = ByPlace(work, batches)
+    task = partial(_rows_of, work, batches)
     _, interrupted = run_tasks(
         task, len(batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep
     )
     return interrupted
+
+
+def _rows_of(work: Work, batches: list[Batch], number: int) -> list[AnyDict]:
+    """Rows of the batch of this number."""
+    return work(batches[number])
 
 
 def model_of(definition: StudyDefinition, cell: Cell) -> str:

@@ -18,9 +18,10 @@ from tests.helpers.scenes import observations
 def one_process(monkeypatch):
     """Tasks stay in this process: that others compute the same is seen where the tasks are."""
 
-    def stay(task, n_tasks, _workers, _chunk, _caller, keep):
-        for index in range(n_tasks):
-            keep([(index, task(index))])
+    def stay(task, chunks, _workers, _caller, keep):
+        for numbers in chunks:
+            for number in numbers:
+                keep([(number, task(number))])
 
     monkeypatch.setattr("starcal_uq.core.tasks._spread", stay)
 
