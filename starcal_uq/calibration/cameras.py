@@ -140,10 +140,7 @@ def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFo
         if not np.isfinite(cost):
             return none
         # A focal length that is longer by one per cent is a pattern that is larger by as much.
-        slope = (
-            likelihood.project_out(state, likelihood.derivatives(theta, state)[2:3])[0]
-            * camera.focal_px
-        )
+        slope = likelihood.slopes(theta, state)[2] * camera.focal_px
         curvature = frames.sum(np.sum(slope**2, axis=0))
         step = frames.sum(np.sum(slope * state.e, axis=0)) / curvature
         log_scale -= np.clip(step, -0.2, 0.2)

@@ -538,7 +538,7 @@ class _Air:
         lowest = np.minimum.reduceat(grid @ state.b, frames.starts[:-1], axis=1)
         columns = likelihood.project_out(state, shifts)
         size = np.where(lowest > _LOWEST, frames.sum(np.sum(columns**2, axis=1)), np.inf)
-        h = likelihood.project_out(state, likelihood.derivatives(self._cal.theta, state))
+        h = likelihood.slopes(self._cal.theta, state)
         e = likelihood.project_out(state, state.e[None])[0]
         basis = np.linalg.qr(h.reshape(len(h), -1).T)[0]
         number, star = np.repeat(np.arange(frames.n_frames), frames.sizes), np.arange(n)

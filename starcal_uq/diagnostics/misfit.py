@@ -46,8 +46,10 @@ from starcal_uq.estimation.noise_model import (
     sigma_ratios,
     weighed,
 )
+from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarModel
+from starcal_uq.likelihood.terms import TermSums
 from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -442,14 +444,11 @@ class _Sums:
             own=frame_shapes(cal.camera),
             names=cal.parameter_names,
         )
-        rotations = quaternion_to_rotation(cal.quaternions)
-        starts = likelihood.frames.starts
-        model = None if cal.star_errors is None else StarModel(obs, cal.star_errors.focal_px)
-        stars = None if model is None else model.sums()
-        for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
-            part = MarginalLikelihood(likelihood.frames.part(first, last), cal.camera.distortion)
-            state, _ = part.profile(theta, rotations[first:last])
-            rows = slice(int(starts[first]), int(starts[last]))
+        rotations, stars = quaternion_to_rotation(cal.quaternions), None
+        if cal.star_errors is not None:
+            model = StarModel(obs, cal.star_errors.focal_px)
+            stars = TermSums(model.term(cal.star_errors.tau_px))
+        for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
             fitted, columns, view = found._add(part, state, theta, rows)
             if stars is not None:
                 stars.add(
@@ -466,13 +465,11 @@ class _Sums:
             found._add_blocks(part, state, view, fitted, columns)
             h, e = fitted[:p], fitted[p]
             found.noise.add(part.frames, state, h, e, rows)
-            matrices = np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
+            matrices = products_by_frame(part.frames, h, h)
             squares = part.frames.sum(np.sum(e**2, axis=0))
             found.frames.append((squares, np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
-        if model is not None and stars is not None and cal.star_errors is not None:
-            found.gram -= stars.solved(
-                model.ratio(cal.star_errors.tau_px**2, cal.sigma)
-            ).correction()
+        if stars is not None:
+            found.gram -= stars.eliminated(stars.term.ratio(cal.sigma)).correction()
         return found
 
     def _add(
@@ -516,7 +513,7 @@ class _Sums:
         frames.whiten(columns)
         raw = np.sqrt(frames.sum(np.sum(columns**2, axis=1)))
         columns = part.project_out(state, columns / frames.spread(raw)[:, None])
-        gram = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", columns, columns)), 2, 0)
+        gram = products_by_frame(frames, columns, columns)
         values, vectors = np.linalg.eigh(gram)
         kept = values > _ABSORBED
         root = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :]
@@ -725,9 +722,9 @@ class NoiseSums:
             flat = h.reshape(len(h), -1)
             self.parameters1[i] += weighted.reshape(len(h), -1) @ flat.T
             self.parameters2[i] += doubly.reshape(len(h), -1) @ flat.T
-            awa = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", a * w, a)), 2, 0) @ inverse
-            aw2a = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", a * w**2, a)), 2, 0) @ inverse
-            awh = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", a * w, h)), 2, 0)
+            awa = products_by_frame(frames, a * w, a) @ inverse
+            aw2a = products_by_frame(frames, a * w**2, a) @ inverse
+            awh = products_by_frame(frames, a * w, h)
             self.trace[i] += 2.0 * np.sum(w) - np.einsum("kaa->", awa)
             # tr(W W) - 2 tr(P W W) + tr(P W P W) for the attitudes' part of P.
             self.trace2[i] += (

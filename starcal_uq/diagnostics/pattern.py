@@ -37,6 +37,7 @@ from starcal_uq.diagnostics.shapes import (
     frame_shapes,
     shapes,
 )
+from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.propagation.alignment import alignment_weights
@@ -218,22 +219,17 @@ class _Turned:
         geometry = FrameGeometry.of(post, frames)
         turns = geometry.noise_response / geometry.noise_px[:, None]
         likelihood = MarginalLikelihood(frames, camera.distortion)
-        starts = likelihood.frames.starts
         turned = []
-        for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
-            part = MarginalLikelihood(likelihood.frames.part(first, last), camera.distortion)
-            rows = slice(int(starts[first]), int(starts[last]))
-            view = View.of(part, part.profile(camera.theta)[0], camera.theta, rows)
+        for part, state, rows in likelihood.pieces(camera.theta, None, _STARS_AT_ONCE):
+            view = View.of(part, state, camera.theta, rows)
             columns = frame_shapes(camera).columns(view)
             if chosen:
                 found = np.concatenate([family.columns(view) for family in chosen])
                 columns = np.concatenate(
                     [columns, np.einsum("qj,qan->jan", pattern.directions, found)]
                 )
-            edges = starts[first:last] - starts[first]
-            turned.append(
-                np.add.reduceat(np.einsum("jan,ani->nij", columns, turns[:, rows]), edges, axis=0)
-            )
+            products = np.einsum("jan,ani->nij", columns, turns[:, rows])
+            turned.append(np.add.reduceat(products, part.frames.starts[:-1], axis=0))
         moving, direct = np.split(np.concatenate(turned), [3], axis=2)
         if chosen:
             direct = direct + geometry.response @ pattern.parameters.T
@@ -508,12 +504,10 @@ def frame_covariance(
     chosen = pattern.among(families)
     own = frame_shapes(cal.camera)
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-    rotations, starts = quaternion_to_rotation(cal.quaternions), likelihood.frames.starts
+    rotations = quaternion_to_rotation(cal.quaternions)
     grams, slopes = [], []
-    for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
-        part = MarginalLikelihood(likelihood.frames.part(first, last), cal.camera.distortion)
-        state, _ = part.profile(cal.theta, rotations[first:last])
-        view = View.of(part, state, cal.theta, slice(int(starts[first]), int(starts[last])))
+    for part, state, rows in likelihood.pieces(cal.theta, rotations, _STARS_AT_ONCE):
+        view = View.of(part, state, cal.theta, rows)
         weight = 1.0 if part.frames.weight is None else part.frames.weight
         e = state.e.copy()
         if chosen:
@@ -524,11 +518,9 @@ def frame_covariance(
             )
             e -= weight * shift
         projected = part.project_out(state, np.concatenate([own.columns(view) * weight, e[None]]))
-        products = np.stack(
-            [part.frames.sum(np.sum(column * projected, axis=1)) for column in projected[:3]]
-        )
-        grams.append(np.moveaxis(products[:, :3], 2, 0))
-        slopes.append(products[:, 3].T)
+        products = products_by_frame(part.frames, projected[:3], projected)
+        grams.append(products[:, :, :3])
+        slopes.append(products[:, :, 3])
     # The mean over frames went into the parameters, and with it one frame's worth of the spread.
     lost = obs.n_frames / max(obs.n_frames - 1, 1)
     return _moments(np.concatenate(grams), np.concatenate(slopes), pattern.variance) * lost

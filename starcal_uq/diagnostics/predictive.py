@@ -121,7 +121,7 @@ def predictive_check(
     part = MarginalLikelihood(some, cal.camera.distortion, axes=cal.star_errors is None)
     frames = part.frames
     state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[places]))
-    e, h = state.e, part.project_out(state, part.derivatives(cal.theta, state))
+    e, h = state.e, part.slopes(cal.theta, state)
     stars = None
     if cal.star_errors is not None:
         # Residuals after each star's offset, as they follow the parameters; replicates go the same
@@ -166,12 +166,8 @@ def _turns(part: MarginalLikelihood, state: Profile) -> Any:
     from scipy.sparse import csr_array
 
     frames = part.frames
-    factor: FloatArray = np.asarray(
-        np.linalg.cholesky(np.moveaxis(state.inverse, 2, 0)), dtype=np.float64
-    )
-    root = frames.spread(np.moveaxis(factor, 0, 2))
-    # Star by star and axis by axis: A times the root of (A^T A)^-1.
-    values = np.einsum("axn,abn->xnb", state.attitude, root, optimize=True)
+    # Star by star and axis by axis.
+    values = part.attitudes(state).orthonormal.transpose(1, 2, 0)
     columns = 3 * np.repeat(np.arange(frames.n_frames), frames.sizes)[:, None] + np.arange(3)
     n = frames.n_stars
     place = np.broadcast_to(columns, (2, n, 3)).ravel()

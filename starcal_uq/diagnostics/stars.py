@@ -27,7 +27,8 @@ from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import StarNormals
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.star_errors import StarSums, add_linearised, star_numbers
+from starcal_uq.likelihood.star_errors import star_numbers, star_term
+from starcal_uq.likelihood.terms import TermSums
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -218,9 +219,9 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     frames = everything.select(used)
     rotations = quaternion_to_rotation(cal.quaternions)[present]
     stars = np.unique(numbers[used], return_inverse=True)[1]
-    sums = StarSums(stars, frames.r, float(cal.theta[2]), rigid=True)
+    sums = TermSums(star_term(stars, frames.r, float(cal.theta[2]), rigid=True))
     p, likelihood = len(cal.theta), MarginalLikelihood(frames, cal.camera.distortion)
-    gram = add_linearised(sums, likelihood, cal.theta, cal.sigmas, rotations)
+    gram = sums.add_linearised(likelihood, cal.theta, cal.sigmas, rotations)
     values, vectors = np.linalg.eigh(gram[:p, :p])
     kept = values > _ABSORBED * values.max()
     root = vectors[:, kept] / np.sqrt(values[kept])
@@ -229,7 +230,7 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     total = float(gram[p, p] - explained @ explained)
     pull = sums.cross[:, p] - absorbed @ explained
     dof = 2 * frames.n_stars - 3 * frames.n_frames - int(kept.sum())
-    nothing = _Likeness(sums.n_stars, frames.n_stars)
+    nothing = _Likeness(sums.n_groups, frames.n_stars)
     if dof < _LEAST_DOF:
         return nothing
     g1, g2, g3, g4 = _traces(sums.matrix, absorbed)
@@ -256,7 +257,7 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     unit = 1.0 if frames.weight is None else float(1.0 / np.sqrt(np.mean(frames.weight**2)))
     low, high = np.sqrt(max(tau2 - sd, 0.0)), np.sqrt(max(tau2, 0.0) + sd)
     return _Likeness(
-        n_stars=sums.n_stars,
+        n_stars=sums.n_groups,
         n_images=frames.n_stars,
         p_value=_gamma_tail(statistic, skewness),
         tau2=max(tau2, 0.0) * unit**2,

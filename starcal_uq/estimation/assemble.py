@@ -181,8 +181,8 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
     trajectory, cost = [theta], []
     rotations = likelihood.rotations_at(theta)
     for _ in range(2):
-        ratio = model.ratio(errors.tau_px**2, sigma)
-        compressed = compress(likelihood, theta, covariance, rotations, model.sums(), ratio)
+        term = model.term(errors.tau_px)
+        compressed = compress(likelihood, theta, covariance, rotations, term, sigma)
         cost.append(float(compressed.gram[0, 0]))
         found = optimum(compressed)
         theta, covariance, sigma = found.theta, found.covariance, found.sigma
@@ -197,7 +197,7 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
     exact = StarLikelihood(obs, likelihood.model_name, theta, rotations, errors, sigma)
     state, _ = exact.profile(theta, rotations)
     rest, offsets = exact.conditioned(state, state.e[None])
-    shifts = state.e[None] - exact.offset_shifts(state, offsets)
+    shifts = state.e[None] - exact.term.shifts(exact, state, offsets)
     turned = exact.attitude_response(state, shifts)[0].T
     weight = likelihood.frames.weight
     # The stars of a frame err each by themselves: to its attitude that is more noise, which a stare

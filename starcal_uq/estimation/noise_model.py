@@ -281,12 +281,11 @@ def star_squares(
     `theta` (p,): estimate, px units.
     """
     state, _ = likelihood.profile(theta)
-    h = likelihood.project_out(state, likelihood.derivatives(theta, state))
+    h = likelihood.slopes(theta, state)
     flat = h.reshape(len(h), -1)
     inverse = scaled_inverse(flat @ flat.T)
     by_camera = np.einsum("pxn,pxn->n", h, np.tensordot(inverse, h, axes=1))
-    spread = likelihood.frames.spread(state.inverse)
-    by_attitude = np.einsum("axn,abn,bxn->n", state.attitude, spread, state.attitude, optimize=True)
+    by_attitude = np.sum(likelihood.attitudes(state).orthonormal ** 2, axis=(0, 1))
     return np.sum(state.e**2, axis=0), np.maximum(2.0 - by_camera - by_attitude, 1e-6)
 
 
@@ -326,13 +325,10 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     """
     state, _ = likelihood.profile(theta)
     frames, n = likelihood.frames, likelihood.frames.n_stars
-    h = likelihood.project_out(state, likelihood.derivatives(theta, state))
+    h = likelihood.slopes(theta, state)
     flat = h.reshape(len(h), -1)
     camera = np.tensordot(scaled_cholesky(scaled_inverse(flat @ flat.T)).T, h, axes=1)
-    root = np.asarray(
-        np.moveaxis(np.linalg.cholesky(np.moveaxis(state.inverse, 2, 0)), 0, 2), dtype=np.float64
-    )
-    attitude = np.einsum("ijn,ixn->jxn", frames.spread(root), state.attitude)
+    attitude = likelihood.attitudes(state).orthonormal
 
     def products(one: int, other: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """U^T U over the stars of the axes: attitudes of each frame, both ways of attitudes with
@@ -468,7 +464,7 @@ def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: fl
     """
     likelihood = MarginalLikelihood(obs, camera.distortion)
     state, _ = likelihood.profile(camera.theta)
-    h = likelihood.project_out(state, likelihood.derivatives(camera.theta, state))
+    h = likelihood.slopes(camera.theta, state)
     whitened = model.sigma_px(obs) * (
         1.0 if likelihood.frames.weight is None else likelihood.frames.weight
     )

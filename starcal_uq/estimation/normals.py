@@ -16,8 +16,9 @@ from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.residual_map import FrameScatter
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.star_errors import StarSums, add_by_star
+from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, frame_normals
+from starcal_uq.likelihood.terms import add_by_group
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -176,37 +177,29 @@ class StarNormals:
         """Sums over the stars that `numbers` (N,) tells apart, at the estimate of a calibration."""
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         frames, p = likelihood.frames, len(cal.theta)
-        sums = StarSums(numbers, frames.r, float(cal.theta[2]))
+        term = star_term(numbers, frames.r, float(cal.theta[2]))
         start = quaternion_to_rotation(cal.quaternions)
         matrix, slope, squares = np.zeros((p, p)), np.zeros(p), 0.0
-        s = sums.n_stars
+        s = len(term.prior_scale)
         scores, slopes, matrices, response = (
             np.zeros((s, *shape)) for shape in ((p,), (p,), (p, p), (2, p))
         )
-        for first, last in frames.parts(_STARS_AT_ONCE):
-            part = MarginalLikelihood(frames.part(first, last), likelihood.model_name)
-            rows = slice(int(frames.starts[first]), int(frames.starts[last]))
-            state, _ = part.profile(cal.theta, start[first:last])
-            h = part.project_out(state, part.derivatives(cal.theta, state))
-            h = h * cal.sigmas[:, None, None]
+        for part, state, rows in likelihood.pieces(cal.theta, start, _STARS_AT_ONCE):
+            h = part.slopes(cal.theta, state) * cal.sigmas[:, None, None]
             stars = numbers[rows]
             # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has
             # hidden.
-            a = state.attitude
-            pulled = np.einsum(
-                "axn,abn,byn->xyn", a, part.frames.spread(state.inverse), a, optimize=True
-            )
-            free = np.linalg.inv(np.eye(2) - np.moveaxis(pulled, 2, 0))
+            a = part.attitudes(state).orthonormal
+            free = np.linalg.inv(np.eye(2) - np.einsum("axn,ayn->nxy", a, a, optimize=True))
             raised = np.einsum("nxy,pyn->pxn", free, h, optimize=True)
             matrix += np.einsum("axn,bxn->ab", h, h, optimize=True)
             slope += np.einsum("axn,xn->a", h, state.e)
             squares += float(np.sum(state.e**2))
-            add_by_star(scores, np.sum(h * state.e, axis=1), stars)
-            add_by_star(slopes, np.sum(raised * state.e, axis=1), stars)
-            add_by_star(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
-            add_by_star(
-                response, np.einsum("ixn,pxn->ipn", sums.columns(part, state, rows), h), stars
-            )
+            add_by_group(scores, np.sum(h * state.e, axis=1), stars)
+            add_by_group(slopes, np.sum(raised * state.e, axis=1), stars)
+            add_by_group(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
+            z = term.columns(part, state, rows)
+            add_by_group(response, np.einsum("ixn,pxn->ipn", z, h), stars)
         unit = 1.0 / np.sqrt(np.diag(matrix))
         return cls(
             scale=cal.sigmas * unit,

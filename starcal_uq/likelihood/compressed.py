@@ -24,7 +24,6 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.likelihood.loops import gram_loop, kernels
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
-from starcal_uq.likelihood.star_errors import StarSums
 from starcal_uq.likelihood.sums import (
     ATTITUDE_STEPS,
     ATTITUDE_TOLERANCE_RAD,
@@ -32,6 +31,7 @@ from starcal_uq.likelihood.sums import (
     NormalSums,
     settled_sums,
 )
+from starcal_uq.likelihood.terms import Term, TermSums
 from starcal_uq.maths.linear import (
     COLUMNS,
     ROWS,
@@ -337,8 +337,8 @@ def compress(
     theta_hat: FloatArray,
     covariance: FloatArray,
     rotations: FloatArray | None = None,
-    stars: StarSums | None = None,
-    ratio: FloatArray | None = None,
+    term: Term | None = None,
+    sigma: float = 1.0,
 ) -> CompressedLikelihood:
     """Compress a likelihood around an estimate.
 
@@ -347,8 +347,7 @@ def compress(
     `covariance` (p, p): covariance there; sets the whitened coordinates. `rotations` (K, 3, 3):
     attitudes to start from; otherwise those where the likelihood's own searches start, or
         QUEST's.
-    `stars`: stars that bring errors along, nothing added yet.
-    `ratio` (2 S,): variances of their errors, in units of sigma^2.
+    `term`: linear in the pixels, marginalised; `sigma` is the noise that its prior is relative to.
     """
     whitening, theta = scaled_cholesky(covariance), np.asarray(theta_hat, dtype=np.float64)
     frames, model_name = likelihood.frames, likelihood.model_name
@@ -363,19 +362,17 @@ def compress(
         rotations = known[1].rotations if compiled and known is not None else likelihood.rotations
     if rotations is None:
         rotations = likelihood.start_rotations(theta)
-    if stars is not None and ratio is not None:
-        # Bound here: the types of what a function closes over are those of the arguments.
-        bringing = stars
+    if term is not None:
+        of_term = TermSums(term)
 
         def add(part: StarFrames, block: _Block, rows: slice) -> None:
             own = MarginalLikelihood(part, model_name)
             state, _ = own.profile(theta, block.rotations)
-            bringing.add(own, state, own.project_out(state, block.columns), rows)
+            of_term.add(own, state, own.project_out(state, block.columns), rows)
 
         sums = _expanded(frames, model_name, theta, whitening, rotations, add)
-        return dataclasses.replace(
-            sums, gram=sums.gram - stars.solved(ratio).correction()
-        ).likelihood(theta, whitening)
+        taken = of_term.eliminated(term.ratio(sigma)).correction()
+        return dataclasses.replace(sums, gram=sums.gram - taken).likelihood(theta, whitening)
     return gram_sums(frames, model_name, theta, whitening, rotations, known).likelihood(
         theta, whitening
     )

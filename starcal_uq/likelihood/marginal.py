@@ -13,6 +13,7 @@ complement of the attitudes.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
 from starcal_uq.core.types import FloatArray
+from starcal_uq.likelihood.elimination import ByFrame
 from starcal_uq.likelihood.loops import kernels
 from starcal_uq.likelihood.solvers import Normal
 from starcal_uq.likelihood.sums import (
@@ -270,21 +272,37 @@ class MarginalLikelihood:
         self.frames.whiten(h)
         return h
 
+    def attitudes(self, state: Profile) -> ByFrame:
+        """The frames' rotations, which are eliminated."""
+        return ByFrame(self.frames, state.attitude, state.inverse)
+
     def attitude_response(self, state: Profile, columns: FloatArray) -> FloatArray:
         """Least-squares rotation vectors (q, 3, K) that reproduce columns (q, 2, N) of pixel
         shifts.
         """
-        products = [np.sum(a * columns, axis=1) for a in state.attitude]
-        x, y, z = (self.frames.sum(product)[:, None, :] for product in products)
-        response: FloatArray = x * state.inverse[0] + y * state.inverse[1] + z * state.inverse[2]
-        return response
+        return self.attitudes(state).coefficients(columns)
 
     def project_out(self, state: Profile, columns: FloatArray) -> FloatArray:
         """Remove from columns (q, 2, N) what a rotation of each frame can reproduce."""
-        response = self.frames.spread(self.attitude_response(state, columns))
-        a = state.attitude
-        remainder: FloatArray = columns - sum(response[:, i, None, :] * a[i] for i in range(3))
-        return remainder
+        return self.attitudes(state).removed_from(columns)
+
+    def slopes(self, theta: FloatArray, state: Profile) -> FloatArray:
+        """`derivatives` (p, 2, N) without what a rotation of each frame can reproduce."""
+        return self.project_out(state, self.derivatives(theta, state))
+
+    def pieces(
+        self, theta: FloatArray, rotations: FloatArray | None, max_stars: int
+    ) -> Iterator[tuple[MarginalLikelihood, Profile, slice]]:
+        """Some frames at a time: their likelihood, the model at theta (p,), and the rows of their
+        stars.
+
+        Attitudes are searched from `rotations` (K, 3, 3) or QUEST's.
+        """
+        for first, last in self.frames.parts(max_stars):
+            part = MarginalLikelihood(self.frames.part(first, last), self.model_name)
+            state, _ = part.profile(theta, None if rotations is None else rotations[first:last])
+            rows = slice(int(self.frames.starts[first]), int(self.frames.starts[last]))
+            yield part, state, rows
 
     def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
         """Turn columns (q, 2, N) into (q, m) with products by the covariance of the data, attitudes

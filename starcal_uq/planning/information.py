@@ -19,6 +19,7 @@ import numpy as np
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.noise_model import NoiseModel
+from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
@@ -195,15 +196,12 @@ def frame_matrices(
     frames.
     """
     information, response, noise = [], [], []
-    for first, last in frames.parts(_STARS_AT_ONCE):
-        likelihood = MarginalLikelihood(frames.part(first, last), camera.distortion)
-        state, _ = likelihood.profile(camera.theta, rotations[first:last])
-        derivatives = likelihood.derivatives(camera.theta, state)
-        h = likelihood.project_out(state, derivatives)
-        information.append(
-            np.moveaxis(likelihood.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
-        )
+    whole = MarginalLikelihood(frames, camera.distortion)
+    for part, state, _ in whole.pieces(camera.theta, rotations, _STARS_AT_ONCE):
+        derivatives = part.derivatives(camera.theta, state)
+        h = part.project_out(state, derivatives)
+        information.append(products_by_frame(part.frames, h, h))
         # A parameter too large turns the attitude the other way: the stars are where they are.
-        response.append(-likelihood.attitude_response(state, derivatives).transpose(2, 1, 0))
+        response.append(-part.attitude_response(state, derivatives).transpose(2, 1, 0))
         noise.append(np.moveaxis(state.inverse, 2, 0))
     return np.concatenate(information), np.concatenate(response), np.concatenate(noise)

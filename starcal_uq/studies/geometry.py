@@ -22,7 +22,8 @@ from starcal_uq.core.errors import StudyError
 from starcal_uq.core.formatting import count
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.star_errors import add_by_star, offset_columns, sky_axes
+from starcal_uq.likelihood.star_errors import star_term
+from starcal_uq.likelihood.terms import add_by_group
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.information import frame_matrices
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Window
@@ -442,12 +443,12 @@ def _star_spread(
     camera, m = geometry.camera, geometry.n_frames
     likelihood = MarginalLikelihood(frames, camera.distortion)
     state, _ = likelihood.profile(camera.theta, geometry.rotations)
-    h = likelihood.project_out(state, likelihood.derivatives(camera.theta, state))
+    h = likelihood.slopes(camera.theta, state)
     numbers = np.unique(geometry.star, return_inverse=True)[1]
-    z = offset_columns(likelihood, state, sky_axes(frames.r, numbers), camera.focal_px)
+    z = star_term(numbers, frames.r, camera.focal_px).columns(likelihood, state, slice(None))
     score = offset_px * np.einsum("pxn,jxn->pjn", h, z)
     total = np.zeros((int(numbers.max()) + 1, len(h), 2))
-    add_by_star(total, score, numbers)
+    add_by_group(total, score, numbers)
     own, every = np.einsum("pjn,qjn->pq", score, score), np.einsum("spj,sqj->pq", total, total)
     # Of the whole variance by which an image is weighed, centroid noise is this share.
     share = noise_px**2 / (noise_px**2 + offset_px**2)

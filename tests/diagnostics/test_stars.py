@@ -102,7 +102,7 @@ def test_false_alarms_and_power_are_as_stated():
     rng = np.random.default_rng(7)
     likelihood = MarginalLikelihood(obs, "brown")
     state, _ = likelihood.profile(cal.theta, quaternion_to_rotation(cal.quaternions))
-    z = StarModel(obs, cal.theta[2]).sums()
+    z = StarModel(obs, cal.theta[2]).term()
     shift = z.columns(likelihood, state, slice(None))
     model = obs.xy - state.e.T
     h = (
@@ -112,13 +112,13 @@ def test_false_alarms_and_power_are_as_stated():
     p_values = {0.0: [], 0.01: [], 0.03: []}
     for tau in p_values:
         for _ in range(400 if tau == 0.0 else 40):
-            u = tau * rng.standard_normal((z.n_stars, 2))[z.numbers]
+            u = tau * rng.standard_normal(z.prior_scale.shape)[z.groups]
             noise = 0.05 * rng.standard_normal((2, obs.n_stars)) + np.einsum("nj,jxn->xn", u, shift)
             step = np.linalg.solve(h @ h.T, h @ likelihood.project_out(state, noise[None]).ravel())
             x, y = model.T + noise
             table = dataclasses.replace(obs, x_px=x, y_px=y)
             fitted = dataclasses.replace(cal, theta=cal.theta + step * cal.sigmas)
-            p_values[tau].append(diagnostics_stars._likeness(table, fitted, z.numbers).p_value)
+            p_values[tau].append(diagnostics_stars._likeness(table, fitted, z.groups).p_value)
     share = {tau: np.mean(np.array(p) < 0.05) for tau, p in p_values.items()}
     assert 0.025 < share[0.0] < 0.08
     assert np.mean(np.array(p_values[0.0]) < 0.5) == pytest.approx(0.5, abs=0.1)

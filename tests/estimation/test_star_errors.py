@@ -12,7 +12,8 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import CalibrationError, SamplingError
 from starcal_uq.likelihood.compressed import compress
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.star_errors import SolvedStars, StarErrors, StarLikelihood, StarModel
+from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood, StarModel, sky_axes
+from starcal_uq.likelihood.terms import Eliminated, TermSums
 from tests.helpers.outside import campaign
 
 
@@ -41,7 +42,7 @@ def dense(obs, cal, model, ratio):
     frame = np.searchsorted(obs.frame_ids, obs.frame)
     # Derivatives by finite turns of the directions and of the camera, without the columns under
     # test.
-    axes = model.sums().axes
+    axes = sky_axes(model.directions, model.numbers)
     for i in range(2):
         step = 1e-7
         turned = np.einsum("nij,jn->in", state.rotations[frame], axes[i])
@@ -68,7 +69,7 @@ def test_products_are_those_of_the_covariance_as_written():
     e, w = dense(obs, cal, model, ratio)
     likelihood = MarginalLikelihood(obs, "brown")
     rotations = quaternion_to_rotation(cal.quaternions)
-    found = compress(likelihood, cal.theta, cal.covariance, rotations, model.sums(), ratio)
+    found = compress(likelihood, cal.theta, cal.covariance, rotations, model.term(0.03), 0.05)
     assert found.gram[0, 0] == pytest.approx(e @ w @ e, rel=1e-6)
     # The control: star errors matter here.
     assert found.gram[0, 0] < 0.9 * e @ e
@@ -84,11 +85,11 @@ def test_either_side_can_be_eliminated():
     cal = sc.calibrate(obs, camera)
     likelihood, model = MarginalLikelihood(obs, "brown"), StarModel(obs, cal.theta[2])
     state, _ = likelihood.profile(cal.theta)
-    sums, ratio = model.sums(), model.ratio(0.03**2, 0.05)
+    sums, ratio = TermSums(model.term()), model.ratio(0.03**2, 0.05)
     sums.add(likelihood, state, likelihood.project_out(state, state.e[None]), slice(None))
     ways = []
     for by_star in (True, False):
-        solved = SolvedStars(sums, ratio, by_star)
+        solved = Eliminated(sums, ratio, by_star)
         ways.append((float(solved.correction()[0, 0]), solved.log_determinant))
     assert ways[0] == pytest.approx(ways[1], rel=1e-9)
     g = np.eye(len(ratio)) + ratio[:, None] * sums.matrix.toarray()

@@ -1,0 +1,56 @@
+"""Elimination of coefficients that every frame has for itself, such as its attitude.
+
+Columns a of whitened shifts, with coefficients of frame k that no other frame sees, leave of other
+columns x what they cannot reproduce, ``x - a (a^T a)_k^-1 a^T x``: a Schur complement in blocks of
+the size of the number of columns. Weights and axes of the noise are in the columns already.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray
+from starcal_uq.observations.frames import StarFrames
+
+
+@dataclass(frozen=True, eq=False)
+class ByFrame:
+    """Columns (c, 2, N) with coefficients of every frame, and the inverse (c, c, K) of their
+    products.
+    """
+
+    frames: StarFrames
+    columns: FloatArray
+    inverse: FloatArray
+
+    def coefficients(self, values: FloatArray) -> FloatArray:
+        """Least-squares coefficients (q, c, K) of values (q, 2, N)."""
+        products = [self.frames.sum(np.sum(own * values, axis=1))[:, None] for own in self.columns]
+        found: FloatArray = sum(
+            product * row for product, row in zip(products, self.inverse, strict=True)
+        )
+        return found
+
+    def removed_from(self, values: FloatArray) -> FloatArray:
+        """What is left of values (q, 2, N)."""
+        spread = self.frames.spread(self.coefficients(values))
+        left: FloatArray = values - sum(
+            spread[:, i, None, :] * own for i, own in enumerate(self.columns)
+        )
+        return left
+
+    @cached_property
+    def orthonormal(self) -> FloatArray:
+        """Columns (c, 2, N) that span the same, orthonormal in every frame."""
+        root: FloatArray = np.asarray(np.linalg.cholesky(np.moveaxis(self.inverse, 2, 0)))
+        spread = self.frames.spread(np.moveaxis(root, 0, 2))
+        found: FloatArray = np.einsum("axn,abn->bxn", self.columns, spread, optimize=True)
+        return found
+
+
+def products_by_frame(frames: StarFrames, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Products (K, a, b) of columns (a, 2, N) and (b, 2, N) over the stars of each frame."""
+    return np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", one, other)), 2, 0)

@@ -1,0 +1,292 @@
+"""Terms of the residuals that are linear in the pixels and have a prior, and their elimination.
+
+A term shifts the images of a group of stars, such as those of one star, of one frame or of the
+whole run, by ``Z u`` with the same few coefficients u, which have variances `prior_scale` squared.
+In units of the noise the data then have the covariance
+
+    V = I + Z Lambda Z^T,   Lambda = prior_scale^2 / sigma^2.
+
+After the attitudes are projected out (P), products with W = V^-1 - V^-1 A (A^T V^-1 A)^-1 A^T V^-1
+need one system:
+
+    x^T W y = x^T (I-P) y - c_x^T G^-1 c_y,   c_x = Z^T (I-P) x,   G = Lambda^-1 + Z^T (I-P) Z.
+
+G couples groups that were seen together. Z^T Z is block-diagonal over groups and P over frames, so
+that either side can be eliminated; the smaller one is left over, and is solved as a sparse or a
+dense matrix. Residuals and columns are whitened: any weights and axes of the noise are in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
+from starcal_uq.observations.frames import StarFrames
+
+# A variance, in units of the noise, that is none.
+_NO_RATIO = 1e-10
+# Rows of a dense matrix, 400 MB; a larger one must have few entries, as frames all over the sky
+# give.
+_LARGEST, _THIN = 7000, 0.01
+# Share of entries from which a matrix is solved as a dense one.
+_FULL = 0.2
+_STARS_AT_ONCE = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """Shifts of the images that groups of stars share, linear in c coefficients of each of G
+    groups.
+    """
+
+    # `name`, `option`: its errors in words, and the setting that asks for them.
+    name: str
+    option: str
+    groups: IntArray  # (N,): group of every image, from 0
+    # (G, c): standard deviation of the coefficients before any data; infinite where they are free
+    prior_scale: FloatArray
+    # Whitened shifts (c, 2, n) of the images of some rows by coefficients of one, of the model of
+    # their frames.
+    columns: Callable[[MarginalLikelihood, Profile, slice], FloatArray]
+
+    def ratio(self, sigma: float) -> FloatArray:
+        """Variances (G c,) of the coefficients in units of `sigma` squared."""
+        return np.asarray((self.prior_scale / sigma) ** 2).ravel()
+
+    def shifts(
+        self, part: MarginalLikelihood, state: Profile, coefficients: FloatArray
+    ) -> FloatArray:
+        """Whitened shifts (q, 2, N) of all images by coefficients (G c, q)."""
+        z = self.columns(part, state, slice(None))
+        by_image = coefficients.reshape(*self.prior_scale.shape, -1)[self.groups]
+        return np.asarray(np.einsum("niq,ixn->qxn", by_image, z, optimize=True))
+
+
+def add_by_group(total: FloatArray, values: FloatArray, groups: IntArray) -> None:
+    """Add values (..., n) of images to the sums (G, ...) of their groups."""
+    if len(total) <= 4 * len(groups):
+        present, member = np.arange(len(total)), groups
+    else:
+        present, member = np.unique(groups, return_inverse=True)
+    rows = [np.bincount(member, row, len(present)) for row in values.reshape(-1, values.shape[-1])]
+    total[present] += np.stack(rows, axis=1).reshape(len(present), *values.shape[:-1])
+
+
+class TermSums:
+    """Sums over all images from which products with the covariance of a term follow."""
+
+    def __init__(self, term: Term) -> None:
+        self.term = term
+        self.n_groups, self.size = term.prior_scale.shape
+        self.own = np.zeros((self.n_groups, self.size, self.size))
+        self._cross: FloatArray | None = None
+        self._blocks: list[tuple[FloatArray, IntArray, IntArray]] = []
+        self._frames = 0
+
+    @property
+    def cross(self) -> FloatArray:
+        """``Z^T (I-P) X`` (G c, q) of the columns that were added."""
+        rows = self.n_groups * self.size
+        return np.zeros((rows, 0)) if self._cross is None else self._cross.reshape(rows, -1)
+
+    def add(
+        self, part: MarginalLikelihood, state: Profile, projected: FloatArray, rows: slice
+    ) -> None:
+        """Add frames, with columns (q, 2, n) whose attitudes are projected out."""
+        groups, z = self.term.groups[rows], self.term.columns(part, state, rows)
+        if self._cross is None:
+            self._cross = np.zeros((self.n_groups, self.size, len(projected)))
+        add_by_group(self.own, np.einsum("ixn,jxn->ijn", z, z), groups)
+        add_by_group(self._cross, np.einsum("ixn,qxn->iqn", z, projected), groups)
+        # P in the coordinates of the groups is the square of this.
+        block = np.einsum("ixn,bxn->nib", z, part.attitudes(state).orthonormal, optimize=True)
+        frame = self._frames + np.repeat(np.arange(part.frames.n_frames), part.frames.sizes)
+        self._blocks.append((block, groups, frame))
+        self._frames += part.frames.n_frames
+
+    def add_linearised(
+        self,
+        likelihood: MarginalLikelihood,
+        theta: FloatArray,
+        scale: FloatArray,
+        rotations: FloatArray | None,
+    ) -> FloatArray:
+        """Add all frames with the parameters in units of `scale` (p,) and the residuals; the Gram
+        matrix (p + 1, p + 1) of these comes back.
+        """
+        p = len(theta)
+        gram = np.zeros((p + 1, p + 1))
+        for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
+            h = part.derivatives(theta, state) * scale[:, None, None]
+            columns = part.project_out(state, np.concatenate([h, state.e[None]]))
+            flat = columns.reshape(p + 1, -1)
+            gram += flat @ flat.T
+            self.add(part, state, columns, rows)
+        return gram
+
+    @cached_property
+    def coupling(self) -> Any:
+        """``Z^T A (A^T A)^(-1/2)`` (G c, 3 K), sparse."""
+        from scipy.sparse import csr_array
+
+        block, groups, frames = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
+        rows = self.size * groups[:, None, None] + np.arange(self.size)[:, None]
+        columns = 3 * frames[:, None, None] + np.arange(3)
+        place = np.broadcast_arrays(rows, columns)
+        shape = (self.n_groups * self.size, 3 * self._frames)
+        return csr_array((block.ravel(), tuple(index.ravel() for index in place)), shape=shape)
+
+    @cached_property
+    def matrix(self) -> Any:
+        """``Z^T (I-P) Z`` (G c, G c), sparse."""
+        b = self.coupling
+        return (_block_diagonal(self.own) - b @ b.T).tocsr()
+
+    def eliminated(self, ratio: FloatArray) -> Eliminated:
+        """Eliminate coefficients of variances `ratio` (G c,), in units of sigma^2."""
+        return Eliminated(self, ratio)
+
+
+def _block_diagonal(blocks: FloatArray) -> Any:
+    """A block-diagonal matrix of blocks (G, c, c), sparse."""
+    from scipy.sparse import bsr_array
+
+    n, size, _ = blocks.shape
+    return bsr_array((blocks, np.arange(n), np.arange(n + 1)), shape=(size * n, size * n)).tocsr()
+
+
+def _factor(matrix: Any, term: Term) -> tuple[Callable[[FloatArray], FloatArray], float]:
+    """What solves with a sparse positive definite matrix, and the log of its determinant."""
+    from scipy.linalg import cho_factor, cho_solve
+    from scipy.sparse.linalg import splu
+
+    n = matrix.shape[0]
+    density = matrix.nnz / n**2
+    if n > _LARGEST and density > _THIN:
+        raise CalibrationError(
+            f"the {term.name} need a full matrix of {n} rows, and {_LARGEST} are possible: "
+            f"calibrate fewer frames, or leave {term.option} out."
+        )
+    if density > _FULL:
+        dense = cho_factor(matrix.toarray(), lower=True, overwrite_a=True, check_finite=False)
+        volume = 2.0 * float(np.sum(np.log(np.diag(dense[0]))))
+        return lambda columns: np.asarray(cho_solve(dense, columns, check_finite=False)), volume
+    sparse = splu(
+        matrix.tocsc(),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    volume = float(np.sum(np.log(np.abs(sparse.U.diagonal()))))
+    return lambda columns: np.asarray(sparse.solve(np.asfortranarray(columns))), volume
+
+
+class Eliminated:
+    """``G = Lambda^-1 + Z^T (I-P) Z`` with a factor of its smaller side, or of the groups' or the
+    frames'.
+    """
+
+    def __init__(self, sums: TermSums, ratio: FloatArray, by_group: bool | None = None) -> None:
+        from scipy.sparse import diags_array, eye_array
+
+        self._sums, self.ratio = sums, np.maximum(ratio, _NO_RATIO)
+        precision = 1.0 / self.ratio
+        b = sums.coupling
+        self._by_group = b.shape[0] <= b.shape[1] if by_group is None else by_group
+        log_own = 0.0
+        if self._by_group:
+            left = sums.matrix + diags_array(precision)
+        else:
+            own = sums.own + precision.reshape(-1, sums.size, 1) * np.eye(sums.size)
+            self._inverse: FloatArray = np.asarray(np.linalg.inv(own), dtype=np.float64)
+            log_own = float(np.sum(np.log(np.linalg.det(own))))
+            left = eye_array(b.shape[1]) - b.T @ self._own_solve(b)
+        self._solve, log_factor = _factor(left, sums.term)
+        # log |I + Lambda Z^T (I-P) Z|; of free coefficients, that of their own matrix.
+        finite = self.ratio[np.isfinite(self.ratio)]
+        self.log_determinant = log_factor + log_own + float(np.sum(np.log(finite)))
+
+    def _own_solve(self, values: Any) -> Any:
+        return _block_diagonal(self._inverse) @ values
+
+    def coefficients(self, cross: FloatArray) -> FloatArray:
+        """``G^-1 c`` (G c, q): best coefficients for ``c = Z^T (I-P) X``."""
+        if self._by_group:
+            return self._solve(cross)
+        b, first = self._sums.coupling, self._own_solve(cross)
+        return np.asarray(first + self._own_solve(b @ self._solve(b.T @ first)))
+
+    def correction(self) -> FloatArray:
+        """What the term takes off the Gram matrix (q, q) of the columns that were added."""
+        cross = self._sums.cross
+        taken = cross.T @ self.coefficients(cross)
+        return np.asarray(0.5 * (taken + taken.T))
+
+
+class TermLikelihood(MarginalLikelihood):
+    """Exact likelihood with a term marginalised, its prior in units of sigma.
+
+    Coefficients are linear over fractions of a pixel; they are the best ones of the estimate's
+    system, and the cost that they and the attitudes leave is that of these residuals. Beyond the
+    attitudes' volume, determinants do not depend on theta enough to matter (1e-3 nat).
+
+    `frames`: data, with any weights and axes of the noise.
+    `theta` (p,): estimate, px units.
+    `rotations` (K, 3, 3): attitudes there.
+    `sigma`: noise that the prior is relative to.
+    """
+
+    def __init__(
+        self,
+        frames: StarFrames,
+        model_name: str,
+        term: Term,
+        theta: FloatArray,
+        rotations: FloatArray,
+        sigma: float,
+    ) -> None:
+        super().__init__(frames, model_name)
+        state, _ = self.profile(theta, rotations)
+        self.use_rotations(state.rotations)
+        sums = TermSums(term)
+        sums.add(self, state, np.zeros((1, 2, self.frames.n_stars)), slice(None))
+        self.term, self._eliminated = term, sums.eliminated(term.ratio(sigma))
+
+    def conditioned(self, state: Profile, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Columns (q, 2, N) less what attitudes and coefficients take of them, and those
+        coefficients (G c, q).
+        """
+        projected = self.project_out(state, columns)
+        z, q = self.term.columns(self, state, slice(None)), len(columns)
+        cross = np.zeros((*self.term.prior_scale.shape, q))
+        add_by_group(cross, np.einsum("ixn,qxn->iqn", z, projected), self.term.groups)
+        found = self._eliminated.coefficients(cross.reshape(-1, q))
+        return projected - self.project_out(state, self.term.shifts(self, state, found)), found
+
+    def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
+        rest, coefficients = self.conditioned(state, columns)
+        scaled = coefficients / np.sqrt(self._eliminated.ratio)[:, None]
+        return np.concatenate([rest.reshape(len(columns), -1), scaled.T], axis=1)
+
+    def random_shifts(self, state: Profile, rng: np.random.Generator) -> FloatArray:
+        """Whitened shifts (1, 2, N) of all images by random coefficients, in units of sigma."""
+        drawn = np.sqrt(self._eliminated.ratio) * rng.standard_normal(len(self._eliminated.ratio))
+        return self.term.shifts(self, state, drawn[:, None])
+
+    def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
+        state, cost = self.profile(theta, self._rotations)
+        if not np.isfinite(cost):
+            return -np.inf
+        left = self.whitened(state, state.e[None])
+        return float(
+            -0.5 * np.sum(left**2) / sigma**2
+            - self.dof * np.log(sigma)
+            - 0.5 * np.sum(state.log_determinant)
+        )
