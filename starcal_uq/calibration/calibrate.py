@@ -24,6 +24,7 @@ from starcal_uq.estimation.fit import fit_composed
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.partitioned import calibrate_partitions
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.robust import with_tail_weights
 from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
 from starcal_uq.likelihood.loops import kernels
@@ -203,9 +204,11 @@ def _estimate(
         asked=settings.model is not None,
         throw=throw,
     )
-    if settings.composed.star_errors and calibration.status.ok:
-        return with_star_errors(weighed(obs, calibration), calibration)
-    return calibration
+    if not (settings.composed.star_errors and calibration.status.ok):
+        return calibration
+    if settings.composed.tails is not None:
+        calibration = with_tail_weights(weighed(obs, calibration), calibration)
+    return with_star_errors(weighed(obs, calibration), calibration)
 
 
 def _in_memory(

@@ -21,7 +21,7 @@ from starcal_uq.cli.options import (
     parse_start,
 )
 from starcal_uq.core import settings
-from starcal_uq.core.conflicts import conflict, typed
+from starcal_uq.core.conflicts import conflict, sampled_by_default, typed
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def settings_of(
         "partitioned": partitioned,
     }
     if sampling is not None:
-        settings["sampled"] = sampling.likelihood or settings.get("likelihood")
+        settings["sampled"] = sampling.likelihood or sampled_by_default(settings)
         settings["sampled_dof"] = sampling.dof
     return settings
 

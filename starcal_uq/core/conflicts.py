@@ -106,6 +106,13 @@ def parsed(words: Sequence[str]) -> tuple[list[str], Options]:
     return places, options
 
 
+def sampled_by_default(settings: Mapping[str, object]) -> object:
+    """The likelihood of the draws: that of the estimate, unless star errors give its stars known
+    weights.
+    """
+    return None if settings.get("star_errors") else settings.get("likelihood")
+
+
 def arguments_of(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:
     """Options as they are typed by the names that the rules have for them; a tuple where one is
     given several times.
@@ -122,7 +129,7 @@ def arguments_of(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:
 def named(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:
     """Options as they are typed for `conflict`: draws are of the likelihood of the estimate."""
     arguments = arguments_of(options)
-    return {"sampled": arguments.get("likelihood")} | arguments
+    return {"sampled": sampled_by_default(arguments)} | arguments
 
 
 def words_of(arguments: Mapping[str, Any]) -> list[str]:

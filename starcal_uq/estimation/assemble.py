@@ -177,12 +177,13 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
         )
     errors, sigma, spread = model.estimate(likelihood, cal.theta, cal.sigmas, cal.sigma)
     theta, covariance = cal.theta, cal.covariance
-    factors = np.ones(len(theta)) if cal.coma_factors is None else cal.coma_factors
+    factors = cal.width_factors
     trajectory, cost = [theta], []
     rotations = likelihood.rotations_at(theta)
     for _ in range(2):
         term = model.term(errors.tau_px)
         compressed = compress(likelihood, theta, covariance, rotations, term, sigma)
+        compressed = replace(compressed, dof=likelihood.dof)
         cost.append(float(compressed.gram[0, 0]))
         found = optimum(compressed)
         theta, covariance, sigma = found.theta, found.covariance, found.sigma

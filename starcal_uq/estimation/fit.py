@@ -23,7 +23,7 @@ from starcal_uq.estimation.assemble import (
     noise_px,
     raise_unless_good,
 )
-from starcal_uq.estimation.noise_model import NoiseModel, Refit, fit_noise
+from starcal_uq.estimation.noise_model import NoiseModel, Refit, fit_noise, fit_noise_of_tails
 from starcal_uq.estimation.result import Calibration, KeptFrames, check_camera
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
 from starcal_uq.estimation.settings import ITERATIONS, EstimationSettings
@@ -300,7 +300,7 @@ def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) ->
     """The noise model of stars whose residuals have tails: the scale of the t, as it varies."""
     nu = cal.provenance["settings"]["dof"]
 
-    def refit(frames: StarFrames, theta: FloatArray, turn: int) -> Refit | None:
+    def refit(frames: StarFrames, theta: FloatArray) -> Refit | None:
         found = refine(
             frames,
             cal.camera.distortion,
@@ -313,7 +313,7 @@ def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) ->
             return None
         return Refit(found.stage.theta, found.state.weight, found.nu)
 
-    return fit_noise(obs, cal.camera, max_iterations=max_iterations, refit=refit)[0]
+    return fit_noise_of_tails(obs, cal.camera, refit)
 
 
 def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:

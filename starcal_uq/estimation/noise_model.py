@@ -50,8 +50,8 @@ _NEWTON_STEPS, _LONGEST_STEP, _STEP_SETTLED = 50, 2.0, 1e-8
 _FRAME_LOG_DOF, _FRAME_LOG_DOF_START = (0.0, 9.0), 3.0
 # Correlations beyond leave the noise no second axis.
 _MOST_CORRELATED = 0.99
-# Relative precision of a star that has no say.
-_NO_SAY = 1e-9
+# Residuals that tails exceed with less probability than this are those of wrong stars.
+_WRONG_P = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,6 +240,18 @@ def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observa
     left_out = np.isin(obs.frame, result.provenance.get("dropped_frames", ()))
     if left_out.any():
         obs = obs.select(~left_out)
+    if "tail_weights" not in result.provenance:
+        return _by_noise_model(obs, result)
+    obs = _by_noise_model(obs.unweighted, result)
+    if len(getattr(result, "residuals_px", ())) != len(obs):
+        # Of a mission's stars no tails are known.
+        return obs
+    from starcal_uq.estimation.robust import tail_weighted
+
+    return tail_weighted(obs, result)
+
+
+def _by_noise_model(obs: Observations, result: Any) -> Observations:
     model = noise_model_of(result)
     if model is None or not model.varies:
         return obs if obs.stated_px is None else replace(obs, stated_px=None, noise_axes=None)
@@ -383,6 +395,39 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     )
 
 
+def fit_noise(
+    obs: Observations, camera: Camera, *, rounds: int = _ROUNDS, max_iterations: int = 200
+) -> tuple[NoiseModel, FloatArray]:
+    """Fit the noise model around an estimate, weights and estimate in turn until they settle.
+
+    `obs`: identified stars; a noise that they state is multiplied.
+    `rounds`: largest number of fits; with 1 the estimate stays where it is.
+    Returns the model, and the estimate (p,) with its weights.
+    """
+    obs, theta = obs.unweighted, camera.theta
+    plain = StarFrames.from_observations(obs)
+    variance, before = np.ones(obs.n_stars), np.ones(obs.n_stars)
+    found: _Round | None = None
+    for turn in range(rounds):
+        axes = None if found is None else found.model.axes
+        frames = replace(plain, weight=1.0 / (_stated(obs) * np.sqrt(variance)), axes=axes)
+        likelihood = MarginalLikelihood(frames, camera.distortion)
+        if turn > 0:
+            likelihood.use_rotations(likelihood.start_rotations(theta))
+            stage = refinement_stage(likelihood, theta, max_iterations)
+            if not stage.status.ok:
+                break
+            theta = stage.theta
+        last = found
+        found = _round(obs, camera.with_theta(theta), likelihood, variance, found)
+        variance = found.variance
+        if not found.model.varies or _settled(found, last, variance, before):
+            break
+        before = variance
+    assert found is not None
+    return found.model, theta
+
+
 class Refit(NamedTuple):
     """An estimate whose residuals have tails."""
 
@@ -391,68 +436,95 @@ class Refit(NamedTuple):
     dof: float  # Degrees of freedom of the tails
 
 
-def fit_noise(
+def fit_noise_of_tails(
     obs: Observations,
     camera: Camera,
-    *,
-    rounds: int = _ROUNDS,
-    max_iterations: int = 200,
-    refit: Callable[[StarFrames, FloatArray, int], Refit | None] | None = None,
-) -> tuple[NoiseModel, FloatArray]:
-    """Fit the noise model around an estimate, weights and estimate in turn until they settle.
+    refit: Callable[[StarFrames, FloatArray], Refit | None],
+) -> NoiseModel:
+    """Fit the noise model to the scale of tails.
 
-    `obs`: identified stars; a noise that they state is multiplied.
-    `rounds`: largest number of fits; with 1 the estimate stays where it is. `refit`: the estimate
-    with tails for stars of given weights, from theta (p,) in a turn; None where it is not found.
-    The model is then that of their scale: given its precision, a star is Gaussian, and the mean of
-    its weighted square is that of the scale.
-    Returns the model, and the estimate (p,) with its weights.
+    Given its precision, a star is Gaussian, and the mean of its weighted square is that of the
+    scale. Wrong stars, which no noise explains, say nothing of it. `obs`: identified stars. `refit`:
+    the estimate with tails for stars of given weights, from theta (p,); None where it is not found.
+    CalibrationError where it is not found at once.
     """
     obs, theta = obs.unweighted, camera.theta
-    plain = StarFrames.from_observations(obs)
-    stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
-    variance, before = np.ones(obs.n_stars), np.ones(obs.n_stars)
-    fit, model = _Fit((), np.zeros(1), np.zeros(1), None, np.ones(obs.n_frames)), None
-    precision, informed = np.ones(obs.n_stars), np.ones(obs.n_stars, dtype=np.bool_)
-    for turn in range(rounds):
-        weight = 1.0 / (stated * np.sqrt(variance))
-        frames = replace(plain, weight=weight, axes=None if model is None else model.axes)
-        if refit is not None:
-            again = refit(frames, theta, turn)
-            if again is None:
-                break
-            theta, informed = again.theta, again.weight > _NO_SAY
-            precision = np.sqrt(np.where(informed, again.weight, _NO_SAY))
-            frames = replace(frames, weight=weight * precision)
-        likelihood = MarginalLikelihood(frames, camera.distortion)
-        if turn > 0 and refit is None:
-            likelihood.use_rotations(likelihood.start_rotations(theta))
-            stage = refinement_stage(likelihood, theta, max_iterations)
-            if not stage.status.ok:
-                break
-            theta = stage.theta
-        squares, share = star_squares(likelihood, theta)
-        share = np.where(informed, share, _NO_SAY)
-        stars = _Stars.of(obs, camera.with_theta(theta), squares * variance, share)
-        # The first residuals come from wrong weights: terms are chosen again.
-        fit = (
-            _chosen(stars)
-            if turn < _CHOOSING_ROUNDS
-            else _fitted(stars, fit.terms, fit.frame_dof is not None)
-        )
-        variance = fit.variance(stars)
-        alike = MarginalLikelihood(
-            replace(plain, weight=precision / (stated * np.sqrt(variance))), camera.distortion
-        )
-        found = _model(obs, camera.with_theta(theta), stars, fit, axis_noise(alike, theta))
-        settled = model is not None and abs(found.axis_ratio / model.axis_ratio - 1.0) < _SETTLED
-        model = found
-        if not model.varies or (settled and np.max(np.abs(variance / before - 1.0)) < _SETTLED):
+    plain, sigma_px = StarFrames.from_observations(obs), _stated(obs)
+    found: _Round | None = None
+    for _ in range(_ROUNDS):
+        axes = None if found is None else found.model.axes
+        frames = replace(plain, weight=1.0 / sigma_px, axes=axes)
+        again = refit(frames, theta)
+        if again is None:
             break
-        before = variance
-    if model is None:
+        theta = again.theta
+        limit = again.dof * np.expm1(-2.0 * np.log(_WRONG_P) / again.dof)
+        right = again.weight > (again.dof + 2.0) / (again.dof + limit)
+        right &= frames.spread(frames.sum(right.astype(np.float64))) >= 3.0
+        part, weight = obs.select(right), np.sqrt(again.weight[right])
+        own = replace(frames.select(right), weight=weight / sigma_px[right])
+        likelihood = MarginalLikelihood(own, camera.distortion)
+        variance = (sigma_px[right] / _stated(part)) ** 2
+        last, before = found, sigma_px
+        found = _round(part, camera.with_theta(theta), likelihood, variance, last, weight)
+        sigma_px = found.model.sigma_px(obs)
+        if not found.model.varies or _settled(found, last, sigma_px**2, before**2):
+            break
+    if found is None:
         raise CalibrationError("how the noise varies cannot be fitted: leave noise='model' out.")
-    return model, theta
+    return found.model
+
+
+class _Round(NamedTuple):
+    """One regression."""
+
+    model: NoiseModel
+    fit: _Fit
+    variance: FloatArray  # (N,): of every star, in units of the stated one
+    number: int  # Of the regressions before
+
+
+def _round(
+    obs: Observations,
+    camera: Camera,
+    likelihood: MarginalLikelihood,
+    variance: FloatArray,
+    last: _Round | None,
+    precision: FloatArray | None = None,
+) -> _Round:
+    """The regression of residuals at the estimate of a camera, weighed with `variance` (N,) and,
+    relative to it, the square of `precision` (N,).
+    """
+    number = 0 if last is None else last.number + 1
+    squares, share = star_squares(likelihood, camera.theta)
+    stars = _Stars.of(obs, camera, squares * variance, share)
+    # The first residuals come from wrong weights: terms are chosen again.
+    fit = (
+        _chosen(stars)
+        if last is None or number < _CHOOSING_ROUNDS
+        else _fitted(stars, last.fit.terms, last.fit.frame_dof is not None)
+    )
+    variance = fit.variance(stars)
+    weight = 1.0 / (_stated(obs) * np.sqrt(variance))
+    if precision is not None:
+        weight = weight * precision
+    alike = MarginalLikelihood(
+        replace(likelihood.frames, weight=weight, axes=None), camera.distortion
+    )
+    model = _model(obs, camera, stars, fit, axis_noise(alike, camera.theta))
+    return _Round(model, fit, variance, number)
+
+
+def _settled(found: _Round, last: _Round | None, now: FloatArray, before: FloatArray) -> bool:
+    """Whether two regressions have nearly the same axes, and variances (N,)."""
+    if last is None or abs(found.model.axis_ratio / last.model.axis_ratio - 1.0) >= _SETTLED:
+        return False
+    return bool(np.max(np.abs(now / before - 1.0)) < _SETTLED)
+
+
+def _stated(obs: Observations) -> FloatArray:
+    """Noise (N,) that the stars state; 1 where they do not."""
+    return np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
 
 
 def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: float) -> FloatArray:

@@ -370,6 +370,34 @@ class Calibration(Shown):
         )
 
     @property
+    def tail_factors(self) -> FloatArray | None:
+        """Factors (p,) on the sigmas of stars whose weights are known, for weights that come from
+        the residuals themselves; None where there are none.
+        """
+        record = self.provenance.get("tail_weights")
+        if record is None:
+            return None
+        return np.array([record["factors"][name] for name in self.parameter_names])
+
+    @property
+    def width_factors(self) -> FloatArray:
+        """Factors (p,) on the sigmas of the likelihood that `covariance` holds, but for inflation."""
+        widths = np.ones(len(self.theta))
+        for factors in (self.coma_factors, self.tail_factors):
+            if factors is not None:
+                widths = widths * factors
+        return widths
+
+    @property
+    def sampled_likelihood(self) -> str:
+        """The likelihood by which a posterior is that of the estimate: ``marginal`` also where
+        stars have the weights of their tails.
+        """
+        if self.provenance.get("tail_weights"):
+            return "marginal"
+        return str(self.provenance.get("settings", {}).get("likelihood", "marginal"))
+
+    @property
     def n_stars(self) -> int:
         """Number of stars."""
         return (

@@ -7,14 +7,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import CompressedLikelihood, compress
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -27,8 +30,12 @@ from starcal_uq.likelihood.student import (
     StudentState,
     log_excess_prior,
 )
-from starcal_uq.maths.linear import unit_inverse
+from starcal_uq.maths.linear import scaled_inverse, unit_inverse
 from starcal_uq.observations.frames import StarFrames
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.result import Calibration
+    from starcal_uq.observations.table import Observations
 
 # A star whose angles to the others are this many times worse than the typical star's is left out of
 # the start.
@@ -39,6 +46,8 @@ _OPTICS_ROUNDS = 2
 _TRUSTED_SHARE = 0.5
 _PARTNERS, _STARS_AT_ONCE, _SEED = 400, 2000, 20170925
 _NEGLIGIBLE_WEIGHT = 1e-9
+# Stars in the field keep a say, however far they are off.
+_LEAST_WEIGHT, _NO_WEIGHT = 1e-7, 1e-18
 _MAX_STEPS = 60
 # Gains, nat, that are worth no further round: a thousandth of a standard deviation, and a two
 # hundredth for the noise.
@@ -370,3 +379,53 @@ def compress_reweighted(fit: RobustFit) -> CompressedLikelihood:
         replace(frames.select(remaining), weight=weight), fit.likelihood.model_name
     )
     return compress(likelihood, theta, fit.covariance, rotations)
+
+
+def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
+    """A calibration with tails whose stars keep the weights that these have at its estimate.
+
+    `weighed` gives the stars these weights, so that a Gaussian likelihood can take further parts.
+    Its sigmas are wider by `Calibration.tail_factors`: weights that follow the residuals tell less
+    than known ones, and the scatter of the stars' scores says by how much. `obs`: as `weighed`
+    gives them for the calibration.
+    """
+    record: AnyDict = {
+        "theta": cal.theta.tolist(),
+        "sigma": cal.sigma,
+        "dof": cal.provenance["student_t"]["dof"],
+    }
+    plain = dict.fromkeys(cal.parameter_names, 1.0)
+    known = replace(cal, provenance=cal.provenance | {"tail_weights": record | {"factors": plain}})
+    likelihood = MarginalLikelihood(tail_weighted(obs, known), cal.camera.distortion, axes=True)
+    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    normal = likelihood.evaluate(cal.theta)
+    sigma = float(np.sqrt(normal.cost / (likelihood.dof - len(cal.theta))))
+    alone = np.sqrt(np.diag(scaled_inverse(normal.matrix))) * sigma
+    wide = cal.sigmas if cal.coma_factors is None else cal.sigmas / cal.coma_factors
+    record["factors"] = dict(zip(cal.parameter_names, (wide / alone).tolist(), strict=True))
+    return replace(
+        cal,
+        sigma=sigma,
+        sigma_name=sigma_parameter(True).name,
+        provenance=cal.provenance | {"tail_weights": record},
+    )
+
+
+def tail_weighted(obs: Observations, cal: Calibration) -> Observations:
+    """Stars with the noise that the weights of a calibration's tails leave them, (N,) px.
+
+    `obs`: with the noise that the calibration has without them.
+    """
+    record, model = cal.provenance["tail_weights"], cal.camera.distortion
+    frames = StarFrames.from_observations(obs, axes=True)
+    likelihood = StudentLikelihood(
+        frames,
+        model,
+        np.array(record["theta"]),
+        quaternion_to_rotation(cal.quaternions),
+        usable_stars(frames, model, cal.pair_theta),
+    )
+    state = likelihood.state(np.array(record["theta"]), record["sigma"], record["dof"])
+    sigma_px = np.full(obs.n_stars, record["sigma"]) if obs.sigma_px is None else obs.sigma_px
+    weight = np.where(state.seen, np.maximum(state.weight, _LEAST_WEIGHT), _NO_WEIGHT)
+    return obs.weighted(sigma_px / np.sqrt(weight), obs.noise_axes)

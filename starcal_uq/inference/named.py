@@ -124,13 +124,12 @@ def find_source(
         at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
         return Source(label_of(likelihood), *at, exact=likelihood.log_likelihood, fast=None)
     source = _named_source(likelihood, obs, cal, dof)
-    if cal.inflation is not None or cal.coma_factors is not None:
-        unchanged = np.ones_like(cal.theta)
+    widths = cal.width_factors
+    if cal.inflation is not None or np.any(widths != 1.0):
         accepted = cal.inflation
         if accepted is not None and source.scatters:
-            accepted = unchanged
-        coma = unchanged if cal.coma_factors is None else cal.coma_factors
-        wider = _inflated(source, coma if accepted is None else coma * accepted)
+            accepted = np.ones_like(cal.theta)
+        wider = _inflated(source, widths if accepted is None else widths * accepted)
         source = replace(wider, inflation=accepted)
     if (ignored := _settings(cal).get("ignored_distortion")) is None:
         return source
@@ -235,7 +234,7 @@ def resolved_dof(cal: Calibration, dof: float | str | None) -> float | Literal["
 
 
 def _marginal(obs: Observations | None, cal: Calibration) -> Source:
-    if _settings(cal).get("likelihood") == "student_t":
+    if cal.sampled_likelihood == "student_t":
         raise SamplingError(
             "the calibration was made with likelihood='student_t': sample with the same, or "
             "calibrate again with "

@@ -80,7 +80,7 @@ class MarginalLikelihood:
     @property
     def dof(self) -> int:
         """Independent numbers in the data after the attitudes: ``sum_k (2 m_k - 3)``."""
-        return 2 * self.frames.n_stars - 3 * self.frames.n_frames
+        return 2 * self.frames.n_informed - 3 * self.frames.n_frames
 
     @property
     def kernels(self) -> str:

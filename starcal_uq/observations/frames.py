@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 
+_NOTHING = 1e-4
+
+
 @dataclass(frozen=True)
 class StarFrames:
     """Measured pixels (2, N), px, and unit vectors `r` (3, N), ICRS, contiguous by frame.
@@ -74,6 +77,13 @@ class StarFrames:
     def n_stars(self) -> int:
         """Number of stars over all frames."""
         return int(self.pixel.shape[1])
+
+    @cached_property
+    def n_informed(self) -> int:
+        """Number of stars that have a say: a weight is nothing beside one 10,000 times as large."""
+        if self.weight is None:
+            return self.n_stars
+        return int(np.count_nonzero(self.weight > _NOTHING * np.max(self.weight)))
 
     @property
     def n_frames(self) -> int:

@@ -13,7 +13,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from starcal_uq.core.conflicts import arguments_of, conflict, parsed, words_of
+from starcal_uq.core.conflicts import (
+    arguments_of,
+    conflict,
+    parsed,
+    sampled_by_default,
+    words_of,
+)
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, SITE, SOME_IMAGES, UTC, Near, Remedies, Remedy
 from starcal_uq.core.status import Check, Level
@@ -177,7 +183,7 @@ class Place:
         options = changed(given, asked)
         if any(options == one.options for one in self.tried):
             return f"{words} was tried already"
-        settings = {"sampled": options.get("likelihood")} | options
+        settings = {"sampled": sampled_by_default(options)} | options
         if rule := conflict(settings | {"partitioned": self.partitioned}):
             return (
                 f"the run was made with options that {words} excludes ({rule.name}, {rule.other})"

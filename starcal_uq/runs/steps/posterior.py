@@ -33,9 +33,7 @@ def sample(
     obs = run.observations if run._keeps_observations else None
     if options.get("likelihood") is None:
         # A calibration knows which likelihood its estimate maximises.
-        options["likelihood"] = run.calibration.provenance.get("settings", {}).get(
-            "likelihood", "marginal"
-        )
+        options["likelihood"] = run.calibration.sampled_likelihood
     checkpoint = run.folder.path / CHECKPOINT
     posterior = sample(obs, run.calibration, progress=progress, checkpoint=checkpoint, **options)
     with run._step(

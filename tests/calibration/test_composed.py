@@ -1,0 +1,108 @@
+"""Parts of a likelihood together: tails with noise that varies, and tails with errors of the stars.
+
+The sensor and its wrong identifications are made with NumPy alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.likelihood import Likelihood, StarDirections, StudentTails
+from tests.helpers.outside import campaign
+
+DRAWS = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 100, "n_burn": 30, "seed": 3}
+
+
+def worse_outside(radius, mag, frame):
+    """Three times the noise at the edge of the field."""
+    return 0.05 * (1.0 + 2.0 * (radius / 0.75) ** 4)
+
+
+def spoilt(seed, share=0.05, **options):
+    """A campaign with wrong identifications: a third anywhere, the others within 60 px."""
+    rng = np.random.default_rng([77, seed])
+    c = campaign(rng, **options)
+    columns = {name: np.array(values) for name, values in c.columns.items()}
+    n = len(columns["x_px"])
+    wrong = rng.choice(n, round(share * n), replace=False)
+    radius = 60.0 * np.sqrt(rng.uniform(0.01, 1.0, len(wrong)))
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(wrong))
+    columns["x_px"][wrong] += radius * np.cos(angle)
+    columns["y_px"][wrong] += radius * np.sin(angle)
+    far = wrong[: len(wrong) // 3]
+    for name in ("ra_deg", "dec_deg"):
+        columns[name][far] = rng.permutation(columns[name][far])
+    obs = sc.Observations(**columns, meta={"directions": "apparent"})
+    return c, obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+
+
+def uneven(seed, **options):
+    return spoilt(seed, **({"n_frames": 40, "sigma_px": worse_outside} | options))
+
+
+def starred(seed):
+    return spoilt(seed, n_frames=60, patch_stars=40, star_sigma_px=0.1)
+
+
+def test_tails_and_noise_that_varies_go_together():
+    _, obs, camera = uneven(1)
+    cal = sc.calibrate(obs, camera, likelihood="student_t", noise="model")
+    alone = sc.calibrate(obs, camera, likelihood="student_t")
+    assert "radius" in cal.noise_model.terms and cal.noise_model.frame_dof is None
+    assert np.all(cal.sigmas[2:] < 0.93 * alone.sigmas[2:]) and cal.sigma_name == "sigma_scale"
+    composed = Likelihood("model", StudentTails())
+    again = sc.calibrate(obs, camera, likelihood=composed)
+    assert np.array_equal(again.theta, cal.theta)
+    assert again.provenance["settings"] == cal.provenance["settings"]
+    assert cal.sampled_likelihood == "student_t"
+    # The control: without tails the wrong stars spoil the fit.
+    with pytest.raises(sc.errors.CalibrationError, match="do not fit the others"):
+        sc.calibrate(obs, camera, noise="model")
+
+
+def test_even_noise_with_tails_stays_even():
+    _, obs, camera = uneven(2, sigma_px=0.05)
+    cal = sc.calibrate(obs, camera, likelihood="student_t", noise="model")
+    alone = sc.calibrate(obs, camera, likelihood="student_t")
+    assert not cal.noise_model.varies and np.array_equal(cal.theta, alone.theta)
+
+
+def test_tails_and_errors_of_the_stars_go_together():
+    c, obs, camera = starred(1)
+    cal = sc.calibrate(obs, camera, likelihood="student_t", star_errors=True)
+    composed = Likelihood(tails=StudentTails(), terms=(StarDirections(),))
+    assert np.array_equal(sc.calibrate(obs, camera, likelihood=composed).theta, cal.theta)
+    assert abs(cal.star_errors.tau_px - 0.1) < 3.0 * cal.star_errors.tau_px_std
+    assert np.all(np.abs(cal.theta - c.theta) < 3.0 * cal.sigmas)
+    assert np.all(cal.tail_factors >= 1.0) and cal.residuals_px.shape == (obs.n_stars, 2)
+    # Weights are the same whenever they are taken, and wrong stars have hardly any.
+    seen = weighed(obs, cal)
+    assert np.array_equal(weighed(seen, cal).sigma_px, seen.sigma_px)
+    right = np.hypot(*cal.residuals_px.T) < 5.0
+    assert np.min(seen.sigma_px[~right]) > 5.0 * np.median(seen.sigma_px[right])
+    post = sc.sample(obs, cal, **DRAWS)
+    assert np.allclose(np.std(post.draws[:, :5], axis=0), cal.sigmas, rtol=0.3)
+    # The control: without tails the wrong stars are errors of the stars or noise.
+    gaussian = sc.calibrate(obs, camera, star_errors=True, throw=False)
+    assert gaussian.sigmas[2] > 5.0 * cal.sigmas[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("made", "options"), [(uneven, {"noise": "model"}), (starred, {"star_errors": True})]
+)
+def test_intervals_of_parts_together_hold(made, options):
+    """Of 24 campaigns; the control has the tails alone."""
+    z, plain = [], []
+    for seed in range(24):
+        c, obs, camera = made(100 + seed)
+        for kept, parts in ((z, options), (plain, {})):
+            cal = sc.calibrate(obs, camera, likelihood="student_t", **parts)
+            kept.append((cal.theta - c.theta) / cal.sigmas)
+    coverage, control = (np.mean(np.abs(np.array(kept)) < 1.96) for kept in (z, plain))
+    assert coverage > 0.88, coverage
+    if "star_errors" in options:
+        assert control < 0.87, control
