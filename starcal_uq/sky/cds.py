@@ -8,6 +8,7 @@ Where that is not at hand, the description of the few needed columns below is us
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +18,7 @@ import numpy as np
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import reading, unpack
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.sky.catalogue import StarCatalogue
 
 CdsFormat = Literal["hipparcos", "sao", "bsc"]
@@ -128,8 +129,9 @@ _LAYOUTS: dict[str, _Layout] = {
 }
 # Labels that other editions of a ReadMe use.
 _OTHER_LABELS = {"RAdeg": "RAICRS", "DEdeg": "DEICRS"}
+# Place, width and label of a column.
 _COLUMN = re.compile(
-    r"\s*(?P<bytes>(\d+\s*-)?\s*\d+)\s+(?P<kind>[AIFED])(?P<width>\d+)\S*\s+(?P<unit>\S+)\s+(?P<label>\S+)(\s|$)"
+    r"^\s*((?:\d+\s*-)?\s*\d+)\s+[AIFED](\d+)\S*\s+\S+\s+(\S+)(?=\s|$)", re.MULTILINE
 )
 _FAINTEST_BELIEVABLE = 90.0
 
@@ -142,45 +144,37 @@ def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
     else the published layout.
     """
     layout = _LAYOUTS[kind]
-    lines = _text(path).split("\n")
-    kept = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    kept = [(n, line) for n, line in enumerate(_text(path).split("\n"), 1) if line.strip()]
     if not kept:
         raise CatalogueError(f"{path}: is empty; give the data file of {layout.title}.")
-    rows = _Rows(path, layout, np.array([number for number, _ in kept]), {})
-    description = _description(path, layout, readme)
-    rows.columns.update(_parse(rows, description, [line for _, line in kept]))
+    line_numbers, lines = zip(*kept, strict=True)
+    rows = _Rows(path, layout, line_numbers, _cells(_description(path, layout, readme), lines))
 
-    present = rows.present(layout.ra) & rows.present(layout.dec)
+    ra, dec = rows.angle(layout.ra) * 15.0 ** (len(layout.ra) > 1), rows.angle(layout.dec)
+    number, mag, pm_ra, pm_dec = map(rows.numbers, (layout.number, layout.mag, *layout.pm))
+    present = np.isfinite(ra) & np.isfinite(dec)
     if layout.deleted is not None:
-        present &= rows.columns[layout.deleted] != "D"
-    nameless = np.flatnonzero(present & ~np.isfinite(rows.columns[layout.number]))
-    if len(nameless):
-        raise rows.fail(int(nameless[0]), layout.number, "has no value")
+        present &= rows.cells[layout.deleted] != "D"
+    rows.refuse(layout.number, present & ~np.isfinite(number), lambda row: "has no value")
     if not present.any():
         raise CatalogueError(
             f"{path}: no line holds a position where {layout.title} has it; check the format."
         )
-    ra, dec = (
-        rows.angle(layout.ra, present) * (15.0 if len(layout.ra) > 1 else 1.0),
-        rows.angle(layout.dec, present),
-    )
+    for label in (*layout.ra[1:], *layout.dec[2:]):
+        rows.check_range(label, rows.numbers(label), 0.0, 60.0, present)
     rows.check_range(layout.ra[0], ra, 0.0, 360.0, present)
     rows.check_range(layout.dec[-min(3, len(layout.dec))], dec, -90.0, 90.0, present)
-    ra, dec = ra[present], dec[present]
-    pm_ra, pm_dec = (rows.columns[label][present] for label in layout.pm)
+    ra, dec, pm_ra, pm_dec = ra[present], dec[present], pm_ra[present], pm_dec[present]
     known = np.isfinite(pm_ra) & np.isfinite(pm_dec)
     pm_ra, pm_dec = np.where(known, pm_ra, 0.0), np.where(known, pm_dec, 0.0)
     if kind != "hipparcos":
         ra, dec, pm_ra, pm_dec = _fk5_to_icrs(ra, dec, pm_ra, pm_dec, layout.pm_ra_in_seconds)
     left_out = int((~present).sum())
     return StarCatalogue(
-        star_id=np.array(
-            [f"{layout.prefix} {n:.0f}" for n in rows.columns[layout.number][present]],
-            dtype=np.str_,
-        ),
+        star_id=np.array([f"{layout.prefix} {n:.0f}" for n in number[present]], dtype=np.str_),
         ra_deg=ra,
         dec_deg=dec,
-        mag=rows.columns[layout.mag][present],
+        mag=np.where(mag > _FAINTEST_BELIEVABLE, np.nan, mag)[present],
         pm_ra_mas_yr=np.where(known, pm_ra, 0.0),
         pm_dec_mas_yr=np.where(known, pm_dec, 0.0),
         has_proper_motion=known,
@@ -194,134 +188,95 @@ def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Columns by the labels of the layout: floats with NaN for blanks, or text; with what error
-    messages need.
-    """
+    """Cells by the labels of the layout, with what error messages need."""
 
     path: Path
     layout: _Layout
-    line_numbers: IntArray
-    columns: dict[str, Any]
+    line_numbers: Sequence[int]
+    cells: dict[str, Any]
 
-    def fail(self, row: int, label: str, what: str) -> CatalogueError:
-        return CatalogueError(
-            f"{self.path}, line {self.line_numbers[row]}, column {label!r}: {what}; correct or "
-            "remove the line, or "
-            f"check that the file is {self.layout.title}."
-        )
+    def numbers(self, label: str) -> FloatArray:
+        """A column as numbers, NaN where it is blank."""
+        values = np.full(len(self.line_numbers), np.nan)
+        for row in np.flatnonzero(self.cells[label] != ""):
+            cell = str(self.cells[label][row])
+            try:
+                values[row] = float(cell)
+            except ValueError:
+                raise self.fail(int(row), label, f"{cell!r} is not a number") from None
+        return values
 
-    def present(self, labels: tuple[str, ...]) -> BoolArray:
-        """Whether every number of an angle is there."""
-        numbers = [self.columns[label] for label in labels if not label.endswith("-")]
-        finite: BoolArray = np.isfinite(np.array(numbers)).all(axis=0)
-        return finite
-
-    def angle(self, labels: tuple[str, ...], present: BoolArray) -> FloatArray:
+    def angle(self, labels: tuple[str, ...]) -> FloatArray:
         """Hours or degrees from one label, or from sexagesimal parts with an optional sign, shape
         (n,).
         """
         sign = np.ones(len(self.line_numbers))
         if labels[0].endswith("-"):
             # The sign stands in a column of its own, which keeps it for declinations of -00.
-            sign = np.where(self.columns[labels[0]] == "-", -1.0, 1.0)
-            labels = labels[1:]
+            sign, labels = np.where(self.cells[labels[0]] == "-", -1.0, 1.0), labels[1:]
         total = np.zeros(len(sign))
         for place, label in enumerate(labels):
-            part: FloatArray = self.columns[label]
-            if place:
-                self.check_range(label, part, 0.0, 60.0, present)
-            total += part / 60.0**place
+            total += self.numbers(label) / 60.0**place
         return sign * total
 
     def check_range(
         self, label: str, values: FloatArray, low: float, high: float, present: BoolArray
     ) -> None:
-        bad = np.flatnonzero(present & ~((values >= low) & (values <= high)))
-        if len(bad):
-            raise self.fail(
-                int(bad[0]), label, f"{values[bad[0]]:g} is outside [{low:g}, {high:g}]"
-            )
+        bad = present & ~((values >= low) & (values <= high))
+        self.refuse(label, bad, lambda row: f"{values[row]:g} is outside [{low:g}, {high:g}]")
+
+    def refuse(self, label: str, bad: BoolArray, what: Callable[[int], str]) -> None:
+        """Refuse the first of the rows that are bad, where there is one."""
+        if bad.any():
+            raise self.fail(int(bad.argmax()), label, what(int(bad.argmax())))
+
+    def fail(self, row: int, label: str, what: str) -> CatalogueError:
+        return CatalogueError(
+            f"{self.path}, line {self.line_numbers[row]}, column {label!r}: {what}; correct or "
+            f"remove the line, or check that the file is {self.layout.title}."
+        )
 
 
-def _parse(rows: _Rows, description: list[str], lines: list[str]) -> dict[str, Any]:
-    """The needed columns through astropy's reader, named by the labels of the layout."""
+def _cells(description: list[str], lines: Sequence[str]) -> dict[str, Any]:
+    """The needed columns as text, through astropy's reader, named by the labels of the layout."""
     with extra("images", "catalogue files"):
         from astropy.io import ascii
 
     # A list is read with the description at its head, whatever the file is called and however it is
     # compressed.
-    reader = ascii.get_reader(ascii.Cds)
-    try:
-        table = reader.read([*description, *lines])
-    except Exception as error:  # of whatever kind: the cell is looked for
-        raise _locate(rows, reader, error) from error
-    columns = {label: _plain(table[label]) for label in rows.layout.labels}
-    magnitudes = columns[rows.layout.mag]
-    magnitudes[magnitudes > _FAINTEST_BELIEVABLE] = np.nan
-    return columns
-
-
-def _locate(rows: _Rows, reader: Any, error: Exception) -> CatalogueError:
-    """The error for the first cell that is not the number which its column should hold."""
-    for column in reader.header.cols:
-        if column.name.endswith("-") or column.name == rows.layout.deleted:
-            continue
-        for row, cell in enumerate(getattr(column, "str_vals", [])):
-            text = str(cell).strip()
-            if not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([EeDd][+-]?\d+)?|nan|", text):
-                return rows.fail(row, column.name, f"{text!r} is not a number")
-    reason = " ".join(str(error).split()).rstrip(".")
-    return CatalogueError(
-        f"{rows.path}: cannot be read as {rows.layout.title} ({reason}); check the format."
-    )
-
-
-def _plain(column: Any) -> Any:
-    """Text as stripped str, numbers as floats with NaN for masked cells."""
-    if column.dtype.kind in "iuf":
-        return np.ma.filled(np.ma.asarray(column, dtype=np.float64), np.nan)
-    return np.char.strip(np.ma.filled(np.ma.asarray(column).astype(str), ""))
+    table = ascii.get_reader(ascii.Cds).read([*description, *lines])
+    return {
+        name: np.char.strip(np.ma.filled(np.ma.asarray(table[name]).astype(str), ""))
+        for name in table.colnames
+    }
 
 
 def _description(path: Path, layout: _Layout, readme: Path | None) -> list[str]:
     """Lines of a byte-by-byte description that holds the needed columns."""
     beside = path.parent / "ReadMe"
-    source = readme if readme is not None else beside if beside.is_file() else None
-    if source is not None:
-        for section in _text(source).split(_MARK)[1:]:
-            needed = _needed(section, layout)
-            if needed is not None:
-                return needed
-        if readme is not None:
-            raise CatalogueError(
-                f"{readme}: does not describe {layout.title}; leave it out or give its own."
-            )
-    published = _needed(layout.description, layout)
-    if published is None:
-        raise CatalogueError(f"{path}: the layout of {layout.title} is not known; give its ReadMe.")
-    return published
+    source = beside if readme is None and beside.is_file() else readme
+    sections = [] if source is None else _text(source).split(_MARK)[1:]
+    found = next(filter(None, (_needed(section, layout) for section in sections)), None)
+    if found is None and readme is not None:
+        raise CatalogueError(
+            f"{readme}: does not describe {layout.title}; leave it out or give its own."
+        )
+    return found or _needed(layout.description, layout) or []
 
 
 def _needed(section: str, layout: _Layout) -> list[str] | None:
     """A description of the needed columns only, under the labels of the layout; None if the section
     lacks one.
 
-    In it, every number may be blank. The ReadMe files say so as "*?" or "?Hours", which astropy's
-    reader takes for a number that is never blank, or for one whose blank is written "Hours". Fewer
-    columns are also read faster.
+    In it, every column is text, because the ReadMe files say that a number may be blank as "*?" or
+    "?Hours", which astropy's reader takes for a number that is never blank, or for one whose blank
+    is written "Hours". Fewer columns are also read faster.
     """
     lines: dict[str, str] = {}
-    for line in section.split("\n"):
-        match = _COLUMN.match(line)
-        if match is None:
-            continue
-        label = _OTHER_LABELS.get(match["label"], match["label"])
-        if label in layout.labels and label not in lines:
-            is_text = match["kind"] == "A"
-            kind, note = ("A", "-") if is_text else ("F", "? -")
-            lines[label] = (
-                f"{match['bytes']:>8}  {kind}{match['width']}  {match['unit']}  {label}  {note}"
-            )
+    for place, width, found in _COLUMN.findall(section):
+        label = _OTHER_LABELS.get(found, found)
+        if label in layout.labels:
+            lines.setdefault(label, f"{place:>8}  A{width}  ---  {label}  -")
     if len(lines) < len(layout.labels):
         return None
     head = "   Bytes Format Units   Label    Explanations"
