@@ -30,7 +30,7 @@ from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.settings import PROBABILITY
+from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_toml
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
@@ -190,7 +190,7 @@ def _read(data: Any, where: str, section: Section) -> AnyDict:
 
 def checked_confidence(value: float, where: str) -> float:
     """A confidence between 0 and 1, or a `BudgetError`."""
-    if not PROBABILITY.holds(value):
+    if not KEYS["probability"].holds(value):
         hint = f"; write {value / 100:g} for {value:g} %" if 1.0 < value < 100.0 else ""
         raise BudgetError(
             f"{where} is {value!r}, but a confidence lies between 0 and 1, such as 0.997{hint}."

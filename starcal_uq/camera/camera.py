@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starcal_uq.camera.distortion import get_model, model_names, parameter_names
-from starcal_uq.camera.formats import ENDINGS, read_pinhole
+from starcal_uq.camera.formats import read_pinhole
 from starcal_uq.camera.opencv import from_opencv, to_opencv
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
@@ -271,7 +271,7 @@ class Camera(Shown):
             If the file cannot be read or its content does not fit; the message names file, key and
             remedy.
         """
-        if os.fspath(path).endswith((*ENDINGS.values(), ".yml")):
+        if os.fspath(path).endswith((".yaml", ".yml", ".cameramodel")):
             return cls._of_others(path)
         return cls(
             **_checked(read_section(path, "camera", CameraError), f"{path}, section [camera]")

@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.camera.formats import ENDINGS, KEPT, Pinhole, write_pinhole
+from starcal_uq.camera.formats import TEXT_FORMATS, Pinhole, write_pinhole
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CameraError
 from starcal_uq.core.extras import extra
@@ -137,22 +138,14 @@ def _said(error: float, what: str) -> str:
     )
 
 
-def _pinhole_file(to: str, what: str) -> Callable[[Camera, Path], tuple[float, str]]:
-    def write(camera: Camera, path: Path) -> tuple[float, str]:
-        held, error = _held(camera, KEPT[to])
-        matrix, coefficients = held.to_opencv() if any(held.coefficients) else _bare(held)
-        plain = Pinhole(
-            held.width_px, held.height_px, matrix, coefficients, held.pixel_um, held.name
-        )
-        path.write_text(write_pinhole(plain, to), encoding="utf-8")
-        return error, _said(error, what)
-
-    return write
-
-
-def _bare(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """OpenCV's terms of a camera without distortion, of whatever model."""
-    return camera.replace(distortion="none", coefficients=()).to_opencv()
+def _pinhole_file(to: str, camera: Camera, path: Path) -> tuple[float, str]:
+    held, error = _held(camera, TEXT_FORMATS[to].kept)
+    # OpenCV has terms for a camera without distortion, of whatever model.
+    bare = held if any(held.coefficients) else held.replace(distortion="none", coefficients=())
+    size = held.width_px, held.height_px
+    plain = Pinhole(*size, *bare.to_opencv(), held.pixel_um, held.name)
+    path.write_text(write_pinhole(plain, to), encoding="utf-8")
+    return error, _said(error, TEXT_FORMATS[to].title)
 
 
 def _tetra3rs(camera: Camera, path: Path) -> tuple[float, str]:
@@ -223,19 +216,15 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
     ideal = camera.focal_px * seen[:, :2] / seen[:, 2:]
     scale = camera.corner_radius_px
     header = fits.Header()
-    header["WCSAXES"], header["IMAGEW"], header["IMAGEH"] = 2, camera.width_px, camera.height_px
+    header.update(WCSAXES=2, IMAGEW=camera.width_px, IMAGEH=camera.height_px)
     sides = (("RA---TAN-SIP", camera.x0_px), ("DEC--TAN-SIP", camera.y0_px))
     for axis, (kind, centre) in enumerate(sides, 1):
-        header[f"CTYPE{axis}"], header[f"CRPIX{axis}"], header[f"CRVAL{axis}"] = (
-            kind,
-            centre + 1.0,
-            0.0,
-        )
-        header[f"CUNIT{axis}"] = "deg"
         # x and y of a pixel run against right ascension and declination for who looks at the sky
         # from within.
-        header[f"CD{axis}_{axis}"] = -np.degrees(1.0 / camera.focal_px)
-        header[f"CD{axis}_{3 - axis}"] = 0.0
+        step = -np.degrees(1.0 / camera.focal_px)
+        own = {"CTYPE": kind, "CRPIX": centre + 1.0, "CRVAL": 0.0, "CUNIT": "deg"}
+        header.update({f"{name}{axis}": value for name, value in own.items()})
+        header.update({f"CD{axis}_{axis}": step, f"CD{axis}_{3 - axis}": 0.0})
     worst = 0.0
     for names, start, end in ((("A", "B"), measured, ideal), (("AP", "BP"), ideal, measured)):
         order, coefficients, error = _polynomial(start / scale, (end - start) / scale, scale)
@@ -297,10 +286,9 @@ class CameraFormat:
 
 
 CAMERA_FORMATS = {
-    "opencv": CameraFormat(ENDINGS["opencv"], _pinhole_file("opencv", "OpenCV")),
-    "ros": CameraFormat(ENDINGS["ros"], _pinhole_file("ros", "ROS camera_info")),
-    "kalibr": CameraFormat(ENDINGS["kalibr"], _pinhole_file("kalibr", "Kalibr")),
-    "mrcal": CameraFormat(ENDINGS["mrcal"], _pinhole_file("mrcal", "mrcal")),
+    name: CameraFormat(form.ending, partial(_pinhole_file, name))
+    for name, form in TEXT_FORMATS.items()
+} | {
     "tetra3rs": CameraFormat(".bin", _tetra3rs),
     "tetra3": CameraFormat(".json", _tetra3),
     "sip": CameraFormat(".hdr", _sip),

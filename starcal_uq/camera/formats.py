@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,10 +21,6 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray
 
-# What each of them keeps of k1, k2, p1, p2, k3.
-_ALL = ("k1", "k2", "p1", "p2", "k3")
-KEPT = {"opencv": _ALL, "ros": _ALL, "mrcal": _ALL, "kalibr": _ALL[:4]}
-ENDINGS = {"opencv": ".yaml", "ros": ".yaml", "kalibr": ".yaml", "mrcal": ".cameramodel"}
 _PITCH = re.compile(r"^\s*# pixel_um: (\S+)\s*$", re.MULTILINE)
 
 
@@ -44,62 +40,128 @@ class Pinhole:
     name: str = ""
 
 
+@dataclass(frozen=True)
+class TextFormat:
+    """How a program writes a camera: its name, the ending of its files, what they keep of k1, k2,
+    p1, p2, k3, and their text.
+    """
+
+    title: str
+    ending: str
+    kept: tuple[str, ...]
+    text: str
+
+
+_ALL = ("k1", "k2", "p1", "p2", "k3")
+TEXT_FORMATS = {
+    "opencv": TextFormat(
+        "OpenCV",
+        ".yaml",
+        _ALL,
+        """\
+%YAML:1.0
+---
+{pitch}camera_name: "{name}"
+image_width: {width}
+image_height: {height}
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ {f}, 0.0, {x0}, 0.0, {f}, {y0}, 0.0, 0.0, 1.0 ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ {terms} ]
+""",
+    ),
+    "ros": TextFormat(
+        "ROS camera_info",
+        ".yaml",
+        _ALL,
+        """\
+{pitch}image_width: {width}
+image_height: {height}
+camera_name: "{name}"
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [{f}, 0.0, {x0}, 0.0, {f}, {y0}, 0.0, 0.0, 1.0]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [{terms}]
+rectification_matrix:
+  rows: 3
+  cols: 3
+  data: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [{f}, 0.0, {x0}, 0.0, 0.0, {f}, {y0}, 0.0, 0.0, 0.0, 1.0, 0.0]
+""",
+    ),
+    "kalibr": TextFormat(
+        "Kalibr",
+        ".yaml",
+        _ALL[:4],
+        """\
+{pitch}cam0:
+  camera_model: pinhole
+  intrinsics: [{f}, {f}, {x0}, {y0}]
+  distortion_model: radtan
+  distortion_coeffs: [{terms}]
+  resolution: [{width}, {height}]
+  rostopic: /cam0/image_raw
+""",
+    ),
+    "mrcal": TextFormat(
+        "mrcal",
+        ".cameramodel",
+        _ALL,
+        """\
+{pitch}{{
+    'lensmodel': 'LENSMODEL_OPENCV5',
+
+    # fx, fy, cx, cy, k1, k2, p1, p2, k3
+    'intrinsics': [{f}, {f}, {x0}, {y0}, {terms}],
+
+    'extrinsics': [0, 0, 0, 0, 0, 0],
+
+    'imagersize': [{width}, {height}],
+}}
+""",
+    ),
+}
+
+
 def write_pinhole(camera: Pinhole, to: str) -> str:
-    """Content of a file in the format of ``opencv``, ``ros``, ``kalibr`` or ``mrcal``."""
-    f, x0, y0 = (repr(float(camera.matrix[i])) for i in ((0, 0), (0, 2), (1, 2)))
-    width, height, d = (
-        camera.width_px,
-        camera.height_px,
-        [repr(float(value)) for value in camera.dist_coeffs],
+    """Content of a file in one of the `TEXT_FORMATS`."""
+    form = TEXT_FORMATS[to]
+    matrix, terms = camera.matrix.tolist(), camera.dist_coeffs[: len(form.kept)].tolist()
+    return form.text.format(
+        pitch="" if camera.pixel_um is None else f"# pixel_um: {camera.pixel_um!r}\n",
+        # A name is free text; these files get what cannot end a line or a quotation.
+        name=re.sub(r"[^\w .+-]", "_", camera.name, flags=re.ASCII) or "star_camera",
+        width=camera.width_px,
+        height=camera.height_px,
+        f=matrix[0][0],
+        x0=matrix[0][2],
+        y0=matrix[1][2],
+        terms=", ".join(map(repr, terms)),
     )
-    matrix = f"{f}, 0.0, {x0}, 0.0, {f}, {y0}, 0.0, 0.0, 1.0"
-    pitch = "" if camera.pixel_um is None else f"# pixel_um: {camera.pixel_um!r}\n"
-    # A name is free text; these files get what cannot end a line or a quotation.
-    name = re.sub(r"[^\w .+-]", "_", camera.name, flags=re.ASCII) or "star_camera"
-    if to == "opencv":
-        return (
-            f'%YAML:1.0\n---\n{pitch}camera_name: "{name}"\nimage_width: {width}\nimage_height: '
-            f"{height}\n"
-            f"camera_matrix: {_opencv_matrix(3, 3, matrix)}distortion_coefficients: "
-            f"{_opencv_matrix(1, 5, ', '.join(d))}"
-        )
-    if to == "ros":
-        return (
-            f'{pitch}image_width: {width}\nimage_height: {height}\ncamera_name: "{name}"\n'
-            f"camera_matrix:\n{_ros_matrix(3, 3, matrix)}distortion_model: plumb_bob\n"
-            f"distortion_coefficients:\n{_ros_matrix(1, 5, ', '.join(d))}"
-            f"rectification_matrix:\n{_ros_matrix(3, 3, '1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0')}"
-            f"projection_matrix:\n"
-            f"{_ros_matrix(3, 4, f'{f}, 0.0, {x0}, 0.0, 0.0, {f}, {y0}, 0.0, 0.0, 0.0, 1.0, 0.0')}"
-        )
-    if to == "kalibr":
-        return (
-            f"{pitch}cam0:\n  camera_model: pinhole\n  intrinsics: [{f}, {f}, {x0}, {y0}]\n"
-            f"  distortion_model: radtan\n  distortion_coeffs: [{', '.join(d[:4])}]\n"
-            f"  resolution: [{width}, {height}]\n  rostopic: /cam0/image_raw\n"
-        )
-    return (
-        f"{pitch}{{\n    'lensmodel': 'LENSMODEL_OPENCV5',\n\n    # fx, fy, cx, cy, k1, k2, p1, "
-        "p2, k3\n"
-        f"    'intrinsics': [{', '.join([f, f, x0, y0, *d])}],\n\n    'extrinsics': [0, 0, 0, 0, "
-        "0, 0],\n\n"
-        f"    'imagersize': [{width}, {height}],\n}}\n"
-    )
-
-
-def _opencv_matrix(rows: int, columns: int, data: str) -> str:
-    return f"!!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {data} ]\n"
-
-
-def _ros_matrix(rows: int, columns: int, data: str) -> str:
-    return f"  rows: {rows}\n  cols: {columns}\n  data: [{data}]\n"
 
 
 def read_pinhole(text: str) -> Pinhole:
     """What a file of any of the four holds; ValueError says what else its text is."""
-    pitch = _PITCH.search(text)
-    content = _content(text)
-    read = _reader(content)
+    pitch, content = _PITCH.search(text), _content(text)
+    read = next((reader for key, reader in _READERS.items() if key in content), None)
+    if read is None:
+        raise ValueError(
+            "it has none of camera_matrix (OpenCV, ROS), cam0 (Kalibr) and lensmodel (mrcal)"
+        )
     width, height, name, intrinsics, coefficients = read(content)
     numbers = [*intrinsics, *coefficients]
     if not all(
@@ -133,18 +195,6 @@ def _content(text: str) -> Mapping[str, Any]:
     if not isinstance(content, Mapping):
         raise ValueError("it is no table of keys")
     return content
-
-
-def _reader(content: Mapping[str, Any]) -> Any:
-    if "lensmodel" in content:
-        return _mrcal
-    if "cam0" in content:
-        return _kalibr
-    if "camera_matrix" in content:
-        return _opencv
-    raise ValueError(
-        "it has none of camera_matrix (OpenCV, ROS), cam0 (Kalibr) and lensmodel (mrcal)"
-    )
 
 
 def _opencv(content: Mapping[str, Any]) -> _Read:
@@ -188,3 +238,11 @@ def _mrcal(content: Mapping[str, Any]) -> _Read:
         raise ValueError(f"its lens is {lens!r}, and only OpenCV's have a counterpart here")
     width, height = content["imagersize"]
     return int(width), int(height), "", content["intrinsics"][:4], content["intrinsics"][4:]
+
+
+# By the key that none of the others has.
+_READERS: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
+    "lensmodel": _mrcal,
+    "cam0": _kalibr,
+    "camera_matrix": _opencv,
+}

@@ -11,10 +11,6 @@ from starcal_uq.cli.options import (
     parse_columns,
 )
 from starcal_uq.core import settings
-from starcal_uq.core.settings import Limit
-
-_FORGETTING = Limit(1e-9, 1.0, whole=False)
-_WALK_PX = Limit(0.0, 1e6, whole=False)
 
 
 def filter_command(

@@ -17,7 +17,7 @@ from starcal_uq.cli.options import (
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
 from starcal_uq.core.manifest import refuse_others
-from starcal_uq.core.settings import MAGNITUDES, Limit
+from starcal_uq.core.settings import KEYS
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -27,11 +27,6 @@ if TYPE_CHECKING:
     from starcal_uq.planning.check import ForecastCheck
     from starcal_uq.planning.design import FrameChoice
     from starcal_uq.planning.plan import Plan
-
-
-_CHOSEN = Limit(1, 10**6)
-# The displacement of the corner by a distortion that still folds nowhere stays far within.
-_PERCENT = Limit(-30.0, 30.0, whole=False)
 
 
 def check_output(out: Path | None, command: str, force: bool) -> None:
@@ -190,7 +185,7 @@ def plan_command(
         sheet = known.camera
     used = noise if sigma is None else sigma
     # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
-    deep = sc.load_catalogue(max_mag=min(max_mag + 1.0, MAGNITUDES.high), epoch=epoch)
+    deep = sc.load_catalogue(max_mag=min(max_mag + 1.0, KEYS["magnitude"].high), epoch=epoch)
     stars = deep.select(deep.mag <= max_mag)
     sizes = tuple(frames or N_FRAMES)
     with progress_bar("points of the sweeps") as progress:

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import inspect
 import os
+import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar
 
 from starcal_uq.core.errors import SettingError
@@ -99,83 +101,16 @@ def _written(number: float) -> str:
     return str(number) if isinstance(number, int) else f"{number:.15g}"
 
 
-# What `numpy.random.SeedSequence` makes of one seed for others.
-SEED = Limit(0, 2**64 - 1)
-SIGMA_PX = Limit(0.0, 100.0, whole=False)
-EPOCH = Limit(1800.0, 2200.0, whole=False)
-MAGNITUDES = Limit(-2.0, 10.0, whole=False)
-PROBABILITY = Limit(1e-9, 1.0 - 1e-9, whole=False)
-# Of an error that is aimed at.
-ARCSEC = Limit(1e-9, 1e6, whole=False)
-LIMITS = {
-    "seed": SEED,
-    "n_frames": Limit(1, 10**9),
-    "gallery_frames": Limit(1, 1000),
-    "partition_frames": Limit(1, 10**7),
-    "alignment_frames": Limit(1, 10**6),
-    "min_stars": Limit(2, 10**4),
-    "max_stars": Limit(1, 10**6),
-    "n_replicates": Limit(1, 10**6),
-    "n_campaigns": Limit(1, 10**6),
-    "n_geometries": Limit(1, 10**6),
-    "n_starts": Limit(0, 10**4),
-    "max_iterations": Limit(1, 10**6),
-    "n_draws": Limit(1, 10**7),
-    "n_samples": Limit(1, 10**9),
-    "n_ensembles": Limit(1, 10**4),
-    "n_walkers": Limit(1, 10**6),
-    "n_steps": Limit(1, 10**8),
-    "n_burn": Limit(0, 10**8),
-    "workers": Limit(0, 10**4),
-    "sigma_px": SIGMA_PX,
-    "rate_hz": Limit(1e-6, 1e6, whole=False),
-    "gain_e_per_count": Limit(1e-6, 1e6, whole=False),
-    "read_noise_e": Limit(0.0, 1e6, whole=False),
-    "saturation": Limit(0.0, 1e12, whole=False),
-    "threshold_sigma": Limit(2.0, 1e6, whole=False),
-    "psf_sigma_px": Limit(0.2, 20.0, whole=False),
-    "min_pixels": Limit(1, 10**6),
-    "focal_tolerance": Limit(1e-9, 0.3, whole=False),
-    "centre_tolerance_px": Limit(1e-3, 1e5, whole=False),
-    "distortion_tolerance_px": Limit(0.0, 1e5, whole=False),
-}
+def _limits(table: str) -> dict[str, Limit]:
+    return {
+        name: Limit(low, high, isinstance(low, int))
+        for name, (low, high) in _DECLARED[table].items()
+    }
 
 
-# The same for keys of files and axes of studies that are no parameters of functions, or have limits
-# of their own there.
-KEYS = {
-    "width_px": Limit(1, 10**6),
-    "height_px": Limit(1, 10**6),
-    "pixel_um": Limit(0.01, 1e4, whole=False),
-    "focal_mm": Limit(1e-3, 1e7, whole=False),
-    "focal_px": Limit(1e-2, 1e9, whole=False),
-    "x0_px": Limit(-1e6, 1e6, whole=False),
-    "y0_px": Limit(-1e6, 1e6, whole=False),
-    "coefficient": Limit(-1.0, 1.0, whole=False),
-    "fov_deg": Limit(0.1, 120.0, whole=False),
-    "pixels": Limit(16, 10**5),
-    "x0_offset_px": Limit(-1e5, 1e5, whole=False),
-    "y0_offset_px": Limit(-1e5, 1e5, whole=False),
-    "distortion_px": Limit(-1e5, 1e5, whole=False),
-    "max_mag": Limit(-1.0, 10.0, whole=False),
-    "stars": Limit(3, 10**5),
-    "frames": Limit(1, 10**7),
-    "min_stars": Limit(3, 10**4),
-    "sigma_px": Limit(1e-6, 20.0, whole=False),
-    "noise_per_mag": Limit(0.0, 1.0, whole=False),
-    "noise_mag": Limit(-30.0, 60.0, whole=False),
-    "noise_floor_px": Limit(0.0, 20.0, whole=False),
-    "direction_mas": Limit(0.0, 1e6, whole=False),
-    "seeds": Limit(1, 10**6),
-    "target_arcsec": ARCSEC,
-    "target_sigma": Limit(1e-9, 1e6, whole=False),
-    "epoch": EPOCH,
-    "probability": PROBABILITY,
-    "magnitude": MAGNITUDES,
-    "geometries": Limit(20, 10**5),
-    "draws": Limit(100, 10**6),
-    "values": Limit(1, 10**6),
-}
+_DECLARED = tomllib.loads(Path(__file__).with_name("limits.toml").read_text("utf-8"))
+# Those of parameters of functions, and of keys of files and axes of studies.
+LIMITS, KEYS = _limits("parameters"), _limits("keys")
 
 
 def bounded(function: Callable[P, R]) -> Callable[P, R]:

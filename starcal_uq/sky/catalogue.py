@@ -14,7 +14,7 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.settings import EPOCH
+from starcal_uq.core.settings import KEYS
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.sky.apparent import aberrate, check_velocity
 from starcal_uq.sky.gaia import (
@@ -258,9 +258,10 @@ def prepare(
 
 def check_epoch(epoch: float) -> float:
     """The epoch as a float; CatalogueError unless it is a Julian year between 1800 and 2200."""
-    if not EPOCH.holds(epoch):
+    limit = KEYS["epoch"]
+    if not limit.holds(epoch):
         raise CatalogueError(
-            f"The epoch {epoch!r} is not a Julian year between {EPOCH.low:g} and {EPOCH.high:g}; "
+            f"The epoch {epoch!r} is not a Julian year between {KEYS['epoch'].low:g} and {KEYS['epoch'].high:g}; "
             "write it as 2026.9."
         )
     return float(epoch)

@@ -22,7 +22,7 @@ from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_nam
 from starcal_uq.core.errors import CameraError, PriorError, StudyError
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.settings import KEYS, SEED, StudyTemplate
+from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.inference.priors import PRIORS
@@ -47,7 +47,7 @@ _STUDY = Section(
         "seeds": Key(
             int | list[int], "a number of repetitions of at least 1, or a list of whole numbers"
         ),
-        "seed": Key.number(SEED, "the root of all that is random"),
+        "seed": Key.number(LIMITS["seed"], "the root of all that is random"),
         "target_arcsec": Key.number(KEYS["target_arcsec"], "an error in arcsec"),
         "target_sigma": Key(
             dict[str, float], "a table of errors above zero by parameter, such as {f = 0.05}"
@@ -229,7 +229,7 @@ class StudyDefinition:
             (
                 len(self.seeds) > 0
                 and len(set(self.seeds)) == len(self.seeds)
-                and SEED.holds(self.seeds),
+                and LIMITS["seed"].holds(self.seeds),
                 (
                     "seeds holds no number, one twice, below 0 or beyond 64 bits; write how many "
                     "repetitions you want"
