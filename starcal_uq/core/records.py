@@ -31,19 +31,13 @@ S = TypeVar("S", bound="Saved")
 Arrays = dict[str, Any]
 
 _FORMAT, _DOCUMENT = "format", "document"
-_WORDS: dict[Any, str] = {
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    str: "text",
-}
 # Kinds of arrays that each kind may be made of.
 _FROM = {"f": "fiu", "i": "iu", "u": "iu"}
-_SCALARS: dict[Any, tuple[type, ...]] = {
-    bool: (bool,),
-    int: (int,),
-    float: (int, float),
-    str: (str,),
+_SCALARS: dict[Any, tuple[tuple[type, ...], str]] = {
+    bool: ((bool,), "true or false"),
+    int: ((int,), "a whole number"),
+    float: ((int, float), "a number"),
+    str: ((str,), "text"),
 }
 # Halves of characters, which JSON can write by their numbers and UTF-8 cannot hold.
 _HALVES = re.compile("[\ud800-\udfff]")
@@ -64,51 +58,44 @@ def to_plain(
     result; without it they become lists. `null` writes NaN as None, because strict JSON has no
     other word for it; `from_plain` reads both. TypeError for a value that no file of ours can hold.
     """
-    return _Writer(arrays, apart, null).plain(record, "")
+    return _plain(record, "", arrays, apart, null)
 
 
-class _Writer:
-    def __init__(self, arrays: Arrays | None, apart: Collection[str] | None, null: bool) -> None:
-        self.arrays, self.apart, self.null = arrays, apart, null
-
-    def plain(self, value: Any, name: str) -> Any:
-        if isinstance(value, np.ndarray | np.generic):
-            value = value.tolist()
-        if isinstance(value, Enum):
-            return value.name
-        if isinstance(value, float):
-            return None if self.null and value != value else value
-        if value is None or isinstance(value, bool | int | str):
-            return value
-        if isinstance(value, list | tuple):
-            return [
-                self.plain(item, f"{name.removesuffix('s')}{index}")
-                for index, item in enumerate(value)
-            ]
-        if isinstance(value, Mapping):
-            return self.items(value, name)
-        if is_dataclass(value) and not isinstance(value, type):
-            # Both: a class that only tells itself in plain values, for readers, is read field by
-            # field.
-            own = getattr(value, "to_dict", None) if hasattr(value, "from_dict") else None
-            return self.items(
-                {f.name: getattr(value, f.name) for f in fields(value)} if own is None else own(),
-                name,
-            )
+def _plain(
+    value: Any, name: str, arrays: Arrays | None, apart: Collection[str] | None, null: bool
+) -> Any:
+    value = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, float):
+        return None if null and value != value else value
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, list | tuple):
+        start = name.removesuffix("s")
+        return [_plain(item, f"{start}{i}", arrays, apart, null) for i, item in enumerate(value)]
+    if is_dataclass(value) and not isinstance(value, type):
+        # Both: a class that only tells itself in plain values, for readers, is read field by field.
+        own = hasattr(value, "to_dict") and hasattr(value, "from_dict")
+        value = value.to_dict() if own else {f.name: getattr(value, f.name) for f in fields(value)}
+    if not isinstance(value, Mapping):
         raise TypeError(f"a file cannot hold {name or 'this'}: {type(value).__name__}")
+    kept: AnyDict = {}
+    for key, item in value.items():
+        if not isinstance(key, str):
+            raise TypeError(f"a file cannot hold the key {key!r} of {name}")
+        place = _below(name, key)
+        wanted = apart is None or key in apart
+        if arrays is not None and wanted and isinstance(item, np.ndarray):
+            arrays[place] = item
+        else:
+            kept[key] = _plain(item, place, arrays, apart, null)
+    return kept
 
-    def items(self, values: Mapping[str, Any], name: str) -> AnyDict:
-        kept: AnyDict = {}
-        for key, value in values.items():
-            if not isinstance(key, str):
-                raise TypeError(f"a file cannot hold the key {key!r} of {name}")
-            place = f"{name}_{key}" if name else key
-            wanted = self.arrays is not None and (self.apart is None or key in self.apart)
-            if wanted and isinstance(value, np.ndarray):
-                self.arrays[place] = value  # type: ignore[index]
-            else:
-                kept[key] = self.plain(value, place)
-        return kept
+
+def _below(name: str, key: str) -> str:
+    """The name of a field in a record of that name."""
+    return f"{name}_{key}" if name else key
 
 
 def from_plain(cls: type[Record], data: Any, arrays: Arrays | None = None) -> Record:
@@ -128,22 +115,9 @@ def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
     if hint is Any:
         return data
     if hint in _SCALARS:
-        if hint is float and data is None:
-            return float("nan")
-        if not isinstance(data, _SCALARS[hint]) or (isinstance(data, bool) and hint is not bool):
-            raise ValueError(f"{name} is {shown(data)}, not {_WORDS[hint]}")
-        if isinstance(data, int) and not isinstance(data, bool):
-            if hint is float:
-                return float(data)
-            if not -(2**63) <= data < 2**63:
-                raise ValueError(f"{name} is {shown(data)}, too large a number")
-        if isinstance(data, str) and _HALVES.search(data):
-            raise ValueError(f"{name} is {shown(data)}, which no file can hold")
-        return data
+        return _scalar(hint, data, name)
     if origin is Literal:
-        if data not in args:
-            raise ValueError(f"{name} is {shown(data)}, not one of {', '.join(map(str, args))}")
-        return data
+        return _one_word(data, {word: word for word in args}, name)
     if origin in (Union, UnionType):
         return _one_of(args, data, arrays, name)
     if origin is np.ndarray:
@@ -158,9 +132,7 @@ def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
             for key, item in _mapping(data, name).items()
         }
     if isinstance(hint, type) and issubclass(hint, Enum):
-        if data not in hint.__members__:
-            raise ValueError(f"{name} is {shown(data)}, not one of {', '.join(hint.__members__)}")
-        return hint[data]
+        return _one_word(data, hint.__members__, name)
     if hasattr(hint, "from_dict"):
         start = f"{name}_"
         inside = {
@@ -172,6 +144,20 @@ def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
     raise TypeError(f"no file holds {name}: {hint}")
 
 
+def _scalar(kind: type, data: Any, name: str) -> Any:
+    if kind is float and data is None:
+        return float("nan")
+    types, words = _SCALARS[kind]
+    fits = isinstance(data, types) and isinstance(data, bool) == (kind is bool)
+    if not fits:
+        raise ValueError(f"{name} is {shown(data)}, not {words}")
+    if kind is int and not -(2**63) <= data < 2**63:
+        raise ValueError(f"{name} is {shown(data)}, too large a number")
+    if kind is str and _HALVES.search(data):
+        raise ValueError(f"{name} is {shown(data)}, which no file can hold")
+    return float(data) if kind is float else data
+
+
 def _as_array(data: Any, kind: np.dtype[Any], name: str) -> Any:
     array = np.asarray(data)
     if array.dtype.kind not in _FROM.get(kind.kind, kind.kind):
@@ -180,6 +166,12 @@ def _as_array(data: Any, kind: np.dtype[Any], name: str) -> Any:
         if not listed or (kind.kind != "f" and array.size):
             raise ValueError(f"{name} does not hold what it should")
     return array.astype(kind) if array.dtype != kind else array
+
+
+def _one_word(data: Any, words: Mapping[Any, Any], name: str) -> Any:
+    if data not in list(words):
+        raise ValueError(f"{name} is {shown(data)}, not one of {', '.join(map(str, words))}")
+    return words[data]
 
 
 def _mapping(data: Any, name: str) -> Mapping[str, Any]:
@@ -225,7 +217,7 @@ def _record(cls: Any, data: Mapping[str, Any], arrays: Arrays, name: str) -> Any
             raise ValueError(f"{cls.__name__} has no field {key!r}")
     values: AnyDict = {}
     for field in known:
-        place = f"{name}_{field.name}" if name else field.name
+        place = _below(name, field.name)
         if place in arrays:
             values[field.name] = _value(hints[field.name], arrays[place], arrays, place)
         elif field.name in data:
@@ -240,18 +232,19 @@ def _record(cls: Any, data: Mapping[str, Any], arrays: Arrays, name: str) -> Any
 def _check_sizes(record: Any, name: str) -> None:
     """Arrays must have the sizes that the class states, and where it says so no gap.
 
-    ``SHAPES`` of a class are sizes by field (or property): numbers, or names of sizes that are the
+    ``SHAPES`` of a class are sizes by field (or property): digits, or names of sizes that are the
     same wherever they stand, such as ``{"theta": ("p",), "draws": ("n", "p+1")}``; a tuple has its
     length. Fields in ``FINITE`` hold neither NaN nor infinities.
     """
-    sizes: dict[str, int] = {}
+    # A number is its own size.
+    sizes = {str(number): number for number in range(10)}
     empty: dict[str, set[str]] = {}
     for field, wanted in getattr(record, "SHAPES", {}).items():
         value = getattr(record, field)
         if value is None:
             continue
         shape = value.shape if isinstance(value, np.ndarray) else (len(value),)
-        place = f"{name}_{field}" if name else field
+        place = _below(name, field)
         if shape == (0,) and len(wanted) > 1:
             empty[place] = {str(want).partition("+")[0] for want in wanted}
             continue
@@ -259,22 +252,17 @@ def _check_sizes(record: Any, name: str) -> None:
             raise ValueError(f"{place} has {len(shape)} dimensions, not {len(wanted)}")
         for size, want in zip(shape, wanted, strict=True):
             letter, _, more = str(want).partition("+")
-            known = sizes.setdefault(
-                letter, int(letter) if letter.isdigit() else size - int(more or 0)
-            )
-            if size != known + int(more or 0):
-                raise ValueError(
-                    f"{place} has {size} entries where there should be {known + int(more or 0)}"
-                )
+            extra = int(more or 0)
+            right = sizes.setdefault(letter, size - extra) + extra
+            if size != right:
+                raise ValueError(f"{place} has {size} entries where there should be {right}")
     # A list of JSON does not tell the sizes of an array that holds nothing.
     for place, letters in empty.items():
-        if all(int(letter) if letter.isdigit() else sizes.get(letter, 0) for letter in letters):
+        if all(sizes.get(letter, 0) for letter in letters):
             raise ValueError(f"{place} holds nothing")
     for field in getattr(record, "FINITE", ()):
         if not np.isfinite(getattr(record, field)).all():
-            raise ValueError(
-                f"{f'{name}_{field}' if name else field} holds a value that is not finite"
-            )
+            raise ValueError(f"{_below(name, field)} holds a value that is not finite")
 
 
 def write_json(record: Any, path: PathLike) -> None:
@@ -338,11 +326,9 @@ class Saved:
         RunFolderError
             If the file is missing or is something else.
         """
-        return (
-            read_json(cls, path, *cls.FILE)
-            if cls.KIND is None
-            else read(cls, path, cls.KIND, *cls.FILE)
-        )
+        if cls.KIND is None:
+            return read_json(cls, path, *cls.FILE)
+        return read(cls, path, cls.KIND, *cls.FILE)
 
 
 def read_arrays(path: PathLike) -> Arrays:
@@ -371,12 +357,10 @@ def _array(member: IO[bytes], size: int, name: str) -> Any:
     version = np.lib.format.read_magic(member)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"{name} is no array")
-    header = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, _, dtype = header(member)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+    else:
+        shape, _, dtype = np.lib.format.read_array_header_2_0(member)
     if dtype.hasobject:
         raise ValueError(f"{name} holds Python objects")
     if math.prod(shape) * dtype.itemsize != size - member.tell():
