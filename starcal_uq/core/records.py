@@ -76,8 +76,8 @@ def _plain(
         return [_plain(item, f"{start}{i}", arrays, apart, null) for i, item in enumerate(value)]
     if is_dataclass(value) and not isinstance(value, type):
         # Both: a class that only tells itself in plain values, for readers, is read field by field.
-        own = hasattr(value, "to_dict") and hasattr(value, "from_dict")
-        value = value.to_dict() if own else {f.name: getattr(value, f.name) for f in fields(value)}
+        own = getattr(value, "to_dict", None) if hasattr(value, "from_dict") else None
+        value = {f.name: getattr(value, f.name) for f in fields(value)} if own is None else own()
     if not isinstance(value, Mapping):
         raise TypeError(f"a file cannot hold {name or 'this'}: {type(value).__name__}")
     kept: AnyDict = {}
