@@ -24,7 +24,7 @@ from starcal_uq.core.files import listed, read_parquet, reading, shown, table_en
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.settings import Scalar, Sense, bounded
 from starcal_uq.core.times import julian_days
-from starcal_uq.core.types import FloatArray, IntArray, PathLike
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike
 
 _UNIT = 1e-6
 _NEARLY_UNIT = 1e-3
@@ -80,7 +80,7 @@ class AttitudeProfile(Shown):
         far = np.degrees(np.linalg.norm(left_error(q[1:], q[:-1]), axis=1)) > _FAR_DEG
         if far.any():
             messages += (
-                f"{plural(int(far.sum()), 'step')} of the profile turn the camera by more than "
+                f"{plural(far.sum(), 'step')} of the profile turn the camera by more than "
                 f"{_FAR_DEG:g} degrees: "
                 "attitudes in between are taken on the shortest arc; give more samples if the "
                 "camera went otherwise.",
@@ -223,7 +223,7 @@ def check_samples(
         return ()
     return (
         f"{plural(uneven, 'quaternion')} differed from unit length by up to "
-        f"{significant(float(off.max()))} and "
+        f"{significant(off.max())} and "
         f"{'was' if uneven == 1 else 'were'} normalised.",
     )
 
@@ -268,7 +268,7 @@ def read_profile(path: PathLike, scalar: str | None) -> ProfileTable:
         return ProfileTable(_times(path, word, numbers, columns), q, numbers, word)
 
 
-def _components(path: Path, columns: dict[str, Any], scalar: str | None) -> tuple[str, ...]:
+def _components(path: Path, columns: AnyDict, scalar: str | None) -> tuple[str, ...]:
     """Names of the columns in the order x, y, z, w."""
     if all(name in columns for name in NAMED):
         return NAMED
@@ -290,7 +290,7 @@ def _components(path: Path, columns: dict[str, Any], scalar: str | None) -> tupl
     )
 
 
-def _times(path: Path, word: str, numbers: IntArray, columns: dict[str, Any]) -> FloatArray:
+def _times(path: Path, word: str, numbers: IntArray, columns: AnyDict) -> FloatArray:
     if "time_s" in columns:
         return _numbers(path, word, numbers, "time_s", columns["time_s"])
     if "time_utc" not in columns:
@@ -323,7 +323,7 @@ def _numbers(
     return np.array(values, dtype=float)
 
 
-def _text(path: Path, *, ecsv: bool) -> tuple[dict[str, Any], IntArray, str]:
+def _text(path: Path, *, ecsv: bool) -> tuple[AnyDict, IntArray, str]:
     """Cells by column, and the line of each row; an ECSV file's header stands in comments."""
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -348,11 +348,11 @@ def _text(path: Path, *, ecsv: bool) -> tuple[dict[str, Any], IntArray, str]:
     return cells, np.array([number for number, _ in rows[1:]], dtype=np.int64), "line"
 
 
-def _parquet(path: Path) -> tuple[dict[str, Any], IntArray, str]:
+def _parquet(path: Path) -> tuple[AnyDict, IntArray, str]:
     import pyarrow as pa
 
     table = read_parquet(path)
-    columns: dict[str, Any] = {}
+    columns: AnyDict = {}
     for name in table.column_names:
         column = table.column(name)
         cells = column.to_numpy()

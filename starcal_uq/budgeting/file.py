@@ -32,7 +32,7 @@ from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_toml
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, PathLike
 
 # As people write them: X and Y are across the boresight, Z is along it.
 _AXIS_NAMES = {
@@ -268,7 +268,7 @@ def _frames(tables: Any, path: PathLike) -> dict[str, FloatArray]:
     return frames
 
 
-def _tables(content: Mapping[str, Any], key: str, path: PathLike) -> Iterator[tuple[Any, str]]:
+def _tables(content: AnyMapping, key: str, path: PathLike) -> Iterator[tuple[Any, str]]:
     """The tables of one kind, and how messages call each: by its number and name."""
     found = content.get(key, [])
     if not isinstance(found, list):

@@ -10,7 +10,6 @@ import dataclasses
 import math
 import operator
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -27,7 +26,7 @@ from starcal_uq.core.errors import CameraError, DistortionError
 from starcal_uq.core.files import reading
 from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
-from starcal_uq.core.types import BoolArray, FloatArray, PathLike
+from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, PathLike, floats
 
 
 @dataclass(frozen=True)
@@ -182,7 +181,7 @@ class Camera(Shown):
         -------
         array of bool, shape (...)
         """
-        points = np.asarray(xy, dtype=np.float64)
+        points = floats(xy)
         limit = np.array([self.width_px - 0.5, self.height_px - 0.5])
         inside: BoolArray = np.all((points >= -0.5) & (points <= limit), axis=-1)
         return inside
@@ -195,7 +194,7 @@ class Camera(Shown):
         theta
             x0, y0, f, k... in pixels, shape (p,), in the order of `parameter_names`.
         """
-        values = np.asarray(theta, dtype=np.float64)
+        values = floats(theta)
         if values.shape != (len(self.parameter_names),):
             raise CameraError(
                 f"camera: theta has shape {values.shape}; give {len(self.parameter_names)} values "
@@ -235,7 +234,7 @@ class Camera(Shown):
             changes.setdefault("focal_mm", None)
         return dataclasses.replace(self, **changes)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> AnyDict:
         """The [camera] table: plain values, coefficients under their own names."""
         table = dataclasses.asdict(self)
         for key in (
@@ -249,7 +248,7 @@ class Camera(Shown):
         return {"name": name, **table} if name else table
 
     @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> Camera:
+    def from_dict(cls, table: AnyMapping) -> Camera:
         """A camera from the [camera] table; distortion (brown), coefficients (zero) and name may be
         left out.
 
@@ -466,7 +465,7 @@ def _section(distortion: str, in_pixels: bool) -> Section:
     return _CameraSection({**keys, **own}, CameraError, distortion)
 
 
-def _checked(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+def _checked(table: AnyMapping, where: str) -> AnyDict:
     """Arguments of ``Camera`` from a [camera] table, which `where` names in messages."""
     distortion = table.get("distortion", "brown")
     if not isinstance(distortion, str):

@@ -24,7 +24,7 @@ from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CameraError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, ensure_new
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, floats
 
 # Points along each side of the detector at which a fit is made, and checked between them.
 _POINTS = 33
@@ -153,7 +153,7 @@ def _tetra3rs(camera: Camera, path: Path) -> tuple[float, str]:
         import tetra3rs as library
     held, error = _held(camera, ("k1", "k2", "k3", "p1", "p2"))
     names = [c.name for c in get_model(held.distortion).coefficients]
-    terms: dict[str, Any] = dict(zip(names, held.coefficients, strict=True))
+    terms: AnyDict = dict(zip(names, held.coefficients, strict=True))
     centre = np.subtract((held.x0_px, held.y0_px), held.centre_px)
     distortion = library.RadialDistortion(**terms) if any(terms.values()) else None
     library.CameraModel(
@@ -245,7 +245,7 @@ def _polynomial(at: FloatArray, shift: FloatArray, scale: float) -> tuple[int, F
     """Least order, coefficients (n, 2) and largest error (px) of polynomials for a displacement."""
     for order in range(2, _MOST_ORDERS + 1):
         terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in _powers(order)], axis=1)
-        found = np.asarray(np.linalg.lstsq(terms, shift, rcond=None)[0], dtype=np.float64)
+        found = floats(np.linalg.lstsq(terms, shift, rcond=None)[0])
         error = scale * float(np.max(np.linalg.norm(terms @ found - shift, axis=1)))
         if error < _CLOSE_PX:
             break

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, floats
 
 # Stars are evaluated in blocks whose temporaries stay in the processor's second-level cache.
 BLOCK = 2048
@@ -102,7 +102,7 @@ class Kernel:
         (elements, n).
         """
         outputs = [np.empty((int(np.prod(shape)), n)) for shape in self.shapes]
-        arrays = [np.asarray(value, dtype=np.float64) for value in inputs]
+        arrays = [floats(value) for value in inputs]
         # Python floats keep the arithmetic of shared scalars cheap.
         shared = [value.tolist() if value.ndim == 1 else None for value in arrays]
         for start in range(0, n, BLOCK):
@@ -136,7 +136,7 @@ def build_kernel(
     function = ca.Function(
         name, list(inputs), [ca.densify(ca.vec(ca.SX(output))) for output in outputs], {"cse": True}
     )
-    scope: dict[str, Any] = {"np": np}
+    scope: AnyDict = {"np": np}
     # The source is generated from CasADi's instruction list above and holds nothing from outside.
     exec(compile(emit_source(function, name), f"<kernel {name}>", "exec"), scope)
     return Kernel(function=function, run=scope[name], shapes=tuple(shapes))

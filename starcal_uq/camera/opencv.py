@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CameraError, DistortionError
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 # Place in OpenCV's (k1, k2, p1, p2, k3), and the power of f that makes our coefficient
 # dimensionless.
@@ -48,8 +48,8 @@ def from_opencv(
     camera_matrix: ArrayLike, dist_coeffs: ArrayLike | None, distortion: str | None
 ) -> tuple[str, list[float]]:
     """Distortion model and x0, y0, f, k... in pixels; see ``Camera.from_opencv``."""
-    x0, y0, f = _pinhole(np.asarray(camera_matrix, dtype=np.float64))
-    dist = np.zeros(0) if dist_coeffs is None else np.asarray(dist_coeffs, dtype=np.float64).ravel()
+    x0, y0, f = _pinhole(floats(camera_matrix))
+    dist = np.zeros(0) if dist_coeffs is None else floats(dist_coeffs).ravel()
     if not np.all(np.isfinite(dist)):
         raise CameraError("dist_coeffs: give finite numbers.")
     if np.any(dist[5:] != 0.0):

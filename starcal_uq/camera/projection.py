@@ -23,7 +23,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.kernels import Kernel, build_kernel
 from starcal_uq.core.errors import DistortionError
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
 
 _NEWTON_STEPS = 60
 # After a last step of this size the error is its square times what the distortion bends per px,
@@ -367,8 +367,8 @@ def unproject_jacobian(
 def _unprojected(
     model_name: str, theta: FloatArray, xy: FloatArray, derivatives: bool
 ) -> tuple[FloatArray, ...]:
-    pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
-    theta = np.asarray(theta, dtype=np.float64)
+    pixel = np.ascontiguousarray(floats(xy).T)
+    theta = floats(theta)
     root = backward_root(model_name, theta, pixel)
     outputs = backward_kernel(model_name, derivatives)(pixel.shape[1], theta, pixel, root)
     # The displacement acts on ideal points (forward) or on measured ones (inverse).
@@ -425,7 +425,7 @@ def project(camera: Camera, b_cam: FloatArray) -> FloatArray:
     DistortionError
         When a direction lies where the distortion has folded over, so that the image is not unique.
     """
-    b = np.asarray(b_cam, dtype=np.float64).reshape(-1, 3).T
+    b = floats(b_cam).reshape(-1, 3).T
     theta = camera.theta
     xy = np.full((2, b.shape[1]), np.nan)
     front = b[2] > 0.0
@@ -470,7 +470,7 @@ def unproject(camera: Camera, xy_px: FloatArray) -> FloatArray:
     DistortionError
         When a pixel has no ideal point before the distortion folds over.
     """
-    xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
+    xy = floats(xy_px).reshape(-1, 2)
     theta = camera.theta
     if not np.isfinite(xy).all():
         raise DistortionError("a pixel position is not finite: pass finite x and y in px.")

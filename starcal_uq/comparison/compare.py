@@ -48,7 +48,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import ComparisonError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.observations.splits import split_frames, split_labels
 
 if TYPE_CHECKING:
@@ -242,7 +242,7 @@ def _aligned(
     return moved @ rotation, rotation
 
 
-def _shared_parameters(a: Estimate, b: Estimate, rule: Rule) -> dict[str, Any]:
+def _shared_parameters(a: Estimate, b: Estimate, rule: Rule) -> AnyDict:
     """Parameters that mean the same in both models."""
     specs = {p.name: (i, p.unit) for i, p in enumerate(parameters(a.camera.distortion))}
     names = [p.name for p in parameters(b.camera.distortion)]

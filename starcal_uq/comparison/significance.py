@@ -11,7 +11,7 @@ from starcal_uq.camera.fields import rotated, rotation_response, tangent_axes
 from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.comparison.covariance import Rule, is_efficient
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.maths.linear import scaled_cholesky
 from starcal_uq.maths.quadratic_forms import weighted_chi_square_tail
 
@@ -97,8 +97,8 @@ def difference_matrix(
 
 def estimate_of(result: Any) -> Estimate:
     """Posterior mean and covariance, or the estimate of a calibration."""
-    theta = np.asarray(result.mean if hasattr(result, "mean") else result.theta, dtype=np.float64)
-    covariance = np.asarray(result.covariance, dtype=np.float64)
+    theta = floats(result.mean if hasattr(result, "mean") else result.theta)
+    covariance = floats(result.covariance)
     noise = (
         float(np.mean(result.sigma_draws))
         if hasattr(result, "sigma_draws")

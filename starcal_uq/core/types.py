@@ -14,11 +14,17 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 StrArray: TypeAlias = NDArray[np.str_]
 AnyDict: TypeAlias = dict[str, Any]
+AnyMapping: TypeAlias = Mapping[str, Any]
 PathLike: TypeAlias = str | os.PathLike[str]
 # Called with how many are done, and of how many.
 Progress: TypeAlias = Callable[[int, int], None]
 # Sizes of the arrays of a record, by field; see `starcal_uq.core.records`.
 Shapes: TypeAlias = Mapping[str, tuple[int | str, ...]]
+
+
+def floats(values: Any) -> FloatArray:
+    """Numbers as an array of doubles, the same array where it is one."""
+    return np.asarray(values, dtype=np.float64)
 
 
 def unaliased(hint: Any) -> Any:

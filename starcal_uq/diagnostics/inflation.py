@@ -105,9 +105,7 @@ def _pattern(
         if not upper.any():
             return ()
         pairs = zip(value, upper, strict=True)
-        values = ", ".join(
-            f"{significant(float(v))} (at most {significant(float(u))})" for v, u in pairs
-        )
+        values = ", ".join(f"{significant(v)} (at most {significant(u)})" for v, u in pairs)
         return (
             (
                 f"misfit, {names}, through the attitudes of these frames: {values} arcsec of "

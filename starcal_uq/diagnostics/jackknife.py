@@ -16,7 +16,7 @@ import numpy as np
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.core.types import FloatArray, Shapes, floats
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 
@@ -135,7 +135,7 @@ class Jackknife(Shown):
         share = (self._tail + (self.ratio**2 - 1.0) * np.sqrt(self.dof * self._tail)) / (
             self.residual_dof or _MANY
         )
-        return np.asarray(betaincc(*self._shape, np.clip(share, 0.0, 1.0)), dtype=np.float64)
+        return floats(betaincc(*self._shape, np.clip(share, 0.0, 1.0)))
 
     def detectable(self, alpha: float, power: float = 0.9) -> FloatArray:
         """Ratios (p,) of true uncertainties that a test at this level finds with this
@@ -147,7 +147,7 @@ class Jackknife(Shown):
         # Frames that err by more scatter as evenly as they weigh: Satterthwaite's approximation,
         # which is never zero.
         missed = np.sqrt(2.0 / self.dof * gammaincinv(0.5 * self.dof, 1.0 - power))
-        return np.asarray(found / missed, dtype=np.float64)
+        return floats(found / missed)
 
     @property
     def factors(self) -> FloatArray:

@@ -27,7 +27,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.core.types import FloatArray, Shapes, floats
 from starcal_uq.diagnostics.shapes import (
     FRAME_BY_FRAME,
     MAX_CELLS,
@@ -163,7 +163,7 @@ def response(
             fitted if aligned is obs else aligned,
             fitted,
         )
-    camera = post.camera.with_theta(np.asarray(theta, dtype=np.float64))
+    camera = post.camera.with_theta(floats(theta))
     here = _Turned.of(pattern, camera, post, obs, seen)
     there = (
         here
@@ -406,7 +406,7 @@ class Fit:
                 free.T @ loose[1:, 1:] @ free, raw, free.T @ loose[1:, 0], variance
             )
             precision[certain:, certain:] = raw / size
-            covariance = np.asarray(np.linalg.inv(matrix / variance + precision), dtype=np.float64)
+            covariance = floats(np.linalg.inv(matrix / variance + precision))
         amplitudes = covariance @ slope / variance
         absorbed = (
             scaled_inverse(self.gram[: self.p, : self.p])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import BoolArray, FloatArray, floats
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, ResidualMap
 
@@ -135,7 +135,7 @@ def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
     obs = weighed(obs, cal)
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
     n_stars = obs.n_stars if cal.partitions is None else cal.n_stars
-    return np.asarray(_unit_scale(cal, n_stars) * stated, dtype=np.float64)
+    return floats(_unit_scale(cal, n_stars) * stated)
 
 
 def _unit_scale(cal: Calibration, n_stars: int) -> float:

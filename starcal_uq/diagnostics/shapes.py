@@ -17,7 +17,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import get_model, model_names
 from starcal_uq.core.constants import LIGHT_SPEED_KM_S
-from starcal_uq.core.types import FloatArray, IntArray, StrArray
+from starcal_uq.core.types import FloatArray, IntArray, StrArray, floats
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ def _seconds(times: StrArray) -> FloatArray | None:
     except ValueError:
         return None
     stamps = [(t if t.tzinfo is not None else t.replace(tzinfo=UTC)).timestamp() for t in parsed]
-    return np.asarray(stamps, dtype=np.float64)[inverse.reshape(-1)]
+    return floats(stamps)[inverse.reshape(-1)]
 
 
 def frame_shapes(camera: Camera) -> Shape:

@@ -25,7 +25,7 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray, Progress
+from starcal_uq.core.types import FloatArray, Progress, floats
 from starcal_uq.identification.blind import (
     AGREEMENT,
     FIRST_GROUP,
@@ -578,7 +578,7 @@ def calibrated_tolerance(
     """Four standard deviations of a calibration, at most the given tolerances."""
     camera = calibration.camera
     p = len(camera.parameter_names)
-    covariance = np.asarray(calibration.covariance, dtype=np.float64)[:p, :p]
+    covariance = floats(calibration.covariance)[:p, :p]
     sd = 4.0 * np.sqrt(np.diag(covariance))
     orders = [c.order for c in get_model(camera.distortion).coefficients]
     corner = camera.corner_radius_px ** np.array(orders, dtype=np.float64)
@@ -651,7 +651,7 @@ def _result(
         [field.xy[k][m.centroid] for k, m in zip(solved, matches, strict=True)]
         or [np.empty((0, 2))]
     )
-    sigma = np.asarray(table.sigma_px, dtype=np.float64)[rows]
+    sigma = floats(table.sigma_px)[rows]
     taste, p_value = np.empty((2, 0))
     if matches:
         starts = np.concatenate([[0], np.cumsum([len(m) for m in matches])])
@@ -714,9 +714,7 @@ def _check(table: CentroidTable, camera: Camera, stars: StarCatalogue) -> None:
             f"the catalogue has {len(stars)} stars, too few to find patterns in: raise its "
             "magnitude limit."
         )
-    xy = np.column_stack(
-        [np.asarray(table.x_px, dtype=np.float64), np.asarray(table.y_px, dtype=np.float64)]
-    )
+    xy = np.column_stack([floats(table.x_px), floats(table.y_px)])
     outside = np.flatnonzero(~camera.contains(xy))
     if outside.size:
         row = int(outside[0])
@@ -726,7 +724,7 @@ def _check(table: CentroidTable, camera: Camera, stars: StarCatalogue) -> None:
             f"{camera.width_px} x {camera.height_px} detector of the camera: give the camera "
             "that took the images."
         )
-    sigma = np.asarray(table.sigma_px, dtype=np.float64)
+    sigma = floats(table.sigma_px)
     if (
         not np.all(np.isfinite(sigma) & (sigma >= 0.0))
         or not np.isfinite(np.asarray(table.flux)).all()

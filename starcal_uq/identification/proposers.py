@@ -14,7 +14,7 @@ from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.settings import Engine
 from starcal_uq.core.temporary import TemporaryFolder
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.identification.pairs import StarPairs, prepared_star_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis, hypotheses
 from starcal_uq.sky.catalogue import StarCatalogue
@@ -123,7 +123,7 @@ class PlateSolver:
         if not result or result.parity_flip:
             return
         # In single precision, so that it is no rotation to ours.
-        u, _, v = np.linalg.svd(np.asarray(result.rotation_matrix_icrs_to_camera, dtype=np.float64))
+        u, _, v = np.linalg.svd(floats(result.rotation_matrix_icrs_to_camera))
         focal_px = 0.5 * geometry.width_px / np.tan(np.radians(0.5 * float(result.fov_deg)))
         yield [Hypothesis(u @ v, float(focal_px / geometry.focal_px))]
 

@@ -13,7 +13,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject
-from starcal_uq.core.types import FloatArray, IntArray, StrArray
+from starcal_uq.core.types import FloatArray, IntArray, StrArray, floats
 from starcal_uq.identification.brightness import instrumental_mag
 from starcal_uq.identification.match import CameraState, Match, match_frame, start_state
 from starcal_uq.identification.nearby import NearbyStars
@@ -87,13 +87,11 @@ class FrameTable:
     def __init__(self, table: CentroidTable, camera: Camera, mirrored: bool = False) -> None:
         self.camera = flipped(camera) if mirrored else camera
         self.ids = [int(i) for i in table.frame_ids]
-        x = np.asarray(table.x_px, dtype=np.float64)
-        xy = np.column_stack(
-            [camera.width_px - 1 - x if mirrored else x, np.asarray(table.y_px, dtype=np.float64)]
-        )
+        x = floats(table.x_px)
+        xy = np.column_stack([camera.width_px - 1 - x if mirrored else x, floats(table.y_px)])
         frame = np.asarray(table.frame)
         # lexsort is stable: centroids of equal brightness keep their order.
-        order = np.lexsort((-np.asarray(table.flux, dtype=np.float64), frame))
+        order = np.lexsort((-floats(table.flux), frame))
         edges = (
             np.searchsorted(frame[order], self.ids, side="left"),
             np.searchsorted(frame[order], self.ids, "right"),
@@ -102,9 +100,9 @@ class FrameTable:
             order[i:j].astype(np.int64) for i, j in zip(*edges, strict=True)
         ]
         self.xy: list[FloatArray] = [xy[rows] for rows in self.rows]
-        sigma = np.hypot(np.asarray(table.sigma_px, dtype=np.float64), LEAST_SIGMA_PX)
+        sigma = np.hypot(floats(table.sigma_px), LEAST_SIGMA_PX)
         self.sigma: list[FloatArray] = [sigma[rows] for rows in self.rows]
-        flux = np.asarray(table.flux, dtype=np.float64)
+        flux = floats(table.flux)
         if len(saturated := np.asarray(getattr(table, "saturated", ()), dtype=np.bool_)):
             flux = np.where(saturated, np.nan, flux)
         self.mag = [instrumental_mag(flux[rows]) for rows in self.rows]

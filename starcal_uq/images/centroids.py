@@ -29,12 +29,20 @@ from starcal_uq.core.files import (
     table_ending,
 )
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, StrArray
+from starcal_uq.core.types import (
+    AnyDict,
+    AnyMapping,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    PathLike,
+    StrArray,
+)
 from starcal_uq.observations.origin import CentroidsOrigin
 from starcal_uq.observations.rows import FrameRows, locked
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    pass
 
 # Name -> (type, description), of one row per star and of one entry per frame.
 COLUMNS: dict[str, tuple[type, str]] = {
@@ -325,7 +333,7 @@ _TRUTH = {"True": True, "False": False}
 _MARK = f"# {_KEY} "
 
 
-def _read_csv(path: Path) -> tuple[Mapping[str, Any], str | None]:
+def _read_csv(path: Path) -> tuple[AnyMapping, str | None]:
     with path.open(encoding="utf-8-sig", newline="") as file:
         first = file.readline()
         if not first.startswith(_MARK):
@@ -342,7 +350,7 @@ def _read_csv(path: Path) -> tuple[Mapping[str, Any], str | None]:
     return columns, first.removeprefix(_MARK)
 
 
-def _read_ecsv(path: Path) -> tuple[Mapping[str, Any], str | None]:
+def _read_ecsv(path: Path) -> tuple[AnyMapping, str | None]:
     with extra("images", "ECSV tables"):
         from astropy.table import Table
 
@@ -350,7 +358,7 @@ def _read_ecsv(path: Path) -> tuple[Mapping[str, Any], str | None]:
     return {name: np.asarray(table[name]) for name in table.colnames}, table.meta.get(_KEY)
 
 
-def _read_parquet(path: Path) -> tuple[Mapping[str, Any], str | None]:
+def _read_parquet(path: Path) -> tuple[AnyMapping, str | None]:
     table = read_parquet(path)
     text = (table.schema.metadata or {}).get(_KEY.encode())
     columns = {name: table.column(name).to_numpy() for name in table.column_names}

@@ -69,7 +69,7 @@ class FrameStars:
     `windowed` where star images are no round Gaussians.
     """
 
-    columns: dict[str, Any]
+    columns: AnyDict
     background: float
     noise: float
     psf_sigma_px: float

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
 from starcal_uq.images.background import PreparedImage
 from starcal_uq.maths.intervals import median_of
 
@@ -98,9 +98,7 @@ def cut_stamps(
     height, width = counts.shape
     size = 2 * half_px + 1
     x0, y0 = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
-    variance = (
-        np.asarray(noise[y0.clip(0, height - 1), x0.clip(0, width - 1)], dtype=np.float64) ** 2
-    )
+    variance = floats(noise[y0.clip(0, height - 1), x0.clip(0, width - 1)]) ** 2
     x0, y0 = x0 - half_px, y0 - half_px
     inside = (x0 >= 0) & (x0 <= width - size) & (y0 >= 0) & (y0 <= height - size)
     stamp, good = np.zeros((len(x0), size, size)), np.ones((len(x0), size, size), dtype=np.bool_)

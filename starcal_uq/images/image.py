@@ -10,7 +10,6 @@ import os
 import re
 import warnings
 import zlib
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -26,7 +25,7 @@ from starcal_uq.core.files import check_fits, check_size, unpack
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, Mosaic
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR, utc_of_scale
-from starcal_uq.core.types import AnyDict, PathLike
+from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 from starcal_uq.images.optics import exif_of
 
 if TYPE_CHECKING:
@@ -433,7 +432,7 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> l
     return found
 
 
-def _planes(pixels: Any, header: Mapping[str, Any]) -> tuple[Any, list[str]]:
+def _planes(pixels: Any, header: AnyMapping) -> tuple[Any, list[str]]:
     """Frames (n, height, width) of the pixels of one HDU, and what is to be said of them."""
     frames = pixels.reshape(-1, *pixels.shape[-2:])
     n = len(frames)
@@ -455,7 +454,7 @@ def _planes(pixels: Any, header: Mapping[str, Any]) -> tuple[Any, list[str]]:
     return frames, [f"{n} planes were read as frames, {cycle:g} s apart ({by})."]
 
 
-def _cycle_s(header: Mapping[str, Any], n: int) -> tuple[float | None, str]:
+def _cycle_s(header: AnyMapping, n: int) -> tuple[float | None, str]:
     """Seconds from one of n planes to the next, and the keyword that says it."""
     if kinetic := _positive(header, "KCT"):
         return kinetic, "KCT"
@@ -517,7 +516,7 @@ def _fits_image(
     )
 
 
-def _stated_mosaic(header: Mapping[str, Any], height: int) -> tuple[str, str]:
+def _stated_mosaic(header: AnyMapping, height: int) -> tuple[str, str]:
     """The mosaic of colours that a header states, from the first row stored; or why it is not
     used.
     """
@@ -778,7 +777,7 @@ def _full_scale(pixels: Any) -> float | None:
     return float(np.iinfo(pixels.dtype).max)
 
 
-def _positive(header: Mapping[str, Any], *keys: str) -> float | None:
+def _positive(header: AnyMapping, *keys: str) -> float | None:
     for key in keys:
         try:
             value = float(header[key])
@@ -790,7 +789,7 @@ def _positive(header: Mapping[str, Any], *keys: str) -> float | None:
 
 
 def _middle(
-    header: Mapping[str, Any], exposure_s: float | None, plane: int = 0, planes: int = 1
+    header: AnyMapping, exposure_s: float | None, plane: int = 0, planes: int = 1
 ) -> tuple[str | None, str]:
     """Middle of the exposure, UTC: DATE-AVG, or DATE-OBS (its start) plus half the exposure; why a
     time is not used.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, AnyMapping
 
 # Exif's names, as the header of a picture has them.
 EXIF = {
@@ -33,7 +33,7 @@ _PLACES = (
 _PIXEL_UM, _FOCAL_MM = (0.3, 200.0), (0.5, 50_000.0)
 
 
-def optics_of(header: Mapping[str, Any], width_px: int, height_px: int) -> AnyDict:
+def optics_of(header: AnyMapping, width_px: int, height_px: int) -> AnyDict:
     """Size of an image, and ``pixel_um``, ``focal_mm`` and ``focal_px`` as far as its header has
     them.
 
@@ -66,7 +66,7 @@ def optics_of(header: Mapping[str, Any], width_px: int, height_px: int) -> AnyDi
     return found
 
 
-def place_of(header: Mapping[str, Any]) -> AnyDict:
+def place_of(header: AnyMapping) -> AnyDict:
     """Latitude and longitude (degrees, north and east positive), height (m) and the keys that say
     so, or nothing.
 
@@ -106,7 +106,7 @@ def _place(latitude: float, longitude: float, height: float, keys: str) -> AnyDi
     return {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height, "keys": keys}
 
 
-def _angle(header: Mapping[str, Any], key: str) -> float | None:
+def _angle(header: AnyMapping, key: str) -> float | None:
     """Degrees, of a number or of degrees, minutes and seconds in a text."""
     if (value := _number(header, key)) is not None:
         return value
@@ -159,12 +159,12 @@ def exif_of(picture: Any) -> AnyDict:
         return {}
 
 
-def _within(limits: tuple[float, float], header: Mapping[str, Any], *keys: str) -> float | None:
+def _within(limits: tuple[float, float], header: AnyMapping, *keys: str) -> float | None:
     values = [_number(header, key) for key in keys]
     return next((v for v in values if v is not None and limits[0] <= v <= limits[1]), None)
 
 
-def _number(header: Mapping[str, Any], key: str) -> float | None:
+def _number(header: AnyMapping, key: str) -> float | None:
     try:
         value = float(header.get(key, np.nan))
     except (TypeError, ValueError):

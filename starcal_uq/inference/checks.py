@@ -8,7 +8,7 @@ sampling. Everything that shows or collects checks takes them from `Diagnostics.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ from starcal_uq.core.status import (
     pass_or_fail,
     pass_or_warn,
 )
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.ensemble import Chains, autocorrelation
 from starcal_uq.inference.named import LIKELIHOODS
@@ -72,7 +72,7 @@ _FOLD_DRAWS = 40
 _PRIOR_SHARE = 0.5
 _PRIOR_PULL = 3.0
 # Arguments of `starcal_uq.sample` that a remedy repeats, and their defaults.
-_DEFAULTS: dict[str, Any] = {
+_DEFAULTS: AnyDict = {
     "sigma": "sampled",
     "n_ensembles": 4,
     "n_walkers": 64,
@@ -636,7 +636,7 @@ def resample(post: Posterior, **changes: Any) -> Remedies:
     """Sampling again with some settings changed: a command and a call; of a likelihood of the
     user's, the call.
     """
-    settings: Mapping[str, Any] = _DEFAULTS | post.provenance.get("settings", {}) | changes
+    settings: AnyMapping = _DEFAULTS | post.provenance.get("settings", {}) | changes
     kept = {name: settings[name] for name, usual in _DEFAULTS.items() if settings[name] != usual}
     if settings["likelihood"] in LIKELIHOODS:
         return (Remedy("sample", (RUN,), {"force": True, **kept}),)

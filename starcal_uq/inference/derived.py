@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC, AXES
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.inference import arviz as arviz_compat
 from starcal_uq.inference.posterior import Derived, Posterior
 
@@ -47,7 +47,7 @@ def corner_displacement_px(post: Posterior) -> FloatArray:
     du, dv = get_model(camera.distortion).displacement(
         far[0], far[1], list(post.theta_draws[:, 3:].T)
     )
-    return np.asarray((du * far[0] + dv * far[1]) / np.hypot(*far), dtype=np.float64)
+    return floats((du * far[0] + dv * far[1]) / np.hypot(*far))
 
 
 def _diagnosed(post: Posterior, name: str, unit: str, values: FloatArray) -> Derived:

@@ -30,7 +30,7 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.files import write_netcdf
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray, PathLike, Progress
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.inference.arviz import to_arviz
 from starcal_uq.inference.posterior import Variables, write_group
@@ -230,7 +230,7 @@ class _Draws:
         elif post.diagnostics.likelihood == _STUDENT:
             self.dof = np.full(len(self.sigma), float(post.provenance["settings"]["dof"]))
 
-    def coords(self) -> dict[str, Any]:
+    def coords(self) -> AnyDict:
         return {"chain": np.arange(self.shape[0]), "draw": np.arange(self.shape[1])}
 
 
@@ -316,16 +316,14 @@ class _Images:
         state, frames = self._at.reference, self._at.frames
         self._predicted = frames.pixel - frames.in_pixels(state.e)
         self._theta = post.camera.theta
-        self._coords: dict[str, Any] = {
+        self._coords: AnyDict = {
             "star": np.arange(obs.n_stars),
             "star_frame": ("star", obs.frame),
         }
         if obs.star_id is not None:
             self._coords["star_id"] = ("star", np.asarray(obs.star_id, dtype=str))
 
-    def _dataset(
-        self, pixels: FloatArray, dims: tuple[str, ...], coords: dict[str, Any]
-    ) -> xr.Dataset:
+    def _dataset(self, pixels: FloatArray, dims: tuple[str, ...], coords: AnyDict) -> xr.Dataset:
         """Positions (..., 2, n) and their residuals."""
         import xarray as xr
 

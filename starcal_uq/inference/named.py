@@ -22,7 +22,7 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.remedy import calibrated
 from starcal_uq.core.settings import Evaluation, LikelihoodName
 from starcal_uq.core.status import Check, Level, Question
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
 from starcal_uq.likelihood.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
@@ -218,8 +218,8 @@ def _named_source(
     return _pairs(obs, cal, adjusted=likelihood == "pairs")
 
 
-def _settings(cal: Calibration) -> dict[str, Any]:
-    settings: dict[str, Any] = cal.provenance.get("settings", {})
+def _settings(cal: Calibration) -> AnyDict:
+    settings: AnyDict = cal.provenance.get("settings", {})
     return settings
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 # Dimensions, values and attributes by name.
-Variables = dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]
+Variables = dict[str, tuple[tuple[str, ...], NDArray[Any], AnyDict]]
 
 DRAW_ORDER = (
     "chain is one separately seeded ensemble; within a chain, draws are ordered by half of the "
@@ -412,7 +412,7 @@ class Posterior(Shown):
 
         quantiles = np.quantile(self.draws, _QUANTILES, axis=0)
         shown, d = self.parameters, self.diagnostics
-        columns: dict[str, Any] = {
+        columns: AnyDict = {
             "parameter": list(self.parameter_names),
             "unit": [p.unit for p in shown],
             "prior_mean": self.priors.mean(self.parameter_names),

@@ -16,7 +16,7 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -118,7 +118,7 @@ def prior_sensitivity(
             raise PriorError(
                 f"{name!r} has shape {np.shape(values)}: give one value for each of the draws."
             )
-        columns[name] = np.asarray(values, dtype=np.float64)
+        columns[name] = floats(values)
     log_prior = posterior.priors.log_density_theta(posterior.theta_draws)
     if posterior.sigma_sampled:
         log_prior = log_prior + posterior.priors.log_density_log_sigma(

@@ -26,7 +26,7 @@ from starcal_uq.camera.projection import (
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.settings import bounded, check_memory
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
 
@@ -103,7 +103,7 @@ class PriorPredictive(Shown):
 
         with np.errstate(all="ignore"):
             quantiles = np.nanquantile(self.draws, _QUANTILES, axis=0)
-        columns: dict[str, Any] = {"quantity": self.names}
+        columns: AnyDict = {"quantity": self.names}
         columns |= {f"q{100 * q:g}": quantiles[i] for i, q in enumerate(_QUANTILES)}
         return pd.DataFrame({**columns, "observed": self.observed, "tail_probability": self.tail})
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from starcal_uq.camera.distortion import get_model, parameter_names, parameters,
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.toml import Key, Section, read_section
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
 from starcal_uq.maths.linear import correlation_of
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Priors(Shown, ABC):
         """Mean (p,) and covariance (p, p) of the camera parameters, px units."""
 
     @abstractmethod
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> AnyDict:
         """Plain values, for files."""
 
     @abstractmethod
@@ -85,7 +85,7 @@ class Priors(Shown, ABC):
         return priors_from_table(path, table, camera, per_star_sigma)
 
     @staticmethod
-    def from_dict(values: Mapping[str, Any]) -> Priors:
+    def from_dict(values: AnyMapping) -> Priors:
         """Read what `to_dict` wrote, of either kind."""
         kind = GaussianPriors if values.get("kind") == KIND else PhysicalPriors
         return kind(**{name: value for name, value in values.items() if name != "kind"})
@@ -330,7 +330,7 @@ class PhysicalPriors(Priors):
             np.square(sd)
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> AnyDict:
         """Plain values, for files."""
         return {
             **dataclasses.asdict(self),
@@ -368,7 +368,7 @@ PRIORS = Section(
 
 
 def priors_from_table(
-    path: str | Path, table: Mapping[str, Any], camera: Camera, per_star_sigma: bool = False
+    path: str | Path, table: AnyMapping, camera: Camera, per_star_sigma: bool = False
 ) -> PhysicalPriors:
     """Priors from the entries of a ``[priors]`` table; `path` is for messages."""
     where = f"{path}, section [priors]"
@@ -447,7 +447,7 @@ class GaussianPriors(Priors):
         """Mean (p,) and covariance (p, p), px units."""
         return self.theta_mean, self.theta_covariance
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> AnyDict:
         """Plain values, for files."""
         arrays = {
             "theta_mean": self.theta_mean.tolist(),

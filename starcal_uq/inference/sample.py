@@ -20,7 +20,7 @@ from starcal_uq.core.records import to_plain
 from starcal_uq.core.settings import Evaluation, LikelihoodName, Moves, bounded, check_memory
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress, floats
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.undetermined import open_parameters
 from starcal_uq.inference.checks import (
@@ -393,9 +393,9 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
         priors=run.priors,
         laplace=laplace,
         diagnostics=diagnostics,
-        information=np.asarray(cal.information, dtype=np.float64),
-        rotation_per_theta=np.asarray(cal.rotation_per_theta, dtype=np.float64),
-        attitude_noise=np.asarray(cal.attitude_noise, dtype=np.float64),
+        information=floats(cal.information),
+        rotation_per_theta=floats(cal.rotation_per_theta),
+        attitude_noise=floats(cal.attitude_noise),
         camera=cal.camera,
         provenance=run.provenance,
         dof_draws=None if extra is None else extra.reshape(-1),

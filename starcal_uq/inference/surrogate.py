@@ -14,7 +14,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.inference.target import Target, curvature
 
 # Points per coefficient, and their spread against the posterior's.
@@ -52,9 +52,7 @@ class PolynomialLikelihood:
         point = np.column_stack(columns)
         scale = np.diag(self.target.transform)
         shift = (point - self.target.centre) / scale
-        u: FloatArray = np.asarray(
-            np.linalg.solve(self.target.transform / scale[:, None], shift.T).T, dtype=np.float64
-        )
+        u: FloatArray = floats(np.linalg.solve(self.target.transform / scale[:, None], shift.T).T)
         return np.concatenate([self._at(u[i : i + _CHUNK]) for i in range(0, len(u), _CHUNK)])
 
     def _at(self, u: FloatArray) -> FloatArray:

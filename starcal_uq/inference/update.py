@@ -7,9 +7,9 @@ the shift that did happen is tested.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.provenance import data_hashes
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyMapping, FloatArray
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import SIGMA_NAMES, GaussianPriors, Priors, positive_number
 from starcal_uq.maths.linear import correlation_of
@@ -156,7 +156,7 @@ def prior_from(
 
 def check_chain(priors: Priors, camera: Camera, data_sha256: Collection[str] = ()) -> None:
     """Refuse a chained prior of another camera, or one that the same data have shaped already."""
-    source: Mapping[str, Any] = getattr(priors, "source", {})
+    source: AnyMapping = getattr(priors, "source", {})
     name = source.get("name", "the prior")
     if priors.distortion != camera.distortion:
         raise PriorError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 # Midpoints of the quarter circle: the integrand is smooth and periodic, so that few points give all
 # digits.
@@ -27,7 +27,7 @@ def mixture_radius(covariances: FloatArray, confidence: float) -> float:
         raise ValueError(
             f"confidence is {confidence!r}: give a probability between 0 and 1, such as 0.997."
         )
-    C = np.asarray(covariances, dtype=np.float64).reshape(-1, 2, 2)
+    C = floats(covariances).reshape(-1, 2, 2)
     half_trace = 0.5 * (C[:, 0, 0] + C[:, 1, 1])
     half_gap = np.hypot(0.5 * (C[:, 0, 0] - C[:, 1, 1]), C[:, 0, 1])
     variance = half_trace[:, None] + half_gap[:, None] * np.cos(2.0 * _ANGLES)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 # Standard deviations of a normal 95 % interval.
 HALF_WIDTH_95, HALF_WIDTH_997 = 1.959963984540054, 2.9677379253417833
@@ -54,7 +54,7 @@ def holm(p_values: Sequence[float]) -> FloatArray:
     """p-values (m,) of several tests after Holm's step-down correction (1979); NaN stands for no
     test.
     """
-    p = np.asarray(p_values, dtype=np.float64)
+    p = floats(p_values)
     order = np.argsort(p)[: np.count_nonzero(np.isfinite(p))]
     stepped = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
     corrected = np.full(len(p), np.nan)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 # Nodes of the trapezoidal rule on one side, and the standard widths that it spans: the rest is
 # below exp(-72).
@@ -35,7 +35,7 @@ def weighted_chi_square_tail(weights: FloatArray, x: float, dof: float = np.inf)
 
     ValueError for weights (r,) that are negative, or none that is positive.
     """
-    w = np.asarray(weights, dtype=np.float64)
+    w = floats(weights)
     if np.any(w < 0.0) or not np.any(w > 0.0):
         raise ValueError(
             "weights of squared normal variables must not be negative, and one must be positive."

@@ -6,7 +6,7 @@ All bad rows are found before any is reported: whoever repairs a file wants the 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, StrArray
+from starcal_uq.core.types import AnyMapping, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.observations.columns import COLUMNS
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def parse_times(name: str, cells: Sequence[str]) -> tuple[StrArray, list[Problem
 
 
 def check_columns(
-    columns: Mapping[str, Any], camera: Camera | None = None, unknown_frame: BoolArray | None = None
+    columns: AnyMapping, camera: Camera | None = None, unknown_frame: BoolArray | None = None
 ) -> list[Problem]:
     """Everything that is wrong with the columns (N,) of a table, where a camera is given also for
     its detector.
@@ -184,7 +184,7 @@ def check_columns(
     return problems + _check_counts(columns["frame"]) + _check_repeats(columns, rows)
 
 
-def _pixel_remedy(columns: Mapping[str, Any], camera: Camera) -> str:
+def _pixel_remedy(columns: AnyMapping, camera: Camera) -> str:
     x, y, width, height = columns["x_px"], columns["y_px"], camera.width_px, camera.height_px
     if np.all((y >= -0.5) & (y <= width - 0.5) & (x >= -0.5) & (x <= height - 0.5)):
         return "exchange x_px and y_px, which look swapped"
@@ -216,7 +216,7 @@ def _check_counts(frame: IntArray) -> list[Problem]:
     ]
 
 
-def _check_repeats(columns: Mapping[str, Any], rows: IntArray) -> list[Problem]:
+def _check_repeats(columns: AnyMapping, rows: IntArray) -> list[Problem]:
     """Stars that a frame holds twice, by name, direction or place, among `rows`."""
     frame = columns["frame"]
     searches: list[tuple[str, str, Any, tuple[Any, ...]]] = [

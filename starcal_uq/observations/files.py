@@ -36,7 +36,15 @@ from starcal_uq.core.files import (
     shown,
     table_ending,
 )
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, StrArray
+from starcal_uq.core.types import (
+    AnyDict,
+    AnyMapping,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    PathLike,
+    StrArray,
+)
 from starcal_uq.observations.checks import (
     Problem,
     check_columns,
@@ -70,7 +78,7 @@ class RawTable:
     `starcal_uq.core.files.cell_text`; with `decimal_comma`, numbers are written as 0,5.
     """
 
-    columns: dict[str, Any]
+    columns: AnyDict
     names: list[str]
     numbers: IntArray
     word: str
@@ -106,7 +114,7 @@ def read_table(
     only: Sequence[str] = tuple(COLUMNS),
     check: bool = True,
     frames: IntArray | None = None,
-) -> tuple[dict[str, Any], AnyDict]:
+) -> tuple[AnyDict, AnyDict]:
     """Checked columns and metadata of a file; see
     `starcal_uq.observations.table.load_observations`.
 
@@ -236,9 +244,9 @@ def say_column(name: str, names: Sequence[str]) -> str:
 
 def convert_columns(
     path: Path, raw: RawTable, names: Mapping[str, str]
-) -> tuple[dict[str, Any], list[Problem], BoolArray]:
+) -> tuple[AnyDict, list[Problem], BoolArray]:
     """Typed columns, what was wrong with their cells, and the rows whose frame is unknown."""
-    columns: dict[str, Any] = {}
+    columns: AnyDict = {}
     converted: dict[str, tuple[float, float]] = {}
     problems = list(raw.problems)
     unknown_frame = np.zeros(len(raw.numbers), dtype=np.bool_)
@@ -572,7 +580,7 @@ def arrow_values(column: Any) -> Any:
     return ["" if value is None else str(value) for value in column.to_pylist()]
 
 
-def astropy_table(columns: Mapping[str, Any], meta: AnyDict) -> Any:
+def astropy_table(columns: AnyMapping, meta: AnyDict) -> Any:
     """The columns as an astropy Table with units and descriptions."""
     with extra("images", "ECSV tables"):
         from astropy.table import Table
@@ -585,7 +593,7 @@ def astropy_table(columns: Mapping[str, Any], meta: AnyDict) -> Any:
 
 
 def write_table(
-    columns: Mapping[str, Any],
+    columns: AnyMapping,
     meta: AnyDict,
     path: PathLike,
     force: bool,
@@ -625,7 +633,7 @@ def write_table(
             _write_parquet(columns, temporary, plain)
 
 
-def _csv_text(columns: Mapping[str, Any]) -> str:
+def _csv_text(columns: AnyMapping) -> str:
     texts = []
     for name, values in columns.items():
         cells = values.tolist()
@@ -641,7 +649,7 @@ def _csv_text(columns: Mapping[str, Any]) -> str:
 
 
 def write_partition(
-    columns: Mapping[str, Any],
+    columns: AnyMapping,
     named: Mapping[str, tuple[IntArray, StrArray]],
     meta: AnyDict,
     path: Path,
@@ -674,7 +682,7 @@ def write_partition(
         )
 
 
-def _write_parquet(columns: Mapping[str, Any], path: Path, meta: AnyDict) -> None:
+def _write_parquet(columns: AnyMapping, path: Path, meta: AnyDict) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 

@@ -21,7 +21,7 @@ from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import as_plain, check_fits, check_size
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
 from starcal_uq.observations.columns import COLUMNS
 
 if TYPE_CHECKING:
@@ -48,13 +48,13 @@ _CORR_NAMES = (
 _OTHERS = tuple(name for name in COLUMNS if name not in _CORR and name != "frame")
 
 
-def fits_content(columns: Mapping[str, Any], meta: AnyDict) -> bytes:
+def fits_content(columns: AnyMapping, meta: AnyDict) -> bytes:
     """A FITS file with all columns, in a table named OBSERVATIONS."""
     units = {name: _UNITS.get(COLUMNS[name].unit, COLUMNS[name].unit) for name in columns}
     return _written({name: (values, units[name]) for name, values in columns.items()}, meta)
 
 
-def corr_content(columns: Mapping[str, Any], meta: AnyDict, camera: Camera | None) -> bytes:
+def corr_content(columns: AnyMapping, meta: AnyDict, camera: Camera | None) -> bytes:
     """One frame as astrometry.net writes its ``.corr`` files, pixels counted from (1, 1).
 
     ``field_ra``, ``field_dec`` and ``index_x``, ``index_y``, the star where the camera saw it and
@@ -148,7 +148,7 @@ def _value(cards: Sequence[bytes], key: bytes) -> bytes:
     return b""
 
 
-def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict, dict[str, str]]:
+def read_fits(path: Path, data: bytes) -> tuple[AnyDict, AnyDict, dict[str, str]]:
     """Columns under our names, metadata and units of a FITS table or ``.corr`` file; texts as
     lists, or else arrays.
     """
@@ -164,7 +164,7 @@ def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict, dict[st
             )
         header, rows = tables[0].header, tables[0].data
         check_size(int(header["NAXIS1"]) * int(header["NAXIS2"]), len(data))
-        columns: dict[str, Any] = {}
+        columns: AnyDict = {}
         units = {column.name.lower(): str(column.unit or "").strip() for column in rows.columns}
         for name in rows.names:
             values = np.asarray(rows[name])
@@ -186,7 +186,7 @@ def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict, dict[st
     return columns, meta, units
 
 
-def read_json(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
+def read_json(path: Path, data: bytes) -> tuple[AnyDict, AnyDict]:
     """Columns and metadata of matches of tetra3 or tetra3rs: a solution, a list of them, or a list
     named "frames".
     """
@@ -201,7 +201,7 @@ def read_json(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
 
 def matched_columns(
     solutions: Any, size_px: tuple[int, int] | None, times: Sequence[str] | None = None
-) -> tuple[dict[str, Any], AnyDict]:
+) -> tuple[AnyDict, AnyDict]:
     """Columns and metadata of solutions; see
     `starcal_uq.observations.table.Observations.from_matches`.
     """

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes, floats
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -303,8 +303,8 @@ class _Search:
     def __init__(self, marks: Fingerprints) -> None:
         self.counts = marks.counts
         self.starts = np.cumsum(self.counts) - self.counts
-        self.xy = np.asarray(marks.xy_px, dtype=np.float64)
-        self.square = np.asarray(marks.error_px, dtype=np.float64) ** 2
+        self.xy = floats(marks.xy_px)
+        self.square = floats(marks.error_px) ** 2
         # Median length of two normal errors, so that wrong stars do not count; it is that of a
         # sample.
         self.sigma = (

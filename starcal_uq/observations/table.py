@@ -124,7 +124,7 @@ class Observations(FrameRows, Sourced, Shown):
         object.__setattr__(self, "meta", {**self.meta, "directions": self.origin.directions})
 
     @property
-    def columns(self) -> dict[str, Any]:
+    def columns(self) -> AnyDict:
         """The columns that are present, in their fixed order: name to array of shape (N,)."""
         return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
 

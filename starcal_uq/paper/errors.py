@@ -26,7 +26,7 @@ from starcal_uq.camera.fields import detector_axes, grid_points
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 _GRID = 33
 _FIXED_POINT_STEPS = 40
@@ -119,7 +119,7 @@ def map_error(
     if xy_px is None:
         xy, weight = detector_grid(truth, n)
     else:
-        xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
+        xy = floats(xy_px).reshape(-1, 2)
         weight = np.full(len(xy), 1.0 / len(xy))
     true = unproject(truth, xy)
     turned, rotation = aligned(unproject(estimate, xy), true, weight)
@@ -155,7 +155,7 @@ def undistorted(camera: Camera, xy_px: FloatArray, how: Undistortion = "model") 
     makes it implicit; eq. 14 with r of the measured point; eq. 6. DistortionError when the camera's
     own distortion folds over within these points.
     """
-    xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
+    xy = floats(xy_px).reshape(-1, 2)
     if how not in UNDISTORTIONS:
         raise ValueError(f"undistortion {how!r} is unknown: use one of {', '.join(UNDISTORTIONS)}.")
     centre = camera.theta[:2]
@@ -196,7 +196,7 @@ def reprojection_error_px(
     """
     if optics not in OPTICS:
         raise ValueError(f"optics {optics!r} is unknown: use one of {', '.join(OPTICS)}.")
-    xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
+    xy = floats(xy_px).reshape(-1, 2)
     ideal = undistorted(truth, xy)
     corrected = undistorted(estimate, xy if noise_px is None else xy + noise_px, undistortion)
     if optics == "truth":
@@ -295,7 +295,7 @@ def point_errors(
 
     Stars are seen at `xy_px` (N, 2) without noise; `noise_px` is added for readings that have some.
     """
-    points, weight = np.asarray(xy_px, dtype=np.float64), np.full(len(xy_px), 1.0 / len(xy_px))
+    points, weight = floats(xy_px), np.full(len(xy_px), 1.0 / len(xy_px))
     if reading.whole_field:
         points, weight = detector_grid(truth)
     if reading.rotated:

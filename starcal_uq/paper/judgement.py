@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.maths.intervals import HALF_WIDTH_95
 from starcal_uq.paper.published import Printed
 
@@ -148,7 +148,7 @@ def trial(
     """Compare a printed number with draws (n,) of a reading, of which two must be finite (else
     ValueError).
     """
-    values = np.asarray(draws, dtype=np.float64)
+    values = floats(draws)
     values = values[np.isfinite(values)]
     n = len(values)
     if n < 2:

@@ -23,7 +23,7 @@ from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.status import Status
 from starcal_uq.core.store import Kept
-from starcal_uq.core.types import FloatArray, IntArray, PathLike, Progress
+from starcal_uq.core.types import FloatArray, IntArray, PathLike, Progress, floats
 from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
@@ -345,7 +345,7 @@ def fit_angles(obs: Observations, model: str, start: FloatArray) -> FloatArray:
     i, j = _pairs(obs.frame_starts)
     r = obs.directions_icrs
     given = _angle(r[i], r[j])[0]
-    theta = np.asarray(start, dtype=np.float64)
+    theta = floats(start)
     for _ in range(_MAX_STEPS):
         b, db = unproject_jacobian(model, theta, obs.xy)
         angle, sine = _angle(b[i], b[j])

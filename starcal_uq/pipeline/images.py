@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from starcal_uq.core.errors import CalibrationError, IdentificationError, Observ
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, Engine, bounded
 from starcal_uq.core.times import TIMES_IN_NAMES, julian_year, utc_text
+from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.matches import is_fits_table
 from starcal_uq.sky.apparent import catalogue_directions, make_apparent, without_low_stars
 from starcal_uq.sky.site import check_sky
@@ -224,7 +225,7 @@ def observations_from_centroids(
     directions: str | None = None,
     site: Site | None = None,
     in_space: bool = False,
-    identification: dict[str, Any] | None = None,
+    identification: AnyDict | None = None,
     known: Calibration | Posterior | None = None,
     model: str | None = None,
     lenient: bool = False,

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, IdentificationError, RepeatedFramesError
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.types import AnyDict
 from starcal_uq.identification.engine import identify
 from starcal_uq.pipeline.displacement import ToCatalogue, as_measured, mirrored, undisplaced
 
@@ -63,9 +64,9 @@ def identify_and_calibrate(
     first: Identification | None = None,
     prepare: Callable[[Observations], Observations] | None = None,
     to_catalogue: ToCatalogue | None = None,
-    method: dict[str, Any] | None = None,
+    method: AnyDict | None = None,
     model: str | None = None,
-    identification: dict[str, Any] | None = None,
+    identification: AnyDict | None = None,
 ) -> ImageCalibration:
     """Identify with the nominal camera, calibrate, and do both again with what was learnt.
 
@@ -134,7 +135,7 @@ def identify_and_calibrate(
 
 
 def _calibrated(
-    obs: Observations, camera: Camera, model: str | None, options: dict[str, Any]
+    obs: Observations, camera: Camera, model: str | None, options: AnyDict
 ) -> Calibration:
     """The calibration with the lens of a camera; with the model that was asked for where that is of
     no avail.
@@ -158,7 +159,7 @@ def _again(
     known: Calibration,
     stars: StarCatalogue,
     to_catalogue: ToCatalogue | None,
-    options: dict[str, Any],
+    options: AnyDict,
 ) -> Identification:
     """The second identification, with the calibrated camera and centroids freed from what displaces
     the stars.

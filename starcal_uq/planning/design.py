@@ -26,7 +26,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import Criterion, bounded
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, floats
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import quantities, spreads
 from starcal_uq.planning.information import FrameSet, Noise, look_at, random_frames
@@ -155,7 +155,7 @@ def _pool(
     if isinstance(candidates, int):
         rotations = random_rotations(max(candidates, 1), np.random.default_rng([seed, 3]))
     else:
-        rotations = np.asarray(candidates, dtype=np.float64)
+        rotations = floats(candidates)
         if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
             raise PlanningError(
                 f"candidates have the shape {rotations.shape}: give rotation matrices R_cam_icrs "

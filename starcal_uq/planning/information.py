@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.errors import PlanningError
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation.noise_model import NoiseModel
 from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -148,11 +148,7 @@ def noise_of(noise: Noise, mag: FloatArray, pixel: FloatArray) -> FloatArray:
     """
     if isinstance(noise, NoiseModel):
         return noise.at(pixel[0], pixel[1], mag)
-    values = (
-        np.asarray(noise(mag), dtype=np.float64)
-        if callable(noise)
-        else np.full(mag.shape, float(noise))
-    )
+    values = floats(noise(mag)) if callable(noise) else np.full(mag.shape, float(noise))
     if values.shape != mag.shape or not np.all((values > 0.0) & np.isfinite(values)):
         raise PlanningError(
             "sigma_px must be a noise above zero in px, or a function that gives one for every "

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import DistortionError, PlanningError
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.planning.forecast import SCOPES, Forecaster
 from starcal_uq.planning.information import FrameSet, Noise, random_frames
 from starcal_uq.sky.catalogue import StarCatalogue
@@ -174,7 +173,7 @@ def distortion_range(
     min_stars: int,
     target_arcsec: float | None,
     scope: str,
-    options: dict[str, Any],
+    options: AnyDict,
     seed: int,
 ) -> DistortionRange:
     """Forecast over a range of distortions, `bounds` on the displacement of the corner, per cent.
@@ -215,5 +214,5 @@ def distortion_range(
     )
 
 
-def _forecaster(seen: FrameSet, scope: str, options: dict[str, Any]) -> Forecaster:
+def _forecaster(seen: FrameSet, scope: str, options: AnyDict) -> Forecaster:
     return Forecaster(seen.information, seen.mean_stars, seen, scope=scope, **options)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import AnyDict, FloatArray, Progress
+from starcal_uq.core.types import AnyDict, FloatArray, Progress, floats
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.planning.forecast import (
     N_CAMPAIGNS,
@@ -238,11 +238,11 @@ class _Base(NamedTuple):
     seed: int
 
 
-def _forecaster(frames: FrameSet, scope: str, options: dict[str, Any]) -> Forecaster:
+def _forecaster(frames: FrameSet, scope: str, options: AnyDict) -> Forecaster:
     return Forecaster(frames.information, frames.mean_stars, frames, scope=scope, **options)
 
 
-def _needs(frames: FrameSet, target_arcsec: float, options: dict[str, Any]) -> tuple[Need, ...]:
+def _needs(frames: FrameSet, target_arcsec: float, options: AnyDict) -> tuple[Need, ...]:
     needs = []
     for scope in SCOPES:
         forecaster = _forecaster(frames, scope, options)
@@ -262,13 +262,13 @@ def _sweep(
     frames: FrameSet,
     noise_px: float,
     scope: str,
-    options: dict[str, Any],
+    options: AnyDict,
     target_arcsec: float | None,
     progress: Progress | None,
 ) -> pd.DataFrame:
     import pandas as pd
 
-    rows: list[dict[str, Any]] = []
+    rows: list[AnyDict] = []
     n_points = len(_MAG_STEPS) + len(_NOISE_FACTORS) + len(_FIELD_PARTS)
     for name, value, information, mission, sky in _points(base, frames, noise_px):
         forecaster = Forecaster(information, mission.mean_stars, mission, scope=scope, **options)
@@ -336,7 +336,7 @@ def start_information(after: HasInformation | None, camera: Camera) -> FloatArra
     """
     if after is None:
         return None
-    start = np.asarray(after.information, dtype=np.float64)
+    start = floats(after.information)
     if start.shape != (len(camera.theta),) * 2:
         raise PlanningError(
             f"the data that are there already are about {len(start)} parameters, but the camera "

@@ -13,7 +13,7 @@ import csv
 import json
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from starcal_uq.core.files import reading, write_csv
 from starcal_uq.core.formatting import count, join_words, plural, significant
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.types import BoolArray, FloatArray, PathLike
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, PathLike, floats
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
 
@@ -293,7 +293,7 @@ class AttitudeError(Shown):
             self.calibration_total_arcsec,
             self.interaction_arcsec,
         )
-        return np.stack([with_cross(np.asarray(row, dtype=np.float64)) for row in rows])
+        return np.stack([with_cross(floats(row)) for row in rows])
 
     @property
     def with_misfit_found_arcsec(self) -> FloatArray:
@@ -491,7 +491,7 @@ class AttitudeError(Shown):
                 if first.get("misfit")
                 else None
             )
-            later: dict[str, Any] = {}
+            later: AnyDict = {}
             if first.get("alignment"):
 
                 def matrix(contributor: str, prefix: str = "") -> list[list[float]]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.maths.linear import correlation_of, unit_inverse
 
 if TYPE_CHECKING:
@@ -187,17 +187,17 @@ def coupling(result: HasCovariance) -> Coupling:
 
     specs = parameters(result.camera.distortion)
     names = tuple(spec.name for spec in specs)
-    covariance = np.asarray(result.covariance, dtype=np.float64)
+    covariance = floats(result.covariance)
     correlation, sigma = correlation_of(covariance)
     conditional = sigma / np.sqrt(np.diag(np.linalg.inv(correlation)))
-    information = np.asarray(result.information, dtype=np.float64)
+    information = floats(result.information)
     inverse, scale = unit_inverse(information)
     bound = np.sqrt(np.diag(inverse)) * scale
     priors = getattr(result, "priors", None)
-    prior_sigma = None if priors is None else np.asarray(priors.sd(names), dtype=np.float64)
-    response = np.asarray(result.rotation_per_theta, dtype=np.float64)
+    prior_sigma = None if priors is None else floats(priors.sd(names))
+    response = floats(result.rotation_per_theta)
     extended, common = _extended(covariance, response)
-    noise = np.asarray(result.attitude_noise, dtype=np.float64)
+    noise = floats(result.attitude_noise)
     frame_sigma = np.sqrt(np.diag(response @ covariance @ response.T + noise))
     return Coupling(
         parameter_names=names,

@@ -14,7 +14,7 @@ from starcal_uq.core.errors import RunFolderError, SensorError
 from starcal_uq.core.files import ensure_new
 from starcal_uq.core.manifest import alone
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.types import FloatArray, PathLike, Progress
+from starcal_uq.core.types import FloatArray, PathLike, Progress, floats
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
 from starcal_uq.simulation.rendering import Scene
 from starcal_uq.simulation.sensor import Sensor
@@ -107,12 +107,10 @@ def render_frames(
         np.random.default_rng(seed),
         n_frames=n_frames,
         min_stars=min_stars,
-        attitudes=None
-        if attitudes is None
-        else np.asarray(attitudes, dtype=np.float64).reshape(-1, 3, 3),
+        attitudes=None if attitudes is None else floats(attitudes).reshape(-1, 3, 3),
     )
     n = len(rotations)
-    rates = np.zeros(3) if rates_rad_s is None else np.asarray(rates_rad_s, dtype=np.float64)
+    rates = np.zeros(3) if rates_rad_s is None else floats(rates_rad_s)
     if rates.shape not in ((3,), (n, 3)):
         raise SensorError(
             f"rendering: the rates have shape {rates.shape}; give (3,) or ({n}, 3) in rad/s."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -175,7 +175,7 @@ class _Maker:
         frame, star, xy = observed(
             sky, rng, self.sigma_px, n_frames=meta["frames"], min_stars=self.min_stars
         )
-        columns: dict[str, Any] = {
+        columns: AnyDict = {
             "frame": frame + meta["first_frame"],
             "x_px": xy[:, 0],
             "y_px": xy[:, 1],

@@ -13,7 +13,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import SensorError
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.simulation.psf import half_width_px, profiles
 from starcal_uq.simulation.sensor import Sensor
@@ -57,8 +57,8 @@ class Scene:
         time_utc: str | None = None,
     ) -> RenderedFrame:
         """One frame; the arguments are those of `render`."""
-        centre = np.asarray(rotation, dtype=np.float64)
-        rate = np.zeros(3) if rate_rad_s is None else np.asarray(rate_rad_s, dtype=np.float64)
+        centre = floats(rotation)
+        rate = np.zeros(3) if rate_rad_s is None else floats(rate_rad_s)
         if centre.shape != (3, 3) or not np.allclose(centre @ centre.T, np.eye(3), atol=1e-6):
             raise SensorError(
                 "rendering: the attitude is no rotation; give R_cam_icrs as an orthogonal 3 x 3 "

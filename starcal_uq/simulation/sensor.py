@@ -5,7 +5,6 @@ in them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from starcal_uq.core.errors import SensorError
 from starcal_uq.core.toml import Key, Section, read_section, write_section
-from starcal_uq.core.types import FloatArray, IntArray, PathLike
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, IntArray, PathLike, floats
 from starcal_uq.simulation.psf import KINDS, profiles
 
 _HEADER = """\
@@ -173,11 +172,7 @@ class Sensor:
 
     def electrons(self, mag: FloatArray | float) -> FloatArray:
         """Electrons of stars of these magnitudes in one exposure."""
-        return np.asarray(
-            self.zero_point_e_s
-            * self.exposure_s
-            * 10.0 ** (-0.4 * np.asarray(mag, dtype=np.float64))
-        )
+        return np.asarray(self.zero_point_e_s * self.exposure_s * 10.0 ** (-0.4 * floats(mag)))
 
     def hot_pixels(self, width_px: int, height_px: int) -> tuple[IntArray, FloatArray]:
         """Flat indices (row by row, ascending) and mean extra electrons in one exposure of the hot
@@ -225,12 +220,12 @@ class Sensor:
         """A copy with some attributes changed."""
         return self.from_dict(asdict(self) | changes)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> AnyDict:
         """The [sensor] table: plain values."""
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> Sensor:
+    def from_dict(cls, table: AnyMapping) -> Sensor:
         """A sensor from the [sensor] table; what is left out has its default.
 
         Raises

@@ -19,7 +19,7 @@ from starcal_uq.core.errors import ImageError, SensorError, StarcalError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_bytes, ensure_new
 from starcal_uq.core.provenance import NAME, installed_version
-from starcal_uq.core.types import FloatArray, PathLike, StrArray
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, StrArray
 from starcal_uq.images.image import Image
 from starcal_uq.observations.table import Observations
 from starcal_uq.simulation.sensor import Sensor
@@ -338,7 +338,7 @@ def truth_table(paths: Iterable[PathLike]) -> Observations:
     if not truths:
         raise ImageError("rendered frames: no file was named; give at least one.")
     tables = [truth.observations for truth in truths]
-    columns: dict[str, Any] = {}
+    columns: AnyDict = {}
     for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg"):
         columns[name] = np.concatenate([getattr(table, name) for table in tables])
     columns["star_id"] = np.concatenate([truth.star_id for truth in truths])

@@ -25,7 +25,7 @@ from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import julian_days
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, floats
 from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
 from starcal_uq.sky.refraction import (
     LEAST_ALTITUDE_DEG,
@@ -77,7 +77,7 @@ def earth_velocity_km_s(time_utc: Any) -> FloatArray:
 
     days, _, inverse = julian_days(time_utc)
     _, barycentric = erfa.epv00(days[:, 0], days[:, 1])
-    velocity = (np.asarray(barycentric["v"], dtype=np.float64) * AU_PER_DAY_KM_S)[inverse]
+    velocity = (floats(barycentric["v"]) * AU_PER_DAY_KM_S)[inverse]
     return velocity[0] if np.ndim(time_utc) == 0 else velocity
 
 
@@ -111,9 +111,7 @@ def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]
         / LIGHT_SPEED_KM_S
     )
     inverse_gamma = np.sqrt(1.0 - np.sum(velocity**2, axis=-1))
-    return np.asarray(
-        erfa.ab(directions, velocity, SUN_DISTANCE_AU, inverse_gamma), dtype=np.float64
-    )
+    return floats(erfa.ab(directions, velocity, SUN_DISTANCE_AU, inverse_gamma))
 
 
 def apparent_directions(
@@ -365,7 +363,7 @@ def _altitudes(
     return altitude
 
 
-def _atmosphere(site: Site, constants: tuple[float, float], altitude: FloatArray) -> dict[str, Any]:
+def _atmosphere(site: Site, constants: tuple[float, float], altitude: FloatArray) -> AnyDict:
     """What was taken for the air, and what it does, in plain values."""
     return {
         "pressure_hpa": site.air_pressure_hpa,
@@ -389,7 +387,7 @@ def check_velocity(
     Its shape must be (3,), or (rows, 3) where `rows` directions are given.
     """
     try:
-        velocity = np.asarray(velocity_km_s, dtype=np.float64)
+        velocity = floats(velocity_km_s)
     except (TypeError, ValueError):
         velocity = np.empty(0)
     shapes: tuple[tuple[int, ...], ...] = ((3,),) if rows is None else ((3,), (rows, 3))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 
 def unit_vectors(ra_deg: FloatArray, dec_deg: FloatArray) -> FloatArray:
@@ -48,13 +48,9 @@ def propagate_proper_motion(
     position = unit_vectors(ra_deg, dec_deg)
     east, north = _tangent(position)
     motion = _RAD_PER_MAS * (
-        east * np.asarray(pm_ra_mas_yr, dtype=np.float64)[:, None]
-        + north * np.asarray(pm_dec_mas_yr, dtype=np.float64)[:, None]
+        east * floats(pm_ra_mas_yr)[:, None] + north * floats(pm_dec_mas_yr)[:, None]
     )
-    moved = (
-        position
-        + motion * np.broadcast_to(np.asarray(years, dtype=np.float64), len(position))[:, None]
-    )
+    moved = position + motion * np.broadcast_to(floats(years), len(position))[:, None]
     length = np.linalg.norm(moved, axis=1, keepdims=True)
     moved /= length
     rate = (motion - moved * (moved * motion).sum(axis=1, keepdims=True)) / length / _RAD_PER_MAS

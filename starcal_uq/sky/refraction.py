@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.times import julian_days
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.sky.site import Site
 
 # Below this altitude refraction depends on the layers of the air, which two constants do not
@@ -53,10 +53,7 @@ def site_among_stars(
             np.sin(latitude),
         ]
     )
-    place_km = (
-        np.asarray(erfa.gd2gc(_WGS84, longitude, latitude, site.height_m), dtype=np.float64)
-        / 1000.0
-    )
+    place_km = floats(erfa.gd2gc(_WGS84, longitude, latitude, site.height_m)) / 1000.0
     velocity = _EARTH_RATE_RAD_S * np.array([-place_km[1], place_km[0], 0.0])
     # Rows times the rotation are columns times its transpose: from the axes of the Earth to those
     # of the stars.
@@ -101,9 +98,7 @@ def refract(
     # At the zenith itself there is no direction to be raised along, and nothing to raise.
     along = level / np.where(cosine > 0.0, cosine, 1.0)[..., None]
     seen = z_vacuum - raised
-    return np.asarray(
-        np.cos(seen)[..., None] * zenith + np.sin(seen)[..., None] * along, dtype=np.float64
-    )
+    return floats(np.cos(seen)[..., None] * zenith + np.sin(seen)[..., None] * along)
 
 
 def altitude_deg(directions: FloatArray, zenith: FloatArray) -> FloatArray:
@@ -122,5 +117,5 @@ def shrinking(altitude_seen_deg: FloatArray | float, constants: tuple[float, flo
     length that is estimated without refraction is too short by this part.
     """
     a, b = constants
-    squared = np.tan(np.radians(90.0 - np.asarray(altitude_seen_deg, dtype=np.float64))) ** 2
+    squared = np.tan(np.radians(90.0 - floats(altitude_seen_deg))) ** 2
     return 0.5 * ((a + 3.0 * b * squared) * (1.0 + squared) + a + b * squared)

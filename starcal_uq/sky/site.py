@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
 
 from starcal_uq.core.errors import SiteError
 from starcal_uq.core.toml import Key, Section, read_section, write_section
-from starcal_uq.core.types import AnyDict, PathLike
+from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 
 # By which a place turns among the stars in an hour.
 HOUR_DEG = 15.041067
@@ -147,7 +145,7 @@ class Site:
         return {name: value for name, value in asdict(self).items() if value is not None}
 
     @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> Site:
+    def from_dict(cls, table: AnyMapping) -> Site:
         """From keys and values of a [site] table.
 
         Raises

@@ -16,7 +16,7 @@ import numpy as np
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import check_fits, listed, reading, unpack
-from starcal_uq.core.types import FloatArray, IntArray, StrArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, StrArray, floats
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
 from starcal_uq.sky.cds import CdsFormat, read_cds
 from starcal_uq.sky.positions import propagate_proper_motion
@@ -226,7 +226,7 @@ class _Source:
             from astropy.units import Unit, UnitsError
 
         try:
-            return np.asarray(Unit(unit).to(Unit(wanted), values), dtype=np.float64)
+            return floats(Unit(unit).to(Unit(wanted), values))
         except (UnitsError, TypeError, ValueError) as error:
             raise CatalogueError(
                 f"{self.path}, column {self.names[name]!r}: the unit {str(unit)!r} cannot be "
@@ -283,7 +283,7 @@ def _load_table(path: Path, kind: Format) -> Any:
         from astropy.table import Table
         from astropy.utils.exceptions import AstropyWarning
 
-    options: dict[str, Any] = {
+    options: AnyDict = {
         "csv": {"format": "ascii.csv", "comment": "#"},
         "ecsv": {"format": "ascii.ecsv"},
         "fits": {"format": "fits"},

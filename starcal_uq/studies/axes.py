@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import KEYS, Limit
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.simulation.pointing import POINTINGS
 
@@ -112,13 +111,13 @@ CAMERA_AXES = tuple(AXES)[: tuple(AXES).index("max_mag")]
 EXCLUSIVE = (("fov_deg", "focal_mm"), *((name, "distortion_px") for name in COEFFICIENTS))
 
 
-def base_settings(given: Mapping[str, Any]) -> AnyDict:
+def base_settings(given: AnyMapping) -> AnyDict:
     """Values of every axis that has one, those that are given before the usual ones."""
     usual = {axis.name: axis.base for axis in AXES.values() if axis.base is not None}
     return usual | dict(given)
 
 
-def camera_of(base: Camera, settings: Mapping[str, Any]) -> Camera:
+def camera_of(base: Camera, settings: AnyMapping) -> Camera:
     """The camera of a cell.
 
     The distortion stays what it is in millimetres on the detector when pixels change, and in pixels

@@ -13,7 +13,6 @@ what `coupling` says of a posterior, before there is any.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameter_names, simpler_models
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StarcalError, StudyError
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
 from starcal_uq.inference.priors import Priors
 from starcal_uq.maths.linear import correlation_of, inverses
 from starcal_uq.propagation.coupling import weak_directions
@@ -156,7 +155,7 @@ class FisherCells(Cells):
         return statements(chosen, star_noise(chosen.mag, shape), offset)
 
 
-def prior_precision(table: Mapping[str, Any] | None, camera: Camera) -> FloatArray | None:
+def prior_precision(table: AnyMapping | None, camera: Camera) -> FloatArray | None:
     """Precision (p,) of the entries that a prior set states; None for no prior."""
     if table is None:
         return None

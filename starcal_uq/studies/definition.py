@@ -24,7 +24,7 @@ from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
-from starcal_uq.core.types import AnyDict, PathLike
+from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 from starcal_uq.inference.priors import PRIORS
 from starcal_uq.studies.axes import AXES, EXCLUSIVE, FLAT, base_settings, camera_of
 
@@ -155,7 +155,7 @@ class StudyDefinition:
 
     @classmethod
     def from_dict(
-        cls, content: Mapping[str, Any], where: str = "study", folder: Path | None = None
+        cls, content: AnyMapping, where: str = "study", folder: Path | None = None
     ) -> StudyDefinition:
         """A definition from the tables of a STUDY.toml; `folder` is where a camera's path starts
         from.
@@ -408,9 +408,7 @@ def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _camera(
-    content: Mapping[str, Any], path: str | None, where: str, folder: Path | None
-) -> Camera:
+def _camera(content: AnyMapping, path: str | None, where: str, folder: Path | None) -> Camera:
     if ("camera" in content) == (path is not None):
         both = "given twice" if path is not None else "missing"
         raise StudyError(
@@ -427,7 +425,7 @@ def _camera(
         ) from None
 
 
-def _observation(table: Mapping[str, Any], where: str) -> AnyDict:
+def _observation(table: AnyMapping, where: str) -> AnyDict:
     return {name: _axis(name, where).check(value, where) for name, value in table.items()}
 
 
@@ -500,7 +498,7 @@ def _values(name: str, value: Any, where: str) -> tuple[Any, ...]:
     return tuple(values)
 
 
-def _span(axis: Any, span: Mapping[str, Any], keys: dict[str, Key], where: str) -> AnyDict:
+def _span(axis: Any, span: AnyMapping, keys: dict[str, Key], where: str) -> AnyDict:
     inside = f"{where}, {axis.name}"
     checked = Section(keys, StudyError).check(span, inside)
     if checked.get("spacing", "linear") not in _SPACINGS:

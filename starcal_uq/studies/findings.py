@@ -5,7 +5,7 @@ direction turns.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from starcal_uq.core.constants import AXES as ATTITUDE
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, IntArray, floats
 from starcal_uq.propagation.coupling import ALONE, COUPLED, PART
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class Curve:
         """Exponent of the power law between the ends of the axis; None where there is none."""
         if any(isinstance(value, str) for value in self.values) or len(self.values) < 2:
             return None
-        x, y = np.asarray(self.values, dtype=np.float64), self.median
+        x, y = floats(self.values), self.median
         if np.any(x <= 0.0) or np.any(y <= 0.0):
             return None
         slope = float(np.polyfit(np.log(x), np.log(y), 1)[0])
@@ -86,7 +86,7 @@ class Lines:
     values: tuple[Any, ...]
     by: str | None
     by_values: tuple[Any, ...]
-    held: dict[str, Any]
+    held: AnyDict
     median: FloatArray
     low: FloatArray
     high: FloatArray
@@ -106,8 +106,8 @@ class Pair:
     names: tuple[str, str]
     strongest: float
     weakest: float
-    strongest_at: dict[str, Any]
-    weakest_at: dict[str, Any]
+    strongest_at: AnyDict
+    weakest_at: AnyDict
     seeds: float
     mean_size: float
     sizes: tuple[Curve, ...]
@@ -186,7 +186,7 @@ class Sweep:
         shape = tuple(
             1 if axis in pooled else n for axis, n in zip(self.axes, self.shape, strict=True)
         )
-        numbers = np.asarray(numbers, dtype=np.float64)
+        numbers = floats(numbers)
         good = self.ok & ~np.isnan(numbers) & cells
         codes = [
             c[good] * (axis not in pooled) for axis, c in zip(self.axes, self._codes, strict=True)
@@ -204,7 +204,7 @@ class Sweep:
             grid[places] = _statistic(values[order], first, n, statistic)
         return grid.reshape(shape)
 
-    def at(self, index: int) -> dict[str, Any]:
+    def at(self, index: int) -> AnyDict:
         """The values of the axes at a place, by its number in the flattened array."""
         codes = np.unravel_index(index, self.shape) if self.axes else ()
         return {
@@ -275,7 +275,7 @@ class Sweep:
         numbers: FloatArray,
         along: str,
         by: str | None = None,
-        at: Mapping[str, Any] | None = None,
+        at: AnyMapping | None = None,
     ) -> Lines:
         """A number (C,) of every cell along an axis, a line for every value of another one, all
         others held.
@@ -312,9 +312,7 @@ class Sweep:
             high,
         )
 
-    def held(
-        self, along: str, by: str | None = None, at: Mapping[str, Any] | None = None
-    ) -> dict[str, Any]:
+    def held(self, along: str, by: str | None = None, at: AnyMapping | None = None) -> AnyDict:
         """Where the other axes are held."""
         for axis in filter(None, (along, by)):
             self._check(axis)
@@ -341,7 +339,7 @@ class Sweep:
         self,
         numbers: FloatArray,
         along: str,
-        at: Mapping[str, Any] | None = None,
+        at: AnyMapping | None = None,
         statistic: Statistic = "median",
     ) -> FloatArray:
         """A statistic of a number at every value of an axis, over seeds and all axes that `at` does
@@ -351,7 +349,7 @@ class Sweep:
         others = [axis for axis in self.axes if axis != along]
         return self.over(numbers, statistic, others, self._cells(at or {})).ravel()
 
-    def _cells(self, at: Mapping[str, Any]) -> BoolArray:
+    def _cells(self, at: AnyMapping) -> BoolArray:
         """Cells (C,) at values of axes."""
         cells = np.ones(len(self.ok), dtype=np.bool_)
         for axis, value in at.items():
@@ -386,7 +384,7 @@ class Sweep:
 
     def cross(self, variable: str) -> FloatArray:
         """Root mean square over pitch and yaw of a variable by axis, of every cell."""
-        return np.asarray(cross(self.data[variable]).values, dtype=np.float64)
+        return floats(cross(self.data[variable]).values)
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
@@ -405,10 +403,7 @@ class Sweep:
         return tuple(pair for pair in self.pairs if abs(pair.strongest) >= COUPLED)
 
     def _pair(self, first: str, second: str) -> Pair | None:
-        r = np.asarray(
-            self.data["correlation"].sel(parameter=first, parameter_2=second).values,
-            dtype=np.float64,
-        )
+        r = floats(self.data["correlation"].sel(parameter=first, parameter_2=second).values)
         grid = self.over(r).ravel()
         if not np.isfinite(grid).any():
             return None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +20,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.formatting import count
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.terms import add_by_group
@@ -110,7 +110,7 @@ class Heaven:
         self._depths: dict[float, Depth] = {}
         self._hashes: dict[float, str] = {}
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> AnyDict:
         return {"stars": self.stars, "_depths": {}, "_hashes": {}}
 
     def depth(self, max_mag: float) -> Depth:
@@ -237,7 +237,7 @@ class Geometry:
 NoiseShape = tuple[float, float, float, float]
 
 
-def noise_shape(settings: Mapping[str, Any]) -> tuple[NoiseShape, float]:
+def noise_shape(settings: AnyMapping) -> tuple[NoiseShape, float]:
     """How noise depends on magnitude (size, dex per magnitude, magnitude, floor), and a factor on
     all of it.
     """
@@ -266,7 +266,7 @@ class GeometryKey(NamedTuple):
     seed: tuple[int, ...]
 
 
-def margin_px(settings: Mapping[str, Any]) -> float:
+def margin_px(settings: AnyMapping) -> float:
     """Stars nearer to the edge than this are left out: a power of two, so that many noises share
     their frames.
     """
@@ -276,7 +276,7 @@ def margin_px(settings: Mapping[str, Any]) -> float:
 
 
 def geometry_key(
-    camera: Camera, settings: Mapping[str, Any], seed: int, seed_index: int, exact: bool
+    camera: Camera, settings: AnyMapping, seed: int, seed_index: int, exact: bool
 ) -> GeometryKey:
     """What the frames of a cell depend on; `exact` asks for its own number of frames.
 
@@ -461,6 +461,6 @@ def _star_spread(
     return excess / m, common
 
 
-def offset_of(camera: Camera, settings: Mapping[str, Any]) -> float:
+def offset_of(camera: Camera, settings: AnyMapping) -> float:
     """Error of a star's direction in px at the boresight, per axis."""
     return float(camera.focal_px * settings["direction_mas"] / 1000.0 / ARCSEC)

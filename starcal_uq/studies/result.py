@@ -5,11 +5,10 @@ it.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from starcal_uq.core.errors import StudyError
 from starcal_uq.core.files import atomic_path, check_hdf5, new_folder, reading, write_netcdf
 from starcal_uq.core.manifest import read_manifest
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.types import BoolArray, FloatArray, PathLike
+from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, PathLike, floats
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
 from starcal_uq.studies.findings import Statistic, Sweep, cross
@@ -210,7 +209,7 @@ class Study(Shown):
             if label not in known:
                 raise StudyError(f"{variable} needs {name}=: give one of {', '.join(known)}.")
             array = array.sel({name: label})
-        numbers: FloatArray = np.asarray(array.values, dtype=np.float64)
+        numbers: FloatArray = floats(array.values)
         if numbers.ndim != 1:
             raise StudyError(
                 f"{variable} has more than one number per cell along "
@@ -235,7 +234,7 @@ class Study(Shown):
         variable: str,
         along: str,
         *,
-        at: Mapping[str, Any] | None = None,
+        at: AnyMapping | None = None,
         **labels: str | None,
     ) -> pd.DataFrame:
         """A variable along an axis, over seeds and all axes that `at` does not hold.
@@ -262,7 +261,7 @@ class Study(Shown):
         """
         return self._band(self.values(variable, **labels), along, at)
 
-    def _band(self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None) -> pd.DataFrame:
+    def _band(self, numbers: FloatArray, along: str, at: AnyMapping | None) -> pd.DataFrame:
         import pandas as pd
 
         names: dict[str, Statistic] = {
@@ -281,7 +280,7 @@ class Study(Shown):
         return pd.DataFrame({"value": self.sweep.values[along], **columns})
 
     def needed(
-        self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
+        self, along: str, target_arcsec: float | None = None, *, at: AnyMapping | None = None
     ) -> pd.DataFrame:
         """Frames that a target takes, along an axis, as `band` gives a variable; by default the
         study's own target.
@@ -300,7 +299,7 @@ class Study(Shown):
         return target
 
     def met(
-        self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
+        self, along: str, target_arcsec: float | None = None, *, at: AnyMapping | None = None
     ) -> list[float]:
         """Values of an axis of numbers at which the median frame-dependent error crosses the
         target, interpolated.
@@ -330,12 +329,12 @@ class Study(Shown):
 
         data, names = self.data, self.parameter_names
         cells, p = self.n_cells, len(names)
-        columns: dict[str, Any] = {"cell": np.repeat(np.arange(cells), p)}
+        columns: AnyDict = {"cell": np.repeat(np.arange(cells), p)}
         for name in (*self.definition.axes, "seed_index", "key", "status"):
             columns[name] = np.repeat(data[name].values, p)
         columns[_PARAMETER] = np.tile(np.array(names), cells)
         columns["unit"] = np.tile(np.array([PARAMETERS[name].unit for name in names]), cells)
-        late: dict[str, Any] = {}
+        late: AnyDict = {}
         for key, array in data.data_vars.items():
             name = str(key)
             dims, values = array.dims[1:], array.values

@@ -7,7 +7,6 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyMapping, FloatArray
 from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, run_ensembles
 from starcal_uq.inference.named import NaivePairsWarning, find_source
 from starcal_uq.inference.priors import GaussianPriors, Priors
@@ -240,7 +239,7 @@ class GroundPrior:
 
 
 def observe(
-    geometry: Geometry, noise: FloatArray, settings: Mapping[str, Any], rng: np.random.Generator
+    geometry: Geometry, noise: FloatArray, settings: AnyMapping, rng: np.random.Generator
 ) -> Observations:
     """A table of the frames with noise; stars whose catalogue errs have other directions in it than
     in the sky.

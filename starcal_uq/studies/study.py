@@ -24,7 +24,7 @@ from starcal_uq.core.provenance import NAME, provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import held, take_over
 from starcal_uq.core.tasks import one_thread, run_tasks
-from starcal_uq.core.types import AnyDict, PathLike, Progress
+from starcal_uq.core.types import AnyDict, PathLike, Progress, floats
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells
@@ -360,7 +360,7 @@ def dataset(
             if not known.any():
                 continue
             flat = some.drop_null()
-            numbers = np.asarray(flat.flatten() if dims else flat, dtype=np.float64)
+            numbers = floats(flat.flatten() if dims else flat)
             shape = [len(i) for i in index]
             values[np.ix_(members[known], *index)] = numbers.reshape(int(known.sum()), *shape)
         attributes = {"long_name": words} | ({"units": unit} if unit else {})

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.store import Kept
-from starcal_uq.core.types import FloatArray, PathLike, Progress
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
 from starcal_uq.paper.commands import Bar, write_tables
 from starcal_uq.paper.field.attitudes import (
     Repetition,
@@ -196,7 +196,7 @@ def _experiment(
     )
     kept = Kept(folder, [*made_of, cameras])
     replicates = replicate_field(repetition, n_replicates, workers, bar.part("replicates"), kept)
-    settings: dict[str, Any] = {
+    settings: AnyDict = {
         "reading": sensor.name,
         "n_frames": n_frames,
         "n_calibration_frames": n_calibration_frames,

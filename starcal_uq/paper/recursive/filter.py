@@ -35,7 +35,7 @@ import numpy as np
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import PairCovariance
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, floats
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.recursive.innovations import PairNormals, frame_normals
 
@@ -368,7 +368,7 @@ class Recursion:
         if not np.isfinite(gram[0, 0]):
             return None
         shift = self.offset - self.point
-        gain = np.asarray(np.linalg.solve(_identity(q) + prior @ m, prior), dtype=np.float64)
+        gain = floats(np.linalg.solve(_identity(q) + prior @ m, prior))
         pulled = m @ shift
         slope = a - pulled
         change = gain @ slope

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -150,7 +150,7 @@ class _Seen:
 class _Rows:
     """Rows of a file: columns, and the number of each row in it."""
 
-    columns: dict[str, Any]
+    columns: AnyDict
     numbers: IntArray
 
     def part(self, start: int, stop: int | None) -> _Rows:

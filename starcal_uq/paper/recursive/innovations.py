@@ -30,7 +30,7 @@ import numpy as np
 
 from starcal_uq.camera.projection import backward_kernel, backward_root
 from starcal_uq.core.settings import PairCovariance
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.observations.frames import StarFrames
 
 PAIR_COVARIANCES: tuple[PairCovariance, ...] = get_args(PairCovariance)
@@ -156,7 +156,7 @@ def _attitudes(
     shifts = frames.sum(np.sum(rotated[:, :, None] * slopes[:, None], axis=0)).transpose(2, 0, 1)
     if not np.isfinite(information).all():
         return np.full(shifts.shape, np.nan), np.full(information.shape, np.nan)
-    noise = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    noise = floats(np.linalg.inv(information))
     return noise @ shifts, noise
 
 

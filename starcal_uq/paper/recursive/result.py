@@ -12,7 +12,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.result import Calibration, KeptFrames
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import CompressedLikelihood
@@ -206,7 +206,7 @@ def stream_calibration(
     method: str,
     stages: list[Stage],
     status: Status,
-    settings: dict[str, Any],
+    settings: AnyDict,
     data_hash: str | None,
     per_star: bool,
     estimate: JointEstimate,

@@ -12,7 +12,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import PairCovariance, RecursiveMethod
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.estimation.stages import Stage, optics_stage
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.recursive.filter import REACH_SIGMAS, FrameSums, Recursion
@@ -79,7 +79,7 @@ def begin(
         origin = stage.theta.copy()
     process = None
     if options.process_noise is not None:
-        walk = np.broadcast_to(np.asarray(options.process_noise, dtype=np.float64), (q,))
+        walk = np.broadcast_to(floats(options.process_noise), (q,))
         process = (walk / reference) ** 2
     covariance = np.diag((prior.deviation / reference) ** 2)
     recursion = Recursion(
@@ -164,7 +164,7 @@ class RecursionOptions:
             if getattr(self, name) < 1:
                 raise CalibrationError(f"{name} is {getattr(self, name)}: use 1 or more.")
         if self.process_noise is not None:
-            noise = np.atleast_1d(np.asarray(self.process_noise, dtype=np.float64))
+            noise = np.atleast_1d(floats(self.process_noise))
             if noise.shape not in ((1,), (3,)) or not (
                 np.isfinite(noise).all() and (noise >= 0.0).all()
             ):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -287,7 +287,7 @@ class RecursiveCalibration:
 
     def settings(self, estimate: JointEstimate, *, stream: bool) -> AnyDict:
         """For the provenance; `stream` where the frames are gone."""
-        settings: dict[str, Any] = {
+        settings: AnyDict = {
             "method": self.method,
             "solver": "filter",
             "distortion": self.nominal.distortion,

@@ -12,7 +12,7 @@ import numpy as np
 from starcal_uq.camera.distortion import Parameter, parameters
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import fixed, significant
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, floats
 from starcal_uq.paper.errors import detector_grid, map_error, reprojection_error_px
 from starcal_uq.paper.field.published import FIELD_METHODS, RATE, printed_field
 from starcal_uq.paper.interaction import AXES as STUDY_AXES
@@ -159,9 +159,7 @@ def _distance_axis(axes: Sequence[Axes], threshold: float) -> None:
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     ax = axes[0]
-    values = np.concatenate(
-        [np.asarray(line.get_ydata(), dtype=np.float64) for one in axes for line in one.lines]
-    )
+    values = np.concatenate([floats(line.get_ydata()) for one in axes for line in one.lines])
     low, high = float(values.min()), float(values.max())
     reach = max(-low, high)
     powers = threshold * 10.0 ** np.arange(int(np.ceil(np.log10(max(reach / threshold, 10.0)))) + 1)
@@ -205,7 +203,7 @@ def plot_error_fields(found: Reproduction) -> Figure:
             )
             title = (
                 f"{found.run.label(name)}, {kind}\nlargest "
-                f"{significant(float(np.hypot(*error.T).max()))} px{note}"
+                f"{significant(np.hypot(*error.T).max())} px{note}"
             )
             style.label(
                 panels[row, column], title, "x [px]" if row else "", "y [px]" if column == 0 else ""

@@ -68,7 +68,7 @@ def reproduction_page(found: Reproduction, figures: Mapping[str, bytes]) -> str:
     warning = (
         f"This reproduction has {plural(n, 'frame')} where the paper has {count(N_FRAMES)}: our "
         "draws spread "
-        f"{fixed(float(np.sqrt(N_FRAMES / n)), 1)} times as far, and z-values are that much "
+        f"{fixed(np.sqrt(N_FRAMES / n), 1)} times as far, and z-values are that much "
         "smaller."
     )
     sections = [

@@ -9,7 +9,7 @@ import numpy as np
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
+from starcal_uq.presentation.figures.scales import round_below, round_levels, ticks_at_levels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,10 +75,7 @@ def _filled(
     image = ax.contourf(
         x, y, np.maximum(values, levels[0]), levels=levels, norm=norm, cmap="cividis"
     )
-    ax.set_xlim(x[0], x[-1])
-    ax.set_ylim(y[-1], y[0])
-    ax.set_aspect("equal")
-    style.label(ax, title, "x [px]", "y [px]")
+    style.detector(ax, x, y, title)
     return image
 
 
@@ -101,10 +98,10 @@ def _arrows(ax: Axes, comparison: CameraComparison) -> None:
     d = comparison.difference_arcsec[some, some]
     x, y = np.meshgrid(comparison.x_px[some], comparison.y_px[some])
     # The largest are in the corners and would leave nothing to see elsewhere.
-    typical = float(np.percentile(np.linalg.norm(d, axis=-1), 85.0))
+    typical = np.percentile(np.linalg.norm(d, axis=-1), 85.0)
     if typical < _NOTHING:
         return
-    spacing = float(comparison.x_px[step] - comparison.x_px[0])
+    spacing = comparison.x_px[step] - comparison.x_px[0]
     arrows = ax.quiver(
         x,
         y,
@@ -118,8 +115,7 @@ def _arrows(ax: Axes, comparison: CameraComparison) -> None:
         linewidth=0.6,
         width=0.006,
     )
-    exponent = np.floor(np.log10(typical))
-    key = max(s * 10.0**exponent for s in (1.0, 2.0, 5.0) if s * 10.0**exponent <= typical)
+    key = round_below(typical)
     ax.quiverkey(
         arrows,
         0.93,

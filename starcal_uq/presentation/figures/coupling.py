@@ -36,11 +36,7 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
     if ax is None:
         side = 1.4 + 0.62 * len(names)
         ax = style.new_axes(side + 0.8, side)
-    image = (
-        _extended(ax, coupling)
-        if extended
-        else _heat_map(ax, np.asarray(coupling.correlation), names)
-    )
+    image = _extended(ax, coupling) if extended else _heat_map(ax, coupling.correlation, names)
     style.label(ax, "With the boresight" if extended else "Camera parameters", pad=24)
     style.colour_bar(ax, image, "correlation")
     return ax
@@ -54,7 +50,7 @@ def plot_correlations(coupling: Coupling) -> Figure:
     figure = style.new_figure(width, q * cell + above + 0.1)
     left = style.place(figure, before, 0.1 + (q - p) * cell, p * cell, p * cell)
     right = style.place(figure, before + p * cell + between, 0.1, q * cell, q * cell)
-    _heat_map(left, np.asarray(coupling.correlation), coupling.parameter_names)
+    _heat_map(left, coupling.correlation, coupling.parameter_names)
     image = _extended(right, coupling)
     style.label(left, "Camera parameters", pad=24)
     style.label(right, "With the constant attitude error they cause", pad=24)
@@ -65,33 +61,23 @@ def plot_correlations(coupling: Coupling) -> Figure:
 
 def plot_couplings(coupling: Coupling, ax: Axes | None = None) -> Axes:
     """How many times larger each sigma is because the other parameters are unknown too."""
-    if ax is None:
-        ax = style.new_axes(4.6, 2.6, (0.4, 0.12, 0.5, 0.34))
-    style.dress(ax, grid=True)
-    ratio = np.asarray(coupling.sigma_marginal) / np.asarray(coupling.sigma_conditional)
+    ax = style.panel(ax, 4.6, 2.6, (0.4, 0.12, 0.5, 0.34), grid=True)
+    ratio = coupling.sigma_marginal / coupling.sigma_conditional
     rows = np.arange(len(ratio))
     ax.barh(rows, ratio, color=style.BLUE, height=0.62)
     for row, value in zip(rows, ratio, strict=True):
-        ax.annotate(
-            f"×{significant(float(value))}",
-            (value, row),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=style.TICK_SIZE,
-            color=style.INK,
-        )
+        style.note(ax, f"×{significant(value)}", (value, row), (4, 0), va="center")
     ax.axvline(1.0, color=style.INK, linewidth=1.0)
     ax.set_yticks(rows, [symbol(n) for n in coupling.parameter_names], fontsize=style.LABEL_SIZE)
     ax.invert_yaxis()
-    ax.set_xlim(0.0, 1.18 * float(ratio.max()))
+    ax.set_xlim(0.0, 1.18 * ratio.max())
     ax.grid(False, axis="y")
     style.label(ax, "Price of coupling", "sigma / sigma if all other parameters were known")
     return ax
 
 
 def _extended(ax: Axes, coupling: Coupling) -> AxesImage:
-    image = _heat_map(ax, np.asarray(coupling.extended_correlation), coupling.extended_names)
+    image = _heat_map(ax, coupling.extended_correlation, coupling.extended_names)
     split = len(coupling.parameter_names) - 0.5
     ax.axhline(split, color=style.INK, linewidth=1.2)
     ax.axvline(split, color=style.INK, linewidth=1.2)
@@ -101,31 +87,17 @@ def _extended(ax: Axes, coupling: Coupling) -> AxesImage:
 def _heat_map(ax: Axes, matrix: FloatArray, names: Sequence[str]) -> AxesImage:
     image = ax.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
     style.dress(ax)
-    for spine in ax.spines.values():
-        spine.set_visible(False)
-    ax.tick_params(length=0.0, top=True, labeltop=True, bottom=False, labelbottom=False)
-    ticks = np.arange(len(names))
-    ax.set_xticks(ticks, [symbol(n) for n in names], fontsize=style.LABEL_SIZE)
-    ax.set_yticks(ticks, [symbol(n) for n in names], fontsize=style.LABEL_SIZE)
-    ax.set_xticks(ticks[1:] - 0.5, minor=True)
-    ax.set_yticks(ticks[1:] - 0.5, minor=True)
-    ax.grid(True, which="minor", color="white", linewidth=1.6)
-    ax.tick_params(which="minor", length=0.0, top=False, bottom=False, left=False)
+    ax.tick_params(top=True, labeltop=True, bottom=False, labelbottom=False)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_ticks(range(len(names)), list(map(symbol, names)), fontsize=style.LABEL_SIZE)
+    style.squares(ax, len(names), len(names), 1.6)
+    ax.tick_params(which="minor", top=False, bottom=False, left=False)
     for (row, column), value in np.ndenumerate(matrix):
         colour = "white" if abs(value) > 0.62 else style.INK
         weight = "bold" if row != column and abs(value) >= 0.7 else "normal"
-        ax.text(
-            column,
-            row,
-            correlation_text(float(value), row == column),
-            ha="center",
-            va="center",
-            fontsize=style.TICK_SIZE,
-            color=colour,
-            weight=weight,
-            # Inside its cell: nothing for the layout to make room for.
-            in_layout=False,
-        )
+        text = correlation_text(value, row == column)
+        # Inside its cell: nothing for the layout to make room for.
+        style.in_cell(ax, text, row, column, color=colour, weight=weight, in_layout=False)
     return image
 
 
@@ -134,11 +106,7 @@ def correlation_text(value: float, diagonal: bool = False) -> str:
     if diagonal:
         return "1"
     if abs(value) >= 0.99:
-        text = (
-            f"{np.sign(value) * min(abs(value), 0.9999):.4f}"
-            if abs(value) >= 0.999
-            else f"{value:.3f}"
-        )
+        text = f"{np.clip(value, -0.9999, 0.9999):.{4 if abs(value) >= 0.999 else 3}f}"
     else:
         text = f"{value:.2f}"
     return text.replace("-", "−") if float(text) != 0.0 else "0.00"

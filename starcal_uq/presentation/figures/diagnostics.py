@@ -271,4 +271,4 @@ def _nees_panel(ax: Axes, validation: Validation) -> None:
 
 
 def _p(value: float) -> str:
-    return "< 0.0001" if value < 1e-4 else f"= {significant(float(value))}"
+    return "< 0.0001" if value < 1e-4 else f"= {significant(value)}"

@@ -9,7 +9,7 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters as camera_parameters
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import pretty_unit, significant
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import symbol
@@ -115,7 +115,7 @@ def _joined(cal: Calibration) -> tuple[FloatArray, list[int]]:
     for stage in cal.stages:
         starts.append(length)
         length += len(stage.trajectory)
-    return np.concatenate([np.asarray(s.trajectory, dtype=np.float64) for s in cal.stages]), starts
+    return np.concatenate([floats(s.trajectory) for s in cal.stages]), starts
 
 
 def _mark_stages(ax: Axes, starts: list[int], total: int) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.formatting import pretty_unit
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import AxisScale, axis_scale, symbol
 
@@ -399,7 +399,7 @@ def inner_ticks(low: float, high: float) -> FloatArray:
     margin = _MARGIN * (high - low)
     inside = np.empty(0)
     for intervals in range(3, 8):
-        ticks = np.asarray(MaxNLocator(intervals).tick_values(low, high), dtype=np.float64)
+        ticks = floats(MaxNLocator(intervals).tick_values(low, high))
         inside = ticks[(ticks >= low + margin) & (ticks <= high - margin)]
         if len(inside) > 1:
             break

@@ -4,20 +4,20 @@ check of a forecast.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import count
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, floats
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.sweeps import plain, target_line, target_words
 from starcal_uq.presentation.words.planning import level, need_words
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
     from starcal_uq.planning.check import ForecastCheck
@@ -31,6 +31,7 @@ _SCOPES = {
     "total": "calibration and centroid noise",
 }
 _CROSS = AXES[:2]
+_LINE: AnyDict = {"markersize": 4, "linewidth": 1.5}
 _SWEEPS = (
     ("magnitude limit", "faintest magnitude", False),
     ("noise", "centroid noise [px per axis]", True),
@@ -58,7 +59,7 @@ def plot_forecast(plan: Plan) -> Figure:
     figure = style.new_figure(11.0, 7.6)
     panels = figure.subplots(2, 2)
     table = plan.to_dataframe()
-    n = np.asarray(table["n_frames"], dtype=np.float64)
+    n = floats(table["n_frames"])
     for ax, axes, title in (
         (panels[0, 0], _CROSS, "Across the boresight, per axis"),
         (panels[0, 1], ("roll",), "About the boresight"),
@@ -78,18 +79,8 @@ def _attitude_panel(ax: Axes, table: pd.DataFrame, n: FloatArray, axes: tuple[st
         ("common", "calibration, common rotation", style.ORANGE, "o"),
         ("rest", "calibration, rest", style.GREEN, "s"),
     ):
-        squares = sum(
-            np.asarray(table[f"{part}_{axis}_arcsec"], dtype=np.float64) ** 2 for axis in axes
-        )
-        ax.plot(
-            n,
-            np.sqrt(squares / len(axes)),
-            color=colour,
-            marker=marker,
-            markersize=4,
-            linewidth=1.5,
-            label=words,
-        )
+        squares = (table[[f"{part}_{axis}_arcsec" for axis in axes]] ** 2).mean(axis=1)
+        ax.plot(n, np.sqrt(squares), color=colour, marker=marker, label=words, **_LINE)
     _plain_ticks(ax)
 
 
@@ -98,53 +89,35 @@ def _radius_panel(ax: Axes, plan: Plan, n: FloatArray) -> None:
     found = plan.forecast
     if plan.distortion is not None:
         radii = plan.distortion.radius_arcsec
-        ax.fill_between(
-            n, radii.min(axis=0), radii.max(axis=0), color=style.LIGHT, linewidth=0, zorder=0
-        )
-    ax.fill_between(
-        n, found.radius_low, found.radius_high, color=style.BLUE, alpha=0.2, linewidth=0
-    )
-    ax.plot(n, found.radius, color=style.BLUE, marker="o", markersize=4, linewidth=1.5)
+        style.band(ax, n, radii.min(axis=0), radii.max(axis=0), style.LIGHT, zorder=0)
+    style.band(ax, n, found.radius_low, found.radius_high, style.BLUE, alpha=0.2)
+    ax.plot(n, found.radius, color=style.BLUE, marker="o", **_LINE)
     if plan.target_arcsec is not None:
-        ax.axhline(plan.target_arcsec, color=style.VERMILLION, linewidth=1.2, dashes=(5, 2))
+        target_line(ax, plan.target_arcsec)
         needed = plan.frames_needed
         words = f"target {plan.target_arcsec:g} arcsec"
         if needed is not None and plan.need is not None:
             words += f": {need_words(plan.need, plan.need.frames)}"
-            _continued(ax, plan, n, needed)
-            ax.plot(
-                needed,
-                plan.target_arcsec,
-                linestyle="",
-                marker="D",
-                color=style.VERMILLION,
-                markersize=6,
-                zorder=4,
-            )
-        ax.annotate(
-            words,
-            (0.02, plan.target_arcsec),
-            xycoords=("axes fraction", "data"),
-            xytext=(0, 4),
-            textcoords="offset points",
-            fontsize=style.TICK_SIZE,
-            color=style.VERMILLION,
-        )
+            _continued(ax, plan, n, needed, plan.target_arcsec)
+            _diamond(ax, needed, plan.target_arcsec, markersize=6, zorder=4)
+        target_words(ax, plan.target_arcsec, words)
     _plain_ticks(ax)
     title = f"Two-axis error at {level(plan.confidence)}, {_SCOPES[plan.scope]}"
     style.label(ax, title, "frames", "error across the boresight [arcsec]")
 
 
-def _continued(ax: Axes, plan: Plan, n: FloatArray, needed: int) -> None:
+def _continued(ax: Axes, plan: Plan, n: FloatArray, needed: int, target: float) -> None:
     """The curve from its nearest end to the number of frames that is needed."""
     if n[0] <= needed <= n[-1]:
         return
     place = 0 if needed < n[0] else -1
-    ends = (
-        (n[place], plan.forecast.radius[place]),
-        (float(needed), float(plan.target_arcsec or np.nan)),
-    )
-    ax.plot(*np.transpose(ends), color=style.BLUE, linewidth=1.3, linestyle=":")
+    x, y = (n[place], needed), (plan.forecast.radius[place], target)
+    ax.plot(x, y, color=style.BLUE, linewidth=1.3, linestyle=":")
+
+
+def _diamond(ax: Axes, x: Any, y: Any, **look: Any) -> None:
+    """The plan itself."""
+    ax.plot(x, y, linestyle="", marker="D", color=style.VERMILLION, **look)
 
 
 def _parameter_panel(ax: Axes, plan: Plan, table: pd.DataFrame, n: FloatArray) -> None:
@@ -159,7 +132,7 @@ def _parameter_panel(ax: Axes, plan: Plan, table: pd.DataFrame, n: FloatArray) -
             (table["distortion_corner_px"], "distortion, at the farthest corner", style.PURPLE, "^")
         )
     for values, words, colour, marker in shown:
-        ax.plot(n, values, color=colour, marker=marker, markersize=4, linewidth=1.5, label=words)
+        ax.plot(n, values, color=colour, marker=marker, label=words, **_LINE)
     _plain_ticks(ax)
     style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 0.0))
     style.label(ax, "Parameters", "frames", "1 sigma [px]")
@@ -174,19 +147,8 @@ def _logarithmic(ax: Axes) -> None:
 
 def _plain_ticks(ax: Axes) -> None:
     """Numbers instead of powers of ten on both logarithmic axes."""
-    _plain_axis(ax.xaxis, ax.get_xlim())
-    _plain_axis(ax.yaxis, ax.get_ylim())
-
-
-def _plain_axis(axis: Axis, limits: tuple[float, float]) -> None:
-    """Numbers instead of powers of ten, at 1, 2 and 5 where an axis spans less than two decades."""
-    from matplotlib.ticker import FuncFormatter, LogLocator
-
-    narrow = limits[1] < 150.0 * limits[0]
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,), numticks=20))
-    axis.set_major_formatter(
-        FuncFormatter(lambda value, _: count(int(value)) if value >= 1.0 else f"{value:.6g}")
-    )
+    plain(ax.xaxis, fine=False)
+    plain(ax.yaxis, fine=False)
 
 
 def plot_plan_sweeps(plan: Plan) -> Figure:
@@ -198,89 +160,54 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
     """
     if plan.sweeps is None:
         raise ValueError("this plan was made without sweeps: call plan with sweeps=True.")
-    of_frames = plan.frames_needed is not None
+    of_frames, found = plan.frames_needed is not None, plan.distortion
     column = "frames_needed" if of_frames else "radius_arcsec"
-    open_distortion = plan.distortion is not None
     figure = style.new_figure(11.0, 3.6)
-    panels = figure.subplots(1, 3 + open_distortion, sharey=True)
+    panels = figure.subplots(1, 3 + (found is not None), sharey=True)
     here = {"magnitude limit": plan.max_mag, "noise": plan.sigma_px, "part of the detector": 1.0}
-    if plan.distortion is not None:
-        _distortion_panel(panels[3], plan, of_frames)
+    if found is not None:
+        frames = found.frames[:, found.scopes.index(plan.scope)]
+        own = np.abs(found.percent - found.own_percent)
+        _changed(
+            panels[3],
+            *(found.percent, frames if of_frames else found.radius_after_arcsec),
+            *(np.arange(len(own)) == np.argmin(own), "distortion at the corner [%]"),
+        )
     for ax, (name, words, logarithmic) in zip(panels[:3], _SWEEPS, strict=True):
         rows = plan.sweeps[plan.sweeps["sweep"] == name]
-        x, y = (np.asarray(rows[key], dtype=np.float64) for key in ("value", column))
-        style.dress(ax, grid=True)
-        ax.set_yscale("log")
+        x, y = rows[["value", column]].to_numpy(np.float64).T
         if logarithmic:
             ax.set_xscale("log")
         ax.set_xticks(x, [f"{value:.3g}" for value in x])
-        ax.minorticks_off()
-        good = np.isfinite(y)
-        ax.plot(x[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5)
-        edge = ax.get_xaxis_transform()
-        ax.plot(
-            x[~good],
-            np.full((~good).sum(), 0.97),
-            "^",
-            color=style.GREY,
-            markersize=6,
-            transform=edge,
-        )
-        present = good & np.isclose(x, here[name], rtol=1e-6)
-        ax.plot(
-            x[present], y[present], marker="D", color=style.VERMILLION, markersize=7, linestyle=""
-        )
+        _changed(ax, x, y, np.isclose(x, here[name], rtol=1e-6), words)
         if plan.target_arcsec is not None and not of_frames:
-            ax.axhline(plan.target_arcsec, color=style.VERMILLION, linewidth=1.2, dashes=(5, 2))
-        style.label(ax, "", words)
+            target_line(ax, plan.target_arcsec)
+    at = level(plan.confidence)
     if of_frames:
-        style.label(panels[0], "", "", "frames")
-        title = (
-            f"Frames for {plan.target_arcsec:g} arcsec at {level(plan.confidence)}, "
-            f"{_SCOPES[plan.scope]}"
-        )
+        title, words = f"Frames for {plan.target_arcsec:g} arcsec at {at}", "frames"
     else:
-        style.label(panels[0], "", "", f"error at {level(plan.confidence)} [arcsec]")
-        title = (
-            f"Two-axis error after {count(int(plan.sweeps['n_frames'].iloc[0]))} frames, "
-            f"{_SCOPES[plan.scope]}"
-        )
-        title += (
-            "" if plan.target_arcsec is None else f"; line: target {plan.target_arcsec:g} arcsec"
-        )
-    style.label(panels[0], title)
-    _plain_axis(panels[0].yaxis, panels[0].get_ylim())
+        after = count(int(plan.sweeps["n_frames"].iloc[0]))
+        title, words = f"Two-axis error after {after} frames", f"error at {at} [arcsec]"
+    title += f", {_SCOPES[plan.scope]}"
+    if plan.target_arcsec is not None and not of_frames:
+        title += f"; line: target {plan.target_arcsec:g} arcsec"
+    style.label(panels[0], title, y=words)
+    plain(panels[0].yaxis, fine=False)
     return figure
 
 
-def _distortion_panel(ax: Axes, plan: Plan, of_frames: bool) -> None:
-    found = plan.distortion
-    assert found is not None
-    y = found.frames[:, found.scopes.index(plan.scope)] if of_frames else found.radius_after_arcsec
+def _changed(ax: Axes, x: FloatArray, y: FloatArray, own: BoolArray, words: str) -> None:
+    """What is needed with one thing changed; triangles where it is beyond all numbers."""
     style.dress(ax, grid=True)
     ax.set_yscale("log")
     ax.minorticks_off()
     good = np.isfinite(y)
-    ax.plot(
-        found.percent[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5
-    )
-    ax.plot(
-        *(found.percent[~good], np.full((~good).sum(), 0.97), "^"),
-        color=style.GREY,
-        markersize=6,
-        transform=ax.get_xaxis_transform(),
-    )
-    own = int(np.argmin(np.abs(found.percent - found.own_percent)))
-    if good[own]:
-        ax.plot(
-            found.percent[own],
-            y[own],
-            marker="D",
-            color=style.VERMILLION,
-            markersize=7,
-            linestyle="",
-        )
-    style.label(ax, "", "distortion at the corner [%]")
+    ax.plot(x[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5)
+    edge = ax.get_xaxis_transform()
+    beyond = np.full((~good).sum(), 0.97)
+    ax.plot(x[~good], beyond, "^", color=style.GREY, markersize=6, transform=edge)
+    _diamond(ax, x[good & own], y[good & own], markersize=7)
+    style.label(ax, "", words)
 
 
 def plot_frame_choice(choice: FrameChoice) -> Figure:
@@ -306,16 +233,11 @@ def plot_frame_choice(choice: FrameChoice) -> Figure:
     n = np.arange(1, len(table) + 1)
     # The first frames alone hardly determine the parameters.
     first = min(3, len(n) - 1)
-    right.plot(
-        n[first:],
-        choice.random_path[first:],
-        color=style.GREY,
-        linewidth=1.5,
-        label="random frames, mean",
-    )
-    right.plot(
-        n[first:], choice.score_path[first:], color=style.BLUE, linewidth=1.8, label="chosen frames"
-    )
+    for path, colour, width, words in (
+        (choice.random_path, style.GREY, 1.5, "random frames, mean"),
+        (choice.score_path, style.BLUE, 1.8, "chosen frames"),
+    ):
+        right.plot(n[first:], path[first:], color=colour, linewidth=width, label=words)
     _plain_ticks(right)
     style.legend(right, loc="upper right")
     if choice.criterion == "D":
@@ -334,35 +256,32 @@ def plot_forecast_check(check: ForecastCheck) -> Figure:
     """
     figure = style.new_figure(11.0, 3.9)
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
-    n = np.asarray(check.forecast.n_frames, dtype=np.float64)
-    style.dress(left, grid=True)
-    left.set_xscale("log")
+    n = floats(check.forecast.n_frames)
+    for ax in (left, right):
+        style.dress(ax, grid=True)
+        ax.set_xscale("log")
     left.axhspan(0.95, 1.05, color=style.LIGHT, linewidth=0, zorder=0)
     left.axhline(1.0, color=style.INK, linewidth=0.9)
+    bars = 1.96 * check.ratio_se
     shown = [entry for entry in _CHECKED if entry[0] in check.forecast.names]
     for i, (name, words, colour, marker) in enumerate(shown):
         j = check.forecast.names.index(name)
         at = n * 1.045 ** (i - 0.5 * (len(shown) - 1))
-        bar = 1.96 * check.ratio_se[:, j]
         left.errorbar(
-            at,
-            check.ratio[:, j],
-            yerr=bar,
+            *(at, check.ratio[:, j], bars[:, j]),
             color=colour,
             marker=marker,
             markersize=4,
             linestyle="",
             label=words,
         )
-    reach = max(0.075, 1.1 * float(np.max(np.abs(check.ratio - 1.0) + 1.96 * check.ratio_se)))
+    reach = max(0.075, 1.1 * np.max(np.abs(check.ratio - 1.0) + bars))
     left.set_ylim(1.0 - reach, 1.0 + 1.9 * reach)
     style.legend(left, loc="upper right", ncols=3)
     style.label(
         left, f"Sigmas of {check.n_campaigns} campaigns each", "frames", "stated / forecast"
     )
 
-    style.dress(right, grid=True)
-    right.set_xscale("log")
     found, low, high = check.nees_ratio()
     right.vlines(n, low, high, color=style.LIGHT, linewidth=9.0)
     right.axhline(1.0, color=style.INK, linewidth=0.9)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.formatting import percent, significant
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.estimation import plot_residual_map
-from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
+from starcal_uq.presentation.figures.scales import round_below, round_levels, ticks_at_levels
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
     place = np.arange(len(error.axes))
     for i, (name, colour, hatch) in enumerate(series):
         at = place + (i - 1) * 0.27
-        look: dict[str, Any] = {"color": colour, "edgecolor": "white"}
+        look: AnyDict = {"color": colour, "edgecolor": "white"}
         if not tested:
             look = {"color": "none", "edgecolor": colour}
         ax.bar(at, np.maximum(values[i], floor), width=0.25, hatch=hatch, label=name, **look)
@@ -60,28 +60,14 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
                 ax.plot(
                     [x - 0.125, x + 0.125], [max(first, floor)] * 2, color=style.INK, linewidth=1.6
                 )
-            ax.annotate(
-                f"{significant(float(value))}″",
-                (x, max(value, floor)),
-                xytext=(0, 3),
-                ha="center",
-                textcoords="offset points",
-                fontsize=style.TICK_SIZE,
-                color=style.INK,
-            )
+            top = (x, max(value, floor))
+            style.note(ax, f"{significant(value)}″", top, (0, 3), ha="center")
     style.log_scale(ax.yaxis)
-    ax.set_ylim(floor, max(float(positive.max()) if positive.size else 1.0, floor) * 3.0)
+    ax.set_ylim(floor, 3.0 * positive.max(initial=floor if positive.size else 1.0))
     ax.set_xticks(place, error.axes, fontsize=style.LABEL_SIZE)
     ax.tick_params(axis="x", length=0)
     ax.grid(False, axis="x")
-    style.legend(
-        ax,
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        borderaxespad=0.2,
-        ncols=3,
-        columnspacing=1.4,
-    )
+    style.legend_on_top(ax, columnspacing=1.4)
     which = f"bars: {WITH_MISFIT_FOUND}; lines: {IF_MODEL_HOLDS}"
     if not tested:
         which = f"{IF_MODEL_HOLDS}; {WITH_MISFIT_FOUND}: {NOT_ASSESSED}"
@@ -96,7 +82,7 @@ def _interaction_words(error: AttitudeError) -> str:
     if not np.isfinite(values).all():
         return ""
     return (
-        f"interaction of calibration and noise: at most {significant(float(values.max()))}″ on "
+        f"interaction of calibration and noise: at most {significant(values.max())}″ on "
         "any axis (not drawn)"
     )
 
@@ -180,7 +166,7 @@ def _panel(
     title: str,
 ) -> None:
     style.dress(ax)
-    x, y = np.asarray(field.x_px), np.asarray(field.y_px)
+    x, y = field.x_px, field.y_px
     levels, norm = round_levels(values)
     image = ax.contourf(x, y, values, levels=levels, norm=norm, cmap="cividis")
     ax.contour(x, y, values, levels=levels[1:-1], colors="white", linewidths=0.5)
@@ -189,10 +175,7 @@ def _panel(
     ax.scatter(
         field.star_x_px[some], field.star_y_px[some], s=2.0, color="white", alpha=0.45, linewidths=0
     )
-    ax.set_xlim(x[0], x[-1])
-    ax.set_ylim(y[-1], y[0])
-    ax.set_aspect("equal")
-    style.label(ax, title, "x [px]", "y [px]")
+    style.detector(ax, x, y, title)
     bar = style.colour_bar(ax, image, "1 sigma per axis [arcsec]", own)
     ticks_at_levels(bar, levels)
     if covariance is not None:
@@ -245,11 +228,8 @@ def _middles(axis: FloatArray) -> list[int]:
 
 def _key(ax: Axes, scale: float, largest: float) -> None:
     """A bar of a round length above the panel's right end, with its value."""
-    exponent = np.floor(np.log10(largest))
-    length = max(
-        step * 10.0**exponent for step in (1.0, 2.0, 5.0) if step * 10.0**exponent <= largest
-    )
-    share = length * scale / float(np.ptp(ax.get_xlim()))
+    length = round_below(largest)
+    share = length * scale / np.ptp(ax.get_xlim())
     ax.plot(
         [1.0 - share, 1.0],
         [1.022, 1.022],
@@ -258,16 +238,11 @@ def _key(ax: Axes, scale: float, largest: float) -> None:
         transform=ax.transAxes,
         clip_on=False,
     )
-    ax.annotate(
-        f"semi-axis {significant(length, 1)}″",
-        (1.0 - share, 1.022),
+    style.note(
+        *(ax, f"semi-axis {significant(length, 1)}″", (1.0 - share, 1.022), (-5, 0)),
         xycoords="axes fraction",
-        xytext=(-5, 0),
-        textcoords="offset points",
         ha="right",
         va="center",
-        fontsize=style.TICK_SIZE,
-        color=style.INK,
         annotation_clip=False,
     )
 
@@ -283,42 +258,26 @@ def plot_spectrum(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
     """Power spectral density of the frame-dependent part per axis, over the white floor of centroid
     noise.
     """
-    if ax is None:
-        ax = style.new_axes(7.2, 4.2)
-    style.dress(ax, grid=True)
+    ax = style.panel(ax, 7.2, 4.2, grid=True)
     f = spectrum.frequency_hz
     top, bottom = 0.0, np.inf
     for i, axis in enumerate(spectrum.axes):
         x, y = _binned(f, spectrum.psd_arcsec2_hz[:, i])
-        rest = significant(float(spectrum.rest_arcsec[i]))
+        rest = significant(spectrum.rest_arcsec[i])
         ax.plot(x, y, _DASHES[i], color=_COLOURS[i], lw=1.5, label=f"calibration, {axis}: {rest}″")
-        top, bottom = max(top, float(y.max())), min(bottom, float(y[y > 0.0].min(initial=np.inf)))
+        top, bottom = max(top, float(y.max())), min(bottom, y[y > 0.0].min(initial=np.inf))
     for names, members in (("pitch and yaw", [0, 1]), ("roll", [2])):
         level = float(np.mean(spectrum.nea_psd_arcsec2_hz[members]))
-        nea = significant(float(np.sqrt(np.mean(spectrum.nea_arcsec[members] ** 2))))
+        nea = significant(np.sqrt(np.mean(spectrum.nea_arcsec[members] ** 2)))
         ax.plot(f[[0, -1]], [level, level], ":", color=style.INK, lw=1.3)
-        ax.annotate(
-            f"centroid noise, {names}: {nea}″ a frame",
-            (f[-1], level),
-            xytext=(-4, 3),
-            ha="right",
-            textcoords="offset points",
-            fontsize=style.TICK_SIZE,
-            color=style.INK,
-        )
+        words = f"centroid noise, {names}: {nea}″ a frame"
+        style.note(ax, words, (f[-1], level), (-4, 3), ha="right")
         top = max(top, level)
     style.log_scale(ax.xaxis)
     style.log_scale(ax.yaxis)
     ax.set_xlim(f[0], f[-1])
     ax.set_ylim(max(bottom * 0.5, top * 10.0**-_DECADES), top * 8.0)
-    style.legend(
-        ax,
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        borderaxespad=0.2,
-        ncols=3,
-        columnspacing=1.4,
-    )
+    style.legend_on_top(ax, columnspacing=1.4)
     style.label(ax, "", "frequency [Hz]", "power spectral density [arcsec²/Hz]")
     return ax
 
@@ -327,23 +286,16 @@ def plot_error_series(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
     """Standard deviation of the frame-dependent part over the posterior, at every instant, on a log
     axis.
     """
-    if ax is None:
-        ax = style.new_axes(7.2, 3.2)
-    style.dress(ax, grid=True)
+    ax = style.panel(ax, 7.2, 3.2, grid=True)
     for i, axis in enumerate(spectrum.axes):
-        ax.plot(
-            spectrum.time_s,
-            np.maximum(spectrum.sigma_arcsec[:, i], 1e-12),
-            color=_COLOURS[i],
-            lw=0.9,
-            label=axis,
-        )
+        sigma = np.maximum(spectrum.sigma_arcsec[:, i], 1e-12)
+        ax.plot(spectrum.time_s, sigma, color=_COLOURS[i], lw=0.9, label=axis)
     style.log_scale(ax.yaxis)
     shown = spectrum.sigma_arcsec[spectrum.sigma_arcsec > 0.0]
     if shown.size:
-        ax.set_ylim(0.7 * float(np.quantile(shown, 0.002)), 1.5 * float(shown.max()))
+        ax.set_ylim(0.7 * np.quantile(shown, 0.002), 1.5 * shown.max())
     ax.set_xlim(spectrum.time_s[0], spectrum.time_s[-1])
-    style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3)
+    style.legend_on_top(ax)
     style.label(ax, "", "time [s]", "1 sigma of the\nframe-dependent part [arcsec]")
     return ax
 
@@ -383,7 +335,6 @@ def plot_distortion_curve(curve: DistortionCurve) -> Figure:
         left.plot(
             curve.radius_px, curve.mean_px[row], color=colour, linewidth=1.6, label=f"{azimuth:g}°"
         )
-    left.axhline(0.0, color=style.INK, linewidth=0.8)
     if len(curve.azimuth_deg) > 1:
         # Azimuths differ little in the width of the band; the widest stands for all.
         style.legend(left, title="azimuth", title_fontsize=style.TICK_SIZE, ncols=2)
@@ -394,49 +345,31 @@ def plot_distortion_curve(curve: DistortionCurve) -> Figure:
         if len(curve.azimuth_deg) == 1
         else f", azimuth {curve.azimuth_deg[widest]:g}° (the widest)"
     )
-    style.label(
-        left, "Distortion", "distance from the principal point [px]", "radial displacement [px]"
-    )
-    style.label(
-        right,
-        f"Its uncertainty{where}",
-        "distance from the principal point [px]",
-        "minus the mean [px]",
-    )
-    style.label_distance(left, x_in=0.27, y_in=0.5)
-    style.label_distance(right, x_in=0.27, y_in=0.66)
+    for ax, title, y, aside in (
+        (left, "Distortion", "radial displacement [px]", 0.5),
+        (right, f"Its uncertainty{where}", "minus the mean [px]", 0.66),
+    ):
+        ax.axhline(0.0, color=style.INK, linewidth=0.8)
+        style.label(ax, title, "distance from the principal point [px]", y)
+        style.label_distance(ax, x_in=0.27, y_in=aside)
     return figure
 
 
 def _bands(ax: Axes, curve: DistortionCurve, row: int) -> None:
-    share = percent(curve.level)
-    mean = curve.mean_px[row]
-    simultaneous = (
-        curve.lower_simultaneous_px[row] - mean,
-        curve.upper_simultaneous_px[row] - mean,
-    )
-    pointwise = (curve.lower_px[row] - mean, curve.upper_px[row] - mean)
-    ax.fill_between(
-        curve.radius_px,
-        *simultaneous,
-        color=style.SKY,
-        alpha=0.35,
-        linewidth=0,
-        label=f"{share}, whole curves",
-    )
-    ax.fill_between(
-        curve.radius_px,
-        *pointwise,
-        color=style.BLUE,
-        alpha=0.45,
-        linewidth=0,
-        label=f"{share} at each radius",
-    )
-    ax.axhline(0.0, color=style.INK, linewidth=0.8)
+    for low, high, words, colour, alpha in (
+        (
+            *(curve.lower_simultaneous_px, curve.upper_simultaneous_px),
+            *(", whole curves", style.SKY, 0.35),
+        ),
+        (curve.lower_px, curve.upper_px, " at each radius", style.BLUE, 0.45),
+    ):
+        low, high = low[row] - curve.mean_px[row], high[row] - curve.mean_px[row]
+        words = percent(curve.level) + words
+        style.band(ax, curve.radius_px, low, high, colour, alpha=alpha, label=words)
     style.legend(ax, loc="upper left")
     # The scale of angles changes by a per cent over the field; one right-hand axis would lie by as
     # much.
-    middle = float(curve.arcsec_per_px[0])
+    middle = curve.arcsec_per_px[0]
     second = ax.secondary_yaxis("right", functions=(_times(middle), _times(1.0 / middle)))
     second.set_ylabel(
         "arcsec, at the scale of the centre", fontsize=style.LABEL_SIZE, color=style.INK

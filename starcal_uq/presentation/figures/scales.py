@@ -12,7 +12,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import Parameter
 from starcal_uq.core.formatting import decimals_for, fixed, pretty_unit, superscript
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 if TYPE_CHECKING:
     from matplotlib.colors import Normalize
@@ -45,7 +45,7 @@ class AxisScale:
 
     def __call__(self, values: FloatArray | float) -> FloatArray:
         """Computation units to plotted numbers."""
-        return np.asarray((np.asarray(values, dtype=np.float64) - self.reference) / self.factor)
+        return np.asarray((floats(values) - self.reference) / self.factor)
 
 
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
@@ -90,6 +90,12 @@ def _with_unit(text: str, parameter: Parameter) -> str:
     return f"({text}) × {unit}" if parameter.scale != 1.0 else f"{text} {unit}".strip()
 
 
+def round_below(value: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not above a value."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= value))
+
+
 def round_levels(values: FloatArray) -> tuple[FloatArray, Normalize | None]:
     """Round levels; in equal ratios where the map spans more than a factor of five, else a few
     would hold it all.
@@ -109,7 +115,7 @@ def round_levels(values: FloatArray) -> tuple[FloatArray, Normalize | None]:
     if high - low <= 1e-9 * abs(high):
         # A map without relief still needs two levels to be filled.
         low, high = low - 0.05 * abs(low) - 1e-12, high + 0.05 * abs(high) + 1e-12
-    return np.asarray(MaxNLocator(10).tick_values(low, high), dtype=np.float64), None
+    return floats(MaxNLocator(10).tick_values(low, high)), None
 
 
 def ticks_at_levels(bar: Any, levels: FloatArray) -> None:

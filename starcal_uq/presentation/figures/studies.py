@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from starcal_uq.camera.distortion import parameter_called
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import percent, pretty_unit, significant
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, floats
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.coupling import correlation_text
@@ -23,6 +23,7 @@ from starcal_uq.presentation.figures.sweeps import (
     draw_bars,
     draw_lines,
     held_title,
+    in_the_middle,
     legend,
     logarithmic,
     nothing,
@@ -33,6 +34,7 @@ from starcal_uq.presentation.figures.sweeps import (
     short,
     some,
     target_line,
+    target_words,
     ticks,
     two_axes,
 )
@@ -82,9 +84,9 @@ def numbers_of(
     ValueError
         For a variable or a parameter that the study does not have.
     """
-    if variable not in _SHOWN or variable not in study.data:
-        known = ", ".join(name for name in _SHOWN if name in study.data)
-        raise ValueError(f"variable {variable!r} cannot be drawn: use one of {known}.")
+    known = [name for name in _SHOWN if name in study.data]
+    if variable not in known:
+        raise ValueError(f"variable {variable!r} cannot be drawn: use one of {', '.join(known)}.")
     words, unit = _SHOWN[variable]
     for name, wanted in (("parameter", parameter), ("parameter_2", parameter_2)):
         if name in study.data[variable].dims and wanted not in study.parameter_names:
@@ -95,7 +97,7 @@ def numbers_of(
     if variable.startswith("sigma") and parameter is not None:
         spec = parameter_called(parameter)
         numbers, unit = numbers / spec.scale, pretty_unit(spec.scaled_unit)
-    text = words.format(*(symbol(name) for name in (parameter, parameter_2) if name is not None))
+    text = words.format(*map(symbol, filter(None, (parameter, parameter_2))))
     return numbers, f"{text} [{unit}]" if unit else text
 
 
@@ -105,7 +107,7 @@ def plot_study_correlation(
     *,
     along: str | None = None,
     by: str | None = None,
-    at: Mapping[str, Any] | None = None,
+    at: AnyMapping | None = None,
 ) -> Figure:
     """Size of the correlation of pairs against a swept axis, a line for every value of a second
     one.
@@ -128,39 +130,39 @@ def plot_study_correlation(
     sweep = study.sweep
     along, by = two_axes(sweep, along, by)
     chosen = [tuple(pair) for pair in pairs] if pairs is not None else _main_pairs(sweep)
-    figure = style.new_figure(2.4 + 2.9 * len(chosen), 3.9)
-    panels = figure.subplots(1, len(chosen), sharey=True, squeeze=False)[0]
+    figure, panels = _row(len(chosen), 2.4, 3.9)
+    sampled = "posterior_correlation" in study.data
     top = 0.0
     for ax, (first, second) in zip(panels, chosen, strict=True):
-        r = _correlation(study, first, second)
-        lines = sweep.lines(r, along, by, at)
+        lines = sweep.lines(_correlation(study, first, second), along, by, at)
         style.dress(ax, grid=True)
         draw_lines(ax, _sizes(lines))
-        if "posterior_correlation" in study.data and second not in AXES:
-            sampled = study.values("posterior_correlation", parameter=first, parameter_2=second)
-            draw_bars(ax, _sizes(sweep.lines(sampled, along, by, at)))
-        known = np.abs(np.stack([lines.median, lines.low, lines.high]))
-        top = max(top, float(np.nanmax(known, initial=0.0)))
-        style.label(
-            ax,
-            f"{symbol(first)} and {symbol(second)}{_sign_words(lines.median)}",
-            axis_label(along),
-        )
-    style.label(panels[0], "", "", "size of the correlation")
+        if sampled and second not in AXES:
+            drawn = study.values("posterior_correlation", parameter=first, parameter_2=second)
+            draw_bars(ax, _sizes(sweep.lines(drawn, along, by, at)))
+        top = max(top, np.nanmax(np.abs([lines.median, lines.low, lines.high]), initial=0.0))
+        title = f"{symbol(first)} and {symbol(second)}{_sign_words(lines.median)}"
+        style.label(ax, title, axis_label(along))
+    style.label(panels[0], y="size of the correlation")
     _correlation_axis(panels[0], top)
-    legend(figure, lines, sampled="posterior_correlation" in study.data)
+    legend(figure, lines, sampled=sampled)
     return figure
+
+
+def _row(n: int, beside_in: float, height_in: float) -> tuple[Figure, Any]:
+    """A figure with panels side by side that share their vertical axis."""
+    figure = style.new_figure(beside_in + 2.9 * n, height_in)
+    return figure, figure.subplots(1, n, sharey=True, squeeze=False)[0]
 
 
 def _correlation(study: Study, first: str, second: str) -> FloatArray:
     """Correlation of two parameters, or of a parameter and an axis of the common rotation, of every
     cell.
     """
-    names = study.parameter_names
-    if first not in names or second not in (*names, *AXES):
+    names = (*study.parameter_names, *AXES)
+    if first not in study.parameter_names or second not in names:
         raise ValueError(
-            f"no pair {first}, {second}: name two of {', '.join((*names, *AXES))}, a parameter "
-            "first."
+            f"no pair {first}, {second}: name two of {', '.join(names)}, a parameter first."
         )
     if second in AXES:
         return study.values("attitude_correlation", parameter=first, axis=second)
@@ -177,35 +179,25 @@ def _main_pairs(sweep: Sweep) -> list[tuple[str, str]]:
 
 def _sign_words(r: FloatArray) -> str:
     signs = np.sign(r[np.abs(np.nan_to_num(r)) > 0.05])
-    return (
-        " (opposite)"
-        if len(signs) and np.all(signs < 0)
-        else " (alike)"
-        if len(signs) and np.all(signs > 0)
-        else ""
-    )
+    if not len(signs):
+        return ""
+    return " (opposite)" if signs.max() < 0 else " (alike)" if signs.min() > 0 else ""
 
 
 def _sizes(lines: Lines) -> Lines:
     """Absolute values, the range over seeds with them."""
-    ends = np.sort(np.abs(np.stack([lines.low, lines.high])), axis=0)
-    crosses = lines.low * lines.high < 0.0
-    return replace(
-        lines, median=np.abs(lines.median), low=np.where(crosses, 0.0, ends[0]), high=ends[1]
-    )
+    low, high = np.sort(np.abs([lines.low, lines.high]), axis=0)
+    low[lines.low * lines.high < 0.0] = 0.0
+    return replace(lines, median=np.abs(lines.median), low=low, high=high)
 
 
 def _correlation_axis(ax: Axes, top: float) -> None:
     """From zero to above the largest correlation, on the scale of Fisher's z."""
     top = min(max(top, 0.3), 0.999999)
-    limit = float(np.tanh(np.arctanh(top) * 1.06 + 0.05))
+    limit = np.tanh(np.arctanh(top) * 1.06 + 0.05)
     ax.set_yscale("function", functions=(_to_z, np.tanh))
     ax.set_ylim(0.0, limit)
-    ticks = (
-        [tick for tick in _CORRELATION_TICKS if tick < limit]
-        if limit > 0.6
-        else [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
-    )
+    ticks = _CORRELATION_TICKS if limit > 0.6 else (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
     ax.set_yticks([tick for tick in ticks if tick < limit])
     ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.minorticks_off()
@@ -223,7 +215,7 @@ def plot_study_map(
     parameter_2: str | None = None,
     x: str | None = None,
     y: str | None = None,
-    at: Mapping[str, Any] | None = None,
+    at: AnyMapping | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """A number over two axes, median over seeds: cells with their numbers, or contours where they
@@ -260,15 +252,10 @@ def plot_study_map(
     lines = study.sweep.lines(numbers, x, y, at)
     style.label(ax, capital(text), axis_label(x), axis_label(y))
     style.dress(ax)
+    many = min(lines.median.shape) >= 6 and lines.median.size > _MOST_CELLS
     if not np.isfinite(lines.median).any():
         nothing(ax)
-        return ax
-    if (
-        numeric(lines.values)
-        and numeric(lines.by_values)
-        and min(lines.median.shape) >= 6
-        and lines.median.size > _MOST_CELLS
-    ):
+    elif many and numeric(lines.values) and numeric(lines.by_values):
         _contours(ax, lines, variable)
     else:
         _cells(ax, lines, variable)
@@ -281,30 +268,26 @@ def _cells(ax: Axes, lines: Lines, variable: str) -> None:
     colours, norm, dark = _colours(z, variable)
     ax.imshow(z, cmap=colours, norm=norm, origin="lower", aspect="auto")
     n_y, n_x = z.shape
-    for spine in ax.spines.values():
-        spine.set_visible(False)
-    ax.tick_params(length=0.0)
     ticks(ax.xaxis, lines.values, np.arange(n_x))
     ticks(ax.yaxis, lines.by_values, np.arange(n_y))
-    ax.set_xticks(np.arange(1, n_x) - 0.5, minor=True)
-    ax.set_yticks(np.arange(1, n_y) - 0.5, minor=True)
-    ax.tick_params(which="minor", length=0.0)
-    ax.grid(True, which="minor", color="white", linewidth=1.4)
+    style.squares(ax, n_x, n_y, 1.4)
     size = style.TICK_SIZE if n_x <= 7 else style.TICK_SIZE - 1.5
     for (row, column), value in np.ndenumerate(lines.median):
-        if np.isnan(value):
-            text, colour = "–", style.GREY
-        else:
-            text = (
-                correlation_text(float(value)) if variable == "correlation" else short(float(value))
-            )
-            colour = "white" if np.isfinite(value) and dark(value) else style.INK
-        ax.text(column, row, text, ha="center", va="center", fontsize=size, color=colour)
+        text = "–" if np.isnan(value) else _written(variable)(value)
+        colour = style.GREY if np.isnan(value) else style.INK
+        if np.isfinite(value) and dark(value):
+            colour = "white"
+        style.in_cell(ax, text, row, column, fontsize=size, color=colour)
+
+
+def _written(variable: str) -> Callable[[float], str]:
+    """How a number of a map is written."""
+    return correlation_text if variable == "correlation" else short
 
 
 def _contours(ax: Axes, lines: Lines, variable: str) -> None:
     """Colours on true scales, with contours that carry their numbers."""
-    x, y = (np.asarray(values, dtype=np.float64) for values in (lines.values, lines.by_values))
+    x, y = (floats(values) for values in (lines.values, lines.by_values))
     z = np.ma.masked_invalid(lines.median)
     scale(ax.xaxis, lines.values)
     scale(ax.yaxis, lines.by_values)
@@ -314,28 +297,17 @@ def _contours(ax: Axes, lines: Lines, variable: str) -> None:
         x, y, z, cmap=colours, norm=norm, shading="nearest" if z.mask.any() else "gouraud"
     )
     bar = style.colour_bar(ax, image, "")
-    low, high = float(z.min()), float(z.max())
+    low, high = z.min(), z.max()
     if variable == "correlation":
         levels = np.array(_CORRELATION_LEVELS)
         shown = levels[(levels > low) & (levels < high)]
     else:
-        ends = (float(end) for end in np.ravel([image.norm.vmin, image.norm.vmax]))
-        ticks_at_levels(bar, levels[(levels >= next(ends)) & (levels <= next(ends))])
+        least, most = np.ravel([image.norm.vmin, image.norm.vmax])
+        ticks_at_levels(bar, levels[(levels >= least) & (levels <= most)])
         # Contours of little relief would be those of chance.
         shown = levels[1:-1][:: max(1, len(levels) // 6)] if high > 1.3 * low else levels[:0]
     if not len(shown):
-        words = " to ".join(
-            correlation_text(v) if variable == "correlation" else short(v) for v in (low, high)
-        )
-        ax.text(
-            0.5,
-            0.5,
-            words,
-            transform=ax.transAxes,
-            ha="center",
-            color="white",
-            fontsize=style.LABEL_SIZE,
-        )
+        in_the_middle(ax, " to ".join(map(_written(variable), (low, high))), "white")
         return
     from matplotlib.patheffects import withStroke
 
@@ -351,7 +323,7 @@ def _colours(z: FloatArray, variable: str) -> tuple[str, Any, Any]:
     good = z[np.isfinite(z)]
     if variable == "correlation":
         return "RdBu_r", Normalize(-1.0, 1.0), lambda value: abs(value) > 0.62
-    low, high = float(good.min()), float(good.max())
+    low, high = good.min(), good.max()
     if low > 0.0 and high < _RELIEF * low:
         # Little relief gets little colour, so that chance does not look like a finding.
         middle = np.sqrt(low * high)
@@ -374,15 +346,14 @@ def plot_study_maps(study: Study, x: str | None = None, y: str | None = None) ->
     )
     first, second = changing.names
     figure = style.new_figure(11.0, 2.2 + 0.72 * max(5, min(10, len(sweep.values[y]))))
-    panels = figure.subplots(2, 2).ravel()
-    plot_study_map(
-        study, "correlation", parameter=first, parameter_2=second, x=x, y=y, ax=panels[0]
-    )
-    plot_study_map(
-        study, "variance_inflation", parameter=_most_inflated(study), x=x, y=y, ax=panels[1]
-    )
-    plot_study_map(study, "frame_error_arcsec", x=x, y=y, ax=panels[2])
-    plot_study_map(study, "common_rotation_arcsec", x=x, y=y, ax=panels[3])
+    inflated = _most_inflated(study)
+    for ax, variable, parameter, other in zip(
+        figure.subplots(2, 2).ravel(),
+        *(("correlation", "variance_inflation", "frame_error_arcsec", "common_rotation_arcsec"),),
+        *((first, inflated, None, None), (second, None, None, None)),
+        strict=True,
+    ):
+        plot_study_map(study, variable, parameter=parameter, parameter_2=other, x=x, y=y, ax=ax)
     held_title(figure, sweep.held(x, y))
     return figure
 
@@ -398,7 +369,7 @@ def plot_weakest(
     *,
     along: str | None = None,
     by: str | None = None,
-    at: Mapping[str, Any] | None = None,
+    at: AnyMapping | None = None,
 ) -> Figure:
     """What the weakest direction is made of along an axis, for up to three values of a second one.
 
@@ -417,51 +388,39 @@ def plot_weakest(
     """
     sweep = study.sweep
     along, by = two_axes(sweep, along, by, names=True)
-    shares = np.asarray(study.data["weak_direction"].values, dtype=np.float64) ** 2
+    shares = study.data["weak_direction"].values ** 2
     variance = sweep.lines(study.data["weak_variance"].values, along, by, at)
     rows = some(len(variance.median), _MOST_PANELS)
-    figure = style.new_figure(2.2 + 2.9 * len(rows), 3.8)
-    panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
+    figure, panels = _row(len(rows), 2.2, 3.8)
     places = np.arange(len(variance.values))
-    stack = {
-        name: sweep.lines(shares[:, i], along, by, at).median
-        for i, name in enumerate(study.parameter_names)
-    }
-    total = np.nansum(list(stack.values()), axis=0)
+    names = study.parameter_names
+    stack = np.array([sweep.lines(one, along, by, at).median for one in shares.T])
+    total = np.nansum(stack, axis=0)
+    parts = np.nan_to_num(stack / np.where(total > 0.0, total, np.nan))
     for ax, row in zip(panels, rows, strict=True):
         style.dress(ax)
         below = np.zeros(len(places))
-        for name, share in stack.items():
-            height = np.nan_to_num(share[row] / np.where(total[row] > 0.0, total[row], np.nan))
-            ax.bar(
-                places,
-                height,
-                0.78,
-                bottom=below,
-                color=colour_of(name),
-                edgecolor="white",
-                linewidth=0.8,
-            )
+        look: AnyDict = {"edgecolor": "white", "linewidth": 0.8}
+        for name, height in zip(names, parts[:, row], strict=True):
+            ax.bar(places, height, 0.78, bottom=below, color=colour_of(name), **look)
             below = below + height
         for at_x, value in zip(places, variance.median[row], strict=True):
-            words = "–" if np.isnan(value) else f"×{significant(float(value))}"
-            ax.annotate(
-                words,
-                (at_x, 1.02),
-                ha="center",
-                va="bottom",
-                fontsize=style.TICK_SIZE - 0.5,
-                color=style.INK,
-            )
+            words = "–" if np.isnan(value) else f"×{significant(value)}"
+            size = style.TICK_SIZE - 0.5
+            style.note(ax, words, (at_x, 1.02), ha="center", va="bottom", fontsize=size)
         ax.set_ylim(0.0, 1.12)
         ax.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "25 %", "50 %", "75 %", "100 %"])
         ticks(ax.xaxis, variance.values, places)
-        title = capital(said(by, variance.by_values[row])) if by is not None else ""
-        style.label(ax, title, axis_label(along))
-    style.label(panels[0], "", "", "share of the weakest direction")
-    handles = [style.key(symbol(name), colour_of(name), linewidth=7.0) for name in stack]
+        style.label(ax, _by_title(variance, row), axis_label(along))
+    style.label(panels[0], y="share of the weakest direction")
+    handles = [style.key(symbol(name), colour_of(name), linewidth=7.0) for name in names]
     style.legend_above(figure, handles)
     return figure
+
+
+def _by_title(lines: Lines, row: int) -> str:
+    """The value of the second axis, above a panel."""
+    return "" if lines.by is None else capital(said(lines.by, lines.by_values[row]))
 
 
 def plot_matrices(
@@ -469,7 +428,7 @@ def plot_matrices(
     *,
     along: str | None = None,
     by: str | None = None,
-    at: Mapping[str, Any] | None = None,
+    at: AnyMapping | None = None,
 ) -> Figure:
     """The correlation matrix along an axis, and down a second one, median over seeds.
 
@@ -485,10 +444,10 @@ def plot_matrices(
     sweep = study.sweep
     along, by = two_axes(sweep, along, by, names=True)
     names = study.parameter_names
-    r = np.asarray(study.data["correlation"].values, dtype=np.float64)
+    r = study.data["correlation"].values
     p = len(names)
-    lines = [[sweep.lines(r[:, i, j], along, by, at) for j in range(p)] for i in range(p)]
-    grid = np.array([[entry.median for entry in row] for row in lines])
+    lines = [sweep.lines(one, along, by, at) for one in r.reshape(-1, p * p).T]
+    grid = np.array([entry.median for entry in lines]).reshape(p, p, *lines[0].median.shape)
     columns, rows = some(grid.shape[3], 5), some(grid.shape[2], _MOST_PANELS)
     figure = style.new_figure(11.0, 0.9 + 1.9 * len(rows))
     panels = style.panels(figure, len(rows), len(columns), (0.95, 0.8, 0.58, 0.32), (0.12, 0.12))
@@ -497,17 +456,9 @@ def plot_matrices(
             ax = figure.add_subplot(panels[row, column])
             image = _matrix(ax, grid[:, :, at_row, at_column], names, row == 0, column == 0)
             if column == 0 and by is not None:
-                ax.set_ylabel(
-                    value_words(lines[0][0].by_values[at_row]),
-                    fontsize=style.LABEL_SIZE,
-                    color=style.INK,
-                )
+                style.label(ax, y=value_words(lines[0].by_values[at_row]))
             if row == len(rows) - 1:
-                ax.set_xlabel(
-                    value_words(lines[0][0].values[at_column]),
-                    fontsize=style.LABEL_SIZE,
-                    color=style.INK,
-                )
+                style.label(ax, x=value_words(lines[0].values[at_column]))
     figure.supxlabel(axis_label(along), fontsize=style.LABEL_SIZE, color=style.INK, y=0.01)
     if by is not None:
         figure.supylabel(axis_label(by), fontsize=style.LABEL_SIZE, color=style.INK, x=0.005)
@@ -525,28 +476,13 @@ def _matrix(ax: Axes, matrix: FloatArray, names: Sequence[str], top: bool, left:
     words = [symbol(name) for name in names]
     ax.set_xticks(ticks, words if top else [], fontsize=style.TICK_SIZE)
     ax.set_yticks(ticks, words if left else [], fontsize=style.TICK_SIZE)
-    ax.tick_params(
-        length=0.0, top=False, labeltop=top, bottom=False, labelbottom=False, colors=style.INK
-    )
-    ax.set_xticks(ticks[1:] - 0.5, minor=True)
-    ax.set_yticks(ticks[1:] - 0.5, minor=True)
-    ax.tick_params(which="minor", length=0.0)
-    ax.grid(True, which="minor", color="white", linewidth=1.0)
-    for spine in ax.spines.values():
-        spine.set_visible(False)
+    ax.tick_params(top=False, labeltop=top, bottom=False, labelbottom=False, colors=style.INK)
+    style.squares(ax, len(names), len(names), 1.0)
     if len(names) <= 5:
         for (i, j), value in np.ndenumerate(matrix):
             if np.isfinite(value):
                 colour = "white" if abs(value) > 0.62 else style.INK
-                ax.text(
-                    j,
-                    i,
-                    correlation_text(float(value)),
-                    ha="center",
-                    va="center",
-                    fontsize=6.5,
-                    color=colour,
-                )
+                style.in_cell(ax, correlation_text(value), i, j, fontsize=6.5, color=colour)
     return image
 
 
@@ -556,7 +492,7 @@ def plot_needed(
     along: str | None = None,
     by: str | None = None,
     target_arcsec: float | None = None,
-    at: Mapping[str, Any] | None = None,
+    at: AnyMapping | None = None,
 ) -> Figure:
     """Frame-dependent attitude error along an axis with its target, and the frames that the target
     takes.
@@ -579,28 +515,29 @@ def plot_needed(
     figure = style.new_figure(5.8 * n, 4.0)
     panels = figure.subplots(1, n, squeeze=False)[0]
     lines = sweep.lines(sweep.frame_error, along, by, at)
-    style.dress(panels[0], grid=True)
-    draw_lines(panels[0], lines)
-    logarithmic(panels[0], lines)
+    _line_panel(panels[0], lines)
+    title = "Error that differs from frame to frame"
+    style.label(panels[0], title, axis_label(along), "1 sigma per axis [arcsec]")
     if target is not None:
         low, high = panels[0].get_ylim()
-        panels[0].set_ylim(min(low, float(target) / 1.5), max(high, float(target) * 1.5))
+        panels[0].set_ylim(min(low, target / 1.5), max(high, target * 1.5))
         plain(panels[0].yaxis)
-    style.label(
-        panels[0],
-        "Error that differs from frame to frame",
-        axis_label(along),
-        "1 sigma per axis [arcsec]",
-    )
-    if target is not None:
-        target_line(panels[0], float(target), f"target {target:g} arcsec")
-        needed = sweep.lines(study.frames_for(float(target)), along, by, at)
-        style.dress(panels[1], grid=True)
-        draw_lines(panels[1], needed)
-        logarithmic(panels[1], needed)
+        target_line(panels[0], target)
+        ground = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
+        target_words(panels[0], target, f"target {target:g} arcsec", bbox=ground)
+        _line_panel(panels[1], sweep.lines(study.frames_for(target), along, by, at))
         style.label(panels[1], f"Frames for {target:g} arcsec", axis_label(along), "frames")
     legend(figure, lines)
     return figure
+
+
+def _line_panel(ax: Axes, lines: Lines, dashed: Lines | None = None) -> None:
+    """Lines on a logarithmic axis."""
+    style.dress(ax, grid=True)
+    draw_lines(ax, lines)
+    if dashed is not None:
+        draw_lines(ax, dashed, dashed=True)
+    logarithmic(ax, lines, *filter(None, [dashed]))
 
 
 def plot_inflation(
@@ -608,7 +545,7 @@ def plot_inflation(
     *,
     along: str | None = None,
     by: str | None = None,
-    at: Mapping[str, Any] | None = None,
+    at: AnyMapping | None = None,
 ) -> Figure:
     """Sigma of every parameter along an axis, with all others unknown and, dashed, with all others
     known.
@@ -632,14 +569,10 @@ def plot_inflation(
     figure = style.new_figure(11.0, 0.8 + 2.75 * rows)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for ax, name in zip(panels, names, strict=False):
-        style.dress(ax, grid=True)
         numbers, text = numbers_of(study, "sigma", name)
         known, _ = numbers_of(study, "sigma_conditional", name)
         lines = sweep.lines(numbers, along, by, at)
-        draw_lines(ax, lines)
-        conditional = sweep.lines(known, along, by, at)
-        draw_lines(ax, conditional, dashed=True)
-        logarithmic(ax, lines, conditional)
+        _line_panel(ax, lines, sweep.lines(known, along, by, at))
         style.label(ax, capital(text), axis_label(along))
     for ax in panels[len(names) :]:
         ax.set_visible(False)
@@ -652,7 +585,7 @@ def plot_simpler(
     *,
     along: str | None = None,
     by: str | None = None,
-    at: Mapping[str, Any] | None = None,
+    at: AnyMapping | None = None,
 ) -> Figure:
     """Attitude error that a simpler distortion model would leave, beside the error of the
     calibration itself.
@@ -673,51 +606,35 @@ def plot_simpler(
     ValueError
         For a study in which no simpler model was tried.
     """
-    models = (
-        [str(model) for model in study.data["simpler"].values] if "simpler" in study.data else []
-    )
-    bias = (
-        np.stack([model_bias(study, model) for model in models], axis=1)
-        if models
-        else np.empty((0, 0))
-    )
+    models = list(map(str, study.data["simpler"].values)) if "simpler" in study.data else []
+    bias = {model: model_bias(study, model) for model in models}
     # A model that leaves out zeros alone was not tried.
-    shown = [i for i in range(len(models)) if np.any(np.nan_to_num(bias[:, i]) > 0.0)]
-    if not shown:
+    bias = {model: left for model, left in bias.items() if np.any(np.nan_to_num(left) > 0.0)}
+    if not bias:
         raise ValueError("no simpler distortion model was tried in this study.")
     sweep = study.sweep
     along, by = two_axes(sweep, along, by)
     error = sweep.lines(sweep.frame_error, along, by, at)
-    curves = [sweep.lines(bias[:, i], along, by, at) for i in shown]
+    curves = [sweep.lines(left, along, by, at) for left in bias.values()]
+    looks = [
+        (NAMED[n % 5], {"marker": MARKERS[n % 5], "markersize": 4.5}) for n in range(len(bias))
+    ]
     rows = some(len(error.median), _MOST_PANELS)
-    figure = style.new_figure(2.2 + 2.9 * len(rows), 3.9)
-    panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
+    figure, panels = _row(len(rows), 2.2, 3.9)
     x = positions(error.values)
     for ax, row in zip(panels, rows, strict=True):
         style.dress(ax, grid=True)
-        ax.fill_between(
-            x, error.low[row], error.high[row], color=style.GREY, alpha=0.25, linewidth=0
-        )
+        style.band(ax, x, error.low[row], error.high[row], style.GREY, alpha=0.25)
         ax.plot(x, error.median[row], color=style.GREY, linewidth=2.2)
-        for number, curve in enumerate(curves):
-            ax.plot(
-                x,
-                curve.median[row],
-                color=NAMED[number % 5],
-                marker=MARKERS[number % 5],
-                markersize=4.5,
-            )
+        for curve, (colour, look) in zip(curves, looks, strict=True):
+            ax.plot(x, curve.median[row], color=colour, **look)
         scale(ax.xaxis, error.values)
-        style.label(
-            ax, capital(said(by, error.by_values[row])) if by is not None else "", axis_label(along)
-        )
+        style.label(ax, _by_title(error, row), axis_label(along))
     logarithmic(panels[0], error, *curves)
-    style.label(panels[0], "", "", "arcsec")
+    style.label(panels[0], y="arcsec")
     keys = [
-        style.key(
-            f"left by the model {models[i]}", NAMED[n % 5], marker=MARKERS[n % 5], markersize=4.5
-        )
-        for n, i in enumerate(shown)
+        style.key(f"left by the model {model}", colour, **look)
+        for model, (colour, look) in zip(bias, looks, strict=True)
     ]
     style.legend_above(
         figure, [style.key("error of the calibration", style.GREY, linewidth=2.2), *keys]
@@ -745,16 +662,16 @@ def plot_coverage(study: Study, *, along: str | None = None) -> Figure:
         raise ValueError('coverage needs simulated cells: set mode = "simulate" in [study].')
     sweep = study.sweep
     along, _ = two_axes(sweep, along, None)
-    covered = np.asarray(study.data["covered_95"].values, dtype=np.float64)
+    covered = study.data["covered_95"].values
     others = [axis for axis in sweep.axes if axis != along]
     figure = style.new_figure(8.6, 4.0)
     ax = style.dress(figure.subplots(), grid=True)
     places = np.arange(len(sweep.values[along]))
+    names = study.parameter_names
     lowest = 0.9
-    for i, name in enumerate(study.parameter_names):
-        n = sweep.over(covered[:, i], "count", others).ravel()
-        rate = sweep.over(covered[:, i], "mean", others).ravel()
-        shift = 0.62 * ((i + 0.5) / len(study.parameter_names) - 0.5)
+    for i, name in enumerate(names):
+        n, rate = (sweep.over(covered[:, i], what, others).ravel() for what in ("count", "mean"))
+        shift = 0.62 * ((i + 0.5) / len(names) - 0.5)
         for at_x, part, size in zip(places + shift, rate, n, strict=True):
             if np.isfinite(part):
                 low, high = binomial_interval(round(part * size), int(size))
@@ -766,11 +683,6 @@ def plot_coverage(study: Study, *, along: str | None = None) -> Figure:
     ax.set_ylim(max(0.0, lowest - 0.06), 1.015)
     ax.yaxis.set_major_formatter(lambda value, _: percent(value))
     style.label(ax, "", axis_label(along), "95 % intervals that hold the truth")
-    style.legend_above(
-        figure,
-        [
-            style.key(symbol(name), colour_of(name), marker="o", markersize=6)
-            for name in study.parameter_names
-        ],
-    )
+    dots: AnyDict = {"marker": "o", "markersize": 6}
+    style.legend_above(figure, [style.key(symbol(name), colour_of(name), **dots) for name in names])
     return figure

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.formatting import MINUS, superscript
+from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +38,7 @@ _WHITE = 251
 # Intervals between the ticks of an axis, at most.
 _TICKS = 5
 # Means with their standard errors.
-BARS: dict[str, Any] = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.1}
+BARS: AnyDict = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.1}
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -138,6 +139,18 @@ def new_axes(
     return dress(place(figure, left, bottom, width_in - left - right, height_in - bottom - top))
 
 
+def panel(
+    ax: Axes | None,
+    width_in: float,
+    height_in: float,
+    margins_in: tuple[float, float, float, float] | None = None,
+    *,
+    grid: bool = False,
+) -> Axes:
+    """The panel that is given, dressed, or one on a figure of its own."""
+    return dress(new_axes(width_in, height_in, margins_in) if ax is None else ax, grid=grid)
+
+
 def dress(ax: Axes, *, grid: bool = False) -> Axes:
     """Quiet spines, small ticks, and not many of them."""
     from matplotlib.ticker import AutoLocator
@@ -188,19 +201,67 @@ def power_text(value: float) -> str:
     return f"{MINUS}{text}" if value < 0 else text
 
 
-def label(ax: Axes, title: str = "", x: str = "", y: str = "", *, pad: float = 7.0) -> None:
+def label(
+    ax: Axes,
+    title: str = "",
+    x: str = "",
+    y: str = "",
+    *,
+    pad: float = 7.0,
+    size: float = LABEL_SIZE,
+) -> None:
     """Title, `pad` points above the panel, and axis labels in the common sizes."""
     if title:
         ax.set_title(title, fontsize=TITLE_SIZE, color=INK, loc="left", pad=pad, y=1.0)
     if x:
-        ax.set_xlabel(x, fontsize=LABEL_SIZE, color=INK)
+        ax.set_xlabel(x, fontsize=size, color=INK)
     if y:
-        ax.set_ylabel(y, fontsize=LABEL_SIZE, color=INK)
+        ax.set_ylabel(y, fontsize=size, color=INK)
+
+
+def heading(ax: Axes, text: str, size: float = TITLE_SIZE, pad: float = 5.0) -> None:
+    """A title in the middle above a small panel."""
+    ax.set_title(text, fontsize=size, color=INK, pad=pad, y=1.0)
+
+
+def note(ax: Axes, text: str, at: tuple[Any, Any], shift: Any = None, **look: Any) -> None:
+    """Small words at a place of the panel, `shift` (across, up) points aside."""
+    look = AnyDict(fontsize=TICK_SIZE, color=INK) | look
+    if shift is not None:
+        look |= {"xytext": shift, "textcoords": "offset points"}
+    ax.annotate(text, at, **look)
+
+
+def in_cell(ax: Axes, text: str, row: int, column: int, **look: Any) -> None:
+    """Words in the middle of a cell of a map; nothing for the layout to make room for."""
+    ax.text(column, row, text, ha="center", va="center", **({"fontsize": TICK_SIZE} | look))
+
+
+def squares(ax: Axes, n_x: int, n_y: int, width: float) -> None:
+    """White lines between the cells of a map instead of ticks and spines."""
+    ax.spines[:].set_visible(False)
+    ax.set_xticks(np.arange(1, n_x) - 0.5, minor=True)
+    ax.set_yticks(np.arange(1, n_y) - 0.5, minor=True)
+    ax.tick_params(which="both", length=0.0)
+    ax.grid(True, which="minor", color="white", linewidth=width)
+
+
+def band(ax: Axes, x: Any, low: Any, high: Any, colour: str, **look: Any) -> None:
+    """A filled band without an edge."""
+    ax.fill_between(x, low, high, color=colour, linewidth=0, **look)
+
+
+def detector(ax: Axes, x: Any, y: Any, title: str) -> None:
+    """A map over the detector: equal scales, y downwards as on a picture."""
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(y[-1], y[0])
+    ax.set_aspect("equal")
+    label(ax, title, "x [px]", "y [px]")
 
 
 def legend(ax: Axes, **keywords: Any) -> None:
     """A legend with a faint white ground, so that data under it do not cross the words."""
-    options: dict[str, Any] = {
+    options: AnyDict = {
         "fontsize": TICK_SIZE,
         "framealpha": 0.9,
         "edgecolor": "none",
@@ -224,9 +285,15 @@ def key(text: str, colour: str, **keywords: Any) -> Line2D:
     return Line2D([], [], color=colour, label=text, **keywords)
 
 
+def legend_on_top(ax: Axes, **keywords: Any) -> None:
+    """A legend in a line above the panel."""
+    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2, "ncols": 3}
+    legend(ax, **(place | keywords))
+
+
 def legend_above(figure: Figure, handles: Any, **keywords: Any) -> None:
     """One legend for all panels, in a line above them."""
-    options: dict[str, Any] = {
+    options: AnyDict = {
         "ncols": len(handles),
         "fontsize": TICK_SIZE,
         "frameon": False,
@@ -237,9 +304,7 @@ def legend_above(figure: Figure, handles: Any, **keywords: Any) -> None:
 
 def colour_bar(ax: Axes, image: Any, text: str, own: Axes | None = None) -> Any:
     """A colour bar of one panel, on a panel of its own where there is one."""
-    where: dict[str, Any] = (
-        {"cax": own} if own is not None else {"ax": ax, "fraction": 0.046, "pad": 0.03}
-    )
+    where: AnyDict = {"cax": own} if own is not None else {"ax": ax, "fraction": 0.046, "pad": 0.03}
     bar = ax.figure.colorbar(image, **where)
     dress_bar(bar, text)
     return bar

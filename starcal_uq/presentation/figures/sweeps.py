@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, significant
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyMapping, FloatArray, floats
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.words.axes import axis_label, capital, place, value_words
 from starcal_uq.studies.findings import Lines, Sweep
@@ -75,7 +75,7 @@ def _geometric(values: Sequence[Any]) -> bool:
     """Whether values are spaced by ratios rather than by differences."""
     if not numeric(values) or len(values) < 3:
         return False
-    x = np.asarray(values, dtype=np.float64)
+    x = floats(values)
     if np.any(x <= 0.0) or x[-1] < 4.0 * x[0]:
         return False
     steps, ratios = np.diff(x), np.diff(np.log(x))
@@ -84,11 +84,7 @@ def _geometric(values: Sequence[Any]) -> bool:
 
 def positions(values: Sequence[Any]) -> FloatArray:
     """Where values stand on an axis: names side by side, numbers where they are."""
-    return (
-        np.asarray(values, dtype=np.float64)
-        if numeric(values)
-        else np.arange(len(values), dtype=np.float64)
-    )
+    return floats(values) if numeric(values) else np.arange(len(values), dtype=np.float64)
 
 
 def scale(axis: Any, values: Sequence[Any]) -> None:
@@ -211,7 +207,7 @@ def legend(figure: Figure, lines: Lines, *, sampled: bool = False, dashed: str =
     held_title(figure, lines.held)
 
 
-def held_title(figure: Figure, held: Mapping[str, Any]) -> None:
+def held_title(figure: Figure, held: AnyMapping) -> None:
     if held:
         figure.suptitle(
             f"For {place(held)}", fontsize=style.LABEL_SIZE, color=style.GREY, x=0.01, ha="left"
@@ -234,50 +230,54 @@ def logarithmic(ax: Axes, *lines: Lines) -> None:
     plain(ax.yaxis)
 
 
-def plain(axis: Any) -> None:
-    """Plain numbers on a logarithmic axis, at 1, 2 and 5 where it spans little."""
+def plain(axis: Any, *, fine: bool = True) -> None:
+    """Plain numbers on a logarithmic axis, at 1, 2 and 5 where it spans little, and `fine` ones
+    where it spans less.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator
 
     low, high = axis.get_view_interval()
     span = high / low
     subs = (
         (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-        if span < 6.0
+        if fine and span < 6.0
         else (1.0, 2.0, 5.0)
         if span < 150.0
         else (1.0,)
     )
     axis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    whole = 10.0 if fine else 1.0
     axis.set_major_formatter(
-        FuncFormatter(lambda value, _: count(int(value)) if value >= 10.0 else f"{value:.6g}")
+        FuncFormatter(lambda value, _: count(int(value)) if value >= whole else f"{value:.6g}")
     )
     axis.set_minor_locator(_no_ticks())
 
 
-def target_line(ax: Axes, value: float, words: str) -> None:
+def target_line(ax: Axes, value: float) -> None:
+    """What is aimed at."""
     ax.axhline(value, color=style.VERMILLION, linewidth=1.2, dashes=(5, 2))
-    ax.annotate(
-        words,
-        (0.02, value),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 4),
-        textcoords="offset points",
-        fontsize=style.TICK_SIZE,
-        color=style.VERMILLION,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8},
+
+
+def target_words(ax: Axes, value: float, words: str, **look: Any) -> None:
+    """Words at the left end of the line of a target."""
+    place = {"xycoords": ("axes fraction", "data"), "color": style.VERMILLION}
+    style.note(ax, words, (0.02, value), (0, 4), **place, **look)
+
+
+def in_the_middle(ax: Axes, words: str, colour: str = style.GREY) -> None:
+    """Words in the place of what a panel cannot show."""
+    style.note(
+        *(ax, words, (0.5, 0.5)),
+        xycoords="axes fraction",
+        ha="center",
+        color=colour,
+        fontsize=style.LABEL_SIZE,
     )
 
 
 def nothing(ax: Axes) -> None:
-    ax.text(
-        0.5,
-        0.5,
-        "no cell has this",
-        transform=ax.transAxes,
-        ha="center",
-        color=style.GREY,
-        fontsize=style.LABEL_SIZE,
-    )
+    """No cell has a number of this panel."""
+    in_the_middle(ax, "no cell has this")
 
 
 def short(value: float) -> str:

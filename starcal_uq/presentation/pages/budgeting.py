@@ -14,7 +14,7 @@ from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, atomic_write_text, cell_text
 from starcal_uq.core.status import Level
-from starcal_uq.core.types import PathLike
+from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import template_environment
@@ -357,7 +357,7 @@ def write_budget(budget: Budget, path: PathLike) -> Path:
     return Path(path)
 
 
-def budget_context(budget: Budget | None) -> dict[str, Any]:
+def budget_context(budget: Budget | None) -> AnyDict:
     """What ``budget_section.html.j2`` shows beside the figure, under the name ``budget``; None
     where there is none.
     """

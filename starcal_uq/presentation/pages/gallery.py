@@ -19,7 +19,7 @@ from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.formatting import MINUS, count, fixed, plural, significant
 from starcal_uq.core.provenance import NAME, installed_version
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.types import PathLike
+from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.pipeline.inspection import (
     FAINTER,
     IDENTIFIED,
@@ -150,7 +150,7 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
     return out.getvalue()
 
 
-def _card(frame: InspectedFrame, frames: Frames, factor: float) -> dict[str, Any]:
+def _card(frame: InspectedFrame, frames: Frames, factor: float) -> AnyDict:
     row = frame.row
     counts = (
         [(key, _symbol(key), kind, frame.n(kind)) for key, kind, _ in _LEGEND]
@@ -243,9 +243,7 @@ def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> str:
                 f'class="middle">{escape(str(error))}</text>'
             )
     detections, stars = frame.detections, frame.stars
-    by_kind: dict[str, Any] = {
-        kind: detections[detections["kind"] == kind] for _, kind, _ in _LEGEND[:3]
-    }
+    by_kind: AnyDict = {kind: detections[detections["kind"] == kind] for _, kind, _ in _LEGEND[:3]}
     by_kind |= {"expected": stars, "missed": stars[stars["missed"]]}
     for key in ("e", "u", "l", "m", "i"):
         kind = next(kind for letter, kind, _ in _LEGEND if letter == key)

@@ -14,7 +14,7 @@ from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_fol
 from starcal_uq.core.formatting import count, fixed, significant
 from starcal_uq.core.manifest import making
 from starcal_uq.core.records import to_plain
-from starcal_uq.core.types import PathLike
+from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.plan import Plan
@@ -94,7 +94,7 @@ def write_plan(
     return Path(folder) / PAGE
 
 
-def plan_record(plan: Plan) -> dict[str, Any]:
+def plan_record(plan: Plan) -> AnyDict:
     """The plan as plain values: settings, what is needed, and the forecast by number of frames."""
     return {
         "verdict": plan_text(plan),
@@ -209,7 +209,7 @@ def _needs_table(plan: Plan) -> TextTable:
     )
 
 
-def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
+def _context(plan: Plan, images: Mapping[str, bytes]) -> AnyDict:
     table = plan.to_dataframe()
     # The focal length once: in millimetres where the pitch is known.
     table = table.drop(columns="f_px") if "f_mm" in table else table
@@ -233,20 +233,18 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
         "rows": [
             {
                 "n": count(int(row["n_frames"])),
-                "cells": [
-                    (significant(float(row[column])), column in edges) for column, _ in shown
-                ],
-                "radius": significant(float(row["radius_arcsec"]), 3),
-                "range": f"{significant(float(row['radius_low_arcsec']), 3)} to "
-                f"{significant(float(row['radius_high_arcsec']), 3)}",
+                "cells": [(significant(row[column]), column in edges) for column, _ in shown],
+                "radius": significant(row["radius_arcsec"], 3),
+                "range": f"{significant(row['radius_low_arcsec'], 3)} to "
+                f"{significant(row['radius_high_arcsec'], 3)}",
                 "distortion": None
                 if plan.distortion is None
-                else f"{significant(float(row['radius_least_arcsec']), 3)} to "
-                f"{significant(float(row['radius_most_arcsec']), 3)}",
+                else f"{significant(row['radius_least_arcsec'], 3)} to "
+                f"{significant(row['radius_most_arcsec'], 3)}",
             }
             for row in table.to_dict("records")
         ],
-        "nea": [significant(float(value)) for value in plan.nea_arcsec],
+        "nea": [significant(value) for value in plan.nea_arcsec],
         "camera_rows": [
             (key, value) for key, value in plan.camera.to_dict().items() if key != "name"
         ],

@@ -4,10 +4,11 @@ derived quantities.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import count, decimals_for, fixed, p_words, percent, significant
+from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict.estimate import (
     MISFIT_P,
     models_sentence,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
 
 
-def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> dict[str, Any]:
+def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> AnyDict:
     """What the misfit section shows; empty where there is no diagnosis."""
     if diagnosis is None:
         return {}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.formatting import count, join_words
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.pages import budgeting as budget_tables
@@ -54,7 +54,7 @@ def prepared(results: Results) -> Callable[[Mapping[str, bytes], str], str]:
     return document
 
 
-def context(results: Results) -> dict[str, Any]:
+def context(results: Results) -> AnyDict:
     """What the template shows beside the figures."""
     cal, post, obs = results.calibration, results.posterior, results.observations
     verdict = results.verdict
@@ -146,7 +146,7 @@ def _template_command(results: Results) -> str:
     return results.command(Remedy("budget", (RUN,), {"template": "budget.toml"}))
 
 
-def _distortion(results: Results) -> dict[str, Any]:
+def _distortion(results: Results) -> AnyDict:
     """The formula of the distortion model, from its registry entry."""
     model = get_model(results.calibration.camera.distortion)
     radial = [(c.name, c.order - 1) for c in model.coefficients if c.name.startswith("k")]

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import shlex
 import textwrap
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from starcal_uq.budgeting.rows import AXIS_LABELS, confidence_text
 from starcal_uq.core.constants import CROSS_BORESIGHT
 from starcal_uq.core.formatting import count, fixed, join_words, plural, significant
 from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.types import AnyMapping
 from starcal_uq.presentation.report.tables import parameter_rows
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.budgeting import axis_label, bound
@@ -209,8 +210,8 @@ def methods_paragraph(results: Results) -> str:
         results.observations,
     )
     camera, record = cal.camera, cal.provenance if post is None else post.provenance
-    versions: Mapping[str, Any] = record.get("versions", {})
-    settings: Mapping[str, Any] = record.get("settings", {})
+    versions: AnyMapping = record.get("versions", {})
+    settings: AnyMapping = record.get("settings", {})
     kind = "simulated " if obs.origin.simulated else ""
     noise = "fitted with the camera" if cal.fitted_noise is not None else "a free parameter"
     parts = [

@@ -5,7 +5,7 @@ begins.
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from starcal_uq.core.formatting import (
     significant,
     with_sigma,
 )
+from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict.estimate import truth_z
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable, with_units
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
 
-Row = dict[str, Any]
+Row = AnyDict
 
 
 def all_parameters(results: Results) -> tuple[Parameter, ...]:
@@ -187,7 +188,7 @@ def weak_directions(coupling: Coupling) -> list[Row]:
         if direction.variance <= 1.4:
             continue
         weights = zip(coupling.parameter_names, direction.weights, strict=True)
-        parts = [(symbol(name), fixed(float(w), 2)) for name, w in weights if abs(w) >= 0.1]
+        parts = [(symbol(name), fixed(w, 2)) for name, w in weights if abs(w) >= 0.1]
         share = direction.variance / len(coupling.parameter_names)
         rows.append({"words": direction.words, "weights": parts, "share": percent(share)})
     return rows
@@ -203,13 +204,13 @@ def diagnostics_table(post: Posterior) -> TextTable:
         rows.append(
             (
                 parameter.name,
-                fixed(float(d.rhat[i]), 4),
+                fixed(d.rhat[i], 4),
                 count(int(d.ess_bulk[i])),
                 count(int(d.ess_tail[i])),
                 mean_to_mcse(float(post.draws[:, i].mean()) / parameter.scale, mcse),
                 _with_unit(significant(mcse), parameter),
-                percent(float(d.mcse[i] / post.sd[i])),
-                fixed(float(d.autocorrelation[i]), 1),
+                percent(d.mcse[i] / post.sd[i]),
+                fixed(d.autocorrelation[i], 1),
             )
         )
     heads = (
@@ -317,7 +318,7 @@ def noise_table(cal: Calibration) -> TextTable | None:
     if (model := cal.fitted_noise) is None:
         return None
     rows = [
-        (term.replace("^2", "²"), plus_minus(float(value), float(error)))
+        (term.replace("^2", "²"), plus_minus(value, error))
         for term, value, error in zip(model.terms, model.coefficients, model.errors, strict=True)
     ]
     if model.frame_dof is not None:
@@ -331,7 +332,7 @@ def noise_table(cal: Calibration) -> TextTable | None:
 _LISTED = 40
 
 
-def image_context(record: ImageRecord | None, cal: Calibration) -> dict[str, Any]:
+def image_context(record: ImageRecord | None, cal: Calibration) -> AnyDict:
     """What the section shows; empty where the run did not start from images."""
     if record is None:
         return {"image_record": None}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
+from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corrected_words
 from starcal_uq.presentation.html import card, listed
@@ -118,7 +118,7 @@ def _noise_words(results: Results) -> str:
         floor = results.observations.origin.noise_floor_px
         more = (
             (
-                f", with {significant(float(floor))} px per axis added that even bright stars show "
+                f", with {significant(floor)} px per axis added that even bright stars show "
                 "in their residuals"
             )
             if floor
@@ -126,7 +126,7 @@ def _noise_words(results: Results) -> str:
         )
         return f"stated star by star{more}; the data ask for {significant(cal.sigma, 3)} times that"
     if post is not None and not post.sigma_sampled:
-        return f"given as {significant(float(post.sigma_draws[0]), 3)} px per axis"
+        return f"given as {significant(post.sigma_draws[0], 3)} px per axis"
     return f"estimated from the data: {significant(cal.sigma, 3)} px per axis"
 
 
@@ -143,8 +143,7 @@ def sigma_sentence(results: Results) -> str:
             f"The noise σ ({kind}) is a parameter: it is sampled with the others, on its logarithm."
         )
     return (
-        f"The noise σ ({kind}) was given as {significant(float(post.sigma_draws[0]), 4)} and not "
-        "sampled."
+        f"The noise σ ({kind}) was given as {significant(post.sigma_draws[0], 4)} and not sampled."
     )
 
 
@@ -217,7 +216,7 @@ _ASSUMPTIONS = (
 )
 
 
-def assumption_rows(verdict: Verdict) -> list[dict[str, Any]]:
+def assumption_rows(verdict: Verdict) -> list[AnyDict]:
     """What is assumed, with the outcome of the checks that were made for it."""
     made = {check.name: check for check in verdict.checks}
     return [
@@ -241,10 +240,10 @@ def sampling_sentence(results: Results) -> str:
     post = results.posterior
     if post is None:
         return ""
-    settings: Mapping[str, Any] = post.provenance.get("settings", {})
+    settings: AnyMapping = post.provenance.get("settings", {})
     d = post.diagnostics
     moves = f", moves “{settings['moves']}”" if "moves" in settings else ""
-    rates = f"{fixed(float(d.acceptance.min()), 2)} to {fixed(float(d.acceptance.max()), 2)}"
+    rates = f"{fixed(d.acceptance.min(), 2)} to {fixed(d.acceptance.max(), 2)}"
     return (
         f"emcee: {post.n_ensembles} separately seeded ensembles of {post.n_walkers} walkers, "
         f"{post.n_steps} kept steps "
@@ -263,7 +262,7 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
         rows.append(("Source of the data", str(source)))
     if results.camera_changed:
         rows.append(("Nominal camera", results.camera_changed))
-    steps: list[tuple[str, Mapping[str, Any]]] = [("Calibration", results.calibration.provenance)]
+    steps: list[tuple[str, AnyMapping]] = [("Calibration", results.calibration.provenance)]
     if results.posterior is not None:
         steps.append(("Sampling", results.posterior.provenance))
     if results.diagnosis is not None:
@@ -273,7 +272,7 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
         if step.get("seed") is not None:
             rows.append((f"{name}, seed", str(step["seed"])))
         rows.append((f"{name}, settings", _settings_text(step.get("settings", {}))))
-    versions: Mapping[str, Any] = steps[-1][1].get("versions", {})
+    versions: AnyMapping = steps[-1][1].get("versions", {})
     rows.append(
         (
             "Versions",
@@ -283,7 +282,7 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
     return rows
 
 
-def _settings_text(settings: Mapping[str, Any]) -> str:
+def _settings_text(settings: AnyMapping) -> str:
     return ", ".join(f"{name} = {_plain(value)}" for name, value in settings.items()) or "none"
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 from starcal_uq.camera.distortion import PARAMETERS
 from starcal_uq.core.formatting import count, fixed, join_words, pretty_unit
+from starcal_uq.core.types import AnyMapping
 from starcal_uq.studies.axes import AXES
 
 # Name, and how a value is said; the name of an axis that is missing here is said as it is.
@@ -74,6 +74,6 @@ def capital(text: str) -> str:
     return text if text.split(" ")[0].rstrip(":") in PARAMETERS else text[:1].upper() + text[1:]
 
 
-def place(values: Mapping[str, Any]) -> str:
+def place(values: AnyMapping) -> str:
     """A place in the sweep: ``a field of 10° and 100 frames``."""
     return join_words([said(axis, value) for axis, value in values.items()])

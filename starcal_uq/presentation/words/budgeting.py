@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
 
 from starcal_uq.budgeting.file import SENSOR, Requirement
 from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
@@ -16,10 +15,11 @@ from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
 from starcal_uq.core.status import Check, Level, Question
+from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
-Row = dict[str, Any]
+Row = AnyDict
 NOT_RESOLVED = "not resolved"
 # Above what rounding makes of 2.968.
 _GAUSSIAN_TAIL = 2.98
@@ -34,7 +34,7 @@ _MEANING = {
 }
 
 
-def tables(budget: Budget) -> dict[str, Any]:
+def tables(budget: Budget) -> AnyDict:
     """All rows and sentences."""
     return {
         "title": budget.title,

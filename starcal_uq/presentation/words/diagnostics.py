@@ -157,7 +157,7 @@ def models_table(found: ModelComparison, sigma_unit: str = "", fitted: str = "fi
     """
 
     def moved(part: tuple[float, float, float]) -> str:
-        return f"{significant(float(np.hypot(*part[:2])))} / {significant(abs(part[2]))}"
+        return f"{significant(np.hypot(*part[:2]))} / {significant(abs(part[2]))}"
 
     rows = []
     for score in found.scores:

@@ -93,7 +93,7 @@ def screening_text(screening: Screening) -> str:
         for reason, number in screening.counts.items()
     ]
     lines.append(
-        f"Limits: a star {significant(float(np.sqrt(screening.star_threshold)), 3)} sigma from "
+        f"Limits: a star {significant(np.sqrt(screening.star_threshold), 3)} sigma from "
         "the prediction of the "
         f"others (p < {significant(screening.star_p_value)}), a frame at p < "
         f"{significant(screening.frame_p_value)}; "

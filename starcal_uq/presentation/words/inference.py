@@ -42,10 +42,10 @@ def posterior_table(post: Posterior) -> TextTable:
             (
                 parameter.name,
                 *(
-                    fixed(float(number), decimals)
+                    fixed(number, decimals)
                     for number in (mean, sd, *np.quantile(column, [0.025, 0.975]))
                 ),
-                fixed(float(diagnostics.rhat[index]), 4),
+                fixed(diagnostics.rhat[index], 4),
                 f"{diagnostics.ess_bulk[index]:.0f}",
                 f"{diagnostics.ess_tail[index]:.0f}",
                 pretty_unit(parameter.scaled_unit),

@@ -109,7 +109,7 @@ def profile_text(profile: AttitudeProfile) -> str:
     return (
         f"{name}{len(profile.time_s)} attitudes over {significant(profile.duration_s, 3)} s, "
         "turning at "
-        f"{significant(float(np.median(speed)), 3)} (median) to "
-        f"{significant(float(speed.max()), 3)} degrees per "
+        f"{significant(np.median(speed), 3)} (median) to "
+        f"{significant(speed.max(), 3)} degrees per "
         "second."
     )

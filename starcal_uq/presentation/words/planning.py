@@ -88,7 +88,7 @@ def corner(percent: float) -> str:
 
 def span(found: DistortionRange) -> str:
     """The range of the displacement of the corner."""
-    low, high = (f"{significant(float(p))} %" for p in (found.percent[0], found.percent[-1]))
+    low, high = (f"{significant(p)} %" for p in (found.percent[0], found.percent[-1]))
     return f"{low} to {high}".replace("-", MINUS)
 
 
@@ -119,7 +119,7 @@ def distortion_sentence(plan: Plan) -> str:
 
 
 def _px_range(sigmas: FloatArray) -> str:
-    return f"{significant(float(sigmas.min()))} to {significant(float(sigmas.max()))} px"
+    return f"{significant(sigmas.min())} to {significant(sigmas.max())} px"
 
 
 def _needed(need: Need, target: str) -> str:
@@ -160,7 +160,7 @@ def _largest(plan: Plan) -> str:
         "rest of "
         f"{significant(rest)} arcsec (1 sigma per axis across the boresight), beside centroid "
         "noise of "
-        f"{significant(float(max(plan.nea_arcsec[:2])))} arcsec in every frame."
+        f"{significant(max(plan.nea_arcsec[:2]))} arcsec in every frame."
     )
 
 
@@ -184,13 +184,13 @@ def choice_text(choice: FrameChoice) -> str:
         ratio = random / np.sqrt(np.mean(choice.after[cross] ** 2))
         low, high = np.quantile(ratio, (0.05, 0.95))
         parts.append(
-            f"a {name} smaller by a factor of {fixed(float(ratio.mean()), 2)} "
-            f"({fixed(float(low), 2)} to {fixed(float(high), 2)} for 90 % of random sets)"
+            f"a {name} smaller by a factor of {fixed(ratio.mean(), 2)} "
+            f"({fixed(low, 2)} to {fixed(high, 2)} for 90 % of random sets)"
         )
     main = "rest" if choice.scope == "rest" else "common"
     cross = [choice.names.index(f"{main}_{axis}_arcsec") for axis in AXES[:2]]
     richest = fixed(
-        float(np.sqrt(np.mean(choice.richest[cross] ** 2) / np.mean(choice.after[cross] ** 2))), 2
+        np.sqrt(np.mean(choice.richest[cross] ** 2) / np.mean(choice.after[cross] ** 2)), 2
     )
     aim = (
         "the parameters as a whole"

@@ -128,7 +128,7 @@ def alignment_sentence(error: AttitudeError) -> str:
     head = f"Alignment is on {error.alignment}"
     if not np.isfinite(error.alignment_arcsec).all():
         return f"{head}, the noise of which was not propagated by the version that wrote this."
-    sizes = join_words([significant(float(v)) for v in error.alignment_arcsec])
+    sizes = join_words([significant(v) for v in error.alignment_arcsec])
     text = f"{head}, whose noise leaves {sizes} arcsec ({', '.join(AXES)}) for good."
     if error.stays.any():
         axes = join_words([axis for axis, stays in zip(AXES, error.stays, strict=True) if stays])
@@ -166,7 +166,7 @@ def attitude_table(error: AttitudeError) -> TextTable:
             figures.append(
                 (
                     f"  {name}",
-                    *("not known" if np.isnan(v) else significant(float(v)) for v in values),
+                    *("not known" if np.isnan(v) else significant(v) for v in values),
                     "",
                 )
             )
@@ -174,7 +174,7 @@ def attitude_table(error: AttitudeError) -> TextTable:
         rows.append((str(contributor), *(figures[1][1:-1] if once else [""] * 5), str(words)))
         rows += [] if once else figures
         if (choice := error.choice_of_model_arcsec[place]).any() and error.misfit is not None:
-            rows.append((f"  {CHOICE_OF_MODEL}", *(significant(float(v)) for v in choice), "", ""))
+            rows.append((f"  {CHOICE_OF_MODEL}", *(significant(v) for v in choice), "", ""))
     heads = ("contributor", *TOTAL_AXES, "two-axis 95 %", "absorbed by alignment")
     which = f", {IF_MODEL_HOLDS}" if error.misfit is None else ""
     return TextTable(heads, tuple(rows), f"Attitude error, arcsec, 1 sigma{which}", "lrrrrrl")
@@ -201,12 +201,12 @@ def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextT
         "variance inflation": coupling.variance_inflation,
         "Cramér–Rao bound": coupling.crlb_sigma / scales,
     }
-    texts = {head: [significant(float(v)) for v in column] for head, column in columns.items()}
+    texts = {head: [significant(v) for v in column] for head, column in columns.items()}
     if coupling.contraction is not None:
         # The factor by which the data shrank the prior's sigma: a contraction of 1 - 1e-6 would
         # print as 1.
         shrunk = np.sqrt(np.maximum(1.0 - coupling.contraction, 1e-30))
-        texts["prior σ / σ"] = [f"{significant(float(1.0 / v))} ×" for v in shrunk]
+        texts["prior σ / σ"] = [f"{significant(1.0 / v)} ×" for v in shrunk]
     texts["unit"] = [
         pretty_unit(unit) for unit in ([s.scaled_unit for s in specs] or coupling.units)
     ]
@@ -222,7 +222,7 @@ def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextT
 def correlation_table(coupling: Coupling) -> TextTable:
     """Correlations of the parameters and of the rotation that they cause in every frame."""
     rows = tuple(
-        (name, *(fixed(float(value), 2) for value in row))
+        (name, *(fixed(value, 2) for value in row))
         for name, row in zip(coupling.extended_names, coupling.extended_correlation, strict=True)
     )
     return TextTable(
@@ -256,7 +256,7 @@ def equivalent_shift(field: FieldMap) -> tuple[str, str] | None:
     if pixels is None or angles is None:
         return None
     x, y = (
-        f"{significant(float(p))} px ({significant(float(a))} arcsec)"
+        f"{significant(p)} px ({significant(a)} arcsec)"
         for p, a in zip(pixels, angles, strict=True)
     )
     return x, y
@@ -274,7 +274,7 @@ def field_table(field: FieldMap) -> TextTable:
         (
             name,
             *(
-                significant(float(v))
+                significant(v)
                 for v in (np.min(sigma), np.median(sigma), np.max(sigma), np.max(worst))
             ),
         )
@@ -324,7 +324,7 @@ def spectrum_text(spectrum: ErrorSpectrum) -> str:
         f"{_listed(rest)} arcsec ({', '.join(AXES)}), beside {_listed(spectrum.nea_arcsec)} "
         "arcsec of centroid noise "
         f"in each frame. It keeps its value for about {_listed(tau)} s; "
-        f"{', '.join(percent(float(v)) for v in share)} of its variance lie "
+        f"{', '.join(percent(v) for v in share)} of its variance lie "
         f"below a tenth of the highest frequency ({significant(0.1 * nyquist)} Hz). "
         f"{_averaging(spectrum)}"
     )
@@ -353,9 +353,7 @@ def _averaging(spectrum: ErrorSpectrum) -> str:
 
 
 def _listed(values: FloatArray) -> str:
-    return ", ".join(
-        significant(float(v)) if np.isfinite(v) else "an unknown number of" for v in values
-    )
+    return ", ".join(significant(v) if np.isfinite(v) else "an unknown number of" for v in values)
 
 
 def spectrum_table(spectrum: ErrorSpectrum) -> TextTable:

@@ -23,7 +23,7 @@ from starcal_uq.core.formatting import (
     pretty_unit,
     significant,
 )
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import BoolArray, FloatArray, floats
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.tables import TextTable
@@ -175,9 +175,9 @@ def _what_decouples(sweep: Sweep) -> list[str]:
 def _ends(size: Curve, cost: Curve) -> str:
     """From what to what an axis changes a coupling."""
     high, low = cost.most, cost.least
-    prices = (fixed(float(np.exp(cost.median[i])), 1) for i in (high, low))
+    prices = (fixed(np.exp(cost.median[i]), 1) for i in (high, low))
     ends = [
-        f"{correlation_text(float(size.median[i]))} with {said(size.axis, size.values[i])}"
+        f"{correlation_text(size.median[i])} with {said(size.axis, size.values[i])}"
         for i in (high, low)
     ]
     return (
@@ -278,7 +278,7 @@ def _price(study: Study) -> str:
 def _span(values: FloatArray) -> str:
     """Least to most of what is finite."""
     good = values[np.isfinite(values)]
-    ends = [significant(float(v), 3 if abs(v) >= 0.1 else 2) for v in (good.min(), good.max())]
+    ends = [significant(v, 3 if abs(v) >= 0.1 else 2) for v in (good.min(), good.max())]
     return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
 
 
@@ -370,8 +370,7 @@ def _effect(effect: Effect) -> str:
     else:
         ends = [first, last]
     words = " to ".join(
-        f"{significant(float(curve.median[i]))} with {said(curve.axis, curve.values[i])}"
-        for i in ends
+        f"{significant(curve.median[i])} with {said(curve.axis, curve.values[i])}" for i in ends
     )
     law = ""
     if effect.exponent is not None and curve.axis != "max_mag":
@@ -395,7 +394,7 @@ def _target(study: Study) -> str:
         text = f"{head} nowhere"
     else:
         text = (
-            f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} "
+            f"{head} in {count(met.sum())} of {count(known.sum())} "
             f"places{_where(sweep, met, known)}"
         )
     return f"{text}{_crossings(study)}. {_frames_needed(study, target)}".strip()
@@ -431,7 +430,7 @@ def _target_sigmas(study: Study) -> list[str]:
             text = f"{head} {'everywhere' if met.any() else 'nowhere'}"
         else:
             text = (
-                f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} "
+                f"{head} in {count(met.sum())} of {count(known.sum())} "
                 f"places{_where(sweep, met, known)}"
             )
         needed = study.values("frames_needed_sigma", parameter=name)
@@ -513,7 +512,7 @@ def _price_of_models(study: Study) -> str:
     order = sorted(range(len(curve.values)), key=lambda i: len(parameters(curve.values[i])))
     first = order[0]
     told = [
-        f"{significant(float(curve.median[i] / curve.median[first]))} with {curve.values[i]}"
+        f"{significant(curve.median[i] / curve.median[first])} with {curve.values[i]}"
         for i in order[1:]
     ]
     return (
@@ -580,7 +579,7 @@ def _simpler(study: Study) -> list[str]:
         elif not good.any():
             parts.append(f"The model {model} would do nowhere: it leaves {size}.")
         else:
-            share = f"{count(int(good.sum()))} of {count(int(known.sum()))} places"
+            share = f"{count(good.sum())} of {count(known.sum())} places"
             parts.append(
                 f"The model {model} would do in {share}{_where(sweep, good, known)}: it leaves "
                 f"{size}."
@@ -602,7 +601,7 @@ def _simulated(study: Study) -> list[str]:
     if "covered_95" not in study.data:
         return []
     sweep = study.sweep
-    covered = np.asarray(study.data["covered_95"].values, dtype=np.float64)
+    covered = floats(study.data["covered_95"].values)
     covered = np.where(sweep.ok[:, None], covered, np.nan)
     groups = [("", np.ones(len(sweep.ok), dtype=np.bool_))]
     for axis in ("method", "likelihood", "prior"):
@@ -628,7 +627,7 @@ def _simulated(study: Study) -> list[str]:
                 wrong.append(f"{name}{words} ({percent(hits / n, 3)} of {count(n)})")
     if not told:
         return []
-    cells_words = count(int(sweep.ok.sum()))
+    cells_words = count(sweep.ok.sum())
     text = (
         f"In {cells_words} simulated cells the 95 % intervals hold the truth as often as this: "
         f"{join_words(told)}"
@@ -650,7 +649,7 @@ def _posteriors(study: Study) -> list[str]:
     ratio = np.where(study.sweep.ok[:, None], ratio, np.nan)
     if not np.isfinite(ratio).any():
         return []
-    low, middle, high = (fixed(float(q), 2) for q in np.nanquantile(ratio, (0.05, 0.5, 0.95)))
+    low, middle, high = (fixed(q, 2) for q in np.nanquantile(ratio, (0.05, 0.5, 0.95)))
     return [
         f"Sigmas of the posteriors are {middle} times what the information forecasts (median; "
         f"{low} to {high} for 90 % "

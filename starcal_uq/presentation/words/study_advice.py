@@ -10,6 +10,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import join_words, plural, significant
+from starcal_uq.core.types import floats
 from starcal_uq.presentation.words.axes import axis_name, capital, place, said, value_words
 from starcal_uq.presentation.words.studies import (
     HARDLY,
@@ -153,15 +154,15 @@ def _advice_errors(sweep: Sweep) -> list[str]:
     if sweep.axes and common[most] >= _MIND * common[least]:
         parts.append(
             "If alignment is not calibrated with the same parameters, mind the common rotation: "
-            f"{significant(float(common[most]))} arcsec with {place(sweep.at(most))}, "
-            f"{significant(float(common[least]))} with {place(sweep.at(least))}."
+            f"{significant(common[most])} arcsec with {place(sweep.at(most))}, "
+            f"{significant(common[least])} with {place(sweep.at(least))}."
         )
     return parts
 
 
 def _per_magnitude(curve: Curve) -> float | None:
     """By how much a magnitude divides an error, on average over the axis."""
-    x = np.asarray(curve.values, dtype=np.float64)
+    x = floats(curve.values)
     return float(np.exp(-np.polyfit(x, np.log(curve.median), 1)[0])) if len(x) > 1 else None
 
 
@@ -207,7 +208,7 @@ def _advice_target(study: Study) -> str:
     at = place({axis: value for axis, value in sweep.at(best).items() if axis not in NATURE})
     return (
         f"The fewest frames that keep {target:g} arcsec{whatever}: {at} "
-        f"({significant(float(errors[best]))} arcsec)."
+        f"({significant(errors[best])} arcsec)."
     )
 
 
