@@ -36,7 +36,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from benchmarks.baseline_facts import Cleaner, Facts, read  # noqa: E402
+from benchmarks.baseline_facts import Cleaner, Facts, files, read  # noqa: E402
 from benchmarks.baseline_jobs import JOBS, Job  # noqa: E402
 
 RECORD = "job.json"
@@ -293,18 +293,19 @@ def compare_job(before: Path, after: Path, settings: Settings) -> int:
     folders, most = (before, after), settings.most
     records = [json.loads((folder / RECORD).read_text("utf-8")) for folder in folders]
     cleaners = [Cleaner(record, settings.replaced) for record in records]
-    files = [
-        {str(p.relative_to(f)) for p in f.rglob("*") if p.is_file()} - {RECORD} for f in folders
-    ]
+    kept = [files(folder) for folder in folders]
+    for paths in kept:
+        del paths[RECORD]
     counted, lines = 0, []
-    for name in sorted(files[0] | files[1]):
-        if name not in files[0] or name not in files[1]:
+    for name in sorted(kept[0].keys() | kept[1].keys()):
+        if name not in kept[0] or name not in kept[1]:
             counted += 1
-            lines.append(f"  {name}: {'appeared' if name in files[1] else 'vanished'}")
+            lines.append(f"  {name}: {'appeared' if name in kept[1] else 'vanished'}")
             continue
-        if (before / name).read_bytes() == (after / name).read_bytes():
+        paths = [found[name] for found in kept]
+        if paths[0].read_bytes() == paths[1].read_bytes():
             continue
-        facts = [read(f / name, clean) for f, clean in zip(folders, cleaners, strict=True)]
+        facts = [read(path, clean) for path, clean in zip(paths, cleaners, strict=True)]
         found = list(compare_files(*facts, settings.tolerance))
         if not found:
             continue
@@ -316,7 +317,7 @@ def compare_job(before: Path, after: Path, settings: Settings) -> int:
             lines.append(f"    ... and {len(found) - most} more")
     spent = " -> ".join(f"{record['seconds']:.1f} s" for record in records)
     verdict = f"{counted} differences" if counted else "the same"
-    print(f"{before.name}: {verdict}, {len(files[0])} files, {spent}")
+    print(f"{before.name}: {verdict}, {len(kept[0])} files, {spent}")
     print("".join(f"{line}\n" for line in lines), end="", flush=True)
     return counted
 

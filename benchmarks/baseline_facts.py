@@ -24,13 +24,15 @@ import numpy as np
 class Volatile:
     """A fact that may differ.
 
-    In text, `put` replaces `pattern`; in a document, `key` is left out.
+    In text, `put` replaces `pattern`; in a document, `key` is left out; in the name of a file,
+    `file` is.
     """
 
     what: str
     pattern: str = ""
     put: str = ""
     key: str = ""
+    file: str = ""
 
 
 VOLATILE = (
@@ -57,11 +59,25 @@ VOLATILE = (
         r"\1<spent>",
     ),
     Volatile("seconds that a step took", key=r"(^|/)(milli)?seconds$"),
+    Volatile("hash of cells, which hold their seconds", file=r"(?<=part-)[0-9a-f]{16}"),
     Volatile("versions of packages", key=r"(^|/)versions(/|$)"),
     Volatile(
         "size and hash of files, which are compared themselves", key=r"^files/.*/(bytes|sha256)$"
     ),
 )
+
+
+def files(folder: Path) -> dict[str, Path]:
+    """Files of a folder by their path in it, without what is volatile in their names."""
+    found: dict[str, Path] = {}
+    volatile = re.compile("|".join(v.file for v in VOLATILE if v.file))
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        name = str(path.relative_to(folder))
+        if volatile.search(name):
+            count = sum(volatile.sub("", name) == volatile.sub("", other) for other in found)
+            name = volatile.sub(f"{count:016x}", name)
+        found[name] = path
+    return found
 
 
 class Cleaner:
@@ -242,7 +258,10 @@ def read_npz(path: Path, clean: Cleaner) -> Facts:
     facts = Facts()
     with np.load(path, allow_pickle=False) as arrays:
         for name in arrays.files:
-            facts.add(name, arrays[name])
+            if arrays[name].dtype.kind == "U" and not arrays[name].ndim:
+                facts.include(document(_parsed(str(arrays[name])), clean), f"{name}/")
+            else:
+                facts.add(name, arrays[name])
     return facts
 
 
@@ -252,6 +271,8 @@ def read_netcdf(path: Path, clean: Cleaner) -> Facts:
     facts = Facts()
 
     def visit(name: str, item: Any) -> None:
+        if clean.leaves_out(name):
+            return
         for key, value in item.attrs.items():
             if isinstance(value, str | bytes):
                 text = value.decode() if isinstance(value, bytes) else value
