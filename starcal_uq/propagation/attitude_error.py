@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 import json
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -42,6 +42,9 @@ CONTRIBUTORS = (
 OBSERVED = "observed frames"
 # What alignment was taken to be where nothing is said about it.
 SAME_FRAMES = "the frames themselves"
+# What stands in the table, as it is called now, and as earlier versions called it.
+_NAMES = ("if_model_holds", "p95_if_model_holds", "p997_if_model_holds", "first_order")
+_FORMER_NAMES = ("sigma", "p95", "p997", "first_order")
 # Columns of a row of a covariance, one for each axis.
 _COVARIANCES = tuple(f"covariance_{axis}_arcsec2" for axis in AXES)
 _ABSORBED = ("no", "yes", "no", "in part", "no")
@@ -452,18 +455,6 @@ class AttitudeError(Shown):
         RunFolderError
             If the file is missing or is not such a table.
         """
-        names: tuple[str, ...] = (
-            "if_model_holds",
-            "p95_if_model_holds",
-            "p997_if_model_holds",
-            "first_order",
-        )
-        # What earlier versions called them.
-        old = {
-            "if_model_holds": "sigma",
-            "p95_if_model_holds": "p95",
-            "p997_if_model_holds": "p997",
-        }
         with reading(
             path,
             "a table of attitude errors",
@@ -472,60 +463,42 @@ class AttitudeError(Shown):
             with open(path, newline="", encoding="utf-8") as file:
                 rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
             known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED
-            chosen = [[rows[contributor, axis] for axis in TOTAL_AXES] for contributor in known]
-            table = np.full((len(names), len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
-            first = chosen[0][0]
-            if "if_model_holds_arcsec" not in first:
-                names = tuple(old.get(name, name) for name in names)
-            table[:, : len(known)] = [
-                [[float(row[f"{name}_arcsec"] or "nan") for row in line] for line in chosen]
-                for name in names
-            ]
+
+            def numbers(column: str, axes: Sequence[str] = TOTAL_AXES) -> FloatArray:
+                """A column by contributor and axis; NaN where nothing stands."""
+                found = np.full((len(CONTRIBUTORS), len(axes)), np.nan)
+                found[: len(known)] = [
+                    [float(rows[one, axis][column] or "nan") for axis in axes] for one in known
+                ]
+                return found
+
+            first = rows[known[0], TOTAL_AXES[0]]
+            names = _NAMES if f"{_NAMES[0]}_arcsec" in first else _FORMER_NAMES
+            table = np.array([numbers(f"{name}_arcsec") for name in names])
             if not np.isfinite(table[:, : len(_REQUIRED)]).all():
                 raise ValueError("a number is missing")
-            counts = {name: int(first[name]) for name in ("n_draws", "n_frames")}
-            n_sampled = int(first.get("n_sampled_frames") or 0)
-            frames = first.get("frames") or OBSERVED
-            misfit = (
-                from_plain(MisfitFound, json.loads(first["misfit"]))
-                if first.get("misfit")
-                else None
-            )
-            later: AnyDict = {}
+            sigma, p95, p997, analytic = table
+            others: AnyDict = {name: int(first[name]) for name in ("n_draws", "n_frames")}
+            others["n_sampled_frames"] = int(first.get("n_sampled_frames") or 0)
+            others["frames"] = first.get("frames") or OBSERVED
+            others["interaction_arcsec"] = sigma[4, :3]
+            if first.get("misfit"):
+                others["misfit"] = from_plain(MisfitFound, json.loads(first["misfit"]))
             if first.get("alignment"):
-
-                def matrix(contributor: str, prefix: str = "") -> list[list[float]]:
-                    names = [prefix + name for name in _COVARIANCES]
-                    return [
-                        [float(rows[contributor, axis][name] or "nan") for name in names]
-                        for axis in AXES
-                    ]
-
-                unknown = [[math.nan] * len(AXES)] * len(AXES)
-                later = {
+                constant = [float(rows[known[0], axis]["rest_constant_arcsec"]) for axis in AXES]
+                aligned = [numbers(f"alignment_{name}", AXES)[0] for name in _COVARIANCES]
+                others |= {
                     "alignment": first["alignment"],
-                    "total_arcsec": table[0, 3, :3],
-                    "analytic_total_arcsec": table[3, 3, :3],
-                    "rest_constant_arcsec": np.array(
-                        [float(row["rest_constant_arcsec"]) for row in chosen[0][:3]]
+                    "total_arcsec": sigma[3, :3],
+                    "analytic_total_arcsec": analytic[3, :3],
+                    "rest_constant_arcsec": np.array(constant),
+                    "covariance_arcsec2": np.stack(
+                        [numbers(name, AXES) for name in _COVARIANCES], axis=-1
                     ),
-                    "covariance_arcsec2": np.array(
-                        [matrix(name) for name in known] + [unknown] * (table.shape[1] - len(known))
-                    ),
-                    "alignment_covariance_arcsec2": np.array(matrix(known[0], "alignment_")),
+                    "alignment_covariance_arcsec2": np.stack(aligned, axis=-1),
                 }
-        sigma, p95, p997, analytic = table
-        return cls(
-            *(sigma[0, :3], sigma[1, :3], sigma[2, :3], p95, p997),
-            *(analytic[0, :3], analytic[1, :3], analytic[2, :3]),
-            n_draws=counts["n_draws"],
-            n_frames=counts["n_frames"],
-            n_sampled_frames=n_sampled,
-            interaction_arcsec=sigma[4, :3],
-            frames=frames,
-            misfit=misfit,
-            **later,
-        )
+        single = [*sigma[:3, :3], p95, p997, *analytic[:3, :3]]
+        return cls(*single, **others)
 
 
 def two_figures(with_misfit_found: float, if_model_holds: float) -> str:
