@@ -26,13 +26,13 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.shapes import View, focal_drift, frame_shapes, lens_shapes
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood
+from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood, star_numbers
 from starcal_uq.observations.splits import one_of_each
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
 from starcal_uq.sky.site import Site
@@ -200,6 +200,7 @@ class Remainder:
         )
         self.obs = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
         model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
+        self.focal_px = cal.camera.focal_px
         self.likelihood = MarginalLikelihood(self.obs, model, axes=True)
         if errors is not None:
             self.likelihood = StarLikelihood(self.obs, model, cal.theta, rotations, *errors)
@@ -215,6 +216,12 @@ class Remainder:
         self.least_dof = (
             self.dof if errors is None else max(2 * errors[0].n_recurring - 3 - len(cal.theta), 1)
         )
+
+    @cached_property
+    def groups(self) -> tuple[IntArray, IntArray]:
+        """Star and frame of every image, (N,) each, from 0."""
+        numbers = star_numbers(self.obs, self.focal_px)
+        return numbers, np.repeat(np.arange(self.obs.n_frames), self.likelihood.frames.sizes)
 
     @property
     def sigma(self) -> float:
@@ -338,7 +345,7 @@ class _Air:
     def _apart(self, shifts: FloatArray) -> FloatArray:
         """Shifts (q, 2, N) of each frame by itself, (q K, 2, N)."""
         frames = self._rest.likelihood.frames
-        number = np.repeat(np.arange(frames.n_frames), frames.sizes)
+        number = self._rest.groups[1]
         spread = np.zeros((len(shifts), frames.n_frames, 2, frames.n_stars))
         spread[:, number, :, np.arange(frames.n_stars)] = shifts.transpose(2, 0, 1)
         return spread.reshape(-1, 2, frames.n_stars)
@@ -541,7 +548,7 @@ class _Air:
         h = likelihood.slopes(self._cal.theta, state)
         e = likelihood.project_out(state, state.e[None])[0]
         basis = np.linalg.qr(h.reshape(len(h), -1).T)[0]
-        number, star = np.repeat(np.arange(frames.n_frames), frames.sizes), np.arange(n)
+        number, star = self._rest.groups[1], np.arange(n)
         best, least = np.zeros(frames.n_frames, dtype=np.int64), np.inf
         for tangent in _TANGENTS:
             left = e - h[2] * (

@@ -29,7 +29,13 @@ from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
-from starcal_uq.diagnostics.times import TimeTest, UnseenAberration, time_test, unseen_aberration
+from starcal_uq.diagnostics.times import (
+    TimeTest,
+    UnseenAberration,
+    remainder,
+    time_test,
+    unseen_aberration,
+)
 from starcal_uq.estimation.fit import fit
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.result import Calibration
@@ -173,15 +179,15 @@ def diagnose_apart(
     `whole` is the calibration that partitioned observations have, where `cal` is that of their
     sample.
     """
-    stars = star_test(obs, cal)
+    stars, rest = star_test(obs, cal), remainder(obs, cal, seed)
     return Apart(
         misfit=misfit_tests(obs, whole or cal),
         starts=multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None,
         stars=stars,
         air=air_test(obs, cal, seed=seed, stars=stars),
         cameras=MixedCameras.of(obs, cal.camera),
-        times=time_test(obs, cal, seed=seed),
-        aberration=unseen_aberration(obs, cal, seed=seed),
+        times=time_test(obs, cal, seed=seed, rest=rest),
+        aberration=unseen_aberration(obs, cal, seed=seed, rest=rest),
     )
 
 

@@ -19,10 +19,9 @@ import numpy as np
 from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR
-from starcal_uq.core.types import FloatArray, IntArray, StrArray
+from starcal_uq.core.types import FloatArray, StrArray
 from starcal_uq.diagnostics.air import Remainder
 from starcal_uq.estimation.noise_model import weighed
-from starcal_uq.likelihood.star_errors import star_numbers
 from starcal_uq.sky.apparent import earth_velocity_km_s
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
@@ -111,8 +110,15 @@ class _Moved:
     later: FloatArray
 
 
+def remainder(obs: Observations, cal: Calibration, seed: int) -> Remainder:
+    """What `time_test` and `unseen_aberration` look at."""
+    return Remainder(weighed(obs, cal), cal, seed)
+
+
 @bounded
-def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest | None:
+def time_test(
+    obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remainder | None = None
+) -> TimeTest | None:
     """Look for a wrong time in the residuals of a calibration.
 
     Parameters
@@ -121,15 +127,15 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
         The data and the estimate made from them.
     seed : int
         Seed of the choice of frames, where there are many.
+    rest : Remainder, optional
+        What `remainder` gives for these, where it is known already.
 
     Returns
     -------
     TimeTest or None
         The slip that explains most; None where none is seen.
     """
-    rest = Remainder(weighed(obs, cal), cal, seed)
-    numbers = star_numbers(rest.obs, cal.camera.focal_px)
-    frames = np.repeat(np.arange(rest.obs.n_frames), rest.likelihood.frames.sizes)
+    rest = remainder(obs, cal, seed) if rest is None else rest
     best, most = None, 0.0
     for moved in _causes(rest):
         columns, absorbed = rest.left(moved.shifts)
@@ -140,7 +146,7 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
         i = int(np.argmax(gain))
         if gain[i] <= most:
             continue
-        factor, std, sure = _fitted(columns[i], rest, (numbers, frames))
+        factor, std, sure = _fitted(columns[i], rest)
         later, later_std = float(moved.later[i]), np.nan
         if moved.cause == "epoch":
             later, later_std = factor, std
@@ -150,9 +156,7 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
             if moved.cause in ("date", "hour"):
                 a, b = max(i - 1, 0), min(i + 1, len(size) - 1)
                 slope = (columns[b] - columns[a]) / (moved.later[b] - moved.later[a])
-                step, later_std, _ = _fitted(
-                    slope, rest, (numbers, frames), rest.residuals - columns[i]
-                )
+                step, later_std, _ = _fitted(slope, rest, rest.residuals - columns[i])
                 later += step
         if good and sure > _SIGNIFICANT:
             shift = np.abs(absorbed[i] * (factor if moved.cause == "epoch" else 1.0)) / cal.sigmas
@@ -165,7 +169,7 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
 
 @bounded
 def unseen_aberration(
-    obs: Observations, cal: Calibration, *, seed: int = 0
+    obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remainder | None = None
 ) -> UnseenAberration | None:
     """Ask how far annual aberration would move f without being seen in the residuals of a
     calibration.
@@ -176,30 +180,27 @@ def unseen_aberration(
         The data and the estimate made from them.
     seed : int
         Seed of the choice of frames, where there are many.
+    rest : Remainder, optional
+        What `remainder` gives for these, where it is known already.
 
     Returns
     -------
     UnseenAberration or None
         None where `time_test` would see it, or it moves f by less than a standard deviation.
     """
-    rest = Remainder(weighed(obs, cal), cal, seed)
-    numbers = star_numbers(rest.obs, cal.camera.focal_px)
-    frames = np.repeat(np.arange(rest.obs.n_frames), rest.likelihood.frames.sizes)
+    rest = remainder(obs, cal, seed) if rest is None else rest
     # The first cause is that aberration is missing.
     columns, absorbed = rest.left(next(_causes(rest)).shifts)
     worst = int(np.argmax(np.abs(absorbed[:, 2])))
     f_px = float(abs(absorbed[worst, 2]))
-    visible = 1.0 / _fitted(columns[worst], rest, (numbers, frames))[1]
+    visible = 1.0 / _fitted(columns[worst], rest)[1]
     if f_px < float(cal.sigmas[2]) or visible > _SIGNIFICANT:
         return None
     return UnseenAberration(f_px, f_px / float(cal.sigmas[2]), visible, len(columns) == 1)
 
 
 def _fitted(
-    column: FloatArray,
-    rest: Remainder,
-    groups: tuple[IntArray, ...],
-    residuals: FloatArray | None = None,
+    column: FloatArray, rest: Remainder, residuals: FloatArray | None = None
 ) -> tuple[float, float, float]:
     """The factor of a column, its error and how many errors it is.
 
@@ -209,7 +210,7 @@ def _fitted(
     """
     from scipy.special import stdtrit
 
-    residuals = rest.residuals if residuals is None else residuals
+    residuals, groups = rest.residuals if residuals is None else residuals, rest.groups
     own = (column**2).reshape(2, -1).sum(axis=0)
     by_star = np.bincount(groups[0], own)
     most = float(by_star.sum())
@@ -238,7 +239,7 @@ def _causes(rest: Remainder) -> Iterator[_Moved]:
 
     def seen(moves: FloatArray) -> FloatArray:
         """Shifts of images by moves (3, N), ICRS axes."""
-        turned = rest.state.rotations[np.repeat(np.arange(frames.n_frames), frames.sizes)]
+        turned = rest.state.rotations[rest.groups[1]]
         return rest.shift(np.einsum("nij,jn->in", turned, moves))
 
     # One and the same for all stars of a frame, so that three columns hold the velocities of all
