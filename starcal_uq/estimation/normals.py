@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation
+from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.residual_map import FrameScatter
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
-from starcal_uq.likelihood.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, frame_normals
+from starcal_uq.likelihood.sums import frame_normals
 from starcal_uq.likelihood.terms import add_by_group
 from starcal_uq.observations.frames import StarFrames
 
@@ -77,11 +77,7 @@ class FrameNormals:
         frames = (
             obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes=True)
         )
-        for _ in range(ATTITUDE_STEPS):
-            gram, shift, log_determinant = frame_normals(frames, model, theta, start)
-            if not np.max(np.abs(shift)) >= ATTITUDE_TOLERANCE_RAD:
-                break
-            start = exp_rotation(shift.T) @ start
+        gram, attitudes = frame_normals(frames, model, theta, start)
         matrix = gram[:, 1:, 1:]
         scale = 1.0 / np.sqrt(np.einsum("kaa->a", matrix)) if scale is None else scale
         return cls(
@@ -90,8 +86,8 @@ class FrameNormals:
             matrices=matrix * np.outer(scale, scale),
             slopes=gram[:, 0, 1:] * scale,
             squares=gram[:, 0, 0],
-            log_determinant=log_determinant,
-            rotations=start,
+            log_determinant=attitudes.log_determinant,
+            rotations=attitudes.rotations,
             dof=2 * frames.sizes - 3,
         )
 

@@ -267,18 +267,30 @@ def _columns(
 
 def frame_normals(
     frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Normal equations of every single frame, attitudes eliminated, in one pass.
+) -> tuple[FloatArray, Attitudes]:
+    """Normal equations of every single frame at its best attitude, searched from `rotations` (K, 3,
+    3).
 
-    Returns products (K, p + 1, p + 1) of e and H without what the frame's attitude can reproduce,
-    rotation vectors (3, K) to the best attitudes, rad, and log |A^T A| (K,).
+    Returns products (K, p + 1, p + 1) of e and H without what the frame's attitude can reproduce.
     """
-    p, k = len(theta), frames.n_frames
+    for _ in range(ATTITUDE_STEPS):
+        gram, attitudes = _frame_normals(frames, model_name, theta, rotations)
+        if not np.max(np.abs(attitudes.shift)) >= ATTITUDE_TOLERANCE_RAD:
+            break
+        rotations = attitudes.at(theta)
+    return gram, replace(attitudes, rotations=rotations)
+
+
+def _frame_normals(
+    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray
+) -> tuple[FloatArray, Attitudes]:
+    """The same at given attitudes, in one pass."""
+    p, k, turn = len(theta), frames.n_frames, np.zeros((3, len(theta)))
     rows = p + 4
     sums = np.empty((rows * (rows + 1) // 2, k))
     with np.errstate(all="ignore"):
         for block in _columns(frames, model_name, theta, rotations):
-            sums[:, block.place] = block.products(rows)
+            sums[:, block.place], turn = block.products(rows), block.turn
         packed, mixed = _unpacked(sums[: 3 * (rows - 1)], rows)
         inverse, determinant = inverse_symmetric(packed)
         solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
@@ -287,7 +299,10 @@ def frame_normals(
         gram[:, i, j] = gram[:, j, i] = (
             sums[3 * (rows - 1) :] - np.einsum("cqk,cqk->qk", mixed[:, i], solved[:, j])
         ).T
-        return gram, solved[:, 0], np.log(determinant)
+        response = -solved[:, 1:] - turn[:, :, None]
+        return gram, Attitudes(
+            theta, rotations, solved[:, 0], response, inverse, np.log(determinant)
+        )
 
 
 def settled_sums(

@@ -19,8 +19,7 @@ import numpy as np
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation.noise_model import NoiseModel
-from starcal_uq.likelihood.elimination import products_by_frame
-from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.sums import frame_normals
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
 
@@ -34,7 +33,6 @@ Noise = float | Callable[[FloatArray], FloatArray] | NoiseModel
 
 # An attitude needs this many stars before it says anything about the camera.
 LEAST_STARS = 3
-_STARS_AT_ONCE = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,13 +189,9 @@ def frame_matrices(
     """Information (M, p, p), attitude response (M, 3, p) and attitude noise (M, 3, 3) of noise-free
     frames.
     """
-    information, response, noise = [], [], []
-    whole = MarginalLikelihood(frames, camera.distortion)
-    for part, state, _ in whole.pieces(camera.theta, rotations, _STARS_AT_ONCE):
-        derivatives = part.derivatives(camera.theta, state)
-        h = part.project_out(state, derivatives)
-        information.append(products_by_frame(part.frames, h, h))
-        # A parameter too large turns the attitude the other way: the stars are where they are.
-        response.append(-part.attitude_response(state, derivatives).transpose(2, 1, 0))
-        noise.append(np.moveaxis(state.inverse, 2, 0))
-    return np.concatenate(information), np.concatenate(response), np.concatenate(noise)
+    gram, attitudes = frame_normals(frames, camera.distortion, camera.theta, rotations)
+    return (
+        gram[:, 1:, 1:],
+        attitudes.response.transpose(2, 0, 1),
+        attitudes.inverse.transpose(2, 0, 1),
+    )
