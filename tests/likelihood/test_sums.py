@@ -91,7 +91,7 @@ def test_sums_of_single_frames_keep_their_digits_in_a_narrow_field(field_deg):
     likelihood = MarginalLikelihood(with_sigmas(sc.Observations(**c.columns)), "brown")
     frames = likelihood.frames
     _, attitudes = settled_sums(frames, "brown", c.theta, likelihood.start_rotations(c.theta))
-    gram, shift, log_determinant = frame_normals(frames, "brown", c.theta, attitudes.rotations)
+    gram, found = frame_normals(frames, "brown", c.theta, attitudes.rotations)
     b = frames.rotated(attitudes.rotations)
     xy, h, a = forward_kernel("brown", "first")(frames.n_stars, c.theta, b, np.zeros(2))
     e = (frames.pixel - xy)[None]
@@ -105,12 +105,12 @@ def test_sums_of_single_frames_keep_their_digits_in_a_narrow_field(field_deg):
         q, r = np.linalg.qr(rows[0])
         left = np.hstack(rows[1:]) - q @ (q.T @ np.hstack(rows[1:]))
         own[k] = left.T @ left
-        assert log_determinant[k] == pytest.approx(
+        assert found.log_determinant[k] == pytest.approx(
             2.0 * np.sum(np.log(np.abs(np.diag(r)))), rel=1e-9
         )
     size = np.sqrt(np.einsum("kii->ki", own))
     assert np.max(np.abs(gram - own) / (size[:, :, None] * size[:, None])) < 1e-7
-    assert np.max(np.abs(shift)) < 1e-9
+    assert np.max(np.abs(found.shift)) < 1e-9
 
 
 def test_a_model_that_is_not_finite_costs_infinitely_much():
