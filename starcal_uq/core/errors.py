@@ -7,7 +7,7 @@ line prints it as it stands and exits with status 2.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -41,6 +41,12 @@ def _one_line(message: str) -> str:
         rf"\S{{{_LONGEST_WORD},}}", lambda word: f"{word[0][:40]}...{word[0][-20:]}", line
     )
     return line if len(line) <= _LONGEST else f"{line[:290]} ... {line[-100:]}"
+
+
+def check_known(what: str, name: str, known: Collection[str], error: type[Exception]) -> None:
+    """Refuse a name that is none of those that are known."""
+    if name not in known:
+        raise error(f"{what} {name!r} is unknown: use one of {', '.join(known)}.")
 
 
 class SettingError(StarcalError, ValueError):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.errors import CalibrationError, RepeatedFramesError, check_known
 from starcal_uq.core.settings import Duplicates
 from starcal_uq.core.types import IntArray
 from starcal_uq.observations.repeats import Fingerprints, repeats, shared
@@ -70,10 +70,7 @@ def repeated_frames(a: Calibration, b: Calibration | None = None) -> IntArray:
 
 def check_duplicates(duplicates: str) -> None:
     """Refuse a word that says nothing about repeated frames."""
-    if duplicates not in DUPLICATES:
-        raise CalibrationError(
-            f"duplicates {duplicates!r} is unknown: use one of {', '.join(DUPLICATES)}."
-        )
+    check_known("duplicates", duplicates, DUPLICATES, CalibrationError)
 
 
 def repeated(what: str, pairs: IntArray, n_frames: int) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.errors import CalibrationError, RepeatedFramesError, check_known
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.settings import MergedNoise
@@ -252,8 +252,7 @@ def check_mergeable(
 ) -> None:
     """Refuse runs that cannot be merged, whatever their estimates."""
     check_duplicates(duplicates)
-    if noise not in NOISES:
-        raise CalibrationError(f"noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
+    check_known("noise", noise, NOISES, CalibrationError)
     if len(calibrations) < 2:
         raise CalibrationError("merging needs at least two runs: name another.")
     if len(names) != len(calibrations):

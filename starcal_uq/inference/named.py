@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
-from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.errors import SamplingError, check_known
 from starcal_uq.core.remedy import calibrated
 from starcal_uq.core.settings import Evaluation, LikelihoodName
 from starcal_uq.core.status import Check, Level, Question
@@ -81,14 +81,8 @@ def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bo
             f"likelihood={likelihood!r} says how a likelihood is evaluated, not which: use "
             f"evaluation={likelihood!r}."
         )
-    elif likelihood not in LIKELIHOODS:
-        raise SamplingError(
-            f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}."
-        )
-    if evaluation not in EVALUATIONS:
-        raise SamplingError(
-            f"evaluation {evaluation!r} is unknown: use one of {', '.join(EVALUATIONS)}."
-        )
+    check_known("likelihood", likelihood, LIKELIHOODS, SamplingError)
+    check_known("evaluation", evaluation, EVALUATIONS, SamplingError)
     if dof is not None and likelihood != "student_t":
         raise SamplingError(
             "degrees of freedom (dof) belong to likelihood='student_t': leave dof out, or use that."

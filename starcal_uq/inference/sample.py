@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from starcal_uq.camera.distortion import parameters, sigma_parameter
-from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.errors import SamplingError, check_known
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
@@ -454,8 +454,7 @@ def _settings(
     sigma: Any,
     cal: Calibration,
 ) -> EnsembleSettings:
-    if moves not in _BURN:
-        raise SamplingError(f"moves {moves!r} is unknown: use one of {', '.join(_BURN)}.")
+    check_known("moves", moves, _BURN, SamplingError)
     if sigma != "sampled" and not (
         isinstance(sigma, int | float) and np.isfinite(sigma) and sigma > 0.0
     ):

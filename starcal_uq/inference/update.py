@@ -16,7 +16,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import PriorError
+from starcal_uq.core.errors import PriorError, check_known
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.types import AnyMapping, FloatArray
 from starcal_uq.inference.posterior import Posterior
@@ -113,8 +113,7 @@ def prior_from(
     PriorError
         For an inflation below 1, or a noise that means something else in the next run.
     """
-    if noise not in NOISES:
-        raise PriorError(f"the prior's noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
+    check_known("the prior's noise", noise, NOISES, PriorError)
     if positive_number("inflation", inflation) < 1.0:
         raise PriorError(
             f"the prior's inflation is {inflation:g}: use 1 or more; less would claim what no "

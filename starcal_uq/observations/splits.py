@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from starcal_uq.core.errors import ComparisonError
+from starcal_uq.core.errors import ComparisonError, check_known
 from starcal_uq.core.settings import Split, bounded
 from starcal_uq.core.types import IntArray
 
@@ -82,8 +82,7 @@ def frame_sample(obs: Observations, limit: int, seed: int = 0) -> tuple[Observat
 
 def split_labels(how: str) -> tuple[str, str]:
     """What the two halves are called."""
-    if how not in _LABELS:
-        raise ComparisonError(f"split {how!r} is unknown: use one of {', '.join(SPLITS)}.")
+    check_known("split", how, SPLITS, ComparisonError)
     return _LABELS[how]
 
 

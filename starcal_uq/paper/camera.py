@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.errors import CameraError
+from starcal_uq.core.errors import CameraError, check_known
 
 # The equation of Ye & Yang 2017 that is read as the distortion of their simulation, and the model
 # that says the same.
@@ -26,10 +26,7 @@ def paper_camera(convention: str = "eq14") -> Camera:
     CameraError
         For another convention.
     """
-    if convention not in CONVENTIONS:
-        raise CameraError(
-            f"convention {convention!r} is unknown: use one of {', '.join(CONVENTIONS)}."
-        )
+    check_known("convention", convention, CONVENTIONS, CameraError)
     return Camera(
         width_px=1024,
         height_px=1024,

@@ -25,7 +25,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.fields import detector_axes, grid_points
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.errors import DistortionError
+from starcal_uq.core.errors import DistortionError, check_known
 from starcal_uq.core.types import FloatArray, floats
 
 _GRID = 33
@@ -156,8 +156,7 @@ def undistorted(camera: Camera, xy_px: FloatArray, how: Undistortion = "model") 
     own distortion folds over within these points.
     """
     xy = floats(xy_px).reshape(-1, 2)
-    if how not in UNDISTORTIONS:
-        raise ValueError(f"undistortion {how!r} is unknown: use one of {', '.join(UNDISTORTIONS)}.")
+    check_known("undistortion", how, UNDISTORTIONS, ValueError)
     centre = camera.theta[:2]
     if how == "model":
         b = unproject(camera, xy)
@@ -194,8 +193,7 @@ def reprojection_error_px(
     estimated f ("focal") with the principal point of Table 1, or both estimated. DistortionError
     when a distortion folds over within these points.
     """
-    if optics not in OPTICS:
-        raise ValueError(f"optics {optics!r} is unknown: use one of {', '.join(OPTICS)}.")
+    check_known("optics", optics, OPTICS, ValueError)
     xy = floats(xy_px).reshape(-1, 2)
     ideal = undistorted(truth, xy)
     corrected = undistorted(estimate, xy if noise_px is None else xy + noise_px, undistortion)

@@ -21,7 +21,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.constants import ARCSEC, AXES
-from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.errors import PlanningError, check_known
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.linear import inverses
@@ -204,8 +204,7 @@ class Forecaster:
         n_campaigns: int = N_CAMPAIGNS,
         seed: int = 0,
     ) -> None:
-        if scope not in SCOPES:
-            raise PlanningError(f"the scope {scope!r} is unknown: use one of {', '.join(SCOPES)}.")
+        check_known("the scope", scope, SCOPES, PlanningError)
         if not 0.0 < confidence < 1.0:
             raise PlanningError(
                 f"the confidence {confidence!r} is no probability: give one such as 0.997."

@@ -19,7 +19,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
-from starcal_uq.core.errors import CameraError, PriorError, StudyError
+from starcal_uq.core.errors import CameraError, PriorError, StudyError, check_known
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
@@ -391,8 +391,7 @@ def template(name: str) -> str:
 
     StudyError for a name that is not one of `TEMPLATES`.
     """
-    if name not in TEMPLATES:
-        raise StudyError(f"template {name!r} is unknown: use one of {', '.join(TEMPLATES)}.")
+    check_known("template", name, TEMPLATES, StudyError)
     text = (files("starcal_uq.studies") / "templates" / f"{name}.toml").read_text("utf-8")
     return text.replace("{command}", Remedy("study", ("STUDY.toml",), {"out": "DIR"}).command)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.errors import CalibrationError, check_known
 from starcal_uq.core.settings import PairCovariance, RecursiveMethod
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, floats
@@ -145,11 +145,7 @@ class RecursionOptions:
 
     def check(self, method: str) -> None:
         """Refuse what makes no sense, by a `CalibrationError` with the remedy."""
-        if self.pair_covariance not in PAIR_COVARIANCES:
-            raise CalibrationError(
-                f"pair_covariance {self.pair_covariance!r} is unknown: use one of "
-                f"{', '.join(PAIR_COVARIANCES)}."
-            )
+        check_known("pair_covariance", self.pair_covariance, PAIR_COVARIANCES, CalibrationError)
         if self.parameters not in ("optics", "all"):
             raise CalibrationError(
                 f"parameters {self.parameters!r} is unknown: use one of optics, all."
