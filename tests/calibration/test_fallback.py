@@ -10,7 +10,8 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.calibration.fallback import fallback_words
 from starcal_uq.core.errors import CalibrationError, SamplingError
-from starcal_uq.core.status import PLAN, Level, Status
+from starcal_uq.core.remedy import PLAN
+from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.verdict import estimate
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import symmetric_inverse
@@ -45,7 +46,7 @@ def test_the_richest_model_that_the_data_determine_is_fitted_and_said(tmp_path):
     assert (record["model"], record["used"], record["status"]) == ("brown", "none", "SINGULAR")
     assert fallback_words(cal) in cal.text and "k1 and k2 are zero" in fallback_words(cal)
     check = estimate.determined(cal)
-    assert check.level is Level.WARN and "--model" not in check.remedy and check.remedy == PLAN
+    assert check.level is Level.WARN and "--model" not in check.remedy and check.remedies == PLAN
     cal.save(tmp_path / "calibration.json")
     assert fallback_words(sc.Calibration.load(tmp_path / "calibration.json")) == fallback_words(cal)
 
@@ -73,7 +74,7 @@ def test_sigmas_are_those_without_the_coma_of_a_distortion_that_may_be_none():
     check = estimate.determined(cal)
     assert (
         check.level is Level.WARN
-        and check.remedy == PLAN
+        and check.remedies == PLAN
         and "without its coma" in fallback_words(cal)
     )
     assert np.array_equal(sc.calibrate(obs, camera, model="brown").theta, cal.theta)

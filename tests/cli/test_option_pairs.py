@@ -203,7 +203,9 @@ def test_some_pairs_of_options_work_or_are_refused_in_words(asked):
     assert 20 < np.sum(begun) < 100
     # Controls: these are known.
     assert asked("plain.csv", [("--robust", None), ("--model", "k1")])
-    assert not asked("plain.csv", [("--robust", None), ("--noise", "model")])
+    assert asked("plain.csv", [("--robust", None), ("--noise", "model")])
+    assert asked("plain.csv", [("--robust", None), ("--star-errors", None)])
+    assert not asked("plain.csv", [("--robust", None), ("--method", "three_stage")])
     assert not asked("plain.csv", [("--star-errors", None), ("--method", "samaan")])
     assert not asked("parts", [("--star-errors", None)])
 

@@ -64,7 +64,8 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "star_errors": None,
         "noise_model": None,
         "inflation": None,
-        "coma_factors": None,
+        "width_factors": np.ones(5),
+        "sampled_likelihood": "marginal",
         "undetermined": (),
     }
     values |= changes

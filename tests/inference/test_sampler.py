@@ -20,7 +20,7 @@ from starcal_uq.core.errors import CalibrationError, SamplingError, SettingError
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.jackknife import accept_inflation, jackknife_frames
 from starcal_uq.inference import named
-from starcal_uq.inference.checks import _OPTIONS, check_compression
+from starcal_uq.inference.checks import _DEFAULTS, check_compression
 from starcal_uq.inference.exact import ExactMarginal, FrameSample
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import Priors
@@ -41,9 +41,8 @@ QUICKER = {**QUICK, "n_steps": 20}
 
 def test_a_remedy_knows_what_sample_does_by_itself() -> None:
     own = inspect.signature(sample).parameters
-    assert {name: own[name].default for name in _OPTIONS if name != "dof"} == {
-        name: default for name, (_, default) in _OPTIONS.items() if name != "dof"
-    }
+    known = {name: default for name, default in _DEFAULTS.items() if name != "dof"}
+    assert {name: own[name].default for name in known} == known
 
 
 def whitened(draws: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
