@@ -51,22 +51,10 @@ class EstimationSettings:
 
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
-        options: AnyDict = {
-            "model": self.model,
-            "method": self.method,
-            "solver": self.solver,
-            "screening": self.screen,
-            "noise": self.noise,
-            "duplicates": self.duplicates,
-        }
-        options |= {"star_errors": True} if self.star_errors else {}
-        options |= {"accept_inflation": True} if self.accept_inflation else {}
-        given = {
-            "max_iterations": self.max_iterations,
-            "scheduler": self.scheduler,
-            "workers": self.workers,
-        }
-        options |= {name: value for name, value in given.items() if value is not None}
+        own = vars(self) | {"screening": self.screen}
+        for name in ("screen", "robust", "start", "pixel_um"):
+            del own[name]
+        options = {name: value for name, value in own.items() if value not in (None, False)}
         return options | {"likelihood": "student_t"} if self.robust else options
 
     def started(self, camera: Camera) -> Camera:

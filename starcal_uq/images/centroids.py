@@ -42,7 +42,7 @@ from starcal_uq.observations.origin import CentroidsOrigin
 from starcal_uq.observations.rows import FrameRows, locked
 
 if TYPE_CHECKING:
-    pass
+    from collections.abc import Iterable
 
 # Name -> (type, description), of one row per star and of one entry per frame.
 COLUMNS: dict[str, tuple[type, str]] = {
@@ -187,7 +187,7 @@ class Centroids(FrameRows, Shown):
     def select(self, mask: ArrayLike) -> Centroids:
         """The rows where `mask` (bool, shape (N,)) is true; every frame keeps its place."""
         chosen = self._mask(mask, "centroids")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in COLUMNS})
+        return replace(self, **self._arrays(COLUMNS, chosen))
 
     def select_frames(self, ids: ArrayLike) -> Centroids:
         """The frames with these numbers, and their rows.
@@ -199,9 +199,11 @@ class Centroids(FrameRows, Shown):
         """
         wanted = self._frame_numbers(ids, "centroids")
         kept = np.isin(self.frame_ids, wanted)
-        frames: AnyDict = {name: getattr(self, name)[kept] for name in FRAME_COLUMNS}
-        rows: AnyDict = {name: getattr(self, name)[np.isin(self.frame, wanted)] for name in COLUMNS}
-        return replace(self, **rows, **frames)
+        rows = self._arrays(COLUMNS, np.isin(self.frame, wanted))
+        return replace(self, **rows, **self._arrays(FRAME_COLUMNS, kept))
+
+    def _arrays(self, names: Iterable[str], chosen: Any = ...) -> AnyDict:
+        return {name: getattr(self, name)[chosen] for name in names}
 
     def with_meta(self, **entries: Any) -> Centroids:
         """The same table with entries of `meta` added or changed."""
@@ -211,7 +213,7 @@ class Centroids(FrameRows, Shown):
         """The rows as a pandas DataFrame; `meta` is in its ``attrs``."""
         import pandas as pd
 
-        table = pd.DataFrame({name: getattr(self, name).copy() for name in COLUMNS})
+        table = pd.DataFrame(self._arrays(COLUMNS), copy=True)
         table.attrs.update(self.meta)
         return table
 
@@ -219,7 +221,7 @@ class Centroids(FrameRows, Shown):
         """One row per frame as a pandas DataFrame, with ``n_stars``."""
         import pandas as pd
 
-        table = pd.DataFrame({name: getattr(self, name).copy() for name in FRAME_COLUMNS})
+        table = pd.DataFrame(self._arrays(FRAME_COLUMNS), copy=True)
         table.insert(1, "n_stars", self.stars_per_frame)
         return table.rename(columns={"frame_ids": "frame"})
 
@@ -239,8 +241,8 @@ class Centroids(FrameRows, Shown):
         ensure_new(path, force)
         frames = {
             # JSON has no NaN: null stands for it.
-            name: [None if v != v else v for v in getattr(self, name).tolist()]
-            for name in FRAME_COLUMNS
+            name: [None if v != v else v for v in values.tolist()]
+            for name, values in self._arrays(FRAME_COLUMNS).items()
         }
         document = {"frames": frames, "messages": list(self.messages), "meta": self.meta}
         text = json.dumps(document, default=as_plain)
@@ -254,7 +256,7 @@ class Centroids(FrameRows, Shown):
                 import pyarrow as pa
                 from pyarrow import parquet
 
-                arrow = pa.table({name: getattr(self, name) for name in COLUMNS})
+                arrow = pa.table(self._arrays(COLUMNS))
                 metadata = {_KEY.encode(): text.encode()}
                 parquet.write_table(
                     arrow.replace_schema_metadata(metadata), temporary, compression="zstd"
@@ -264,7 +266,7 @@ class Centroids(FrameRows, Shown):
         with extra("images", "ECSV tables"):
             from astropy.table import Table
 
-        table = Table({name: getattr(self, name) for name in COLUMNS}, meta={_KEY: text})
+        table = Table(self._arrays(COLUMNS), meta={_KEY: text})
         for name, (_, description) in COLUMNS.items():
             table[name].description = description
         return table
