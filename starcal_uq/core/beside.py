@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from starcal_uq.core.tasks import processors
 from starcal_uq.core.temporary import TemporaryFolder
@@ -38,7 +38,7 @@ class Beside:
 
     def __init__(self) -> None:
         self._folder = TemporaryFolder()
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: subprocess.Popen[str] | None = None
         self._n_calls = 0
 
     def __enter__(self) -> Beside:
@@ -53,6 +53,7 @@ class Beside:
                     # Ctrl-C reaches every process of a terminal; the first one decides what to do
                     # about it.
                     start_new_session=True,
+                    text=True,
                 )
         return self
 
@@ -71,46 +72,31 @@ class Beside:
             )
             # The process may have died.
             with contextlib.suppress(OSError):
-                _pipe(self._process).write(f"{number}\n".encode())
-                _pipe(self._process).flush()
+                print(number, file=self._process.stdin, flush=True)
         return number
 
     def result(self, number: int) -> Any:
         """Wait for the call of this number; its result, None if it failed."""
         path = _path(self._folder.name, number, "result")
-        failed = _path(self._folder.name, number, "failed")
-        while (
-            self._process is not None
-            and not (path.exists() or failed.exists())
-            and self._process.poll() is None
-        ):
+        while self._process is not None and not path.exists() and self._process.poll() is None:
             time.sleep(_WAIT_S)
         return pickle.loads(path.read_bytes()) if path.exists() else None
 
     def results(self) -> list[Any]:
-        """Wait for all calls; their results, None for those that failed. Nothing can be handed over
-        afterwards.
-        """
-        if self._process is not None:
-            with contextlib.suppress(OSError):
-                _pipe(self._process).close()
-            self._process.wait()
-        found = (_path(self._folder.name, number, "result") for number in range(self._n_calls))
-        return [pickle.loads(path.read_bytes()) if path.exists() else None for path in found]
+        """Wait for all calls; their results, None for those that failed."""
+        return [self.result(number) for number in range(self._n_calls)]
 
 
 def serve(folder: str, parent: int) -> None:
     """Do the calls of a `Beside` in the process `parent`, until it closes the pipe or is gone."""
     for line in sys.stdin:
         function, arguments = pickle.loads(_path(folder, int(line), "call").read_bytes())
-        try:
-            result = pickle.dumps(function(*arguments))
-        except Exception:
-            # Whoever asked tries again, where the error is seen.
-            _path(folder, int(line), "failed").touch()
-            continue
+        content = pickle.dumps(None)
+        # Whoever asked tries again, where the error is seen.
+        with contextlib.suppress(Exception):
+            content = pickle.dumps(function(*arguments))
         part = _path(folder, int(line), "part")
-        part.write_bytes(result)
+        part.write_bytes(content)
         part.replace(_path(folder, int(line), "result"))
     if os.name == "posix" and os.getppid() != parent:
         # It was killed, and nobody else removes what it left.
@@ -119,8 +105,3 @@ def serve(folder: str, parent: int) -> None:
 
 def _path(folder: str, number: int, kind: str) -> Path:
     return Path(folder) / f"{number}.{kind}"
-
-
-def _pipe(process: subprocess.Popen[bytes]) -> IO[bytes]:
-    assert process.stdin is not None
-    return process.stdin

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from starcal_uq.core.errors import ClusterError
 from starcal_uq.core.extras import extra
@@ -68,10 +68,18 @@ class Cluster:
                     take(place, function(item))
                     check()
         else:
+            from distributed import as_completed
+
             with _explained():
                 futures = self._client.map(function, items, pure=False, retries=_RETRIES)
                 places = {future.key: place for place, future in enumerate(futures)}
-                self._follow(futures, lambda future, result: take(places[future.key], result))
+                try:
+                    for future, result in as_completed(futures, with_results=True):
+                        take(places[future.key], result)
+                except KeyboardInterrupt:
+                    for future in futures:
+                        future.cancel()
+                    raise
         return [results[place] for place in range(len(items))]
 
     def reduce(
@@ -103,17 +111,6 @@ class Cluster:
             del first
             total: T = futures[0].result()
             return total
-
-    def _follow(self, futures: list[Any], take: Callable[[Any, Any], None]) -> None:
-        from distributed import as_completed
-
-        try:
-            for future, result in as_completed(futures, with_results=True):
-                take(future, result)
-        except KeyboardInterrupt:
-            for future in futures:
-                future.cancel()
-            raise
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.records import read_arrays
 from starcal_uq.core.settings import Moves
 from starcal_uq.core.tasks import interrupt_between_steps
-from starcal_uq.core.types import FloatArray, IntArray, PathLike, Progress
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Progress
 from starcal_uq.inference.target import Density, student_t_log_density
 
 # Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is
@@ -122,7 +122,7 @@ def run_ensembles(
                         progress(index * per_ensemble + step, total)
                 store.add(index, first, last, sampler, state)
             store.next_ensemble()
-    return store.chains()
+    return store.chains
 
 
 def autocorrelation(values: FloatArray) -> FloatArray:
@@ -175,8 +175,8 @@ class _Store:
     ) -> None:
         shape = (n_ensembles, settings.n_steps, settings.n_walkers)
         self._n_burn, self._path, self._fingerprint = settings.n_burn, path, fingerprint
-        self._u, self._log_density = np.zeros((*shape, dim)), np.zeros(shape)
-        self._accepted = np.zeros(n_ensembles, dtype=np.int64)
+        accepted = np.zeros(n_ensembles, dtype=np.int64)
+        self.chains = Chains(np.zeros((*shape, dim)), np.zeros(shape), accepted)
         self.ensemble, self.step = 0, 0
         self.state: Any = None
         self._written, self._due = True, 0.0
@@ -189,9 +189,9 @@ class _Store:
         """
         if first >= self._n_burn:
             kept = slice(first - self._n_burn, last - self._n_burn)
-            self._u[index, kept] = sampler.get_chain()
-            self._log_density[index, kept] = sampler.get_log_prob()
-            self._accepted[index] += int(np.sum(sampler.backend.accepted))
+            self.chains.u[index, kept] = sampler.get_chain()
+            self.chains.log_density[index, kept] = sampler.get_log_prob()
+            self.chains.accepted[index] += int(np.sum(sampler.backend.accepted))
         self.ensemble, self.step, self.state = index, last, state
         self._written = False
         if time.monotonic() >= self._due:
@@ -217,9 +217,6 @@ class _Store:
         self.keep()
         self.ensemble, self.step, self.state = self.ensemble + 1, 0, None
 
-    def chains(self) -> Chains:
-        return Chains(self._u, self._log_density, self._accepted)
-
     def _write(self, path: PathLike) -> None:
         _, key, position, has_gauss, gauss = self.state.random_state
         with atomic_path(path, durable=False) as temporary, open(temporary, "wb") as file:
@@ -233,9 +230,7 @@ class _Store:
                 # A half-used pair of normals is part of the state.
                 rest=np.array([position, has_gauss]),
                 gauss=np.array(gauss),
-                u=self._u,
-                log_density=self._log_density,
-                accepted=self._accepted,
+                **vars(self.chains),
             )
 
     def _read(self, path: PathLike) -> None:
@@ -246,26 +241,15 @@ class _Store:
                 content = read_arrays(path)
                 if str(content["fingerprint"]) != self._fingerprint:
                     return
-                shapes = {
-                    "u": self._u.shape,
-                    "log_density": self._log_density.shape,
-                    "accepted": self._accepted.shape,
-                }
-                n_walkers, dim = self._u.shape[2:]
-                shapes |= {
-                    "coords": (n_walkers, dim),
-                    "log_prob": (n_walkers,),
-                    "place": (2,),
-                    "rest": (2,),
-                }
-                for name, shape in (shapes | {"gauss": ()}).items():
-                    kinds = "iu" if name in ("place", "rest", "accepted") else "f"
+                n_walkers, dim = self.chains.u.shape[2:]
+                shapes: AnyDict = {name: array.shape for name, array in vars(self.chains).items()}
+                shapes |= {"coords": (n_walkers, dim), "log_prob": (n_walkers,)}
+                shapes |= {"place": (2,), "rest": (2,), "gauss": ()}
+                for name, shape in shapes.items():
                     found = content[name]
-                    if (
-                        found.shape != shape
-                        or found.dtype.kind not in kinds
-                        or not np.isfinite(found).all()
-                    ):
+                    kinds = "iu" if name in ("place", "rest", "accepted") else "f"
+                    right = found.shape == shape and found.dtype.kind in kinds
+                    if not (right and np.isfinite(found).all()):
                         raise ValueError(f"{name} does not hold what it should")
                 position, has_gauss = (int(v) for v in content["rest"])
                 random_state = (
@@ -282,6 +266,5 @@ class _Store:
         self.state = emcee.State(
             content["coords"], log_prob=content["log_prob"], random_state=random_state
         )
-        self._u, self._log_density = content["u"], content["log_density"]
-        self._accepted = content["accepted"]
+        self.chains = Chains(*(content[name] for name in vars(self.chains)))
         self.ensemble, self.step = (int(v) for v in content["place"])
