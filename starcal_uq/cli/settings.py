@@ -54,7 +54,10 @@ class EstimationSettings:
         own = vars(self) | {"screening": self.screen}
         for name in ("screen", "robust", "start", "pixel_um"):
             del own[name]
-        options = {name: value for name, value in own.items() if value not in (None, False)}
+        # No workers (0) are a choice, and no absence of one.
+        options = {
+            name: value for name, value in own.items() if value is not None and value is not False
+        }
         return options | {"likelihood": "student_t"} if self.robust else options
 
     def started(self, camera: Camera) -> Camera:
