@@ -23,7 +23,7 @@ from starcal_uq.core.formatting import (
     pretty_unit,
     significant,
 )
-from starcal_uq.core.types import BoolArray, FloatArray, floats
+from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.tables import TextTable
@@ -59,7 +59,7 @@ def study_text(study: Study) -> str:
     if not sweep.coupled:
         return _uncoupled(sweep)
     pair = sweep.coupled[0]
-    text = f"{capital(_names(pair))} are coupled most ({_range(pair)})."
+    text = f"{capital(' and '.join(pair.names))} are coupled most ({_range(pair)})."
     if not sweep.axes:
         return text
     if "distortion" in sweep.axes:
@@ -96,24 +96,16 @@ def study_answer(study: Study) -> list[str]:
     return [part for part in parts if part]
 
 
-def _names(pair: Pair) -> str:
-    return f"{pair.names[0]} and {pair.names[1]}"
-
-
 def dashed(pair: Pair) -> str:
-    return f"{pair.names[0]}\N{EN DASH}{pair.names[1]}"
+    return "\N{EN DASH}".join(pair.names)
 
 
 def _range(pair: Pair) -> str:
     """The correlations of a pair over the sweep, and how much other seeds change them."""
-    low, high = sorted((pair.strongest, pair.weakest))
-    ends = f"{correlation_text(low)} to {correlation_text(high)}"
-    text = "correlation " + (
-        correlation_text(high) if correlation_text(low) == correlation_text(high) else ends
-    )
-    return text + (
-        f", ±{significant(0.5 * pair.seeds, 1)} over seeds" if pair.seeds >= 5e-4 else ""
-    )
+    low, high = map(correlation_text, sorted((pair.strongest, pair.weakest)))
+    text = f"correlation {high if low == high else f'{low} to {high}'}"
+    seeds = f", ±{significant(0.5 * pair.seeds, 1)} over seeds" if pair.seeds >= 5e-4 else ""
+    return text + seeds
 
 
 def _uncoupled(sweep: Sweep) -> str:
@@ -123,8 +115,7 @@ def _uncoupled(sweep: Sweep) -> str:
     at = f", with {place(pair.strongest_at)}" if pair.strongest_at else ""
     return (
         "No pair of parameters is coupled: the largest correlation anywhere is "
-        f"{correlation_text(pair.strongest)} "
-        f"({_names(pair)}{at})."
+        f"{correlation_text(pair.strongest)} ({' and '.join(pair.names)}{at})."
     )
 
 
@@ -174,14 +165,13 @@ def _what_decouples(sweep: Sweep) -> list[str]:
 
 def _ends(size: Curve, cost: Curve) -> str:
     """From what to what an axis changes a coupling."""
-    high, low = cost.most, cost.least
-    prices = (fixed(np.exp(cost.median[i]), 1) for i in (high, low))
     ends = [
         f"{correlation_text(size.median[i])} with {said(size.axis, size.values[i])}"
-        for i in (high, low)
+        for i in (cost.most, cost.least)
     ]
+    prices = [fixed(np.exp(cost.median[i]), 1) for i in (cost.most, cost.least)]
     return (
-        f"from {ends[0]} to {ends[1]} in size, which takes the price in sigma from "
+        f"from {' to '.join(ends)} in size, which takes the price in sigma from "
         f"{' to '.join(prices)}"
     )
 
@@ -247,11 +237,13 @@ def _direction(kind: Direction) -> str:
 
 def _run(axis: str, values: Sequence[Any]) -> str:
     if len(values) == 1 or isinstance(values[0], str):
-        return (
-            "with "
-            f"{join_words([said(axis, value) for value in values[:1]] + list(map(value_words, values[1:])))}"
-        )
+        return _with(axis, values)
     return f"from {said(axis, values[0])} to {value_words(values[-1])}"
+
+
+def _with(axis: str, values: Sequence[Any]) -> str:
+    """Values of an axis, the first of them with its name."""
+    return f"with {join_words([said(axis, values[0]), *map(value_words, values[1:])])}"
 
 
 def _price(study: Study) -> str:
@@ -278,8 +270,8 @@ def _price(study: Study) -> str:
 def _span(values: FloatArray) -> str:
     """Least to most of what is finite."""
     good = values[np.isfinite(values)]
-    ends = [significant(v, 3 if abs(v) >= 0.1 else 2) for v in (good.min(), good.max())]
-    return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
+    low, high = (significant(v, 3 if abs(v) >= 0.1 else 2) for v in (good.min(), good.max()))
+    return low if low == high else f"{low} to {high}"
 
 
 def _gauge(study: Study) -> str:
@@ -289,16 +281,14 @@ def _gauge(study: Study) -> str:
     for i, name in enumerate(sweep.names):
         for j, axis in enumerate(AXES):
             r = np.abs(sweep.over(study.data["attitude_correlation"].values[:, i, j]))
-            if np.isfinite(r).any() and float(np.nanmin(r)) >= _SAME:
-                found.append((f"{name} with {axis}", float(np.nanmin(r))))
+            if np.isfinite(r).any() and np.nanmin(r) >= _SAME:
+                found.append((f"{name} with {axis}", np.nanmin(r)))
     if not found:
         return ""
-    least = min(r for _, r in found)
+    least = correlation_text(min(0.9999, *(r for _, r in found)))
     return (
         f"In the whole sweep, {join_words([words for words, _ in found])} cannot be told apart "
-        "(at least "
-        f"{correlation_text(min(least, 0.9999))} in size): a rotation common to all frames, "
-        "which an alignment with "
+        f"(at least {least} in size): a rotation common to all frames, which an alignment with "
         "the same parameters absorbs."
     )
 
@@ -339,43 +329,36 @@ def _errors(sweep: Sweep) -> list[str]:
 def _error(head: str, sweep: Sweep, numbers: FloatArray) -> str:
     effects = error_effects(sweep, numbers)
     grid = sweep.over(numbers).ravel()
-    ends = [int(np.nanargmin(grid)), int(np.nanargmax(grid))]
+    least, most = int(np.nanargmin(grid)), int(np.nanargmax(grid))
     text = f"{head} {_span(grid)} arcsec"
-    if len(sweep.axes) > 1 and grid[ends[1]] >= HARDLY * grid[ends[0]]:
-        text += f", least with {place(sweep.at(ends[0]))}, most with {place(sweep.at(ends[1]))}"
+    if len(sweep.axes) > 1 and grid[most] >= HARDLY * grid[least]:
+        text += f", least with {place(sweep.at(least))}, most with {place(sweep.at(most))}"
     strong = [_effect(effect) for effect in effects if effect.factor >= HARDLY]
     weak = [axis_name(effect.curve.axis) for effect in effects if effect.factor < HARDLY]
     if strong:
-        text += f". {_medians(len(sweep.axes))}{', '.join(strong)}"
+        text += ". Medians: " if len(sweep.axes) > 1 else ". It goes from "
+        text += ", ".join(strong)
     if weak:
-        text += (
-            f"; it hardly depends on {join_words(weak)}"
-            if strong
-            else f", whatever {join_words(weak)} may be"
-        )
+        so = "; it hardly depends on {}" if strong else ", whatever {} may be"
+        text += so.format(join_words(weak))
     return text + "."
-
-
-def _medians(n_axes: int) -> str:
-    return "Medians: " if n_axes > 1 else "It goes from "
 
 
 def _effect(effect: Effect) -> str:
     curve = effect.curve
     first, last = 0, len(curve.values) - 1
-    if not isinstance(curve.values[0], str) and curve.most not in (first, last):
-        ends = [curve.most, curve.least]
-    elif isinstance(curve.values[0], str):
-        ends = [curve.least, curve.most]
+    if isinstance(curve.values[0], str):
+        ends = curve.least, curve.most
+    elif curve.most not in (first, last):
+        ends = curve.most, curve.least
     else:
-        ends = [first, last]
+        ends = first, last
     words = " to ".join(
         f"{significant(curve.median[i])} with {said(curve.axis, curve.values[i])}" for i in ends
     )
-    law = ""
-    if effect.exponent is not None and curve.axis != "max_mag":
-        law = f" (proportional to its power {fixed(effect.exponent, 2)})"
-    return f"{words}{law}"
+    if effect.exponent is None or curve.axis == "max_mag":
+        return words
+    return f"{words} (proportional to its power {fixed(effect.exponent, 2)})"
 
 
 def _target(study: Study) -> str:
@@ -385,19 +368,19 @@ def _target(study: Study) -> str:
         return ""
     sweep = study.sweep
     errors = sweep.over(sweep.frame_error)
-    known = np.isfinite(errors)
-    met = known & (errors <= target)
-    head = f"The target of {target:g} arcsec is met"
-    if met.sum() == known.sum():
-        text = f"{head} everywhere"
-    elif not met.any():
-        text = f"{head} nowhere"
-    else:
-        text = (
-            f"{head} in {count(met.sum())} of {count(known.sum())} "
-            f"places{_where(sweep, met, known)}"
-        )
-    return f"{text}{_crossings(study)}. {_frames_needed(study, target)}".strip()
+    share = _share(sweep, errors <= target, np.isfinite(errors))
+    head = f"The target of {target:g} arcsec is met {share}{_crossings(study)}."
+    return f"{head} {_range_of_frames(sweep, study.frames_for(target))}".strip()
+
+
+def _share(sweep: Sweep, flag: BoolArray, known: BoolArray, everywhere: int | None = None) -> str:
+    """In which of the known places something holds: everywhere where it does in so many."""
+    holds = known & flag
+    if holds.sum() == (known.sum() if everywhere is None else everywhere):
+        return "everywhere"
+    if not holds.any():
+        return "nowhere"
+    return f"in {count(holds.sum())} of {count(known.sum())} places{_where(sweep, holds, known)}"
 
 
 def _crossings(study: Study) -> str:
@@ -423,23 +406,12 @@ def _target_sigmas(study: Study) -> list[str]:
         known = np.isfinite(sigma)
         if not known.any():
             continue
-        met = known & (sigma <= target)
         unit = pretty_unit(spec.scaled_unit)
         head = f"The target of {significant(target / spec.scale)} {unit} for {name} is met"
-        if met.all() or not met.any():
-            text = f"{head} {'everywhere' if met.any() else 'nowhere'}"
-        else:
-            text = (
-                f"{head} in {count(met.sum())} of {count(known.sum())} "
-                f"places{_where(sweep, met, known)}"
-            )
         needed = study.values("frames_needed_sigma", parameter=name)
-        parts.append(f"{text}. {_range_of_frames(sweep, needed)}".strip())
+        text = f"{head} {_share(sweep, sigma <= target, known, known.size)}."
+        parts.append(f"{text} {_range_of_frames(sweep, needed)}".strip())
     return parts
-
-
-def _frames_needed(study: Study, target: float) -> str:
-    return _range_of_frames(study.sweep, study.frames_for(target))
 
 
 def _range_of_frames(sweep: Sweep, cells: FloatArray) -> str:
@@ -447,12 +419,11 @@ def _range_of_frames(sweep: Sweep, cells: FloatArray) -> str:
     needed = sweep.over(cells).ravel()
     if not np.isfinite(needed).any():
         return "No number of frames meets it." if np.isinf(needed).any() else ""
-    others = [axis for axis in sweep.axes if axis != "frames"]
     good = np.where(np.isfinite(needed), needed, np.nan)
     least, most = int(np.nanargmin(good)), int(np.nanargmax(good))
 
     def told(index: int) -> str:
-        at = place({axis: value for axis, value in sweep.at(index).items() if axis in others})
+        at = place({axis: value for axis, value in sweep.at(index).items() if axis != "frames"})
         return f"{plural(int(good[index]), 'frame')}{f' ({at})' if at else ''}"
 
     never = int(np.isinf(needed).sum())
@@ -468,35 +439,30 @@ def _range_of_frames(sweep: Sweep, cells: FloatArray) -> str:
 
 def _where(sweep: Sweep, flag: BoolArray, known: BoolArray) -> str:
     """The cut along one axis that tells best where something holds; nothing where none does."""
-    best: tuple[float, str] = (0.0, "")
-    base = max(float(flag.sum()), float((known & ~flag).sum())) / float(known.sum())
+    best = (0.0, "")
+    total = float(known.sum())
+    base = max(flag.sum(), (known & ~flag).sum()) / total
+
+    def right(inside: Any) -> float:
+        return float((known & (flag == inside)).sum()) / total
+
     for position, axis in enumerate(sweep.axes):
         values = sweep.values[axis]
+        index = np.arange(len(values)).reshape([-1] + [1] * (flag.ndim - position - 1))
         if isinstance(values[0], str):
-            share = [float(np.take(flag, i, position).sum()) for i in range(len(values))]
-            total = [float(np.take(known, i, position).sum()) for i in range(len(values))]
-            inside = [i for i in range(len(values)) if 2.0 * share[i] > total[i]]
-            right = sum(
-                share[i] if i in inside else total[i] - share[i] for i in range(len(values))
-            )
-            if inside and len(inside) < len(values):
-                words = (
-                    "with "
-                    f"{join_words([said(axis, values[inside[0]]), *(values[i] for i in inside[1:])])}"
-                )
-                best = max(best, (right / float(known.sum()), words))
+            others = tuple(i for i in range(flag.ndim) if i != position)
+            chosen = 2 * flag.sum(axis=others) > known.sum(axis=others)
+            inside = [value for value, there in zip(values, chosen, strict=True) if there]
+            if 0 < len(inside) < len(values):
+                best = max(best, (right(chosen[index]), _with(axis, inside)))
             continue
-        index = np.arange(len(values)).reshape(
-            [-1 if i == position else 1 for i in range(flag.ndim)]
-        )
         for cut in range(1, len(values)):
-            for inside_is, value, side in (
-                (index >= cut, values[cut], "on"),
-                (index < cut, values[cut - 1], "down"),
-            ):
-                right = float((known & (flag == inside_is)).sum()) / float(known.sum())
-                words = f"from {said(axis, value)} {'on' if side == 'on' else 'downwards'}"
-                best = max(best, (right, words), key=lambda entry: entry[0])
+            best = max(
+                best,
+                (right(index >= cut), f"from {said(axis, values[cut])} on"),
+                (right(index < cut), f"from {said(axis, values[cut - 1])} downwards"),
+                key=lambda entry: entry[0],
+            )
     told, words = best
     if told < max(0.8, base + 0.05):
         return ""
@@ -509,11 +475,12 @@ def _price_of_models(study: Study) -> str:
     curve = sweep.along(study.values("sigma", parameter="f"), "distortion")
     if curve is None:
         return ""
-    order = sorted(range(len(curve.values)), key=lambda i: len(parameters(curve.values[i])))
-    first = order[0]
+    first, *others = sorted(
+        range(len(curve.values)), key=lambda i: len(parameters(curve.values[i]))
+    )
     told = [
         f"{significant(curve.median[i] / curve.median[first])} with {curve.values[i]}"
-        for i in order[1:]
+        for i in others
     ]
     return (
         f"Beside the model {curve.values[first]}, the sigma of f is larger by factors of "
@@ -527,26 +494,24 @@ def _models(study: Study) -> list[str]:
     if "distortion" not in sweep.axes:
         return []
     known = sweep.values["distortion"]
-    names = sorted(known, key=lambda model: len(parameters(model)))
+    first, *others = sorted(known, key=lambda model: len(parameters(model)))
     position = sweep.axes.index("distortion")
     numbers = {
         "the sigma of f": study.values("sigma", parameter="f"),
         "the error from frame to frame": sweep.frame_error,
         "the common rotation": sweep.common_rotation,
     }
-    grids = {words: sweep.over(array) for words, array in numbers.items()}
     told = []
-    for model in names[1:]:
+    for model in others:
         factors = []
-        for words, grid in grids.items():
-            first, other = (
-                np.take(grid, known.index(name), position) for name in (names[0], model)
-            )
-            if np.isfinite(other / first).any():
-                factors.append(f"{_span(other / first)} times {words}")
+        for words, array in numbers.items():
+            grid = np.moveaxis(sweep.over(array), position, 0)
+            ratio = grid[known.index(model)] / grid[known.index(first)]
+            if np.isfinite(ratio).any():
+                factors.append(f"{_span(ratio)} times {words}")
         if factors:
             told.append(f"{model} has {join_words(factors)}")
-    return [f"Beside the model {names[0]}: {'; '.join(told)}."] if told else []
+    return [f"Beside the model {first}: {'; '.join(told)}."] if told else []
 
 
 def _simpler(study: Study) -> list[str]:
@@ -557,10 +522,8 @@ def _simpler(study: Study) -> list[str]:
     parts = []
     for model in map(str, study.data["simpler"].values):
         bias = model_bias(study, model)
-        grid, error = (
-            sweep.over(bias),
-            sweep.over(np.where(np.isfinite(bias), sweep.frame_error, np.nan)),
-        )
+        grid = sweep.over(bias)
+        error = sweep.over(np.where(np.isfinite(bias), sweep.frame_error, np.nan))
         known = np.isfinite(grid) & np.isfinite(error)
         if not known.any():
             continue
@@ -572,18 +535,9 @@ def _simpler(study: Study) -> list[str]:
                 "zero."
             )
             continue
-        good = known & (grid < error)
+        share = _share(sweep, grid < error, known)
         size = f"{_span(grid[known])} arcsec against {_span(error[known])} of the calibration"
-        if good.sum() == known.sum():
-            parts.append(f"The model {model} would do everywhere: it leaves {size}.")
-        elif not good.any():
-            parts.append(f"The model {model} would do nowhere: it leaves {size}.")
-        else:
-            share = f"{count(good.sum())} of {count(known.sum())} places"
-            parts.append(
-                f"The model {model} would do in {share}{_where(sweep, good, known)}: it leaves "
-                f"{size}."
-            )
+        parts.append(f"The model {model} would do {share}: it leaves {size}.")
     return parts
 
 
@@ -601,9 +555,8 @@ def _simulated(study: Study) -> list[str]:
     if "covered_95" not in study.data:
         return []
     sweep = study.sweep
-    covered = floats(study.data["covered_95"].values)
-    covered = np.where(sweep.ok[:, None], covered, np.nan)
-    groups = [("", np.ones(len(sweep.ok), dtype=np.bool_))]
+    covered = np.where(sweep.ok[:, None], study.data["covered_95"].values, np.nan)
+    groups = [("", np.ones_like(sweep.ok))]
     for axis in ("method", "likelihood", "prior"):
         if axis in sweep.axes:
             names = study.data[axis].values
@@ -627,17 +580,16 @@ def _simulated(study: Study) -> list[str]:
                 wrong.append(f"{name}{words} ({percent(hits / n, 3)} of {count(n)})")
     if not told:
         return []
-    cells_words = count(sweep.ok.sum())
     text = (
-        f"In {cells_words} simulated cells the 95 % intervals hold the truth as often as this: "
-        f"{join_words(told)}"
+        f"In {count(sweep.ok.sum())} simulated cells the 95 % intervals hold the truth as often as "
+        f"this: {join_words(told)}"
     )
-    if wrong:
+    if not wrong:
+        text += "; chance explains what differs from 95 %."
+    else:
         text += (
             f". That is not 95 % for {join_words(wrong)}: do not use these intervals as they are."
         )
-    else:
-        text += "; chance explains what differs from 95 %."
     return [text, *_posteriors(study)]
 
 
@@ -724,21 +676,15 @@ def study_table(study: Study) -> TextTable | None:
 def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
     """Heads, numbers (C,) and forms of what a row of a table tells of a cell."""
     sweep = study.sweep
-    columns: list[tuple[str, FloatArray, Any]] = []
-    for pair in sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)[:2]:
-        columns.append((dashed(pair), correlations(study, pair), _correlation))
-    factor = np.sqrt(study.values("variance_inflation", parameter="f"))
-    spec = parameter_called("f")
-    columns.append(
-        (
-            f"Sigma f [{pretty_unit(spec.scaled_unit)}]",
-            study.values("sigma", parameter="f"),
-            _number,
-        )
-    )
-    columns.append(("Price f", factor, _number))
-    columns.append(("Common [arcsec]", sweep.common_rotation, _number))
-    columns.append(("Rest [arcsec]", sweep.frame_error, _number))
+    coupled = sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)
+    unit = pretty_unit(parameter_called("f").scaled_unit)
+    columns: list[tuple[str, FloatArray, Any]] = [
+        *((dashed(pair), correlations(study, pair), _correlation) for pair in coupled[:2]),
+        (f"Sigma f [{unit}]", study.values("sigma", parameter="f"), _number),
+        ("Price f", np.sqrt(study.values("variance_inflation", parameter="f")), _number),
+        ("Common [arcsec]", sweep.common_rotation, _number),
+        ("Rest [arcsec]", sweep.frame_error, _number),
+    ]
     target = study.definition.target_arcsec
     if target is not None:
         columns.append((f"Frames for {target:g} arcsec", study.frames_for(target), _frames))
