@@ -33,6 +33,7 @@ from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood, star_numbers
+from starcal_uq.maths.linear import principal
 from starcal_uq.observations.splits import one_of_each
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
 from starcal_uq.sky.site import Site
@@ -264,9 +265,8 @@ class Remainder:
 
 def _orthonormal(rows: FloatArray, least: float = 1e-6) -> FloatArray:
     """Directions (r, m) of rows (g, m) whose squares are above `least` of the rows'."""
-    values, vectors = np.linalg.eigh(rows @ rows.T)
-    kept = values > least
-    found: FloatArray = (vectors[:, kept] / np.sqrt(values[kept])).T @ rows
+    values, vectors = principal(rows @ rows.T, least)
+    found: FloatArray = (vectors / np.sqrt(values)).T @ rows
     return found
 
 
@@ -573,12 +573,9 @@ def _largest(rest: Remainder, columns: FloatArray, seed: int) -> tuple[float, fl
     z = columns @ rest.residuals / length / rest.sigma
     best = int(np.argmax(z))
     rng = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(columns @ columns.T / np.outer(length, length))
-    kept = values > 1e-10 * values[-1]
-    noise = (
-        rng.standard_normal((_DRAWS, int(np.count_nonzero(kept))))
-        @ (vectors[:, kept] * np.sqrt(values[kept])).T
-    )
+    products = columns @ columns.T / np.outer(length, length)
+    values, vectors = principal(products, 1e-10, relative=True)
+    noise = rng.standard_normal((_DRAWS, len(values))) @ (vectors * np.sqrt(values)).T
     dof = min(rest.dof, rest.least_dof)
     noise /= np.sqrt(rng.chisquare(dof, _DRAWS) / dof)[:, None]
     p_value = (1.0 + float(np.count_nonzero(noise.max(axis=1) >= z[best]))) / (_DRAWS + 1.0)

@@ -16,7 +16,8 @@ their exact mean and variance.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,7 +52,7 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.likelihood.terms import TermSums
 from starcal_uq.maths.intervals import holm
-from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.maths.linear import principal, scaled_inverse, without_first
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -247,10 +248,8 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     left_out = tuple(np.flatnonzero(~heard(obs, cal)).tolist())
     obs, cal = of_heard(obs, cal)
     families = shapes(obs, cal.camera, max_cells=max_cells)
-    sums = _Sums.over(obs, cal, families)
-    tests = [
-        test for test in (sums.family(index) for index in range(len(families))) if test is not None
-    ]
+    sums = _Sums(obs, cal, families)
+    tests = [test for test in (sums.family(family) for family in families) if test is not None]
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
     of_noise = [
@@ -282,9 +281,8 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
         uneven = UnevenNoise(
             model, cal.parameter_names, sigma_ratios(obs, cal.camera, model, cal.sigma)
         )
-    pattern = sums.pattern(
-        [test.name for test in tests if test.dof > 0 and test.p_holm < ALPHA], len(tests)
-    )
+    found = [test.name for test in tests if test.dof > 0 and test.p_holm < ALPHA]
+    pattern = sums.pattern(found, ALPHA / len(tests))
     pattern = replace(pattern, n_frames=obs.n_frames, max_cells=max_cells, left_out=left_out)
     if FRAME_BY_FRAME in pattern.families:
         pattern = replace(pattern, frame_covariance=frame_covariance(pattern, families, obs, cal))
@@ -396,8 +394,7 @@ def _frame_products(frames: StarFrames, column: FloatArray, many: FloatArray) ->
     return frames.sum(product)
 
 
-@dataclass
-class _Sums:
+class _Sums(Fit):
     """Sums over all stars from which every test follows; the table is visited once, some frames at
     a time.
 
@@ -406,50 +403,23 @@ class _Sums:
     unequal noise.
     """
 
-    families: tuple[Shape, ...]
-    noise: NoiseSums
-    p: int
-    dof: int
-    n_stars: int
-    noise_px: float
-    gram: FloatArray
-    plain: FloatArray
-    raw: FloatArray
-    inner: FloatArray
-    blocks: FloatArray
-    own: Shape
-    block_rank: int = 0
-    # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their normal
-    # matrices.
-    frames: list[tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=list)
-    names: tuple[str, ...] = ()
-
-    @classmethod
-    def over(cls, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> _Sums:
+    def __init__(self, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> None:
         likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=cal.star_errors is None)
         p, theta = len(cal.theta), cal.theta
-        size = p + 1 + sum(family.size for family in families)
-        found = cls(
-            families=families,
-            noise=NoiseSums(noise_weights(obs, cal.camera), p),
-            p=p,
-            dof=likelihood.dof - p,
-            n_stars=obs.n_stars,
-            noise_px=1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2))),
-            gram=np.zeros((size, size)),
-            plain=np.zeros((p + 1, p + 1)),
-            raw=np.zeros(size),
-            inner=np.zeros((size - p - 1, size - p - 1)),
-            blocks=np.zeros((size, size)),
-            own=frame_shapes(cal.camera),
-            names=cal.parameter_names,
-        )
+        super().__init__(families, p, likelihood.dof - p)
+        self.names, self.n_stars = cal.parameter_names, obs.n_stars
+        self.noise = NoiseSums(noise_weights(obs, cal.camera), p)
+        self.noise_px = 1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2)))
+        self.plain, self.own = np.zeros((p + 1, p + 1)), frame_shapes(cal.camera)
+        # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their
+        # normal matrices.
+        self.frames: list[tuple[FloatArray, FloatArray, FloatArray]] = []
         rotations, stars = quaternion_to_rotation(cal.quaternions), None
         if cal.star_errors is not None:
             model = StarModel(obs, cal.star_errors.focal_px)
             stars = TermSums(model.term(cal.star_errors.tau_px))
         for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
-            fitted, columns, view = found._add(part, state, theta, rows)
+            fitted, columns, view = self._add(part, state, theta, rows)
             if stars is not None:
                 stars.add(
                     part,
@@ -461,16 +431,15 @@ class _Sums:
                     1.0 if part.frames.weight is None else part.frames.weight
                 )
             flat = fitted.reshape(p + 1, -1)
-            found.plain += flat @ flat.T
-            found._add_blocks(part, state, view, fitted, columns)
+            self.plain += flat @ flat.T
+            self._add_blocks(part, state, view, fitted, columns)
             h, e = fitted[:p], fitted[p]
-            found.noise.add(part.frames, state, h, e, rows)
+            self.noise.add(part.frames, state, h, e, rows)
             matrices = products_by_frame(part.frames, h, h)
             squares = part.frames.sum(np.sum(e**2, axis=0))
-            found.frames.append((squares, np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
+            self.frames.append((squares, np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
         if stars is not None:
-            found.gram -= stars.eliminated(stars.term.ratio(cal.sigma)).correction()
-        return found
+            self.gram -= stars.eliminated(stars.term.ratio(cal.sigma)).correction()
 
     def _add(
         self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice
@@ -524,73 +493,52 @@ class _Sums:
         self.blocks += explained.T @ explained
         self.block_rank += int(np.count_nonzero(kept))
 
-    @property
-    def parameters(self) -> FloatArray:
-        """Gram matrix of the parameters, attitudes removed."""
-        return self.gram[: self.p, : self.p]
-
-    @property
+    @cached_property
     def projection(self) -> FloatArray:
-        """Inverse of `parameters`."""
-        return scaled_inverse(self.parameters)
+        """Inverse of the Gram matrix of the parameters, attitudes removed."""
+        return scaled_inverse(self.gram[: self.p, : self.p])
 
     @property
     def rss(self) -> float:
         """Sum of squared residuals, what little the parameters could still explain taken off."""
-        slope = self.gram[: self.p, self.p]
-        return float(self.gram[self.p, self.p] - slope @ self.projection @ slope)
+        return float(self.alone[0][0, 0])
 
-    @property
+    @cached_property
     def independent(self) -> tuple[FloatArray, FloatArray, float]:
-        """`parameters`, `projection` and `rss` of residuals that are independent."""
+        """Gram matrix of the parameters, its inverse, and `rss`, of residuals that are
+        independent.
+        """
         matrix, slope = self.plain[: self.p, : self.p], self.plain[: self.p, self.p]
         inverse = scaled_inverse(matrix)
         return matrix, inverse, float(self.plain[self.p, self.p] - slope @ inverse @ slope)
 
-    def family(self, index: int) -> MisfitTest | None:
+    def family(self, family: Shape) -> MisfitTest | None:
         """The test of one family; None where nothing of it is left, or too few data."""
-        family = self.families[index]
-        first = self.p + 1 + sum(f.size for f in self.families[:index])
-        chosen = slice(first, first + family.size)
-        norm = np.sqrt(self.raw[chosen])
-        present = norm > 0.0
-        norm = np.where(present, norm, 1.0)
-        cross, inner = self.gram[chosen, : self.p], self.gram[chosen, chosen]
-        slope = self.gram[chosen, self.p] - cross @ self.projection @ self.gram[: self.p, self.p]
-        left = (inner - cross @ self.projection @ cross.T) / np.outer(norm, norm)
-        values, vectors = np.linalg.eigh(0.5 * (left + left.T))
-        kept = values > _ABSORBED
-        rank = int(np.count_nonzero(kept))
+        at, (system, _) = self.places[family.name], self.alone
+        norm, present = self.norms(at), np.count_nonzero(self.raw[self.p + 1 :][at])
+        cross = self.gram[self.p + 1 :, : self.p][at]
+        slope, left = system[1:, 0][at] / norm, system[1:, 1:][at, at] / np.outer(norm, norm)
+        values, vectors = principal(left, _ABSORBED)
+        rank = len(values)
         if rank == 0 or self.dof - rank < _LEAST_DOF:
             return None
-        scores = (vectors.T @ (slope / norm))[kept]
-        explained = float(np.sum(scores**2 / values[kept]))
+        scores = vectors.T @ slope
+        explained = float(np.sum(scores**2 / values))
         test = self._f_test(family.name, family.against, explained, rank, self.rss)
-        visible = float(np.trace(left) / max(np.count_nonzero(present), 1))
+        visible = float(np.trace(left) / max(present, 1))
         # What fitting the shapes takes from the parameters, in units of their standard deviations.
-        fitted = vectors[:, kept] @ (scores / values[kept]) / norm
+        fitted = vectors @ (scores / values) / norm
         unit = np.sqrt(np.diag(self.projection) * self.rss / self.dof)
         moved = np.abs(self.projection @ cross.T @ fitted) / unit
         worst = int(np.argmax(moved))
-        turned = (
-            self.projection[worst]
-            @ (cross / norm[:, None]).T
-            @ (vectors[:, kept] / np.sqrt(values[kept]))
-        )
-        error = float(
-            np.sqrt((self.rss - explained) / (self.dof - rank))
-            * np.linalg.norm(turned)
-            / unit[worst]
-        )
+        variance = (self.rss - explained) / (self.dof - rank)
+        turned = self.projection[worst] @ (cross / norm[:, None]).T @ (vectors / np.sqrt(values))
+        error = float(np.sqrt(variance) * np.linalg.norm(turned) / unit[worst])
         amplitudes: tuple[Amplitude, ...] = ()
         if family.labels and rank == family.size:
             inverse = (vectors / values) @ vectors.T
-            variance = (self.rss - explained) / (self.dof - rank)
             unit = np.array(family.per_amplitude) / norm
-            best, errors = (
-                inverse @ (slope / norm) * unit,
-                np.sqrt(variance * np.diag(inverse)) * unit,
-            )
+            best, errors = inverse @ slope * unit, np.sqrt(variance * np.diag(inverse)) * unit
             amplitudes = tuple(
                 Amplitude(name, u, float(value), float(sigma))
                 for (name, u), value, sigma in zip(family.labels, best, errors, strict=True)
@@ -601,28 +549,17 @@ class _Sums:
 
     def frame_by_frame(self) -> MisfitTest | None:
         """Does scale or shape change from frame to frame?"""
-        matrix, _, rss = self.independent
-        scale = 1.0 / np.sqrt(np.diag(matrix))
-        left = (matrix - self.blocks[: self.p, : self.p]) * np.outer(scale, scale)
-        slope = (self.plain[: self.p, self.p] - self.blocks[: self.p, self.p]) * scale
-        values, vectors = np.linalg.eigh(0.5 * (left + left.T))
-        kept = values > _ABSORBED
-        full = self.plain[self.p, self.p] - self.blocks[self.p, self.p]
-        full -= float(np.sum((vectors.T @ slope)[kept] ** 2 / values[kept]))
-        rank = self.block_rank + int(np.count_nonzero(kept)) - self.p
+        (matrix, _, rss), size = self.independent, self.p + 1
+        left, kept = without_first(
+            self.plain - self.blocks[:size, :size],
+            self.p,
+            _ABSORBED,
+            1.0 / np.sqrt(np.diag(matrix)),
+        )
+        rank = self.block_rank + kept - self.p
         if rank <= 0 or self.dof - rank < _LEAST_DOF:
             return None
-        return self._f_test(FRAME_BY_FRAME, "frame", rss - full, rank, rss)
-
-    def pattern(self, found: Sequence[str], n_tests: int) -> Pattern:
-        """The shapes of the tests that rejected, fitted together."""
-        fit = Fit(self.gram, self.blocks, self.raw, self.inner, self.p, self.dof, self.block_rank)
-        families, first = {}, self.p + 1
-        for family in self.families:
-            if family.name in found:
-                families[family.name] = family, slice(first, first + family.size)
-            first += family.size
-        return fit.pattern(families, FRAME_BY_FRAME in found, ALPHA / n_tests)
+        return self._f_test(FRAME_BY_FRAME, "frame", rss - float(left[0, 0]), rank, rss)
 
     def noise_by_frame(self) -> tuple[float, float] | None:
         """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few

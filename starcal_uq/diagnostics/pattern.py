@@ -20,7 +20,8 @@ prior, as large in every combination, px over the stars, as those are that the r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -39,7 +40,7 @@ from starcal_uq.diagnostics.shapes import (
 )
 from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.maths.linear import principal, scaled_inverse, truncated_inverse, without_first
 from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.propagate import FrameGeometry
 
@@ -250,30 +251,62 @@ def _square(matrices: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatAr
     return value, np.sqrt(np.maximum(4.0 * linear - 2.0 * quadratic, 2.0 * quadratic))
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Fit:
-    """Sums over all stars from which shapes are fitted."""
+    """Sums over all stars from which shapes are fitted, nothing added yet."""
 
-    # `gram`, `blocks`, (p + 1 + q, p + 1 + q): products of parameters, residuals and columns of all
-    # families, attitudes removed; and the part of them that scale and shape of every frame by
-    # itself explain.
-    gram: FloatArray
-    blocks: FloatArray
-    raw: FloatArray  # (p + 1 + q,): squares of the same before attitudes were removed
-    inner: (
-        FloatArray  # (q, q): products of the columns among themselves before attitudes were removed
-    )
-    # `p`, `dof`, `block_rank`: parameters, degrees of freedom of the residuals, and those that
-    # frames by themselves take.
-    p: int
-    dof: int
-    block_rank: int
+    families: tuple[Shape, ...]
+    p: int  # Parameters
+    dof: int  # Degrees of freedom of the residuals
+    # Those that scale and shape of every frame by itself take
+    block_rank: int = field(default=0, init=False)
 
-    def pattern(
-        self, families: dict[str, tuple[Shape, slice]], frame_by_frame: bool, alpha: float
-    ) -> Pattern:
-        """Fit these families, which have these places, and frames by themselves, the strongest
-        first.
+    def __post_init__(self) -> None:
+        q = sum(family.size for family in self.families)
+        size = self.p + 1 + q
+        # (p + 1 + q, p + 1 + q): products of parameters, residuals and columns of all families,
+        # attitudes removed; and the part of them that scale and shape of every frame by itself
+        # explain.
+        self.gram, self.blocks = np.zeros((size, size)), np.zeros((size, size))
+        # (p + 1 + q,): squares of the same before attitudes were removed
+        self.raw = np.zeros(size)
+        # (q, q): products of the columns among themselves before attitudes were removed
+        self.inner = np.zeros((q, q))
+
+    @cached_property
+    def places(self) -> dict[str, slice]:
+        """Columns of every family, from 0."""
+        ends = np.cumsum([0, *(family.size for family in self.families)]).tolist()
+        return {
+            family.name: slice(*ends)
+            for family, *ends in zip(self.families, ends[:-1], ends[1:], strict=True)
+        }
+
+    @cached_property
+    def alone(self) -> tuple[FloatArray, int]:
+        """Residuals and columns (1 + q, 1 + q) with the parameters removed, and degrees of
+        freedom.
+        """
+        left, _ = without_first(self.gram, self.p, _ABSORBED, self._unit)
+        return left, self.dof
+
+    @cached_property
+    def beside_frames(self) -> tuple[FloatArray, int]:
+        """The same with scale and shape of every frame by itself removed as well."""
+        left, rank = without_first(self.gram - self.blocks, self.p, _ABSORBED, self._unit)
+        return left, self.dof - self.block_rank + self.p - rank
+
+    @property
+    def _unit(self) -> FloatArray:
+        return np.asarray(1.0 / np.sqrt(np.diag(self.gram)[: self.p]))
+
+    def norms(self, at: slice) -> FloatArray:
+        """Lengths of some columns before attitudes were removed; 1 where there is none."""
+        norm = np.sqrt(self.raw[self.p + 1 :][at])
+        return np.where(norm > 0.0, norm, 1.0)
+
+    def pattern(self, found: Sequence[str], alpha: float) -> Pattern:
+        """Fit the families of these names, and frames by themselves, the strongest first.
 
         `alpha` is the level of a single test; what does not reach it beside those before is left
         out. A family without labels is a basis for any smooth misfit: amplitudes of the first one,
@@ -281,28 +314,20 @@ class Fit:
         shapes, as a misfit has no reason to be only where attitudes and parameters leave it in
         sight; terms of a known form are then no longer separated from it.
         """
-        size = len(self.gram) - self.p - 1
-        left, places = dict(families), {name: place for name, (_, place) in families.items()}
+        left = {family.name: family for family in self.families if family.name in found}
+        frame_by_frame = FRAME_BY_FRAME in found
         chosen: list[str] = []
-        directions = np.zeros((size, 0))
+        directions = np.zeros((len(self.inner), 0))
         own, certain = False, None
         while left or (frame_by_frame and not own):
-            system = self._system(own)
-            rest, dof = _without(system, directions), self._dof(own) - directions.shape[1]
-            steps = {
-                name: self._step(rest, dof, slice(at.start - self.p, at.stop - self.p), alpha)
-                for name, (_, at) in left.items()
-            }
+            system, dof = self.beside_frames if own else self.alone
+            rest, dof = _without(system, directions), dof - directions.shape[1]
+            steps = {name: self._step(rest, dof, self.places[name], alpha) for name in left}
             gains = {name: step[0] for name, step in steps.items() if step is not None}
             if frame_by_frame and not own:
-                with_frames = _without(self._system(True), directions)[0, 0]
-                gain = _gain(
-                    rest[0, 0],
-                    rest[0, 0] - with_frames,
-                    dof,
-                    dof - self._dof(True) + directions.shape[1],
-                    alpha,
-                )
+                both, least = self.beside_frames
+                explained = rest[0, 0] - _without(both, directions)[0, 0]
+                gain = _gain(rest[0, 0], explained, dof, self.dof - least, alpha)
                 gains |= {} if gain is None else {FRAME_BY_FRAME: gain}
             if not gains:
                 break
@@ -311,48 +336,24 @@ class Fit:
             if best == FRAME_BY_FRAME:
                 own = True
                 continue
-            step, (shape, at) = steps[best], left.pop(best)
+            step, shape, at = steps[best], left.pop(best), self.places[best]
             assert step is not None
             if certain is None and not shape.labels:
                 certain = directions.shape[1]
-            found = step[1]
+            combinations = step[1]
             if not shape.labels and shape.against in OVER_FIELD:
-                norm = np.sqrt(self.raw[at])
-                found = np.diag(1.0 / np.where(norm > 0.0, norm, 1.0))[:, norm > 0.0]
+                combinations = np.diag(1.0 / self.norms(at))[:, self.raw[self.p + 1 :][at] > 0.0]
                 left = {
-                    name: (s, p)
-                    for name, (s, p) in left.items()
-                    if not s.labels or s.against not in OVER_FIELD
+                    name: other
+                    for name, other in left.items()
+                    if not other.labels or other.against not in OVER_FIELD
                 }
-            directions = np.column_stack((directions, _placed(found, at.start - self.p - 1, size)))
+            placed = np.zeros((len(self.inner), combinations.shape[1]))
+            placed[at] = combinations
+            directions = np.column_stack((directions, placed))
         if certain is None:
             certain = directions.shape[1]
-        return self._fitted(tuple(chosen), places, directions, own, certain)
-
-    def _system(self, own: bool) -> FloatArray:
-        """Residuals and columns (1 + q, 1 + q) with the parameters removed, and frames by
-        themselves if `own`.
-        """
-        gram = self.gram - self.blocks if own else self.gram
-        scale = 1.0 / np.sqrt(np.diag(self.gram)[: self.p])
-        values, vectors = np.linalg.eigh(gram[: self.p, : self.p] * np.outer(scale, scale))
-        kept = values > _ABSORBED
-        root = scale[:, None] * vectors[:, kept] / np.sqrt(values[kept])
-        explained = root.T @ gram[: self.p, self.p :]
-        system: FloatArray = gram[self.p :, self.p :] - explained.T @ explained
-        return system
-
-    def _dof(self, own: bool) -> int:
-        if not own:
-            return self.dof
-        scale = 1.0 / np.sqrt(np.diag(self.gram)[: self.p])
-        left = (self.gram - self.blocks)[: self.p, : self.p] * np.outer(scale, scale)
-        return (
-            self.dof
-            - self.block_rank
-            + self.p
-            - int(np.count_nonzero(np.linalg.eigvalsh(left) > _ABSORBED))
-        )
+        return self._fitted(tuple(chosen), directions, own, certain)
 
     def _step(
         self, rest: FloatArray, dof: int, at: slice, alpha: float
@@ -362,15 +363,12 @@ class Fit:
         """
         from scipy.special import fdtrc
 
-        norm = np.sqrt(self.raw[at.start + self.p : at.stop + self.p])
-        norm = np.where(norm > 0.0, norm, 1.0)
-        values, vectors = np.linalg.eigh(rest[at, at] / np.outer(norm, norm))
-        kept = values > _ABSORBED
-        rank = int(np.count_nonzero(kept))
+        norm = self.norms(at)
+        values, vectors = principal(rest[1:, 1:][at, at] / np.outer(norm, norm), _ABSORBED)
+        rank = len(values)
         if rank == 0 or dof - rank < 1:
             return None
-        values, vectors = values[kept], vectors[:, kept]
-        squares = (vectors.T @ (rest[at, 0] / norm)) ** 2 / values
+        squares = (vectors.T @ (rest[1:, 0][at] / norm)) ** 2 / values
         explained = float(np.sum(squares))
         gain = _gain(rest[0, 0], explained, dof, rank, alpha)
         if gain is None:
@@ -382,18 +380,13 @@ class Fit:
         return gain, vectors[:, said if said.any() else slice(None)] / norm[:, None]
 
     def _fitted(
-        self,
-        chosen: tuple[str, ...],
-        places: dict[str, slice],
-        directions: FloatArray,
-        own: bool,
-        certain: int,
+        self, chosen: tuple[str, ...], directions: FloatArray, own: bool, certain: int
     ) -> Pattern:
         """The pattern of all directions, of which the first `certain` have no prior."""
-        system = self._system(own)
+        system, dof = self.beside_frames if own else self.alone
         matrix, slope = directions.T @ system[1:, 1:] @ directions, directions.T @ system[1:, 0]
-        inverse = _inverse(matrix)
-        variance = float(system[0, 0] - slope @ inverse @ slope) / (self._dof(own) - len(slope))
+        inverse = truncated_inverse(matrix, _ABSORBED)
+        variance = float(system[0, 0] - slope @ inverse @ slope) / (dof - len(slope))
         covariance = variance * inverse
         if certain < len(slope):
             loose = _without(system, directions[:, :certain])
@@ -413,10 +406,9 @@ class Fit:
             @ self.gram[: self.p, self.p + 1 :]
             @ directions
         )
-        rows = [np.arange(self.p, len(self.gram) - 1)[:0]]
         names = [name for name in chosen if name != FRAME_BY_FRAME]
-        rows += [np.arange(places[name].start, places[name].stop) - self.p - 1 for name in names]
-        arrays = (directions[np.concatenate(rows)], amplitudes, covariance, absorbed.T)
+        rows = [directions[:0], *(directions[self.places[name]] for name in names)]
+        arrays = (np.concatenate(rows), amplitudes, covariance, absorbed.T)
         # Nothing is nothing, also when it is read from a file.
         directions, amplitudes, covariance, parameters = (
             a if a.size else np.zeros(0) for a in arrays
@@ -452,30 +444,15 @@ def _prior_variance(
     return float(max(np.mean(squares - noise), np.mean(noise) / np.sqrt(len(noise))))
 
 
-def _placed(columns: FloatArray, first: int, size: int) -> FloatArray:
-    found = np.zeros((size, columns.shape[1]))
-    found[first : first + len(columns)] = columns
-    return found
-
-
 def _without(system: FloatArray, directions: FloatArray) -> FloatArray:
     """The system with some directions of its columns removed."""
     if not directions.shape[1]:
         return system
     along = system[:, 1:] @ directions
-    inverse = _inverse(directions.T @ along[1:])
+    # Lengths were 1; what frames by themselves absorb of them is left out.
+    inverse = truncated_inverse(directions.T @ along[1:], _ABSORBED)
     left: FloatArray = system - along @ inverse @ along.T
     return left
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of products of directions, whose length was 1; what frames by themselves absorb of
-    them is left out.
-    """
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    kept = values > _ABSORBED
-    inverse: FloatArray = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-    return inverse
 
 
 def _gain(rss: float, explained: float, dof: int, rank: int, alpha: float) -> float | None:

@@ -29,6 +29,7 @@ from starcal_uq.estimation.normals import StarNormals
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_numbers, star_term
 from starcal_uq.likelihood.terms import TermSums
+from starcal_uq.maths.linear import principal
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -222,14 +223,13 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     sums = TermSums(star_term(stars, frames.r, float(cal.theta[2]), rigid=True))
     p, likelihood = len(cal.theta), MarginalLikelihood(frames, cal.camera.distortion)
     gram = sums.add_linearised(likelihood, cal.theta, cal.sigmas, rotations)
-    values, vectors = np.linalg.eigh(gram[:p, :p])
-    kept = values > _ABSORBED * values.max()
-    root = vectors[:, kept] / np.sqrt(values[kept])
+    values, vectors = principal(gram[:p, :p], _ABSORBED, relative=True)
+    root = vectors / np.sqrt(values)
     explained = root.T @ gram[:p, p]
     absorbed = sums.cross[:, :p] @ root
     total = float(gram[p, p] - explained @ explained)
     pull = sums.cross[:, p] - absorbed @ explained
-    dof = 2 * frames.n_stars - 3 * frames.n_frames - int(kept.sum())
+    dof = 2 * frames.n_stars - 3 * frames.n_frames - len(values)
     nothing = _Likeness(sums.n_groups, frames.n_stars)
     if dof < _LEAST_DOF:
         return nothing

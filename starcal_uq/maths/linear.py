@@ -40,6 +40,40 @@ def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
     return inverse, determinant
 
 
+def principal(
+    matrix: FloatArray, least: float, relative: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues (r,) of a symmetric matrix (p, p) above `least`, or that share of the largest
+    one, and their vectors (p, r).
+    """
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    kept = values > (least * values[-1] if relative else least)
+    return values[kept], vectors[:, kept]
+
+
+def truncated_inverse(matrix: FloatArray, least: float) -> FloatArray:
+    """Inverse (p, p) of a symmetric matrix over the `principal` directions."""
+    values, vectors = principal(matrix, least)
+    inverse: FloatArray = (vectors / values) @ vectors.T
+    return inverse
+
+
+def without_first(
+    gram: FloatArray, p: int, least: float, unit: FloatArray
+) -> tuple[FloatArray, int]:
+    """Products (q - p, q - p) of columns without what the first p of them reproduce, and how many
+    of these are determined.
+
+    `gram` (q, q): products of all columns.
+    `least`: square of a combination of the first columns, in units of `unit` (p,), up to which it
+    counts as none.
+    """
+    values, vectors = principal(gram[:p, :p] * np.outer(unit, unit), least)
+    explained = (unit[:, None] * vectors / np.sqrt(values)).T @ gram[:p, p:]
+    left: FloatArray = gram[p:, p:] - explained.T @ explained
+    return left, len(values)
+
+
 def unit_inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Inverse (p, p) of a symmetric matrix scaled to a unit diagonal, and the scale (p,) of its
     rows and columns.
