@@ -130,7 +130,7 @@ def budget(
             *misfit_notes(attitude),
             *_notes(rows),
         ),
-        provenance=provenance(seed, settings, post.provenance.get("data_sha256")),
+        provenance=provenance(seed, settings, post.provenance.data_sha256),
     )
 
 

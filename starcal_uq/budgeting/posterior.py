@@ -42,7 +42,7 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
     """Common rotation, rest, centroid noise, and their interaction where it was propagated; each on
     three axes.
     """
-    hash_text = str(post.provenance.get("data_sha256") or "")[:12]
+    hash_text = (post.provenance.data_sha256 or "")[:12]
     provenance = f"posterior of {plural(len(post.draws), 'draw')}" + (
         f", data {hash_text}" if hash_text else ""
     )

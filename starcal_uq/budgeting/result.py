@@ -20,6 +20,7 @@ from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, cell_content, cell_text, reading
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Level
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike
@@ -121,7 +122,7 @@ class Budget(Shown):
         Title.
     notes : tuple of str
         Sentences that the reader has to know: inflations, what stays open.
-    provenance : dict
+    provenance : Provenance
         Seed, settings, versions, time and data hash.
     """
 
@@ -131,7 +132,7 @@ class Budget(Shown):
     confidence: float
     title: str
     notes: tuple[str, ...]
-    provenance: AnyDict
+    provenance: Provenance
 
     @property
     def violations(self) -> tuple[Outcome, ...]:
@@ -373,7 +374,7 @@ class Budget(Shown):
                 confidence=float(settings["confidence"]),
                 title=settings["title"],
                 notes=tuple(settings["notes"]),
-                provenance=settings["provenance"],
+                provenance=Provenance(settings["provenance"]),
             )
 
 

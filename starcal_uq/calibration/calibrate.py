@@ -157,7 +157,7 @@ def calibrate(
         return calibration
     kept = obs.select_frames(np.setdiff1d(obs.frame_ids, repeating))
     rest = calibrate(kept, camera, settings, throw=throw, duplicates="keep")
-    return replace(rest, provenance={**rest.provenance, "dropped_frames": repeating.tolist()})
+    return replace(rest, provenance=rest.provenance.adding(dropped_frames=repeating.tolist()))
 
 
 def _estimate(

@@ -108,7 +108,7 @@ def _conditional(
     because = f"{what_is_open(names) if names else because} with the latter"
     record: AnyDict = {"model": model, "used": cal.camera.distortion, "status": status.name}
     record |= {"undetermined": list(names), "because": because}
-    return replace(cal, provenance=cal.provenance | {"fallback": record})
+    return replace(cal, provenance=cal.provenance.adding(fallback=record))
 
 
 def _left_open(obs: Observations, cal: Calibration, richer: str) -> tuple[str, ...] | None:
@@ -173,7 +173,7 @@ def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:
     """
     from scipy.special import fdtrc
 
-    if cal.provenance["settings"].get("likelihood") == "student_t":
+    if cal.provenance.likelihood == "student_t":
         # Of wrong stars a Gaussian test would ask for anything.
         return False
     likelihood, theta = _as_richer(obs, cal, richer)
@@ -195,7 +195,7 @@ def fallback_words(cal: Calibration) -> str:
     """What the data do not determine of the camera's model, and what the sigmas rest on; empty
     where they do.
     """
-    record = cal.provenance.get("fallback")
+    record = cal.provenance.fallback
     if not record:
         return _coma_words(cal)
     left_out = [c.name for c in get_model(record["model"]).coefficients]

@@ -46,6 +46,7 @@ from starcal_uq.comparison.significance import (
 )
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import ComparisonError
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
@@ -157,11 +158,11 @@ def compare(
         worst_ratio=float(tests.ratio[worst]),
         outside_arcsec=tests.outside,
         messages=_messages(a, b, labels, rule, tests),
-        provenance={
-            "a": dict(a.provenance),
-            "b": dict(b.provenance),
-            "settings": {"n": n, "n_draws": n_draws, "seed": seed, "same_data": same_data},
-        },
+        provenance=Provenance(
+            a=a.provenance,
+            b=b.provenance,
+            settings={"n": n, "n_draws": n_draws, "seed": seed, "same_data": same_data},
+        ),
         **shared,
     )
 

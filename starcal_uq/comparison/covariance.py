@@ -190,10 +190,7 @@ def is_efficient(result: Any) -> bool:
     diagnostics = getattr(result, "diagnostics", None)
     if diagnostics is not None:
         return bool(diagnostics.likelihood == "marginal")
-    settings = result.provenance.get("settings", {})
-    return bool(
-        result.method == "efficient" and settings.get("likelihood", "marginal") == "marginal"
-    )
+    return bool(result.method == "efficient" and result.provenance.likelihood == "marginal")
 
 
 def _why_none(a: Any, b: Any, data: str) -> str:

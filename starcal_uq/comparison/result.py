@@ -10,6 +10,7 @@ import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import read_json, to_plain, write_json
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Shapes
@@ -79,7 +80,7 @@ class CameraComparison(Shown):
         Estimates of both, standard deviations, and that of the difference.
     messages : tuple of str
         Sentences that should be known when reading this.
-    provenance : dict
+    provenance : Provenance
         Provenance of both results, by ``a`` and ``b``, and the settings of the comparison.
     """
 
@@ -119,7 +120,7 @@ class CameraComparison(Shown):
     sd_b: FloatArray
     sd_difference: FloatArray
     messages: tuple[str, ...] = ()
-    provenance: AnyDict = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
 
     SHAPES: ClassVar[Shapes] = {
         **{"x_px": ("x",), "y_px": ("y",), "sigma_arcsec": ("y", "x"), "ratio": ("y", "x")},

@@ -28,7 +28,7 @@ from starcal_uq.core.files import (
     new_folder,
     sweep_temporary,
 )
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.store import finished
@@ -71,7 +71,7 @@ class Manifest:
     """
 
     files: dict[str, Entry] = field(default_factory=dict)
-    steps: dict[str, AnyDict] = field(default_factory=dict)
+    steps: dict[str, Provenance] = field(default_factory=dict)
     command: AnyDict | None = None
     words: tuple[str, ...] = ()
     tried: tuple[AnyDict, ...] = ()

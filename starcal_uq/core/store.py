@@ -26,7 +26,7 @@ from starcal_uq.core.files import (
     reading,
     sweep_temporary,
 )
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import installed_versions
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.types import AnyDict, PathLike
 
@@ -127,7 +127,7 @@ class Kept:
     def __init__(self, folder: PathLike, identity: object, kinds: Sequence[type] = ()) -> None:
         import pyarrow as pa
 
-        told = to_plain([identity, provenance(None, {}, None)["versions"]])
+        told = to_plain([identity, installed_versions()])
         self._identity = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
         self._kinds = {kind.__name__: kind for kind in kinds}
         schema = pa.schema([("key", pa.string()), ("result", pa.string())])

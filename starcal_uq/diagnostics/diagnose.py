@@ -17,7 +17,7 @@ from starcal_uq.calibration.calibrate import METHODS, calibrate
 from starcal_uq.calibration.cameras import MixedCameras
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import bounded
@@ -113,7 +113,7 @@ class Diagnosis(Shown, Saved):
         None if it was not asked for.
     theta : tuple of float
         The estimate that all this is about.
-    provenance : dict
+    provenance : Provenance
         Seed, settings, versions, time and data hash.
     stars : StarTest or None
         Errors that stars bring along; None in a diagnosis of an earlier version.
@@ -135,7 +135,7 @@ class Diagnosis(Shown, Saved):
     comparison: ModelComparison | None
     starts: MultiStart | None
     theta: tuple[float, ...]
-    provenance: AnyDict
+    provenance: Provenance
     stars: StarTest | None = None
     air: AirTest | None = None
     cameras: MixedCameras | None = None
@@ -146,7 +146,7 @@ class Diagnosis(Shown, Saved):
 
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
-        same_data = self.provenance.get("data_sha256") == cal.provenance.get("data_sha256")
+        same_data = self.provenance.data_sha256 == cal.provenance.data_sha256
         return same_data and list(self.theta) == cal.theta.tolist()
 
 
@@ -332,7 +332,7 @@ def _few(obs: Observations) -> Observations:
 def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatArray, float]:
     """Estimate and sum of squares that a calibration like this one reaches from a start."""
     method = cal.method if cal.method in METHODS else "efficient"
-    likelihood = cal.provenance.get("settings", {}).get("likelihood", "marginal")
+    likelihood = cal.provenance.likelihood
     if likelihood != "marginal" or method not in ("efficient", "three_stage"):
         options: AnyDict = {} if likelihood == "marginal" else {"likelihood": likelihood}
         other = calibrate(

@@ -260,7 +260,6 @@ def accept_inflation(cal: Calibration, jackknife: Jackknife) -> Calibration:
             f"{', '.join(cal.parameter_names)}: make both from the same run."
         )
     factors = dict(zip(jackknife.parameter_names, jackknife.factors.tolist(), strict=True))
-    settings = {**cal.provenance.get("settings", {}), "inflation": factors}
     covariance = cal.covariance * np.outer(jackknife.factors, jackknife.factors)
     # A sigma that frames were asked for has only their degrees of freedom.
     dof = {
@@ -271,5 +270,5 @@ def accept_inflation(cal: Calibration, jackknife: Jackknife) -> Calibration:
     return replace(
         cal,
         covariance=covariance,
-        provenance={**cal.provenance, "settings": settings, "interval_dof": dof},
+        provenance=cal.provenance.with_settings(inflation=factors).adding(interval_dof=dof),
     )

@@ -103,7 +103,7 @@ def heard(obs: Observations, cal: Calibration) -> BoolArray:
 
     Frames keep at least three of them, or none.
     """
-    if cal.provenance.get("settings", {}).get("likelihood") != "student_t":
+    if cal.provenance.likelihood != "student_t":
         return np.ones(obs.n_stars, dtype=bool)
     stated = 1.0 if obs.sigma_px is None else np.asarray(obs.sigma_px)[:, None]
     size = np.max(np.abs(cal.residuals_px / stated), axis=1)

@@ -204,7 +204,6 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
     # The stars of a frame err each by themselves: to its attitude that is more noise, which a stare
     # does not average.
     own = errors.total_px**2 * (1.0 if weight is None else float(np.mean(weight**2)))
-    settings = cal.provenance.get("settings", {}) | {"star_errors": True}
     return cal.moved(
         theta,
         sigma,
@@ -221,7 +220,7 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
         # The interstar angles err with the same stars.
         pair_covariance=cal.pair_covariance + spread,
         compressed=compressed,
-        provenance=cal.provenance | {"settings": settings},
+        provenance=cal.provenance.with_settings(star_errors=True),
         star_errors=errors,
     )
 

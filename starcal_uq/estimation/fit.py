@@ -78,10 +78,8 @@ def fit_composed(obs: Observations, camera: Camera, settings: EstimationSettings
     if not calibration.status.ok:
         return calibration
     model, weighted = _with_noise_model(obs, camera, calibration, settings)
-    found = weighted.provenance
-    made = {**found["settings"], "noise": "model"}
-    record = {**found, "settings": made, "noise_model": model.record()}
-    return replace(weighted, provenance=record)
+    record = weighted.provenance.with_settings(noise="model")
+    return replace(weighted, provenance=record.adding(noise_model=model.record()))
 
 
 def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
@@ -298,7 +296,7 @@ def _with_noise_model(
 
 def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) -> NoiseModel:
     """The noise model of stars whose residuals have tails: the scale of the t, as it varies."""
-    nu = cal.provenance["settings"]["dof"]
+    nu = cal.provenance.settings["dof"]
 
     def refit(frames: StarFrames, theta: FloatArray) -> Refit | None:
         found = refine(

@@ -21,7 +21,7 @@ from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError, check_known
-from starcal_uq.core.provenance import data_hashes, provenance
+from starcal_uq.core.provenance import Provenance, data_hashes, provenance
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.settings import MergedNoise
 from starcal_uq.core.status import Status
@@ -280,7 +280,7 @@ def check_mergeable(
                 f"{names[0]}: merge with noise "
                 "'own', which states each run's noise."
             )
-        likelihood = cal.provenance.get("settings", {}).get("likelihood", "marginal")
+        likelihood = cal.provenance.likelihood
         if likelihood != "marginal":
             raise CalibrationError(
                 f"{name}: was calibrated with the likelihood {likelihood!r}, which does not add "
@@ -350,7 +350,7 @@ def _provenance(
     consistency: Consistency,
     shifts: Sequence[int],
     runs: Sequence[Optimum],
-) -> AnyDict:
+) -> Provenance:
     parts: list[AnyDict] = [
         {
             "name": name,
@@ -373,7 +373,7 @@ def _provenance(
         "has_observations": observations is not None,
         "consistency": to_plain(consistency, null=True),
     }
-    return {**provenance(None, settings, data_hash), "merge": record}
+    return provenance(None, settings, data_hash).adding(merge=record)
 
 
 # Below this probability, chance is no explanation that a mission would accept.
@@ -464,8 +464,8 @@ class Consistency(Shown):
 
 def consistency_of(calibration: Calibration) -> Consistency | None:
     """The comparison stored with a merged calibration; None for one that was not merged."""
-    record = calibration.provenance.get("merge")
-    return None if record is None else from_plain(Consistency, record["consistency"])
+    record = calibration.provenance.merge
+    return from_plain(Consistency, record["consistency"]) if record else None
 
 
 def consistency_between(

@@ -222,7 +222,7 @@ class NoiseModel:
 
 def noise_model_of(result: Any) -> NoiseModel | None:
     """The noise model of a calibration or posterior; None where there is one noise for all."""
-    record: AnyDict | None = result.provenance.get("noise_model")
+    record = result.provenance.noise_model
     return None if record is None else from_plain(NoiseModel, record)
 
 
@@ -237,7 +237,7 @@ def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observa
     """
     if isinstance(obs, PartitionedObservations):
         return _sample_of(obs, result)
-    left_out = np.isin(obs.frame, result.provenance.get("dropped_frames", ()))
+    left_out = np.isin(obs.frame, result.provenance.dropped_frames)
     if left_out.any():
         obs = obs.select(~left_out)
     if "tail_weights" not in result.provenance:
@@ -266,7 +266,7 @@ def _by_noise_model(obs: Observations, result: Any) -> Observations:
 def _sample_of(obs: PartitionedObservations, result: Any) -> Observations:
     """The sample of frames that a calibration has kept, read again."""
     sample = obs.sample()
-    if result.provenance.get("partitions", {}).get("sample_sha256") != sample.data_hash:
+    if result.provenance.partitions.get("sample_sha256") != sample.data_hash:
         raise CalibrationError(
             f"the calibration was made from other observations than those in {obs.folder}: "
             "calibrate these first."

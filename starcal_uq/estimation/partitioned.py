@@ -308,8 +308,8 @@ def calibrate_partitions(
     state, _ = likelihood.profile(theta)
     residuals = likelihood.frames.in_pixels(state.e).T
     status = check_noise(float(np.sqrt(np.mean(residuals**2))), camera, status)
-    record = provenance(None, start.provenance["settings"], joined_hash(seen.hashes))
-    record["partitions"] = {
+    record = provenance(None, start.provenance.settings, joined_hash(seen.hashes))
+    partitions = {
         "folder": str(obs.folder),
         "n_files": len(obs.parts),
         "n_stars": n_stars,
@@ -334,7 +334,7 @@ def calibrate_partitions(
         rotation_per_theta=rest.response / n_frames,
         attitude_noise=rest.inverse / n_frames * sigma**2,
         compressed=compressed,
-        provenance=record,
+        provenance=record.adding(partitions=partitions),
         fingerprints=None,
         partitions=replace(
             rest.sums, richer=_stepped(camera, rest.richer, sigma**2), scatter=scatter

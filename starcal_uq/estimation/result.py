@@ -19,7 +19,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.manifest import digest
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import Provenance, Traced, in_order, provenance
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.status import Status
@@ -140,7 +140,7 @@ class KeptFrames:
 
 
 @dataclass(frozen=True)
-class Calibration(Shown):
+class Calibration(Shown, Traced):
     """Optics and distortion estimated from star observations.
 
     p is the number of parameters, K of frames, N of stars. A recursive method that was given a
@@ -197,7 +197,7 @@ class Calibration(Shown):
         parameter that which Gaussian noise gives.
     compressed : CompressedLikelihood
         The whole data set's likelihood around the estimate.
-    provenance : dict
+    provenance : Provenance
         Versions, settings, time and the hash of the data.
     fingerprints : Fingerprints or None
         What identifies the frames, so that a measurement is not counted twice; None for a stream,
@@ -235,7 +235,7 @@ class Calibration(Shown):
     pair_theta: FloatArray
     pair_covariance: FloatArray
     compressed: CompressedLikelihood
-    provenance: AnyDict
+    provenance: Provenance
     fingerprints: Fingerprints | None = None
     star_errors: StarErrors | None = None
     partitions: PartitionSums | None = None
@@ -317,7 +317,7 @@ class Calibration(Shown):
 
         A sigma from the scatter of frames has its own degrees of freedom, which provenance states.
         """
-        own = self.provenance.get("interval_dof", {})
+        own = self.provenance.interval_dof
         half = self.sigmas * [
             student_quantile(probability, own.get(n, self.dof)) for n in self.parameter_names
         ]
@@ -354,30 +354,22 @@ class Calibration(Shown):
         """Factors (p,) that `covariance` was accepted to be wider by, per sigma; None for that of
         the likelihood.
         """
-        factors = self.provenance.get("settings", {}).get("inflation")
-        return (
-            None if factors is None else np.array([factors[name] for name in self.parameter_names])
-        )
+        return in_order(self.provenance.inflation, self.parameter_names)
 
     @property
     def coma_factors(self) -> FloatArray | None:
         """Factors (p,) on the sigmas of the likelihood that leave out the coma of a distortion that
         may be none.
         """
-        factors = self.provenance.get("without_coma")
-        return (
-            None if factors is None else np.array([factors[name] for name in self.parameter_names])
-        )
+        return in_order(self.provenance.without_coma, self.parameter_names)
 
     @property
     def tail_factors(self) -> FloatArray | None:
         """Factors (p,) on the sigmas of stars whose weights are known, for weights that come from
         the residuals themselves; None where there are none.
         """
-        record = self.provenance.get("tail_weights")
-        if record is None:
-            return None
-        return np.array([record["factors"][name] for name in self.parameter_names])
+        record = self.provenance.tail_weights
+        return None if record is None else in_order(record["factors"], self.parameter_names)
 
     @property
     def width_factors(self) -> FloatArray:
@@ -393,9 +385,7 @@ class Calibration(Shown):
         """The likelihood by which a posterior is that of the estimate: ``marginal`` also where
         stars have the weights of their tails.
         """
-        if self.provenance.get("tail_weights"):
-            return "marginal"
-        return str(self.provenance.get("settings", {}).get("likelihood", "marginal"))
+        return "marginal" if self.provenance.tail_weights else self.provenance.likelihood
 
     @property
     def n_stars(self) -> int:
@@ -419,9 +409,8 @@ class Calibration(Shown):
         """Hash of the data that a table stands for: that of all partitions for the sample that was
         kept of them.
         """
-        record = self.provenance.get("partitions", {})
-        if record.get("sample_sha256") == obs.data_hash:
-            return str(self.provenance["data_sha256"])
+        if self.provenance.partitions.get("sample_sha256") == obs.data_hash:
+            return str(self.provenance.data_sha256)
         return obs.data_hash
 
     @property

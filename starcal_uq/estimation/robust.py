@@ -392,10 +392,10 @@ def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
     record: AnyDict = {
         "theta": cal.theta.tolist(),
         "sigma": cal.sigma,
-        "dof": cal.provenance["student_t"]["dof"],
+        "dof": cal.provenance.student_t["dof"],
     }
     plain = dict.fromkeys(cal.parameter_names, 1.0)
-    known = replace(cal, provenance=cal.provenance | {"tail_weights": record | {"factors": plain}})
+    known = replace(cal, provenance=cal.provenance.adding(tail_weights=record | {"factors": plain}))
     likelihood = MarginalLikelihood(tail_weighted(obs, known), cal.camera.distortion, axes=True)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     normal = likelihood.evaluate(cal.theta)
@@ -407,7 +407,7 @@ def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
         cal,
         sigma=sigma,
         sigma_name=sigma_parameter(True).name,
-        provenance=cal.provenance | {"tail_weights": record},
+        provenance=cal.provenance.adding(tail_weights=record),
     )
 
 
@@ -416,7 +416,7 @@ def tail_weighted(obs: Observations, cal: Calibration) -> Observations:
 
     `obs`: with the noise that the calibration has without them.
     """
-    record, model = cal.provenance["tail_weights"], cal.camera.distortion
+    record, model = cal.provenance.tail_weights or {}, cal.camera.distortion
     frames = StarFrames.from_observations(obs, axes=True)
     likelihood = StudentLikelihood(
         frames,

@@ -32,7 +32,7 @@ from starcal_uq.core.status import (
     pass_or_fail,
     pass_or_warn,
 )
-from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.ensemble import Chains, autocorrelation
 from starcal_uq.inference.named import LIKELIHOODS
@@ -636,7 +636,7 @@ def resample(post: Posterior, **changes: Any) -> Remedies:
     """Sampling again with some settings changed: a command and a call; of a likelihood of the
     user's, the call.
     """
-    settings: AnyMapping = _DEFAULTS | post.provenance.get("settings", {}) | changes
+    settings = _DEFAULTS | post.provenance.settings | changes
     kept = {name: settings[name] for name, usual in _DEFAULTS.items() if settings[name] != usual}
     if settings["likelihood"] in LIKELIHOODS:
         return (Remedy("sample", (RUN,), {"force": True, **kept}),)

@@ -159,7 +159,7 @@ def _datasets(
     progress: Progress | None,
 ) -> dict[str, xr.Dataset]:
     obs = weighed(obs, post)
-    hashed = post.provenance.get("data_sha256")
+    hashed = post.provenance.data_sha256
     refused = _refused(post, hashed in (None, obs.data_hash))
     for group in groups or ():
         if group not in GROUPS:
@@ -228,7 +228,7 @@ class _Draws:
         if post.dof_draws is not None:
             self.dof = post.dof_draws.reshape(post.n_ensembles, -1)[:, places].ravel()
         elif post.diagnostics.likelihood == _STUDENT:
-            self.dof = np.full(len(self.sigma), float(post.provenance["settings"]["dof"]))
+            self.dof = np.full(len(self.sigma), float(post.provenance.settings["dof"]))
 
     def coords(self) -> AnyDict:
         return {"chain": np.arange(self.shape[0]), "draw": np.arange(self.shape[1])}
@@ -253,7 +253,7 @@ class _Frames:
                 np.mean(
                     post.dof_draws
                     if post.dof_draws is not None
-                    else post.provenance["settings"]["dof"]
+                    else post.provenance.settings["dof"]
                 )
             )
             self.student = StudentLikelihood(

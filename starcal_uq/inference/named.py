@@ -22,7 +22,7 @@ from starcal_uq.core.errors import SamplingError, check_known
 from starcal_uq.core.remedy import calibrated
 from starcal_uq.core.settings import Evaluation, LikelihoodName
 from starcal_uq.core.status import Check, Level, Question
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
 from starcal_uq.likelihood.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
@@ -125,7 +125,7 @@ def find_source(
             accepted = np.ones_like(cal.theta)
         wider = _inflated(source, widths if accepted is None else widths * accepted)
         source = replace(wider, inflation=accepted)
-    if (ignored := _settings(cal).get("ignored_distortion")) is None:
+    if (ignored := cal.provenance.settings.get("ignored_distortion")) is None:
         return source
     sentence = (
         f"The method {cal.method!r} ignores the distortion (model {ignored!r} was given): this "
@@ -172,7 +172,7 @@ def _inflated(source: Source, factors: FloatArray) -> Source:
 def _named_source(
     likelihood: str, obs: Observations | None, cal: Calibration, dof: float | str | None
 ) -> Source:
-    settings = _settings(cal)
+    settings = cal.provenance.settings
     if obs is None and settings.get("stream") and settings.get("method") == "samaan":
         raise SamplingError(
             "a stream leaves only the quadratic likelihood around the estimate, and samaan's is "
@@ -212,17 +212,12 @@ def _named_source(
     return _pairs(obs, cal, adjusted=likelihood == "pairs")
 
 
-def _settings(cal: Calibration) -> AnyDict:
-    settings: AnyDict = cal.provenance.get("settings", {})
-    return settings
-
-
 def resolved_dof(cal: Calibration, dof: float | str | None) -> float | Literal["free"]:
     """Degrees of freedom, "free" or a number in range: as given, else the calibration's, else the
     default.
     """
-    if dof is None and _settings(cal).get("likelihood") == "student_t":
-        dof = _settings(cal)["dof"]
+    if dof is None and cal.provenance.likelihood == "student_t":
+        dof = cal.provenance.settings["dof"]
     nu = parse_dof(dof, SamplingError)
     return "free" if nu is None else nu
 

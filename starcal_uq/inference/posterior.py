@@ -19,6 +19,7 @@ from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import check_hdf5, ensure_new, reading, write_netcdf
+from starcal_uq.core.provenance import Provenance, Traced, in_order
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy, read_remedies
 from starcal_uq.core.settings import bounded
@@ -211,7 +212,7 @@ class Diagnostics:
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior(Shown):
+class Posterior(Shown, Traced):
     """Draws of the camera parameters and the noise, with their diagnostics.
 
     Attributes
@@ -240,7 +241,7 @@ class Posterior(Shown):
         Mean over frames of the attitude covariance due to centroid noise, rad^2.
     camera : Camera
         The calibrated camera around which everything is linearised.
-    provenance : dict
+    provenance : Provenance
         Seed, settings, versions, time and data hash.
     dof_draws : array (n,) or None
         Draws of the degrees of freedom of a Student-t likelihood where they were free.
@@ -263,7 +264,7 @@ class Posterior(Shown):
     rotation_per_theta: FloatArray
     attitude_noise: FloatArray
     camera: Camera
-    provenance: AnyDict
+    provenance: Provenance
     dof_draws: FloatArray | None = None
     star_error_px: float = 0.0
 
@@ -335,8 +336,7 @@ class Posterior(Shown):
         """Factors (p,) of an accepted inflation that the draws hold; None where there is none, or
         they do not.
         """
-        factors = self.provenance.get("inflation")
-        return None if factors is None else np.array([factors[name] for name in self.camera_names])
+        return in_order(self.provenance.inflation, self.camera_names)
 
     @property
     def sampled(self) -> tuple[int, ...]:
@@ -387,7 +387,7 @@ class Posterior(Shown):
             variables["dof"] = (("chain", "draw"), self.dof_draws.reshape(shape), about)
         attrs: AnyDict = {
             "inference_library": "emcee",
-            "inference_library_version": str(self.provenance.get("versions", {}).get("emcee")),
+            "inference_library_version": str(self.provenance.versions.get("emcee")),
             "draw_order": DRAW_ORDER,
             "n_walkers": self.n_walkers,
             "n_steps": self.n_steps,

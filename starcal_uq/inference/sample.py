@@ -15,7 +15,7 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.errors import SamplingError, check_known
 from starcal_uq.core.formatting import join_words
-from starcal_uq.core.provenance import data_hashes, provenance
+from starcal_uq.core.provenance import Provenance, data_hashes, provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.settings import Evaluation, LikelihoodName, Moves, bounded, check_memory
 from starcal_uq.core.status import Status
@@ -171,15 +171,16 @@ def sample(
         "evaluation": evaluation if isinstance(likelihood, str) else "exact",
         **({"dof": dof} if dof is not None else {}),
     }
-    data_hash = cal.provenance.get("data_sha256") if obs is None else cal.data_hash_of(obs)
+    data_hash = cal.provenance.data_sha256 if obs is None else cal.data_hash_of(obs)
     source = find_source(likelihood, obs, cal, dof)
     record = provenance(seed, chosen, data_hash)
-    if "partitions" in cal.provenance:
-        record["partitions"] = cal.provenance["partitions"]
+    if cal.provenance.partitions:
+        record = record.adding(partitions=cal.provenance.partitions)
     if cal.noise_model is not None:
-        record["noise_model"] = cal.noise_model.record(frames=False)
+        record = record.adding(noise_model=cal.noise_model.record(frames=False))
     if source.inflation is not None:
-        record["inflation"] = dict(zip(cal.parameter_names, source.inflation.tolist(), strict=True))
+        factors = dict(zip(cal.parameter_names, source.inflation.tolist(), strict=True))
+        record = record.adding(inflation=factors)
     run = _Run(cal, source, priors, settings, n_ensembles, seed, sigma, progress, record)
     if isinstance(likelihood, str):
         outcome, compression = _with_fallback(run, evaluation, checkpoint)
@@ -204,7 +205,7 @@ class _Run:
         seed: int,
         sigma: Literal["sampled"] | float,
         progress: Progress | None,
-        provenance: AnyDict,
+        provenance: Provenance,
     ) -> None:
         self.cal, self.source, self.priors, self.settings, self.progress = (
             cal,

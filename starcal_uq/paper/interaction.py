@@ -32,7 +32,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import SamplingError, StarcalError
 from starcal_uq.core.files import cell_content, reading, write_csv
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import Kept
@@ -149,7 +149,7 @@ class InteractionStudy(Shown):
 
     table: pd.DataFrame
     interrupted: bool = False
-    provenance: AnyDict = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
 
     def points(self, axis: str, method: str, parameter: str) -> pd.DataFrame:
         """Rows of one curve, in the order of the axis."""

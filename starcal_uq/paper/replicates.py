@@ -20,7 +20,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
@@ -165,7 +165,7 @@ class Replicates(Shown, Saved):
         Replicates asked for.
     interrupted : bool
         Stopped by the user before the last one.
-    provenance : dict
+    provenance : Provenance
         Seed, settings, versions and time.
     """
 
@@ -183,7 +183,7 @@ class Replicates(Shown, Saved):
     failures: tuple[tuple[str, ...], ...]
     n_requested: int
     interrupted: bool
-    provenance: AnyDict
+    provenance: Provenance
 
     KIND = "starcal_uq replicates 1"
     FILE = "a set of replicates", Remedy("reproduce", purpose="to write it")

@@ -16,6 +16,7 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.frames import StarFrames
@@ -270,7 +271,7 @@ class Reproduction(Shown):
     judged: tuple[Judged, ...]
     checks: tuple[PaperCheck, ...]
     study: InteractionStudy | None
-    provenance: AnyDict
+    provenance: Provenance
 
     @property
     def report(self) -> Path:

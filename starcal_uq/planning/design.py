@@ -24,9 +24,9 @@ from starcal_uq.attitude.rotations import random_rotations, rotation_to_quaterni
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.settings import Criterion, bounded
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, floats
+from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import quantities, spreads
 from starcal_uq.planning.information import FrameSet, Noise, look_at, random_frames
@@ -319,7 +319,7 @@ class FrameChoice(Shown):
         Candidates that do not.
     exchanges : int
         Frames exchanged after the greedy choice.
-    provenance : dict
+    provenance : Provenance
         Versions, settings and time.
     """
 
@@ -338,7 +338,7 @@ class FrameChoice(Shown):
     n_candidates: int
     n_refused: int
     exchanges: int
-    provenance: AnyDict
+    provenance: Provenance
 
     @property
     def quaternions(self) -> FloatArray:

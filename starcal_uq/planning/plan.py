@@ -19,7 +19,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, Progress, floats
@@ -442,7 +442,7 @@ class Plan(Shown):
         What the distortion does that the sheet leaves open; None where it is known.
     seed : int
         Seed of the drawn geometries.
-    provenance : dict
+    provenance : Provenance
         Versions, settings and time.
     frame_information : (p, p) array
         Mean information of a frame, its attitude eliminated, px units.
@@ -469,7 +469,7 @@ class Plan(Shown):
     sweeps: pd.DataFrame | None
     distortion: DistortionRange | None
     seed: int
-    provenance: AnyDict
+    provenance: Provenance
     frame_information: FloatArray
     start_information: FloatArray | None
     rotation_per_theta: FloatArray

@@ -114,8 +114,8 @@ def _write_covariance(best: Calibration | Posterior, path: Path) -> str:
         "units": [p.unit for p in specs],
         "mean": (best.calibrated_camera if isinstance(best, Posterior) else best).theta.tolist(),
         "covariance": best.covariance.tolist(),
-        "data_sha256": best.provenance.get("data_sha256"),
-        "versions": best.provenance.get("versions"),
+        "data_sha256": best.provenance.data_sha256,
+        "versions": best.provenance.versions,
     }
     atomic_write_text(path, json.dumps(content, indent=1) + "\n")
     return (

@@ -36,6 +36,7 @@ from starcal_uq.core.manifest import (
     sweep,
     write_manifest,
 )
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, Remedy
 from starcal_uq.core.status import Level, Question
 from starcal_uq.core.types import AnyDict, PathLike
@@ -247,7 +248,7 @@ class RunFolder:
             for name in steps
             if (self.path / name).is_file()
         }
-        return Manifest(files, {entry.step: {} for entry in files.values()})
+        return Manifest(files, {entry.step: Provenance() for entry in files.values()})
 
     def resting_on(self, step: str) -> list[str]:
         """Files that go when a step is done again, because they rest on its result."""
@@ -272,7 +273,7 @@ class RunFolder:
     def step(
         self,
         step: str,
-        record: AnyDict,
+        record: Provenance,
         *,
         making: bool = False,
         tell: Callable[[str], None] | None = None,

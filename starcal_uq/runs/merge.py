@@ -218,7 +218,7 @@ def _drop_shared(
             )
         rest = table.select_frames(np.delete(table.frame_ids, repeating))
         tables[i] = rest
-        noise = cal.provenance["settings"].get("noise", "common")
+        noise = cal.provenance.settings.get("noise", "common")
         model = cal.nominal.distortion
         calibrations[i] = calibrate(
             rest, cal.nominal, model=model, method=cal.method, noise=noise, duplicates="keep"

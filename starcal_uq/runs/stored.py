@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import RunFolderError, StarcalError
 from starcal_uq.core.manifest import entry_of
-from starcal_uq.core.provenance import provenance
+from starcal_uq.core.provenance import installed_versions, provenance
 from starcal_uq.core.remedy import RUN, SOME_IMAGES, Remedy
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.estimation.noise_model import weighed
@@ -161,7 +161,7 @@ class StoredRun:
         """
         calibration = self.calibration
         table = load_observations(self.folder.require("observations"))
-        if calibration.data_hash_of(table) != calibration.provenance.get("data_sha256"):
+        if calibration.data_hash_of(table) != calibration.provenance.data_sha256:
             raise RunFolderError(
                 f"{self.path}: the calibration was made from other observations than "
                 f"{self.folder.observations.name} holds; "
@@ -361,7 +361,7 @@ class StoredRun:
         words : sequence of str
             The command as it was typed, without the program's name: remedies repeat it.
         """
-        record = {**command, "versions": provenance(None, {}, None)["versions"]}
+        record = {**command, "versions": installed_versions()}
         here = self.folder
         try:
             with here.making(record, force, words) as self.folder:
@@ -402,8 +402,8 @@ class StoredRun:
         without them.
         """
         record = self.calibration.provenance
-        merged = record.get("merge", {}).get("has_observations") is False
-        return not merged and not record["settings"].get("stream", False)
+        merged = record.merge.get("has_observations") is False
+        return not merged and not record.settings.get("stream", False)
 
     def _keep(self, name: str, force: bool) -> None:
         """Refuse to do a step again whose result is there."""

@@ -20,7 +20,7 @@ from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.manifest import NEW, alone, making, read_manifest
-from starcal_uq.core.provenance import NAME, provenance
+from starcal_uq.core.provenance import NAME, installed_versions
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import held, take_over
 from starcal_uq.core.tasks import one_thread, run_tasks
@@ -381,15 +381,15 @@ def dataset(
         )
     coordinates["seed_index"] = ("cell", np.array([cell.seed_index for cell in cells]))
     coordinates["key"] = ("cell", np.array(list(keys)))
-    record = provenance(definition.seed, {}, None)
+    versions = installed_versions()
     return xr.Dataset(
         variables,
         coordinates,
         {
             "title": definition.name,
             "definition": json.dumps(definition.to_dict()),
-            "versions": json.dumps(record["versions"]),
-            "starcal_uq": str(record["versions"]["starcal_uq"]),
+            "versions": json.dumps(versions),
+            "starcal_uq": str(versions["starcal_uq"]),
             "seed": definition.seed,
             "missing_cells": int(np.sum(rows < 0)),
             "created_by": f"{NAME} study",

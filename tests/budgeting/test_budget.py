@@ -44,6 +44,7 @@ from starcal_uq.budgeting.shapes import one_axis_factor
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.diagnostics.inflation import with_misfit
 from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
@@ -124,7 +125,7 @@ def attitude(**changes: Any) -> AttitudeError:
 POST = SimpleNamespace(
     draws=np.zeros((400, 6)),
     mean=np.array([500.0, 530.0, 5850.0, 2e-10, -3.5e-15]),
-    provenance={"data_sha256": "0123456789abcdef"},
+    provenance=Provenance(data_sha256="0123456789abcdef"),
     camera=SimpleNamespace(distortion="brown"),
     inflation=None,
 )
@@ -1052,7 +1053,9 @@ def test_rows_of_the_posterior_to_every_field() -> None:
     plain = dataclasses.replace(
         error, covariance_arcsec2=np.full((5, 3, 3), np.nan), nea_arcsec=np.zeros(3)
     )
-    nameless = SimpleNamespace(**{**vars(POST), "provenance": {}, "draws": np.zeros((1, 6))})
+    nameless = SimpleNamespace(
+        **{**vars(POST), "provenance": Provenance(), "draws": np.zeros((1, 6))}
+    )
     first = posterior_rows(plain, nameless)[6]  # type: ignore[arg-type]
     assert (first.axis_correlation, first.tail_997, first.sigma_arcsec) == ((), GAUSSIAN_997, 0.0)
     assert first.provenance == "posterior of 1 draw"

@@ -27,6 +27,7 @@ from starcal_uq.core.errors import (
     DistortionError,
     RunFolderError,
 )
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.priors import GaussianPriors
@@ -55,14 +56,14 @@ def result(theta: np.ndarray, covariance: np.ndarray = COVARIANCE, **changes: An
         "dof": np.inf,
         "method": "efficient",
         "status": Status.CONVERGED,
-        "provenance": {"data_sha256": "a" * 64, "settings": {"method": "efficient"}},
+        "provenance": Provenance(data_sha256="a" * 64, settings={"method": "efficient"}),
     }
     return SimpleNamespace(**{**values, **changes})
 
 
-def other(**changes: Any) -> dict[str, Any]:
+def other(**changes: Any) -> Provenance:
     """Provenance of other data."""
-    return {"data_sha256": "b" * 64, "settings": {"method": "efficient"}, **changes}
+    return Provenance(data_sha256="b" * 64, settings={"method": "efficient"}, **changes)
 
 
 def null_pairs(n: int, seed: int = 0, size_b: float = 1.0) -> list[tuple[Any, Any]]:

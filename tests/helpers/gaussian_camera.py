@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.maths.linear import symmetric_inverse
@@ -60,7 +61,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "compressed": GaussianLikelihood(camera.theta, information, sigma, dof),
         "rotation_per_theta": np.arange(15.0).reshape(3, 5) * 1e-4,
         "attitude_noise": np.eye(3) * 1e-12,
-        "provenance": {"data_sha256": "0" * 64},
+        "provenance": Provenance(data_sha256="0" * 64),
         "star_errors": None,
         "noise_model": None,
         "inflation": None,
@@ -95,7 +96,7 @@ def gaussian_posterior(
         covariance=np.cov(theta, rowvar=False),
         rotation_per_theta=cal.rotation_per_theta,
         attitude_noise=cal.attitude_noise,
-        provenance={},
+        provenance=Provenance(),
         star_error_px=0.0,
         thin=lambda count, seed: draws[np.random.default_rng(seed).permutation(n)[:count]],
     )

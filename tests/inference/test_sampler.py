@@ -17,6 +17,7 @@ from scipy import integrate, stats
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, SamplingError, SettingError
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.jackknife import accept_inflation, jackknife_frames
 from starcal_uq.inference import named
@@ -681,8 +682,10 @@ def test_a_sample_of_frames_checks_the_wider_likelihood(accepted: Any) -> None:
 
 
 def test_degrees_of_freedom_are_the_callers_or_the_calibrations() -> None:
-    student = SimpleNamespace(provenance={"settings": {"likelihood": "student_t", "dof": 7.0}})
-    other = SimpleNamespace(provenance={"settings": {"likelihood": "marginal"}})
+    student = SimpleNamespace(
+        provenance=Provenance(settings={"likelihood": "student_t", "dof": 7.0})
+    )
+    other = SimpleNamespace(provenance=Provenance(settings={"likelihood": "marginal"}))
     assert named.resolved_dof(student, None) == 7.0 and named.resolved_dof(student, 3.0) == 3.0
     assert named.resolved_dof(student, "free") == "free" and named.resolved_dof(other, 3.0) == 3.0
     assert named.resolved_dof(other, None) == DEFAULT_DOF
@@ -690,7 +693,7 @@ def test_degrees_of_freedom_are_the_callers_or_the_calibrations() -> None:
 
 def test_a_stream_of_samaans_has_no_likelihood_to_sample() -> None:
     cal = SimpleNamespace(
-        provenance={"settings": {"stream": True, "method": "samaan"}}, star_errors=1
+        provenance=Provenance(settings={"stream": True, "method": "samaan"}), star_errors=1
     )
     with pytest.raises(SamplingError, match="a stream leaves only the quadratic likelihood"):
         named._named_source("pairs", None, cal, None)

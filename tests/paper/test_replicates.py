@@ -18,6 +18,7 @@ from starcal_uq.core.errors import (
     SamplingError,
     SettingError,
 )
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.maths.intervals import holm, wilson_interval
@@ -75,7 +76,7 @@ def artificial(error, claimed, truth=None, classical=None):
         failures=(("",) * n,) * m,
         n_requested=n,
         interrupted=False,
-        provenance={"seed": 0, "settings": {"n_frames": 10}},
+        provenance=Provenance(seed=0, settings={"n_frames": 10}),
     )
 
 

@@ -14,6 +14,7 @@ import starcal_uq as sc
 from starcal_uq.budgeting.file import Requirement
 from starcal_uq.budgeting.result import Budget, Outcome
 from starcal_uq.comparison.result import CameraComparison
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.diagnostics.diagnose import Diagnosis
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
@@ -89,7 +90,7 @@ def validation(n: int = 100) -> Validation:
         failures=(),
         n_requested=n,
         interrupted=False,
-        provenance={"settings": {"n_frames": 20}},
+        provenance=Provenance(settings={"n_frames": 20}),
     )
 
 

@@ -13,6 +13,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import DistortionError, ObservationError, SettingError
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.observations.table import Observations
 from starcal_uq.propagation.alignment import alignment_frames, random_sky
 from starcal_uq.propagation.attitude_error import AttitudeError
@@ -39,7 +40,7 @@ class Draws:
             np.cov(self.theta_draws, rowvar=False),
         )
         self.sigma_name = "sigma"
-        self.provenance: dict[str, str] = {}
+        self.provenance = Provenance()
         self.star_error_px = 0.0
         self.camera = sc.Camera(
             width_px=1024, height_px=1024, pixel_um=12.0, focal_mm=69.6, x0_px=500.0, y0_px=530.0,

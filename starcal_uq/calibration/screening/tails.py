@@ -176,10 +176,8 @@ def blame_words(
             "wrong identifications "
             f"leave {allowed} at most"
         ]
-    settings = cal.provenance.get("settings", {})
-    tails = (
-        ", with the heavy tails of a Student t" if settings.get("likelihood") == "student_t" else ""
-    )
+    robust = cal.provenance.likelihood == "student_t"
+    tails = ", with the heavy tails of a Student t" if robust else ""
     remedy = "Fit noise that varies (--noise model), or another distortion"
     if follows:
         remedy = "Their residuals follow the place on the detector: fit another distortion"

@@ -10,9 +10,10 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import CAMERA, Remedy
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, Shapes
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
 from starcal_uq.inference.priors import Priors
 from starcal_uq.maths.intervals import binomial_interval, holm
@@ -77,7 +78,7 @@ class Validation(Shown, Saved):
         Replicates asked for.
     interrupted : bool
         Stopped by the user before the last one.
-    provenance : dict
+    provenance : Provenance
         Seed, settings, versions and time.
     """
 
@@ -100,7 +101,7 @@ class Validation(Shown, Saved):
     failures: tuple[str, ...]
     n_requested: int
     interrupted: bool
-    provenance: AnyDict
+    provenance: Provenance
 
     KIND = "starcal_uq validation 1"
     FILE = "a validation", Remedy("validate", (CAMERA,), purpose="to write it")

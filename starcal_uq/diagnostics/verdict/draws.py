@@ -23,13 +23,13 @@ PROPAGATION_SLACK, PROPAGATION_ERRORS = 0.03, 4.0
 
 def same_data(post: Posterior, data_hash: str) -> Check:
     """Was the posterior sampled from the observations of this hash?"""
-    good = post.provenance.get("data_sha256") == data_hash
+    good = post.provenance.data_sha256 == data_hash
     sentence = (
         "The posterior was sampled from the observations at hand."
         if good
         else "The posterior was sampled from other observations than those at hand: sample again."
     )
-    value = f"SHA-256 {str(post.provenance.get('data_sha256'))[:12]}…"
+    value = f"SHA-256 {str(post.provenance.data_sha256)[:12]}…"
     bound = f"{data_hash[:12]}…"
     remedies = () if good else (Remedy("sample", (RUN,), {"force": True}),)
     return Check(

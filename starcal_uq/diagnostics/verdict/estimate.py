@@ -101,7 +101,7 @@ def determined(cal: Calibration) -> Check | None:
     """Do the data determine the model of the camera, without a simpler one and without the coma of
     noise?
     """
-    record, sentence = cal.provenance.get("fallback"), fallback_words(cal)
+    record, sentence = cal.provenance.fallback, fallback_words(cal)
     if record:
         value, bound = str(record["used"]), str(record["model"])
     elif sentence:

@@ -13,6 +13,7 @@ import pandas as pd
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.maths.intervals import wilson_interval
@@ -61,7 +62,7 @@ class FieldExperiment(Shown):
     stars: Mapping[str, FieldStars]
     errors: Mapping[str, AttitudeErrors]
     replicates: FieldReplicates
-    provenance: AnyDict
+    provenance: Provenance
 
     @property
     def report(self) -> Path:

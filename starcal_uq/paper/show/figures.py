@@ -546,7 +546,7 @@ def _legend(figure: Figure, found: Replicates) -> None:
         style.key("claims that the tests reject", _WRONG, linewidth=1.5),
         Patch(color=style.LIGHT, label="Cramer-Rao bound"),
     ]
-    frames = found.provenance["settings"].get("n_frames")
+    frames = found.provenance.settings.get("n_frames")
     title = f"{found.n_replicates} replicates" + ("" if frames is None else f" of {frames} frames")
     style.legend_above(figure, handles, title=title, title_fontsize=style.TITLE_SIZE)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.paper.field.published import MORE_THAN_STARS, N_CHOSEN, N_TAKEN, TRUE_CAMERA
 from starcal_uq.paper.published import N_FRAMES
 from starcal_uq.paper.show import field, tables
@@ -63,7 +63,7 @@ def reproduction_page(found: Reproduction, figures: Mapping[str, bytes]) -> str:
     left out.
     """
     obs = found.run.observations
-    n, settings = obs.n_frames, found.provenance["settings"]
+    n, settings = obs.n_frames, found.provenance.settings
     tried = [len(one.trials) for one in found.judged]
     warning = (
         f"This reproduction has {plural(n, 'frame')} where the paper has {count(N_FRAMES)}: our "
@@ -184,7 +184,7 @@ def _page(
     about: str,
     headline: str,
     sections: list[Section],
-    record: AnyDict,
+    record: Provenance,
     figures: Mapping[str, bytes],
     warning: str = "",
 ) -> str:
@@ -195,8 +195,8 @@ def _page(
         "headline": headline,
         "sections": sections,
         "warning": warning,
-        "created": record["created_utc"],
-        "version": record["versions"].get("starcal_uq") or "",
+        "created": record.created_utc,
+        "version": record.version,
         "images": figures,
     }
     return template_environment().get_template("sections.html.j2").render(context) + "\n"

@@ -21,7 +21,7 @@ from starcal_uq.core.formatting import (
     significant,
     with_sigma,
 )
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.paper.checks import NO
 from starcal_uq.paper.errors import MAXIMUM, REPROJECTION
 from starcal_uq.paper.interaction import AXES, HANDLING, OPTICS
@@ -291,7 +291,7 @@ def errors(found: Reproduction) -> TextTable:
 
 def replicates_text(found: Replicates) -> str:
     """Who is honest, who is biased, and who claims too little or too much."""
-    frames = found.provenance["settings"].get("n_frames")
+    frames = found.provenance.settings.get("n_frames")
     data = "" if frames is None else f" of {plural(int(frames), 'frame')}"
     text = f"Over {plural(found.n_replicates, 'replicate')}{data}: "
     if found.n_replicates < ENOUGH_REPLICATES:
@@ -424,22 +424,20 @@ def _side(one: Threshold | None) -> str:
     return f"{'from' if one.side == 'above' else 'up to'} {significant(one.value, 1)}"
 
 
-def provenance_table(record: AnyDict) -> TextTable:
+def provenance_table(record: Provenance) -> TextTable:
     """What is needed to repeat an experiment."""
-    settings: Iterable[tuple[str, object]] = record["settings"].items()
+    settings: Iterable[tuple[str, object]] = record.settings.items()
     rows = (
-        ("Data, SHA-256", str(record["data_sha256"])),
-        ("Seed", str(record["seed"])),
+        ("Data, SHA-256", str(record.data_sha256)),
+        ("Seed", str(record.seed)),
         (
             "Settings",
             ", ".join(f"{k} = {v if isinstance(v, str) else json.dumps(v)}" for k, v in settings),
         ),
-        ("Time", str(record["created_utc"])),
+        ("Time", record.created_utc),
         (
             "Versions",
-            ", ".join(
-                f"{name} {version}" for name, version in record["versions"].items() if version
-            ),
+            record.software(),
         ),
     )
     return TextTable(("What", "Value"), rows, align="ll")

@@ -51,8 +51,8 @@ def write_tex(budget: Budget, path: PathLike) -> None:
         finalize=tex,
         undefined=jinja2.StrictUndefined,
     )
-    created = budget.provenance.get("created_utc", "")
-    text = environment.get_template("budget.tex.j2").render(created=created, **tables(budget))
+    template = environment.get_template("budget.tex.j2")
+    text = template.render(created=budget.provenance.created_utc, **tables(budget))
     atomic_write_text(path, text + "\n")
 
 
@@ -71,9 +71,9 @@ def write_html(budget: Budget, path: PathLike) -> None:
         .render(
             **budget_context(budget),
             images=_images(budget),
-            created=provenance.get("created_utc", ""),
-            version=provenance.get("versions", {}).get("starcal_uq") or "",
-            data_sha256=provenance.get("data_sha256") or "",
+            created=provenance.created_utc,
+            version=provenance.version,
+            data_sha256=provenance.data_sha256 or "",
         )
     )
     atomic_write_text(path, text + "\n")
@@ -94,7 +94,7 @@ def write_xlsx(budget: Budget, path: PathLike) -> None:
     if budget.outcomes:
         _requirements(book.create_sheet("Requirements"), budget)
     notes = book.create_sheet("Notes")
-    created = str(budget.provenance.get("created_utc", ""))
+    created = budget.provenance.created_utc
     lines = [
         budget.title,
         created,

@@ -11,6 +11,7 @@ from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_csv
 from starcal_uq.core.formatting import fixed, p_words, percent, plus_minus, pretty_unit, significant
 from starcal_uq.core.manifest import making
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.types import PathLike
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import svg_bytes
@@ -143,11 +144,11 @@ def _source_table(found: CameraComparison) -> TextTable:
     """Where both results come from."""
     rows = []
     for label, key in zip(found.labels, "ab", strict=True):
-        provenance = found.provenance.get(key, {})
-        settings = provenance.get("settings", {})
+        provenance = Provenance(found.provenance.get(key, {}))
+        settings = provenance.settings
         how = ", ".join(
             f"{name} {settings[name]}" for name in ("method", "likelihood") if name in settings
         )
-        created = str(provenance.get("created_utc", "")).replace("T", " ").replace("Z", " UTC")
-        rows.append((label, created, how, str(provenance.get("data_sha256") or "")))
+        created = provenance.created_utc.replace("T", " ").replace("Z", " UTC")
+        rows.append((label, created, how, provenance.data_sha256 or ""))
     return TextTable(("Calibration", "Made", "How", "Data (SHA-256)"), tuple(rows), align="llll")

@@ -218,8 +218,8 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> AnyDict:
     edges = {pairs[0][0] for _, pairs in groups}
     return {
         "title": plan.camera.name or "Plan of a calibration",
-        "created": plan.provenance["created_utc"],
-        "version": plan.provenance["versions"].get("starcal_uq") or "",
+        "created": plan.provenance.created_utc,
+        "version": plan.provenance.version,
         "verdict": plan_text(plan),
         "settings": settings_sentence(plan),
         "distortion_words": distortion_sentence(plan),
@@ -252,6 +252,6 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> AnyDict:
         and plan.sweeps is not None
         and not bool(np.isfinite(plan.sweeps["frames_needed"]).all()),
         "seed": plan.seed,
-        "provenance": plan.provenance["settings"],
+        "provenance": plan.provenance.settings,
         "images": images,
     }

@@ -61,12 +61,12 @@ def context(results: Results) -> AnyDict:
     converged = verdict.of(Question.CONVERGED)
     trust = verdict.of(Question.TRUSTWORTHY)
     usable, unusable = summary.uses(results)
-    version = (post or cal).provenance.get("versions", {}).get("starcal_uq") or ""
+    provenance = (post or cal).provenance
     return {
         "title": (results.truth or cal.nominal).name or results.name,
         "run_name": results.name,
-        "created": (post or cal).provenance.get("created_utc", ""),
-        "version": version,
+        "created": provenance.created_utc,
+        "version": provenance.version,
         "usable": usable,
         "unusable": unusable,
         "attitude_summary": None
@@ -77,7 +77,7 @@ def context(results: Results) -> AnyDict:
         else summary.budget_summary(results.budget),
         "glance_caption": summary.glance_caption(results),
         "methods_paragraph": summary.methods_paragraph(results),
-        "citations": [line.format(version=version) for line in summary.CITATIONS],
+        "citations": [line.format(version=provenance.version) for line in summary.CITATIONS],
         "diagnose": results.command(Remedy("diagnose", (RUN,))),
         "report_command": Remedy("report").command,
         "template_command": _template_command(results),

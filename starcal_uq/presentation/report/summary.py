@@ -16,7 +16,6 @@ from starcal_uq.budgeting.rows import AXIS_LABELS, confidence_text
 from starcal_uq.core.constants import CROSS_BORESIGHT
 from starcal_uq.core.formatting import count, fixed, join_words, plural, significant
 from starcal_uq.core.status import Check, Level, Question, worst
-from starcal_uq.core.types import AnyMapping
 from starcal_uq.presentation.report.tables import parameter_rows
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.budgeting import axis_label, bound
@@ -210,14 +209,12 @@ def methods_paragraph(results: Results) -> str:
         results.observations,
     )
     camera, record = cal.camera, cal.provenance if post is None else post.provenance
-    versions: AnyMapping = record.get("versions", {})
-    settings: AnyMapping = record.get("settings", {})
     kind = "simulated " if obs.origin.simulated else ""
     noise = "fitted with the camera" if cal.fitted_noise is not None else "a free parameter"
     parts = [
         f"The camera ({detector_words(camera)}, distortion model "
         f"“{camera.distortion}”) was calibrated with starcal_uq "
-        f"{versions.get('starcal_uq') or ''} on "
+        f"{record.version} on "
         f"{plural(cal.n_stars, f'{kind}identified star')} in {plural(cal.n_frames, 'frame')}. "
         "Start values came from "
         "the angles between stars in three stages (Ye & Yang 2017); the estimate maximises the "
@@ -230,13 +227,13 @@ def methods_paragraph(results: Results) -> str:
         fewest = int(
             min(np.min(d.ess_bulk[list(post.sampled)]), np.min(d.ess_tail[list(post.sampled)]))
         )
-        seed = f", seed {record['seed']}" if record.get("seed") is not None else ""
+        seed = f", seed {record.seed}" if record.seed is not None else ""
         parts.append(
-            f"The posterior was sampled with emcee {versions.get('emcee') or ''} (Foreman-Mackey "
+            f"The posterior was sampled with emcee {record.versions.get('emcee') or ''} (Foreman-Mackey "
             "et al. 2013): "
             f"{post.n_ensembles} separate ensembles of {post.n_walkers} walkers, {post.n_steps} "
             "kept steps"
-            f"{seed}, likelihood “{settings.get('likelihood', d.likelihood)}”; R-hat is at most "
+            f"{seed}, likelihood “{record.settings.get('likelihood', d.likelihood)}”; R-hat is at most "
             f"{fixed(float(np.max(d.rhat[list(post.sampled)])), 4)} and the effective sample "
             "size at least "
             f"{count(fewest)} (Vehtari et al. 2021), and Pareto-smoothed importance sampling "
@@ -264,10 +261,8 @@ def methods_paragraph(results: Results) -> str:
         )
     passed, every = len(results.verdict.at(Level.PASS)), len(results.verdict.checks)
     parts.append(f"Of {plural(every, 'check')}, {passed} passed. {_not_passed(results)}".strip())
-    with_versions = ", ".join(
-        f"{n} {v}" for n, v in versions.items() if v and n not in ("starcal_uq", "emcee")
-    )
-    parts.append(f"Software: {with_versions}. Data: SHA-256 {cal.data_hash_of(obs)[:16]}.")
+    software = record.software("starcal_uq", "emcee")
+    parts.append(f"Software: {software}. Data: SHA-256 {cal.data_hash_of(obs)[:16]}.")
     return " ".join(filter(None, " ".join(parts).split(" ")))
 
 

@@ -240,7 +240,7 @@ def sampling_sentence(results: Results) -> str:
     post = results.posterior
     if post is None:
         return ""
-    settings: AnyMapping = post.provenance.get("settings", {})
+    settings = post.provenance.settings
     d = post.diagnostics
     moves = f", moves “{settings['moves']}”" if "moves" in settings else ""
     rates = f"{fixed(d.acceptance.min(), 2)} to {fixed(d.acceptance.max(), 2)}"
@@ -262,21 +262,20 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
         rows.append(("Source of the data", str(source)))
     if results.camera_changed:
         rows.append(("Nominal camera", results.camera_changed))
-    steps: list[tuple[str, AnyMapping]] = [("Calibration", results.calibration.provenance)]
+    steps = [("Calibration", results.calibration.provenance)]
     if results.posterior is not None:
         steps.append(("Sampling", results.posterior.provenance))
     if results.diagnosis is not None:
         steps.append(("Diagnosis", results.diagnosis.provenance))
     for name, step in steps:
-        rows.append((f"{name}, time", str(step.get("created_utc", "unknown"))))
-        if step.get("seed") is not None:
-            rows.append((f"{name}, seed", str(step["seed"])))
-        rows.append((f"{name}, settings", _settings_text(step.get("settings", {}))))
-    versions: AnyMapping = steps[-1][1].get("versions", {})
+        rows.append((f"{name}, time", step.created_utc or "unknown"))
+        if step.seed is not None:
+            rows.append((f"{name}, seed", str(step.seed)))
+        rows.append((f"{name}, settings", _settings_text(step.settings)))
     rows.append(
         (
             "Versions",
-            ", ".join(f"{name} {version}" for name, version in versions.items() if version),
+            steps[-1][1].software(),
         )
     )
     return rows

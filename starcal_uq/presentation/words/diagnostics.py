@@ -260,7 +260,7 @@ def validation_text(found: Validation) -> str:
         )
     else:
         opening = "The uncertainties are right as far as this validation can tell"
-    frames = found.provenance["settings"].get("n_frames")
+    frames = found.provenance.settings.get("n_frames")
     data = "" if frames is None else f" of {plural(int(frames), 'frame')}"
     sentences = [
         f"{opening}: over {plural(found.n_replicates, 'replicate')}{data}, {_evidence(found)}."

@@ -89,5 +89,5 @@ def _of_one_file(one: Budget, other: Budget) -> bool:
     """Whether the second of two budgets holds no file of the user's that the first does not
     hold.
     """
-    first, second = (made.provenance["settings"].get("file", "") for made in (one, other))
+    first, second = (made.provenance.settings.get("file", "") for made in (one, other))
     return not second or Path(first).resolve() == Path(second).resolve()

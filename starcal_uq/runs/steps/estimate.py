@@ -137,7 +137,7 @@ def write(
 
     Whatever the run has written before goes.
     """
-    with run._step("calibrate", None, calibration.provenance.get("settings", {})) as files:
+    with run._step("calibrate", None, calibration.provenance.settings) as files:
         if obs is not None:
             obs = weighed(obs, calibration)
             obs.unweighted.save(files.observations)

@@ -36,9 +36,8 @@ def sample(
         options["likelihood"] = run.calibration.sampled_likelihood
     checkpoint = run.folder.path / CHECKPOINT
     posterior = sample(obs, run.calibration, progress=progress, checkpoint=checkpoint, **options)
-    with run._step(
-        "sample", posterior.provenance["seed"], posterior.provenance["settings"]
-    ) as files:
+    made = posterior.provenance
+    with run._step("sample", made.seed, made.settings) as files:
         posterior.save(files.posterior)
         posterior.calibrated_camera.save(files.calibrated)
     remove_checkpoints(run.folder.path)
