@@ -4,10 +4,12 @@ direction turns.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations, compress
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -183,20 +185,14 @@ class Sweep:
         Axes `pooled` count as seeds; the array has one value for them. Of `cells` (C,), those that
         are true count.
         """
-        shape = tuple(
-            1 if axis in pooled else n for axis, n in zip(self.axes, self.shape, strict=True)
-        )
-        numbers = floats(numbers)
+        kept = [axis not in pooled for axis in self.axes]
+        shape = tuple(n if keep else 1 for keep, n in zip(kept, self.shape, strict=True))
         good = self.ok & ~np.isnan(numbers) & cells
-        codes = [
-            c[good] * (axis not in pooled) for axis, c in zip(self.axes, self._codes, strict=True)
-        ]
-        where = (
-            np.ravel_multi_index(codes, shape)
-            if codes
-            else np.zeros(int(good.sum()), dtype=np.int64)
-        )
-        grid = np.full(int(np.prod(shape, dtype=np.int64)), np.nan)
+        where = np.zeros(int(good.sum()), dtype=np.int64)
+        if shape:
+            codes = [c[good] * keep for keep, c in zip(kept, self._codes, strict=True)]
+            where = np.ravel_multi_index(codes, shape)
+        grid = np.full(math.prod(shape), np.nan)
         values = numbers[good]
         order = np.lexsort((values, where))
         places, first, n = np.unique(where[order], return_index=True, return_counts=True)
@@ -225,17 +221,13 @@ class Sweep:
         lines = lines[has]
         if len(lines) < 2:
             return None
-        whole = np.isfinite(lines).all(axis=0)
-        lines = lines[:, whole] if whole.any() else lines[:, np.isfinite(lines).sum(axis=0) >= 2]
+        known = np.isfinite(lines)
+        lines = lines[:, known.all(axis=0) if known.all(axis=0).any() else known.sum(axis=0) >= 2]
         if lines.shape[1] == 0 or not np.isfinite(lines).any(axis=1).all():
             return None
         return Curve(
             axis,
-            tuple(
-                value
-                for value, there in zip(self.values[axis], np.atleast_1d(has), strict=True)
-                if there
-            ),
+            tuple(compress(self.values[axis], np.atleast_1d(has))),
             np.nanmedian(lines, axis=1),
             np.nanmin(lines, axis=1),
             np.nanmax(lines, axis=1),
@@ -301,16 +293,9 @@ class Sweep:
         median, low, high = (
             laid_out(statistic)[np.ix_(rows, columns)] for statistic in ("median", "low", "high")
         )
-        return Lines(
-            along,
-            tuple(self.values[along][i] for i in columns),
-            by,
-            () if by is None else tuple(self.values[by][i] for i in rows),
-            held,
-            median,
-            low,
-            high,
-        )
+        values = tuple(self.values[along][i] for i in columns)
+        by_values = () if by is None else tuple(self.values[by][i] for i in rows)
+        return Lines(along, values, by, by_values, held, median, low, high)
 
     def held(self, along: str, by: str | None = None, at: AnyMapping | None = None) -> AnyDict:
         """Where the other axes are held."""
@@ -318,9 +303,8 @@ class Sweep:
             self._check(axis)
         given = {axis: value for axis, value in (at or {}).items() if axis not in (along, by)}
         cells = self.ok & self._cells(given)
-        free = [
-            i for i, axis in enumerate(self.axes) if axis not in (*self.drawn, along, by, *given)
-        ]
+        named = (*self.drawn, along, by, *given)
+        free = [i for i, axis in enumerate(self.axes) if axis not in named]
         if not free or not cells.any():
             return given
         # The middle, unless cells are missing there.
@@ -330,8 +314,8 @@ class Sweep:
         middle = np.array([self.shape[i] // 2 for i in free])[:, None]
         best = int(np.lexsort((np.abs(places - middle).sum(axis=0), -counts))[0])
         chosen = {
-            self.axes[i]: self.values[self.axes[i]][int(places[j, best])]
-            for j, i in enumerate(free)
+            axis: self.values[axis][code]
+            for axis, code in zip((self.axes[i] for i in free), places[:, best], strict=True)
         }
         return chosen | given
 
@@ -389,13 +373,8 @@ class Sweep:
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
         """All pairs of parameters, those that are coupled most somewhere first."""
-        found = []
-        for i, first in enumerate(self.names):
-            for second in self.names[i + 1 :]:
-                pair = self._pair(first, second)
-                if pair is not None:
-                    found.append(pair)
-        return tuple(sorted(found, key=lambda pair: -abs(pair.strongest)))
+        found = (self._pair(*names) for names in combinations(self.names, 2))
+        return tuple(sorted(filter(None, found), key=lambda pair: -abs(pair.strongest)))
 
     @property
     def coupled(self) -> tuple[Pair, ...]:
@@ -462,7 +441,7 @@ class Sweep:
         return found, where.reshape(self.shape)
 
     def _members(self, flags: BoolArray) -> tuple[str, ...]:
-        return tuple(name for name, there in zip(self.names, flags.tolist(), strict=True) if there)
+        return tuple(compress(self.names, flags))
 
     @cached_property
     def turn(self) -> Turn | None:

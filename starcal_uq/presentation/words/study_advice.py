@@ -29,6 +29,8 @@ from starcal_uq.studies.findings import Curve, Pair, Sweep
 if TYPE_CHECKING:
     from starcal_uq.studies.result import Study
 
+# What nobody chooses; a model is chosen.
+_GIVEN = set(NATURE) - {"distortion"}
 # A price in sigma from which it pays to do something about a coupling.
 _DEAR = 2.0
 # A common rotation that differs by this factor over the sweep is worth a word.
@@ -56,17 +58,12 @@ def _advice_couplings(study: Study) -> list[str]:
     stuck = []
     for pair in sweep.coupled:
         found = pair.decoupling()
-        free = [
-            entry for entry in found if entry[0].axis not in NATURE or entry[0].axis == "distortion"
-        ]
+        free = [cost for size, cost in found if size.axis not in _GIVEN]
         if free:
-            _, cost = free[0]
+            cost = free[0]
             key = cost.axis, cost.values[cost.least], _pays(study, pair, cost)
             best.setdefault(key, []).append(dashed(pair))
-        elif (
-            not found
-            and float(np.exp(max((c.median.min() for c in pair.costs), default=0.0))) >= _DEAR
-        ):
+        elif not found and np.exp(max((c.median.min() for c in pair.costs), default=0.0)) >= _DEAR:
             stuck.append(dashed(pair))
     for (axis, value, pays), names in best.items():
         if not pays:
@@ -97,9 +94,8 @@ def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
     """Whether both sigmas are smaller where the pair is least coupled than where it is most."""
     sweep = study.sweep
     for name in pair.names:
-        sigma = np.where(
-            np.isfinite(correlations(study, pair)), study.values("sigma", parameter=name), np.nan
-        )
+        known = np.isfinite(correlations(study, pair))
+        sigma = np.where(known, study.values("sigma", parameter=name), np.nan)
         curve = sweep.along(sigma, cost.axis)
         if curve is None or curve.median[cost.least] >= curve.median[cost.most]:
             return False
@@ -110,15 +106,13 @@ def _advice_errors(sweep: Sweep) -> list[str]:
     """What is worth most for the attitude error, and what trades against what."""
     effects = [e for e in error_effects(sweep, sweep.frame_error) if e.factor >= HARDLY]
     parts = []
-    numeric = [e for e in effects if not isinstance(e.curve.values[0], str)]
-    if numeric:
-        top = numeric[0]
+    top = next((e for e in effects if not isinstance(e.curve.values[0], str)), None)
+    if top is not None:
+        curve = top.curve
         parts.append(
-            f"For the attitude error, {the(top.curve.axis)} is worth most within this sweep: a "
-            "factor of "
-            f"{significant(top.factor)} between "
-            f"{said(top.curve.axis, top.curve.values[top.curve.most])} and "
-            f"{value_words(top.curve.values[top.curve.least])}."
+            f"For the attitude error, {the(curve.axis)} is worth most within this sweep: a factor "
+            f"of {significant(top.factor)} between {said(curve.axis, curve.values[curve.most])} "
+            f"and {value_words(curve.values[curve.least])}."
         )
     laws = {
         e.curve.axis: e.exponent
@@ -127,24 +121,26 @@ def _advice_errors(sweep: Sweep) -> list[str]:
     }
     deeper = next((_per_magnitude(e.curve) for e in effects if e.curve.axis == "max_mag"), None)
     if deeper is not None and deeper > HARDLY:
-        also = []
-        if laws.get("frames"):
-            also.append(f"{significant(deeper ** (-1.0 / laws['frames']))} times the frames")
-        if laws.get("sigma_px"):
-            also.append(f"noise {significant(deeper ** (1.0 / laws['sigma_px']))} times smaller")
+        also = [
+            words.format(significant(deeper ** (side / laws[axis])))
+            for axis, side, words in (
+                ("frames", -1.0, "{} times the frames"),
+                ("sigma_px", 1.0, "noise {} times smaller"),
+            )
+            if laws.get(axis)
+        ]
         same = f", as much as {join_words(also)}" if also else ""
         parts.append(
             "One magnitude more in the limit divides the attitude error by "
             f"{significant(deeper)}{same}."
         )
-    worth = []
-    for axis, law in laws.items():
-        if laws.get("frames") and axis != "frames" and abs(law) > 0.2:
-            more = "half" if law > 0.0 else "twice"
-            worth.append(
-                f"{more} the {axis_name(axis)} is worth "
-                f"{significant(2.0 ** (-abs(law) / laws['frames']))} times"
-            )
+    per_frame = laws.pop("frames", None)
+    worth = [
+        f"{'half' if law > 0.0 else 'twice'} the {axis_name(axis)} is worth "
+        f"{significant(2.0 ** (-abs(law) / per_frame))} times"
+        for axis, law in laws.items()
+        if per_frame and abs(law) > 0.2
+    ]
     if worth:
         parts.append(
             f"{capital(join_words(worth))} the frames: they do the same to the attitude error."
@@ -186,24 +182,20 @@ def _advice_target(study: Study) -> str:
     if "frames" not in sweep.axes:
         return ""
     # What the lens is, nobody chooses: the target is to be met whatever it is.
-    given = [i for i, axis in enumerate(sweep.axes) if axis in NATURE]
-    worst = np.max(sweep.over(sweep.frame_error), axis=tuple(given), keepdims=True)
-    met = np.broadcast_to(worst <= target, sweep.shape).ravel()
-    whatever = (
-        f", whatever {join_words([the(sweep.axes[i]) for i in given])} of this sweep"
-        if given
-        else ""
-    )
-    if not met.any():
-        return (
-            f"No place of this sweep keeps {target:g} arcsec{whatever}: take more frames."
-            if given
-            else ""
-        )
-    frames = np.array([sweep.at(i)["frames"] for i in range(len(met))], dtype=np.float64)
-    fewest = met & (frames == frames[met].min())
+    given = [axis for axis in sweep.axes if axis in NATURE]
+    position = tuple(map(sweep.axes.index, given))
+    worst = np.max(sweep.over(sweep.frame_error), axis=position, keepdims=True)
+    errors = np.broadcast_to(worst, sweep.shape).ravel()
+    kept = errors <= target
+    whatever = f", whatever {join_words(list(map(the, given)))} of this sweep" if given else ""
+    if not kept.any():
+        if not given:
+            return ""
+        return f"No place of this sweep keeps {target:g} arcsec{whatever}: take more frames."
+    frames = np.array([sweep.at(i)["frames"] for i in range(len(kept))], dtype=np.float64)
+    fewest = kept & (frames == frames[kept].min())
     # Of those, the one with most to spare.
-    errors = np.where(fewest, np.broadcast_to(worst, sweep.shape).ravel(), np.inf)
+    errors = np.where(fewest, errors, np.inf)
     best = int(np.argmin(errors))
     at = place({axis: value for axis, value in sweep.at(best).items() if axis not in NATURE})
     return (
