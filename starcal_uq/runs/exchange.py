@@ -73,9 +73,9 @@ def export(
         raise RunFolderError(f"{to!r} is no format: use one of {', '.join(FORMATS)}.")
     if isinstance(what, str | os.PathLike):
         what = Run(what) if os.path.isdir(what) or not os.path.exists(what) else Camera.load(what)
-    name, run = "camera", what if isinstance(what, Run) else None
+    name, run = "camera", None
     if isinstance(what, Run):
-        name, what = what.name, what.best
+        name, run, what = what.name, what, what.best
     place = Path(f"{name}-{to}{FORMATS[to]}" if path is None else path)
     if to in CAMERA_FORMATS:
         return export_camera(

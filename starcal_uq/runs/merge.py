@@ -23,7 +23,7 @@ from starcal_uq.estimation.merging import (
 )
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.likelihood.compressed import optimum
-from starcal_uq.observations.repeats import shared
+from starcal_uq.observations.repeats import Fingerprints, shared
 from starcal_uq.observations.table import Observations, joined_columns
 from starcal_uq.runs.run import Run
 
@@ -179,15 +179,14 @@ def _check_disjoint(columns: AnyDict, tables: Sequence[Observations], names: Seq
     _, group = np.unique(rows, axis=0, return_inverse=True)
     group = group.reshape(-1)
     order = np.lexsort((owner, group))
-    shared = (np.diff(group[order]) == 0) & (np.diff(owner[order]) != 0)
-    if np.any(shared):
-        at = int(np.flatnonzero(shared)[0])
-        first, second = owner[order[at]], owner[order[at + 1]]
+    group, owner = group[order], owner[order]
+    twice = np.flatnonzero((np.diff(group) == 0) & (np.diff(owner) != 0))
+    if len(twice):
+        first, second = owner[twice[0] : twice[0] + 2]
         raise CalibrationError(
-            f"{names[second]}: {int(np.sum(shared))} of its stars are measurements that another "
-            "run holds too (first "
-            f"{names[first]}), which would count twice: leave one of the runs out, or calibrate "
-            "them apart."
+            f"{names[second]}: {len(twice)} of its stars are measurements that another run "
+            f"holds too (first {names[first]}), which would count twice: leave one of the runs "
+            "out, or calibrate them apart."
         )
 
 
@@ -195,17 +194,17 @@ def _drop_shared(
     calibrations: list[Calibration], tables: list[Observations | None], names: Sequence[str]
 ) -> None:
     """Leave the frames that an earlier run holds out of each later run, and calibrate it again."""
+    earlier: list[Fingerprints | None] = []
     for i, (name, table) in enumerate(zip(names, tables, strict=True)):
-        marks = [
-            fingerprints_of(cal, obs)
-            for cal, obs in zip(calibrations[: i + 1], tables, strict=False)
-        ]
-        own = marks.pop()
-        places = [shared(mark, own)[:, 1] for mark in marks if mark is not None and own is not None]
-        repeating = np.unique(np.concatenate(places)) if places else np.empty(0, dtype=np.int64)
-        if not len(repeating):
-            continue
         cal = calibrations[i]
+        own = fingerprints_of(cal, table)
+        places = [np.empty(0, dtype=np.int64)]
+        if own is not None:
+            places += [shared(mark, own)[:, 1] for mark in earlier if mark is not None]
+        repeating = np.unique(np.concatenate(places))
+        if not len(repeating):
+            earlier.append(own)
+            continue
         if len(repeating) == cal.n_frames:
             raise CalibrationError(
                 f"{name}: all of its frames are measurements that earlier runs hold: leave it out."
@@ -213,16 +212,17 @@ def _drop_shared(
         if table is None:
             raise CalibrationError(
                 f"{name}: {len(repeating)} of its frames are measurements that an earlier run "
-                "holds, and it has no "
-                "observations to be calibrated again without them: leave one of the runs out."
+                "holds, and it has no observations to be calibrated again without them: leave "
+                "one of the runs out."
             )
         rest = table.select_frames(np.delete(table.frame_ids, repeating))
-        tables[i] = rest
         noise = cal.provenance.settings.get("noise", "common")
         model = cal.nominal.distortion
-        calibrations[i] = calibrate(
+        again = calibrate(
             rest, cal.nominal, model=model, method=cal.method, noise=noise, duplicates="keep"
         )
+        tables[i], calibrations[i] = rest, again
+        earlier.append(fingerprints_of(again, rest))
 
 
 def _own_observations(run: Run) -> Observations | None:
