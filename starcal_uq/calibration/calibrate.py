@@ -21,12 +21,12 @@ from starcal_uq.core.types import Progress
 from starcal_uq.estimation.assemble import raise_unless_good, with_star_errors
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.fit import fit_composed
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.partitioned import calibrate_partitions
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.robust import with_tail_weights
 from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.loops import kernels
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations

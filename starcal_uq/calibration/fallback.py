@@ -22,7 +22,6 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import join_words, significant
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.undetermined import (
     COMA_MATTERS,
@@ -31,6 +30,7 @@ from starcal_uq.estimation.undetermined import (
     remedy_of,
     what_is_open,
 )
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.table import Observations
 

@@ -22,8 +22,8 @@ from starcal_uq.core.settings import KEYS
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.estimation.noise_model import NoiseModel
     from starcal_uq.estimation.result import Calibration
+    from starcal_uq.likelihood.noise_model import NoiseModel
     from starcal_uq.planning.check import ForecastCheck
     from starcal_uq.planning.design import FrameChoice
     from starcal_uq.planning.plan import Plan

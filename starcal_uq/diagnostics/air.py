@@ -30,8 +30,10 @@ from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.shapes import View, focal_drift, frame_shapes, lens_shapes
 from starcal_uq.diagnostics.stars import StarTest, star_test
-from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, weighed
+from starcal_uq.estimation.noise_model import fit_noise
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood, star_numbers
 from starcal_uq.maths.linear import principal
 from starcal_uq.observations.splits import one_of_each

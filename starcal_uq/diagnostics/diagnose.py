@@ -37,8 +37,8 @@ from starcal_uq.diagnostics.times import (
     unseen_aberration,
 )
 from starcal_uq.estimation.fit import fit
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:

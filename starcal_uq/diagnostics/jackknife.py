@@ -17,8 +17,8 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import FloatArray, Shapes, floats
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.estimation.weights import weighed
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -39,16 +39,11 @@ from starcal_uq.diagnostics.shapes import (
     run_clock,
     shapes,
 )
-from starcal_uq.estimation.noise_model import (
-    NoiseModel,
-    axis_noise,
-    fit_noise,
-    noise_model_of,
-    sigma_ratios,
-    weighed,
-)
+from starcal_uq.estimation.noise_model import axis_noise, fit_noise, sigma_ratios
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.noise_model import NoiseModel, noise_model_of
 from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.likelihood.terms import TermSums
 from starcal_uq.maths.intervals import holm

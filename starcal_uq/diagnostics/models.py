@@ -26,8 +26,8 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.fit import refit
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.inference.arviz import psis
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import student_quantile

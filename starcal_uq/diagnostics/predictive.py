@@ -17,7 +17,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.star_errors import StarLikelihood
 from starcal_uq.maths.linear import scaled_cholesky

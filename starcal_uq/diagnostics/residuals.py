@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.types import BoolArray, FloatArray, floats
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, ResidualMap
+from starcal_uq.estimation.weights import weighed
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration

@@ -24,8 +24,8 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import StarNormals
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_numbers, star_term
 from starcal_uq.likelihood.terms import TermSums

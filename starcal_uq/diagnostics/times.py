@@ -21,7 +21,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR
 from starcal_uq.core.types import FloatArray, StrArray
 from starcal_uq.diagnostics.air import Remainder
-from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.sky.apparent import earth_velocity_km_s
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars

@@ -1,5 +1,4 @@
 from .duplicates import repeated_frames as repeated_frames
 from .merging import consistency_of as consistency_of
 from .merging import merge as merge
-from .noise_model import NoiseModel as NoiseModel
 from .settings import EstimationSettings as EstimationSettings

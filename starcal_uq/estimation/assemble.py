@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -51,25 +51,28 @@ _USUAL_NOISE_PX = 0.1
 _FEWEST_STARS = 5
 
 
+class PairEstimate(NamedTuple):
+    """Estimate from interstar angles."""
+
+    theta: FloatArray  # (p,): px units
+    covariance: FloatArray  # (p, p)
+
+
 def assemble(
     obs: Observations,
     nominal: Camera,
-    method: str,
-    solver: str,
     likelihood: MarginalLikelihood,
     stages: list[Stage],
     status: Status,
-    pair_theta: FloatArray,
-    pair_covariance: FloatArray,
-    *,
-    settings: AnyDict | None = None,
+    pairs: PairEstimate,
+    settings: AnyDict,
 ) -> Calibration:
     """Everything that a calibration tells about the end of its last stage.
 
     The last of `stages` ends in the estimate; one named ``refinement`` is the maximum of
-    `likelihood`. Without it, the covariance of the result is `pair_covariance`, that of the
-    estimate from interstar angles. CalibrationError when there is no estimate that residuals could
-    be taken at.
+    `likelihood`. Without it, the covariance of the result is that of `pairs`, the estimate from
+    interstar angles. `settings` hold ``method`` and ``solver``. CalibrationError when there is no
+    estimate that residuals could be taken at.
     """
     theta = stages[-1].theta
     refined = stages[-1].name == "refinement"
@@ -92,7 +95,7 @@ def assemble(
     names, factors = undetermined(likelihood, theta, normal.matrix, sigma, nominal, status)
     if names:
         status = Status.SINGULAR
-    pair_covariance = pair_covariance * np.outer(factors, factors)
+    pair_covariance = pairs.covariance * np.outer(factors, factors)
     efficient, information = scaled_inverse(normal.matrix) * sigma**2, normal.matrix / sigma**2
     compressed = compress(likelihood, theta, efficient)
     if refined and status.ok:
@@ -113,11 +116,11 @@ def assemble(
         theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     e = np.empty((2, likelihood.frames.n_stars))
     sums, attitudes = likelihood.sums(theta, e)
-    made: AnyDict = {"method": method, "solver": solver, "distortion": nominal.distortion}
+    made = {name: settings[name] for name in ("method", "solver")}
     return Calibration.of(
         nominal,
         KeptFrames.of(obs, likelihood.frames, attitudes.rotations, e, nominal),
-        made | (settings or {}),
+        made | {"distortion": nominal.distortion} | settings,
         theta=theta,
         sigma=sigma,
         dof=dof,
@@ -130,7 +133,7 @@ def assemble(
         information=information,
         rotation_per_theta=np.mean(attitudes.response, axis=2),
         attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
-        pair_theta=pair_theta,
+        pair_theta=pairs.theta,
         pair_covariance=pair_covariance,
         compressed=compressed,
     )

@@ -15,6 +15,7 @@ from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.assemble import (
     IMPLAUSIBLE_NOISE,
+    PairEstimate,
     assemble,
     check_count,
     check_noise,
@@ -23,7 +24,7 @@ from starcal_uq.estimation.assemble import (
     noise_px,
     raise_unless_good,
 )
-from starcal_uq.estimation.noise_model import NoiseModel, Refit, fit_noise, fit_noise_of_tails
+from starcal_uq.estimation.noise_model import Refit, fit_noise, fit_noise_of_tails
 from starcal_uq.estimation.result import Calibration, KeptFrames, check_camera
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
 from starcal_uq.estimation.settings import ITERATIONS, EstimationSettings
@@ -42,6 +43,7 @@ from starcal_uq.estimation.stages import (
 from starcal_uq.estimation.undetermined import EXPLAINED, coma_record, undetermined
 from starcal_uq.likelihood.composite import enough_frames, pair_covariance
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.likelihood.solvers import Last, is_singular
 from starcal_uq.maths.linear import scaled_inverse
@@ -101,13 +103,11 @@ def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSetting
     return assemble(
         obs,
         camera,
-        settings.method,
-        settings.solver,
         likelihood,
         stages,
         status,
-        pair_theta,
-        covariance,
+        PairEstimate(pair_theta, covariance),
+        {"method": settings.method, "solver": settings.solver},
     )
 
 
@@ -261,7 +261,7 @@ def _with_noise_model(
     """How the noise varies, and the calibration with the weights that follow; even noise changes
     nothing.
     """
-    solver, max_iterations = settings.solver, settings.max_iterations
+    max_iterations = settings.max_iterations
     if settings.composed.tails is not None:
         model = _noise_of_tails(obs, calibration, max_iterations)
         if model.varies:
@@ -283,13 +283,11 @@ def _with_noise_model(
         calibration = assemble(
             obs,
             camera,
-            calibration.method,
-            solver,
             likelihood,
             stages,
             status,
-            pair_theta,
-            covariance,
+            PairEstimate(pair_theta, covariance),
+            {"method": calibration.method, "solver": settings.solver},
         )
     return model, calibration
 

@@ -20,29 +20,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.formatting import fixed, significant
-from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.settings import NoiseKind
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.stages import refinement_stage
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.frames import StarFrames
-from starcal_uq.observations.partitions import PartitionedObservations
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from starcal_uq.camera.camera import Camera
     from starcal_uq.observations.table import Observations
 
+from starcal_uq.likelihood.noise_model import QUANTITIES, NoiseModel, log_variance_columns
+
 NOISES = get_args(NoiseKind)
-_QUANTITIES = ("radius", "magnitude")
 _HIGHEST_POWER = 2
 _ROUNDS, _CHOOSING_ROUNDS, _SETTLED = 10, 2, 1e-3
 _NEWTON_STEPS, _LONGEST_STEP, _STEP_SETTLED = 50, 2.0, 1e-8
@@ -52,236 +48,6 @@ _FRAME_LOG_DOF, _FRAME_LOG_DOF_START = (0.0, 9.0), 3.0
 _MOST_CORRELATED = 0.99
 # Residuals that tails exceed with less probability than this are those of wrong stars.
 _WRONG_P = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class NoiseModel:
-    """Variance per axis of a star: ``level_px^2 exp(terms)``, times the factor of its frame, times
-    its stated variance.
-
-    Attributes
-    ----------
-    terms : tuple of str
-        Powers of ``radius`` (distance from the principal point over the half diagonal) and of
-        ``magnitude`` (less the reference) in the log variance, such as ``radius`` and ``radius^2``.
-    coefficients, errors : (q,) array
-        Coefficients of the terms, and their standard errors.
-    level_px : float
-        Noise at radius zero and the reference magnitude, px per axis; a factor where the stars
-        state their noise.
-    multiplies : bool
-        Whether the model multiplies a noise that the stars state.
-    centre_px : (2,) array
-        Principal point, px.
-    corner_px : float
-        Half diagonal, px.
-    radius_range, mag_range : (2,) array
-        Where stars were seen; beyond, the noise is that of the end.
-    mag_reference : float
-        Mean magnitude, which stands for a magnitude that is not known.
-    frame_dof : float or None
-        Degrees of freedom of the inverse chi-square distribution of the frames' variances; None
-        where frames are alike.
-    frame_ids, frame_factors : (K,) array
-        Frames, and the factor of each on the variance; empty where frames are alike, and in a
-        posterior.
-    frame_mean : float
-        Mean of the factors, which stands for frames that were not observed.
-    axis_ratio : float
-        Noise along x over that along y; 1 where they are alike. The variance above is their
-        geometric mean.
-    axis_correlation : float
-        Correlation of the errors of x and y.
-    """
-
-    terms: tuple[str, ...]
-    coefficients: FloatArray
-    errors: FloatArray
-    level_px: float
-    multiplies: bool
-    centre_px: FloatArray
-    corner_px: float
-    radius_range: FloatArray
-    mag_range: FloatArray
-    mag_reference: float
-    frame_dof: float | None
-    frame_ids: IntArray
-    frame_factors: FloatArray
-    frame_mean: float
-    axis_ratio: float = 1.0
-    axis_correlation: float = 0.0
-
-    @property
-    def varies(self) -> bool:
-        """Whether the data ask for more than one noise."""
-        return bool(self.terms) or self.frame_dof is not None or self.axes is not None
-
-    @property
-    def axes(self) -> FloatArray | None:
-        """Covariance (2, 2) of the noise of x and y, of determinant one; None where the axes are
-        alike.
-        """
-        if self.axis_ratio == 1.0 and self.axis_correlation == 0.0:
-            return None
-        matrix = np.array(
-            [
-                [self.axis_ratio, self.axis_correlation],
-                [self.axis_correlation, 1.0 / self.axis_ratio],
-            ]
-        )
-        return np.asarray(matrix / np.sqrt(1.0 - self.axis_correlation**2))
-
-    def __str__(self) -> str:
-        if not self.varies:
-            return "the same for all stars"
-        unit = " times what the stars state" if self.multiplies else " px per axis"
-        middle, edge = (self._noise(r) for r in (0.0, self.radius_range[1]))
-        parts = []
-        if "radius" in self.terms:
-            parts.append(
-                f"{significant(middle)}{unit} in the centre of the field and {significant(edge)} "
-                "at its edge"
-            )
-        if "magnitude" in self.terms:
-            low, high = (float(mag) for mag in self.mag_range)
-            bright, faint = (self._noise(0.0, mag) for mag in (low, high))
-            least, most = sorted(((bright, fixed(low, 1)), (faint, fixed(high, 1))))
-            parts.append(
-                (
-                    f"{significant(most[0] / least[0])} times as much at magnitude {most[1]} as at "
-                    f"{least[1]}"
-                )
-                if parts
-                else f"{significant(bright)}{unit} at magnitude {fixed(low, 1)} and "
-                f"{significant(faint)} at "
-                f"{fixed(high, 1)}"
-            )
-        if self.frame_dof is not None:
-            parts.append("a factor of its own in every frame" + self._frame_words())
-        if self.axis_ratio != 1.0:
-            parts.append(f"{significant(self.axis_ratio)} times as much along x as along y")
-        if self.axis_correlation != 0.0:
-            parts.append(f"a correlation of {fixed(self.axis_correlation, 2)} between x and y")
-        return ", and ".join(filter(None, (", ".join(parts[:-1]), parts[-1])))
-
-    def _frame_words(self) -> str:
-        if not len(self.frame_factors):
-            return ""
-        low, high = np.sqrt(np.quantile(self.frame_factors, (0.05, 0.95)) / self.frame_mean)
-        return f" ({significant(low)} to {significant(high)} in 90 % of them)"
-
-    def _noise(self, radius: float, mag: float | None = None) -> float:
-        x = np.array([self.centre_px[0] + radius * self.corner_px])
-        return float(self.at(x, self.centre_px[1:], None if mag is None else np.array([mag]))[0])
-
-    def to_dataframe(self) -> pd.DataFrame:
-        """One row per term: coefficient of the log variance and its standard error."""
-        import pandas as pd
-
-        columns = {"term": list(self.terms), "coefficient": self.coefficients, "error": self.errors}
-        return pd.DataFrame(columns)
-
-    def at(self, x_px: FloatArray, y_px: FloatArray, mag: FloatArray | None = None) -> FloatArray:
-        """Noise of stars at pixels (n,) with magnitudes (n,), px per axis or a factor; frames
-        apart, their mean.
-        """
-        radius = np.hypot(x_px - self.centre_px[0], y_px - self.centre_px[1]) / self.corner_px
-        centred = np.zeros_like(radius)
-        if mag is not None:
-            centred = np.nan_to_num(np.clip(mag, *self.mag_range) - self.mag_reference)
-        columns = _columns(self.terms, np.clip(radius, *self.radius_range), centred)
-        sigma: FloatArray = (
-            self.level_px * np.sqrt(self.frame_mean) * np.exp(0.5 * (columns @ self.coefficients))
-        )
-        return sigma
-
-    def sigma_px(self, obs: Observations) -> FloatArray:
-        """Noise of every star, (N,) px per axis; frames of a mission get the mean variance of those
-        observed.
-        """
-        stated = obs.unweighted.sigma_px
-        sigma = self.at(obs.x_px, obs.y_px, obs.mag)
-        if len(self.frame_ids) and obs.origin.frames is None:
-            place = np.clip(np.searchsorted(self.frame_ids, obs.frame), 0, len(self.frame_ids) - 1)
-            own = np.where(
-                self.frame_ids[place] == obs.frame, self.frame_factors[place], self.frame_mean
-            )
-            sigma = sigma * np.sqrt(own / self.frame_mean)
-        return sigma if stated is None or not self.multiplies else np.asarray(sigma * stated)
-
-    def record(self, frames: bool = True) -> AnyDict:
-        """The model as plain values, for a provenance, with or without the factors of frames."""
-        kept = (
-            self
-            if frames
-            else replace(self, frame_ids=self.frame_ids[:0], frame_factors=self.frame_factors[:0])
-        )
-        plain: AnyDict = to_plain(kept)
-        return plain
-
-
-def noise_model_of(result: Any) -> NoiseModel | None:
-    """The noise model of a calibration or posterior; None where there is one noise for all."""
-    record = result.provenance.noise_model
-    return None if record is None else from_plain(NoiseModel, record)
-
-
-def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observations:
-    """Observations as a calibration or posterior weighs them: with the noise of its model, if it
-    has one that varies.
-
-    The data and their hash stay what they are, but for repeated frames that a calibration left out.
-    Without a model, weights of another result's are what the table states. Of partitioned
-    observations it is the sample of frames that their calibration has kept. CalibrationError when
-    partitioned observations are not those of the result.
-    """
-    if isinstance(obs, PartitionedObservations):
-        return _sample_of(obs, result)
-    left_out = np.isin(obs.frame, result.provenance.dropped_frames)
-    if left_out.any():
-        obs = obs.select(~left_out)
-    if "tail_weights" not in result.provenance:
-        return _by_noise_model(obs, result)
-    obs = _by_noise_model(obs.unweighted, result)
-    if len(getattr(result, "residuals_px", ())) != len(obs):
-        # Of a mission's stars no tails are known.
-        return obs
-    from starcal_uq.estimation.robust import tail_weighted
-
-    return tail_weighted(obs, result)
-
-
-def _by_noise_model(obs: Observations, result: Any) -> Observations:
-    model = noise_model_of(result)
-    if model is None or not model.varies:
-        return obs if obs.stated_px is None else replace(obs, stated_px=None, noise_axes=None)
-    if model.multiplies and obs.unweighted.sigma_px is None:
-        return obs
-    if obs.stated_px is not None and model.frame_dof is not None and not len(model.frame_ids):
-        # A posterior keeps no factors of frames; the calibration that weighed these does.
-        return obs
-    return obs.weighted(model.sigma_px(obs), model.axes)
-
-
-def _sample_of(obs: PartitionedObservations, result: Any) -> Observations:
-    """The sample of frames that a calibration has kept, read again."""
-    sample = obs.sample()
-    if result.provenance.partitions.get("sample_sha256") != sample.data_hash:
-        raise CalibrationError(
-            f"the calibration was made from other observations than those in {obs.folder}: "
-            "calibrate these first."
-        )
-    return sample
-
-
-def _columns(terms: tuple[str, ...], radius: FloatArray, mag: FloatArray) -> FloatArray:
-    """Columns (n, q) of the log variance."""
-    values = dict(zip(_QUANTITIES, (radius, mag), strict=True))
-    found = [
-        values[name] ** int(power or 1)
-        for name, _, power in (term.partition("^") for term in terms)
-    ]
-    return np.stack(found, axis=-1) if found else np.zeros((len(radius), 0))
 
 
 def star_squares(
@@ -615,12 +381,14 @@ class _Fit:
 
 
 def _design(stars: _Stars, terms: tuple[str, ...]) -> FloatArray:
-    return np.column_stack([np.ones(len(stars.radius)), _columns(terms, stars.radius, stars.mag)])
+    return np.column_stack(
+        [np.ones(len(stars.radius)), log_variance_columns(terms, stars.radius, stars.mag)]
+    )
 
 
 def _chosen(stars: _Stars) -> _Fit:
     """The fit with the best criterion that is reached from even noise by one quantity at a time."""
-    powers, frames = dict.fromkeys(_QUANTITIES, 0), False
+    powers, frames = dict.fromkeys(QUANTITIES, 0), False
     best, n_stars = _fitted(stars, (), False), len(stars.radius)
     while True:
         trials = [

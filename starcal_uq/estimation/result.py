@@ -36,7 +36,7 @@ from starcal_uq.observations.repeats import Fingerprints
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.estimation.noise_model import NoiseModel
+    from starcal_uq.likelihood.noise_model import NoiseModel
     from starcal_uq.observations.frames import StarFrames
     from starcal_uq.observations.table import Observations
 
@@ -337,7 +337,7 @@ class Calibration(Shown, Traced):
     @property
     def noise_model(self) -> NoiseModel | None:
         """How the noise varies, of a calibration with ``noise="model"``; None otherwise."""
-        from starcal_uq.estimation.noise_model import noise_model_of
+        from starcal_uq.likelihood.noise_model import noise_model_of
 
         return noise_model_of(self)
 

@@ -31,7 +31,7 @@ from starcal_uq.core.files import write_netcdf
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
-from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.inference.arviz import to_arviz
 from starcal_uq.inference.posterior import Variables, write_group
 from starcal_uq.likelihood.marginal import MarginalLikelihood

@@ -21,8 +21,8 @@ from starcal_uq.core.settings import Evaluation, LikelihoodName, Moves, bounded,
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress, floats
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.undetermined import open_parameters
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.inference.checks import (
     CompressionCheck,
     chain_order,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 
-_NOTHING = 1e-4
+_NOTHING = 1e-8
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class StarFrames:
 
     @cached_property
     def n_informed(self) -> int:
-        """Number of stars that have a say: a weight is nothing beside one 10,000 times as large."""
+        """Number of stars that have a say: a weight is nothing beside one 1e8 times as large."""
         if self.weight is None:
             return self.n_stars
         return int(np.count_nonzero(self.weight > _NOTHING * np.max(self.weight)))

@@ -18,7 +18,7 @@ import numpy as np
 
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.types import FloatArray, IntArray, floats
-from starcal_uq.estimation.noise_model import NoiseModel
+from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.sums import frame_normals
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes

@@ -41,7 +41,7 @@ from starcal_uq.core.errors import DistortionError, ObservationError, SamplingEr
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.observations.splits import frame_sample
 from starcal_uq.propagation.alignment import alignment_frames as _alignment_frames
 from starcal_uq.propagation.alignment import alignment_weights

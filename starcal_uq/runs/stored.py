@@ -19,8 +19,8 @@ from starcal_uq.core.manifest import entry_of
 from starcal_uq.core.provenance import installed_versions, provenance
 from starcal_uq.core.remedy import RUN, SOME_IMAGES, Remedy
 from starcal_uq.core.types import AnyDict, PathLike
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
 from starcal_uq.runs.folder import FILES, REST_ON, RunFolder

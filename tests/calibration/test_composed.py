@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood import Likelihood, StarDirections, StudentTails
 from tests.helpers.outside import campaign
 

@@ -21,8 +21,8 @@ from starcal_uq.diagnostics.jackknife import Jackknife, accept_inflation, jackkn
 from starcal_uq.diagnostics.models import ModelComparison, closed_form, compare_models
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.verdict.judge import judge
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.runs.folder import DIAGNOSIS_TABLES
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 

@@ -12,9 +12,11 @@ import starcal_uq as sc
 from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.misfit import misfit_tests
 from starcal_uq.diagnostics.verdict.estimate import even_noise
-from starcal_uq.estimation.noise_model import fit_noise, noise_model_of, weighed
+from starcal_uq.estimation.noise_model import fit_noise
 from starcal_uq.estimation.stages import refinement_stage
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.noise_model import noise_model_of
 from tests.helpers.outside import campaign
 
 

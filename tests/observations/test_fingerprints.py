@@ -15,8 +15,8 @@ import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.diagnostics.residuals import normalised_residuals
 from starcal_uq.estimation.merging import consistency_of, merge
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.observations.repeats import Fingerprints, repeats
 from starcal_uq.runs.merge import merge_runs
 from tests.helpers.outside import Campaign, campaign, measured_again

@@ -13,8 +13,8 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.budgeting.shapes import two_axis_radius
 from starcal_uq.core.errors import DistortionError, PlanningError, SettingError
-from starcal_uq.estimation.noise_model import NoiseModel
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning import open_distortion

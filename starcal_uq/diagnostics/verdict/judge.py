@@ -18,7 +18,7 @@ from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
 from starcal_uq.diagnostics.verdict.remedies import INPUT, MOST_COMMANDS, Place, by_cause, telling
-from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.weights import weighed
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.estimation.assemble import assemble, check_count, check_noise, noise_px
+from starcal_uq.estimation.assemble import (
+    PairEstimate,
+    assemble,
+    check_count,
+    check_noise,
+    noise_px,
+)
 from starcal_uq.estimation.stages import optics_stage
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
@@ -63,14 +69,11 @@ def least_squares(
     return assemble(
         obs,
         plain,
-        "least_squares",
-        solver,
         likelihood,
         [stage],
         status,
-        stage.theta,
-        covariance,
-        settings=settings,
+        PairEstimate(stage.theta, covariance),
+        {"method": "least_squares", "solver": solver} | settings,
     )
 
 
@@ -109,14 +112,11 @@ def recursive(
     return assemble(
         obs,
         filtering.nominal,
-        method,
-        "filter",
         likelihood,
         stages,
         status,
-        estimate.theta,
-        estimate.covariance,
-        settings=filtering.settings(estimate, stream=False),
+        PairEstimate(estimate.theta, estimate.covariance),
+        filtering.settings(estimate, stream=False),
     )
 
 

@@ -10,8 +10,8 @@ from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import check_new_folder, write_csv
 from starcal_uq.core.types import Progress
-from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 from starcal_uq.runs.folder import HISTORY
