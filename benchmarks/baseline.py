@@ -36,7 +36,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from benchmarks.baseline_facts import Cleaner, Facts, files, read  # noqa: E402
+from benchmarks.baseline_facts import NUMBER, Cleaner, Facts, files, read  # noqa: E402
 from benchmarks.baseline_jobs import JOBS, Job  # noqa: E402
 
 RECORD = "job.json"
@@ -208,8 +208,8 @@ def compare_files(before: Facts, after: Facts, tolerance: float) -> Iterator[tup
         yield True, f"another kind: {name}"
     for name in before.words:
         if name in after.words and before.words[name] != after.words[name]:
-            for line in changed(before.words[name], after.words[name]):
-                yield True, line if name == "lines" else f"{name}: {line}"
+            for counts, line in changed(before.words[name], after.words[name], tolerance):
+                yield counts, line if name == "lines" else f"{name}: {line}"
 
 
 def alone(names: Set[str], others: Set[str]) -> list[str]:
@@ -224,8 +224,10 @@ def alone(names: Set[str], others: Set[str]) -> list[str]:
     return sorted(found)
 
 
-def changed(before: list[str], after: list[str]) -> Iterator[str]:
-    """Lines that vanished (-) and appeared (+), in their order."""
+def changed(
+    before: list[str], after: list[str], tolerance: float = 0.0
+) -> Iterator[tuple[bool, str]]:
+    """Lines that vanished (-) and appeared (+), in their order, and whether they count."""
     matcher = difflib.SequenceMatcher(None, before, after, autojunk=False)
     for kind, i, j, k, m in matcher.get_opcodes():
         if kind == "equal":
@@ -234,11 +236,23 @@ def changed(before: list[str], after: list[str]) -> Iterator[str]:
             old = before[i + n] if i + n < j else None
             new = after[k + n] if k + n < m else None
             start = _apart(old, new)
-            yield from (
-                f"{sign} {_cut(line, start)}"
-                for sign, line in (("-", old), ("+", new))
-                if line is not None
-            )
+            counts = not _near(old, new, tolerance)
+            for sign, line in (("-", old), ("+", new)):
+                if line is not None:
+                    yield counts, f"{sign} {_cut(line, start)}"
+
+
+def _near(old: str | None, new: str | None, tolerance: float) -> bool:
+    """Whether two lines have the same words, and numbers that are as near as the tolerance."""
+    if not tolerance or old is None or new is None:
+        return False
+    if re.sub(NUMBER, "#", old) != re.sub(NUMBER, "#", new):
+        return False
+    a, b = (
+        np.array([float(number.replace("−", "-")) for number in re.findall(NUMBER, line)])
+        for line in (old, new)
+    )
+    return bool(np.all(np.abs(a - b) <= tolerance * np.max(np.abs(a), initial=0.0)))
 
 
 def _apart(old: str | None, new: str | None) -> int:

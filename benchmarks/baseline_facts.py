@@ -59,6 +59,7 @@ VOLATILE = (
         r"\1<spent>",
     ),
     Volatile("seconds that a step took", key=r"(^|/)(milli)?seconds$"),
+    Volatile("hash of a file, which is compared itself", key=r"(^|/)archive_sha256$"),
     Volatile("hash of cells, which hold their seconds", file=r"(?<=part-)[0-9a-f]{16}"),
     Volatile("versions of packages", key=r"(^|/)versions(/|$)"),
     Volatile(
@@ -305,6 +306,13 @@ NUMBER = r"(?<![\w.#])[-−+]?\d+\.?\d*(?:[eE][-+]?\d+)?"
 
 def drawing(text: str) -> Facts:
     """An SVG: everything but its numbers, and its numbers."""
+    # Names of parts are hashes of their numbers.
+    names = {
+        name: f"part{n}"
+        for n, name in enumerate(dict.fromkeys(re.findall(r"id=['\"]([a-zA-Z][0-9a-f]{10})", text)))
+    }
+    if names:
+        text = re.sub("|".join(names), lambda found: names[found[0]], text)
     number = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?(?![0-9a-f]{6,})")
     lines = text.replace("><", ">\n<").splitlines()
     # Text stays as it is: a label with another number is another label.

@@ -124,3 +124,14 @@ def test_a_job_is_made_and_compared_with_itself(tmp_path, monkeypatch, capsys):
     assert "hello" in (tmp_path / "one/terminal/01-python.txt").read_text("utf-8")
     monkeypatch.setattr(baseline, "JOBS", (job,))
     assert baseline.main(["compare", str(tmp_path), str(tmp_path)]) == 0
+
+
+def test_numbers_in_a_sentence_may_differ_by_rounding_and_its_words_may_not():
+    before = ["f is 3.000000000000001 px"]
+    for after, within in (
+        ("f is 3.000000000000004 px", True),
+        ("f is 3.1 px", False),
+        ("g is 3.000000000000001 px", False),
+    ):
+        assert {counts for counts, _ in baseline.changed(before, [after], 1e-12)} == {not within}
+        assert {counts for counts, _ in baseline.changed(before, [after])} == {True}
