@@ -419,6 +419,13 @@ class StoredRun:
             vars(self).pop(name, None)
 
 
+def save_results(files: RunFolder, **results: Any) -> None:
+    """Save each result in the file of its name; None where there is none."""
+    for name, result in results.items():
+        if result is not None:
+            result.save(getattr(files, name))
+
+
 # What is read when it is first asked for.
 LOADED = tuple(
     name for name, value in vars(StoredRun).items() if isinstance(value, cached_property)

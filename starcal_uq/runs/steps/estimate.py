@@ -15,7 +15,7 @@ from starcal_uq.estimation.weights import weighed
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 from starcal_uq.runs.folder import HISTORY
-from starcal_uq.runs.stored import LOADED, StoredRun, writing
+from starcal_uq.runs.stored import LOADED, StoredRun, save_results, writing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -137,13 +137,18 @@ def write(
 
     Whatever the run has written before goes.
     """
+    table = None
+    if obs is not None:
+        obs = weighed(obs, calibration)
+        table = obs.unweighted
     with run._step("calibrate", None, calibration.provenance.settings) as files:
-        if obs is not None:
-            obs = weighed(obs, calibration)
-            obs.unweighted.save(files.observations)
-        calibration.nominal.save(files.camera)
-        calibration.camera.save(files.calibrated)
-        calibration.save(files.calibration)
+        save_results(
+            files,
+            observations=table,
+            camera=calibration.nominal,
+            calibrated=calibration.camera,
+            calibration=calibration,
+        )
         if screened is not None:
             screened.save_rejected(files.rejected)
         if history is not None:

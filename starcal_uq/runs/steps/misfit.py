@@ -11,7 +11,7 @@ from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.observations.files import arrow_values
 from starcal_uq.observations.table import Observations
 from starcal_uq.runs.folder import DIAGNOSIS_TABLES
-from starcal_uq.runs.stored import StoredRun, writing
+from starcal_uq.runs.stored import StoredRun, save_results, writing
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -48,9 +48,7 @@ def diagnose(run: StoredRun, /, *, force: bool = False, **options: Any) -> Diagn
             part = getattr(diagnosis, name)
             if part is not None:
                 write_csv(part.to_dataframe(), files.path / file_name)
-        diagnosis.save(files.diagnosis)
-        if found is not None:
-            found.save(files.attitude)
+        save_results(files, diagnosis=diagnosis, attitude=found)
     run._forget("diagnosis")
     if found is not None:
         # As the file holds it, without its frames.

@@ -13,7 +13,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import PathLike
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.runs.steps.misfit import with_misfit
-from starcal_uq.runs.stored import StoredRun, writing
+from starcal_uq.runs.stored import StoredRun, save_results, writing
 
 if TYPE_CHECKING:
     from starcal_uq.core.settings import Scalar, Sense
@@ -163,15 +163,15 @@ def propagate(
         "alignment_frames": alignment_frames,
     }
     with run._step("propagate", seed, settings) as files:
-        # A diagnosis of later is carried to the same frames.
-        if sky is not None:
-            frames.save(files.mission)
-        if error.aligned is not None:
-            error.aligned.save(files.alignment)
-        error.save(files.attitude)
-        fields.save(files.field_map)
-        if spectrum is not None:
-            spectrum.save(files.spectrum)
+        save_results(
+            files,
+            # A diagnosis of later is carried to the same frames.
+            mission=None if sky is None else frames,
+            alignment=error.aligned,
+            attitude=error,
+            field_map=fields,
+            spectrum=spectrum,
+        )
     # The file of the attitude error holds less than the result, and a report shows what is in
     # the file.
     run._forget("attitude", "spectrum")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from starcal_uq.core.files import write_csv
 from starcal_uq.core.types import Progress
 from starcal_uq.runs.folder import CHECKPOINT, remove_checkpoints
-from starcal_uq.runs.stored import StoredRun, writing
+from starcal_uq.runs.stored import StoredRun, save_results, writing
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -38,8 +38,7 @@ def sample(
     posterior = sample(obs, run.calibration, progress=progress, checkpoint=checkpoint, **options)
     made = posterior.provenance
     with run._step("sample", made.seed, made.settings) as files:
-        posterior.save(files.posterior)
-        posterior.calibrated_camera.save(files.calibrated)
+        save_results(files, posterior=posterior, calibrated=posterior.calibrated_camera)
     remove_checkpoints(run.folder.path)
     run._forget("coupling", "attitude", "field_map", "spectrum")
     run.posterior = posterior
