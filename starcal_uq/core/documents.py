@@ -183,8 +183,9 @@ def part_of(record: type) -> Part:
         said |= dict.fromkeys(names.split(", "), " ".join(text.split()).removesuffix("."))
     hints = get_type_hints(record)
     written = getattr(record, "WRITTEN_AS", {})
-    names = [written.get(field.name, field.name) for field in fields(record)]
-    names = [*getattr(record, "DOCUMENTED", ()), *names]
+    names = [*getattr(record, "DOCUMENTED", ())]
+    for field in fields(record):
+        names += written.get(field.name, (field.name,))
     for name in set(names) - hints.keys():
         getter = getattr(record, name).fget
         said[name] = _first_paragraph(getter).removesuffix(".")

@@ -86,16 +86,60 @@ class Question(Enum):
     REQUIRED = "required"
 
 
+class Code(Enum):
+    """What a check asks: its title, and the question that it helps to answer."""
+
+    ESTIMATION = "Estimation", Question.CONVERGED
+    MODEL_THAT_THE_DATA_DETERMINE = "Model that the data determine", Question.TRUSTWORTHY
+    TWO_ESTIMATORS = "Two estimators", Question.CONVERGED
+    OTHER_STARTS = "Other starts", Question.CONVERGED
+    DATA_OF_THE_POSTERIOR = "Data of the posterior", Question.CONVERGED
+    R_HAT = "R-hat", Question.CONVERGED
+    EFFECTIVE_DRAWS = "Effective draws", Question.CONVERGED
+    ACCEPTANCE = "Acceptance", Question.CONVERGED
+    DERIVED_QUANTITIES = "Derived quantities", Question.CONVERGED
+    DIGITS = "Digits", Question.CONVERGED
+    DEGREES_OF_FREEDOM = "Degrees of freedom", Question.CONVERGED
+    BOUNDS = "Bounds", Question.CONVERGED
+    INDEPENDENT_POSTERIOR = "Independent posterior", Question.TRUSTWORTHY
+    LIKELIHOOD = "Likelihood", Question.TRUSTWORTHY
+    KIND_OF_LIKELIHOOD = "Kind of likelihood", Question.TRUSTWORTHY
+    METHOD_OF_THE_CALIBRATION = "Method of the calibration", Question.TRUSTWORTHY
+    INFLUENCE_OF_THE_PRIORS = "Influence of the priors", Question.TRUSTWORTHY
+    CATALOGUE_DIRECTIONS = "Catalogue directions", Question.TRUSTWORTHY
+    PATTERN_IN_THE_RESIDUALS = "Pattern in the residuals", Question.TRUSTWORTHY
+    OUTLIERS = "Outliers", Question.TRUSTWORTHY
+    SCREENING = "Screening", Question.TRUSTWORTHY
+    FACTOR_ON_THE_STATED_NOISE = "Factor on the stated noise", Question.TRUSTWORTHY
+    FACTOR_ON_THE_FITTED_NOISE = "Factor on the fitted noise", Question.TRUSTWORTHY
+    CENTROID_NOISE_PER_AXIS = "Centroid noise per axis", Question.TRUSTWORTHY
+    NOISE_OF_THE_FILES = "Noise of the files", Question.TRUSTWORTHY
+    TERMS_OF_THE_DISTORTION = "Terms of the distortion", Question.TRUSTWORTHY
+    COVERAGE_OF_THE_FIELD = "Coverage of the field", Question.TRUSTWORTHY
+    UNEXPLAINED_STRUCTURE = "Unexplained structure", Question.TRUSTWORTHY
+    EVENNESS_OF_THE_NOISE = "Evenness of the noise", Question.TRUSTWORTHY
+    ONE_CAMERA = "One camera", Question.TRUSTWORTHY
+    JACKKNIFE_OVER_FRAMES = "Jackknife over frames", Question.TRUSTWORTHY
+    ERRORS_OF_THE_STARS = "Errors of the stars", Question.TRUSTWORTHY
+    DISTORTION_MODEL = "Distortion model", Question.TRUSTWORTHY
+    POSTERIOR_PREDICTIVE_CHECK = "Posterior predictive check", Question.TRUSTWORTHY
+    PROPAGATION_TO_ATTITUDE = "Propagation to attitude", Question.TRUSTWORTHY
+    KNOWN_TRUTH = "Known truth", Question.TRUSTWORTHY
+    REQUIREMENT = "Requirement", Question.REQUIRED  # Of a budget, by its name
+
+
+# Codes by their titles.
+CODES = {code.value[0]: code for code in Code}
+
+
 @dataclass(frozen=True)
 class Check:
     """One check: what was measured, what was asked for, and what follows.
 
     Attributes
     ----------
-    name : str
-        Short name.
-    question : Question
-        Question that it helps to answer.
+    code : Code
+        What it asks.
     level : Level
         Outcome.
     value : str
@@ -109,19 +153,31 @@ class Check:
     advice : str
         What to do with the instrument or the data, an order: before the command, or where none
         helps; else empty. Of a check that did not pass, remedy and advice are never both empty.
+    title : str
+        Name of what has one of its own, such as a requirement; else empty.
     """
 
     DOCUMENTED: ClassVar = ("key",)
-    WRITTEN_AS: ClassVar = {"remedies": "remedy"}
+    WRITTEN_AS: ClassVar = {"code": ("name", "question"), "remedies": ("remedy",), "title": ()}
 
-    name: str
-    question: Question
+    code: Code
     level: Level
     value: str
     bound: str
     sentence: str
     remedies: Remedies = ()
     advice: str = ""
+    title: str = ""
+
+    @property
+    def name(self) -> str:
+        """Short name."""
+        return self.title or self.code.value[0]
+
+    @property
+    def question(self) -> Question:
+        """Question that it helps to answer."""
+        return self.code.value[1]
 
     @property
     def ways(self) -> tuple[tuple[str, bool], ...]:

@@ -27,8 +27,8 @@ from starcal_uq.core.formatting import (
 from starcal_uq.core.remedy import MORE, PLAN, RUN, Remedies, Remedy, with_model
 from starcal_uq.core.status import (
     Check,
+    Code,
     Level,
-    Question,
     pass_or_fail,
     pass_or_warn,
 )
@@ -289,7 +289,7 @@ def _rhat(post: Posterior) -> Check:
         else f"The {post.n_ensembles} separately seeded ensembles sampled the same distribution."
     )
     return _sampling(
-        post, "R-hat", not bad, fixed(float(np.max(values)), 4), f"< {RHAT_BOUND}", sentence
+        post, Code.R_HAT, not bad, fixed(float(np.max(values)), 4), f"< {RHAT_BOUND}", sentence
     )
 
 
@@ -309,7 +309,7 @@ def _effective_draws(post: Posterior) -> Check:
     value = f"{count(int(np.min(bulk)))} bulk, {count(int(np.min(tail)))} tail"
     longer = ESS_BOUND / float(np.min(fewest))
     return _sampling(
-        post, "Effective draws", not bad, value, f"> {ESS_BOUND:g} each", sentence, longer
+        post, Code.EFFECTIVE_DRAWS, not bad, value, f"> {ESS_BOUND:g} each", sentence, longer
     )
 
 
@@ -329,9 +329,7 @@ def _acceptance(post: Posterior) -> Check:
     value = f"{fixed(float(np.min(rates)), 2)} to {fixed(float(np.max(rates)), 2)}"
     remedies = () if good else resample(post, moves="stretch", n_steps=10 * post.n_steps)
     level = pass_or_fail(good)
-    return Check(
-        "Acceptance", Question.CONVERGED, level, value, f"{low:g} to {high:g}", sentence, remedies
-    )
+    return Check(Code.ACCEPTANCE, level, value, f"{low:g} to {high:g}", sentence, remedies)
 
 
 def _derived(post: Posterior, derived: Sequence[Derived]) -> Check:
@@ -348,7 +346,7 @@ def _derived(post: Posterior, derived: Sequence[Derived]) -> Check:
         if late
         else "Focal length, displacement at the corner and common rotation have converged too."
     )
-    return _converged(post, "Derived quantities", rhat, ess, sentence)
+    return _converged(post, Code.DERIVED_QUANTITIES, rhat, ess, sentence)
 
 
 def _digits(post: Posterior) -> Check:
@@ -374,7 +372,7 @@ def _digits(post: Posterior) -> Check:
     )
     value = f"{fixed(largest, 2)} units of the last digit ({worst})"
     remedies = () if good else _longer(post, largest**2)
-    return Check("Digits", Question.CONVERGED, pass_or_warn(good), value, "≤ 1", sentence, remedies)
+    return Check(Code.DIGITS, pass_or_warn(good), value, "≤ 1", sentence, remedies)
 
 
 def _degrees_of_freedom(post: Posterior) -> Check | None:
@@ -388,7 +386,7 @@ def _degrees_of_freedom(post: Posterior) -> Check | None:
     sentence = f"dof has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
     return _converged(
         post,
-        "Degrees of freedom",
+        Code.DEGREES_OF_FREEDOM,
         arviz_compat.rhat(values),
         arviz_compat.ess_bulk(values),
         sentence,
@@ -432,9 +430,7 @@ def _bounds(post: Posterior) -> Check:
         advice = MORE
     value = f"nearest bound {significant(float(np.min(room)))} sigma away"
     bound = f"≤ {percent(_BOUNDS_SHARE, 1)} of draws outside"
-    return Check(
-        "Bounds", Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedies, advice
-    )
+    return Check(Code.BOUNDS, pass_or_fail(good), value, bound, sentence, remedies, advice)
 
 
 def _independent(post: Posterior) -> Check:
@@ -474,9 +470,7 @@ def _independent(post: Posterior) -> Check:
     elif not agree:
         remedies = _longer(post)
     level = pass_or_fail(light and agree)
-    return Check(
-        "Independent posterior", Question.TRUSTWORTHY, level, value, bound, sentence, remedies
-    )
+    return Check(Code.INDEPENDENT_POSTERIOR, level, value, bound, sentence, remedies)
 
 
 def _evaluation(post: Posterior) -> Check | None:
@@ -523,9 +517,7 @@ def _evaluation(post: Posterior) -> Check | None:
         level, remedies = Level.FAIL, resample(post, evaluation="exact")
         sentence = "The fast likelihood departs from the exact one: sample the exact one."
     bound = f"≤ {COMPRESSED_BOUND:g} nat, ≤ {KHAT_BOUND:g}"
-    return Check(
-        "Likelihood", Question.TRUSTWORTHY, level, value, bound, sentence, remedies, advice
-    )
+    return Check(Code.LIKELIHOOD, level, value, bound, sentence, remedies, advice)
 
 
 def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
@@ -543,8 +535,7 @@ def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
     remedies = () if good else resample(post, likelihood="pairs")
     level = pass_or_fail(good)
     return Check(
-        "Kind of likelihood",
-        Question.TRUSTWORTHY,
+        Code.KIND_OF_LIKELIHOOD,
         level,
         kind,
         "not 'pairs_naive'",
@@ -579,8 +570,7 @@ def _priors(post: Posterior) -> Check:
     level = pass_or_warn(not limited and not pulled)
     bound = f"≤ {percent(_PRIOR_SHARE)}"
     return Check(
-        "Influence of the priors",
-        Question.TRUSTWORTHY,
+        Code.INFLUENCE_OF_THE_PRIORS,
         level,
         value,
         bound,
@@ -602,19 +592,19 @@ def _names(post: Posterior, which: BoolArray) -> list[str]:
     return [post.parameter_names[i] for i, flag in zip(post.sampled, which, strict=True) if flag]
 
 
-def _converged(post: Posterior, name: str, rhat: float, ess: float, sentence: str) -> Check:
+def _converged(post: Posterior, code: Code, rhat: float, ess: float, sentence: str) -> Check:
     value, bound = (
         f"R-hat {fixed(rhat, 4)}, {count(int(ess))} draws",
         f"< {RHAT_BOUND}, > {ESS_BOUND:g}",
     )
     return _sampling(
-        post, name, rhat < RHAT_BOUND and ess > ESS_BOUND, value, bound, sentence, ESS_BOUND / ess
+        post, code, rhat < RHAT_BOUND and ess > ESS_BOUND, value, bound, sentence, ESS_BOUND / ess
     )
 
 
 def _sampling(
     post: Posterior,
-    name: str,
+    code: Code,
     good: bool,
     value: str,
     bound: str,
@@ -622,7 +612,7 @@ def _sampling(
     longer: float = 1.0,
 ) -> Check:
     remedies = () if good else _longer(post, longer)
-    return Check(name, Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedies)
+    return Check(code, pass_or_fail(good), value, bound, sentence, remedies)
 
 
 def _longer(post: Posterior, factor: float = 1.0) -> Remedies:

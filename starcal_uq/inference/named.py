@@ -21,8 +21,8 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import SamplingError, check_known
 from starcal_uq.core.remedy import calibrated
 from starcal_uq.core.settings import Evaluation, LikelihoodName
-from starcal_uq.core.status import Check, Level, Question
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.status import Check, Code, Level
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
 from starcal_uq.likelihood.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
@@ -134,8 +134,7 @@ def find_source(
         "method='efficient'."
     )
     check = Check(
-        "Method of the calibration",
-        Question.TRUSTWORTHY,
+        Code.METHOD_OF_THE_CALIBRATION,
         Level.FAIL,
         cal.method,
         "one that fits the distortion",

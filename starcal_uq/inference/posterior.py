@@ -23,7 +23,7 @@ from starcal_uq.core.provenance import Provenance, Traced, in_order
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy, read_remedies
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.status import Check, Level, worst
+from starcal_uq.core.status import CODES, Check, Level, worst
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Shapes
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 
@@ -515,8 +515,9 @@ class Posterior(Shown, Traced):
                     if name in file.variables
                 }
             for check in record["diagnostics"]["checks"]:
-                # Files of earlier versions have them as text.
+                # Files of earlier versions have titles and commands.
                 if "remedy" in check:
+                    check["code"] = CODES[check["name"]].name
                     check["remedies"] = to_plain(read_remedies(check["remedy"]))
             made = from_plain(cls, record, arrays)
             if made.n_ensembles * made.n_walkers * made.n_steps != len(made.draws):

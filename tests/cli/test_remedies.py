@@ -20,7 +20,7 @@ import starcal_uq as sc
 from starcal_uq.calibration.cameras import MixedCameras
 from starcal_uq.cli.commands import app
 from starcal_uq.core import remedy
-from starcal_uq.core.status import Level, Status
+from starcal_uq.core.status import Code, Level, Status
 from starcal_uq.diagnostics.diagnose import MultiStart
 from starcal_uq.diagnostics.times import TimeTest
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
@@ -33,6 +33,7 @@ from tests.helpers.scenes import observations
 
 PACKAGE = Path(sc.__file__).parent
 TIME = "2026-11-25T02:00:00"
+DOCUMENTED = "docs/explanation/misfit.md"
 SHORT = {"n_ensembles": 2, "n_walkers": 14, "n_steps": 20}
 
 
@@ -414,14 +415,17 @@ def remedies(small):
     """All remedies, each once."""
     small.jackknife = sc.diagnostics.jackknife_frames(small.obs, small.cal)
     small.drifting = small.post.draws.copy()
+    small.codes = set()
     small.drifting[: len(small.drifting) // 2] += small.post.sd
     found = {}
     for name, make in EXAMPLES.items():
         doubts = [check for check in make(small) if check.level is not Level.PASS]
         assert doubts, f"{name} found no fault"
         for check in doubts:
+            small.codes.add(check.code)
             # Something to try: a command, a call, or an order of what to do with instrument or
             # data.
+            assert re.fullmatch(r"[A-Z].*\.", check.sentence), check.sentence
             assert check.remedies or check.advice, f"{name} gives nothing to try: {check}"
             assert not check.advice or re.fullmatch(r"[A-Z].*\.", check.advice), check.advice
             typed = any(remedy.command for remedy in check.remedies)
@@ -460,6 +464,17 @@ def execute(small, cli, tmp_path):
         assert status in (0, 1) and "error:" not in err, (command, out, err)
 
     return run
+
+
+def test_every_check_has_a_sentence_a_remedy_and_a_place_in_the_documentation(
+    small, remedies, root
+):
+    # Requirements have the names and the words of a budget: tests/cli/test_cli_mission.py.
+    assert small.codes == set(Code) - {Code.REQUIREMENT}
+    rows = re.findall(r"^\| ([^|]*) \|", (root / DOCUMENTED).read_text(encoding="utf-8"), re.M)
+    assert [code.value[0] for code in Code if code.value[0] not in rows] == []
+    # Control: the title of no check is in no row.
+    assert "Requirements" not in rows
 
 
 def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):

@@ -15,7 +15,7 @@ import starcal_uq as sc
 from starcal_uq.cli import console
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.remedy import RUN, SITE, Near, Remedy, calibrated, identified
-from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.status import Check, Code, Level, worst
 from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN
 from starcal_uq.diagnostics.verdict.remedies import Place, Tried
@@ -119,8 +119,7 @@ def test_every_reader_shows_the_same_checks(short, disputed, monkeypatch, tmp_pa
 
 def test_checks_are_data():
     check = Check(
-        "R-hat",
-        Question.CONVERGED,
+        Code.R_HAT,
         Level.FAIL,
         "1.2",
         "< 1.01",
@@ -148,7 +147,7 @@ def test_numbers_are_judged_with_their_monte_carlo_error(short):
 
 
 def test_what_a_run_was_made_with_is_no_remedy():
-    asked = Check("A", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Uneven.", NOISE + ROBUST)
+    asked = Check(Code.EVENNESS_OF_THE_NOISE, Level.WARN, "9", "0", "Uneven.", NOISE + ROBUST)
     words = ("run", "obs.csv", "camera.toml", "--noise")
     plain = ("--method", "least_squares")
     found = Place("r", (*words, "model", *plain)).exact(asked)
@@ -177,7 +176,7 @@ def test_remedies_name_the_files_of_the_run():
     """By the command that made the run where there was one, else by what the run holds; calls in
     Python stay.
     """
-    check = Check("Outliers", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Wrong stars.", SCREEN)
+    check = Check(Code.OUTLIERS, Level.WARN, "9", "0", "Wrong stars.", SCREEN)
     made = Place(
         "/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--noise", "model")
     ).exact(check)

@@ -12,7 +12,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
-from starcal_uq.core.status import Check, Level, Question
+from starcal_uq.core.status import Check, Code, Level, Question
 from starcal_uq.diagnostics.diagnose import diagnose
 from starcal_uq.diagnostics.models import REJECT_P
 from starcal_uq.diagnostics.pattern import Pattern
@@ -85,7 +85,12 @@ def test_a_good_run_passes_every_check(run):
 )
 def test_a_requirement_of_the_budget_is_part_of_the_verdict(run, level, words):
     required = Check(
-        "Requirement 'R-1'", Question.REQUIRED, level, "2 arcsec", "at most 1 arcsec", "It is so."
+        Code.REQUIREMENT,
+        level,
+        "2 arcsec",
+        "at most 1 arcsec",
+        "It is so.",
+        title="Requirement 'R-1'",
     )
     verdict = judge(run.obs, run.cal, run.post, run.truth, requirements=[required])
     assert verdict.level is level and verdict.level.exit_status == (level is Level.FAIL)

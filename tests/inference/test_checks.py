@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starcal_uq.core.remedy import PLAN, read_remedies, with_model
-from starcal_uq.core.status import Check, Level, Question
+from starcal_uq.core.status import Check, Code, Level
 from starcal_uq.inference import checks
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.posterior import Derived, Posterior
@@ -189,7 +189,7 @@ def test_sampling_again_keeps_the_settings(post: Posterior) -> None:
 def test_remedies_that_were_written_as_text_are_read(post: Posterior) -> None:
     own = checks.resample(post, likelihood="gaussian")
     for remedies in (checks.resample(post, n_steps=900), own, with_model("k1") + PLAN, PLAN, ()):
-        bad = Check("A", Question.CONVERGED, Level.FAIL, "1", "0", "Bad.", remedies)
+        bad = Check(Code.BOUNDS, Level.FAIL, "1", "0", "Bad.", remedies)
         assert read_remedies(bad.remedy) == remedies
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from starcal_uq.core.formatting import percent
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.status import Check, Question, pass_or_fail, pass_or_warn
+from starcal_uq.core.status import Check, Code, pass_or_fail, pass_or_warn
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -33,8 +33,7 @@ def same_data(post: Posterior, data_hash: str) -> Check:
     bound = f"{data_hash[:12]}…"
     remedies = () if good else (Remedy("sample", (RUN,), {"force": True}),)
     return Check(
-        "Data of the posterior",
-        Question.CONVERGED,
+        Code.DATA_OF_THE_POSTERIOR,
         pass_or_fail(good),
         value,
         bound,
@@ -62,8 +61,7 @@ def propagation(error: AttitudeError) -> Check:
     remedies = () if good else (Remedy("propagate", (RUN,), more, form="command"),)
     level = pass_or_warn(good)
     return Check(
-        "Propagation to attitude",
-        Question.TRUSTWORTHY,
+        Code.PROPAGATION_TO_ATTITUDE,
         level,
         value,
         f"≤ {percent(bound)}",

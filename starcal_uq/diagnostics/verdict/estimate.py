@@ -12,8 +12,8 @@ from starcal_uq.core.formatting import count, fixed, join_words, p_words, plural
 from starcal_uq.core.remedy import CAMERA, PLAN, Remedies, Remedy, calibrated, with_model
 from starcal_uq.core.status import (
     Check,
+    Code,
     Level,
-    Question,
     Status,
     pass_or_fail,
     pass_or_warn,
@@ -92,9 +92,7 @@ def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
         # Sampling refuses priors that do not determine what the data leave open.
         level, said = Level.WARN, what_is_open(cal.undetermined)
         sentence = f"{said[0].upper()}{said[1:]}: there the posterior is that of the priors."
-    return Check(
-        "Estimation", Question.CONVERGED, level, words, "converged", sentence, remedies, advice
-    )
+    return Check(Code.ESTIMATION, level, words, "converged", sentence, remedies, advice)
 
 
 def determined(cal: Calibration) -> Check | None:
@@ -110,8 +108,7 @@ def determined(cal: Calibration) -> Check | None:
         return None
     # To ask for what was fitted would determine nothing.
     return Check(
-        "Model that the data determine",
-        Question.TRUSTWORTHY,
+        Code.MODEL_THAT_THE_DATA_DETERMINE,
         Level.WARN,
         value,
         bound,
@@ -143,8 +140,7 @@ def estimators_agree(cal: Calibration) -> Check | None:
     value = f"{fixed(largest, 1)} sigma ({name})"
     remedies = () if good else SCREEN
     return Check(
-        "Two estimators",
-        Question.CONVERGED,
+        Code.TWO_ESTIMATORS,
         level,
         value,
         f"< {fixed(limit, 1)} sigma",
@@ -174,7 +170,7 @@ def against_truth(cal: Calibration, truth: Camera, post: Posterior | None = None
     value = f"largest |z| {fixed(largest, 1)} ({name})"
     level, bound = pass_or_fail(good), f"< {fixed(limit, 1)}"
     remedies = () if good else (Remedy("validate", (CAMERA,), form="command"),)
-    return Check("Known truth", Question.TRUSTWORTHY, level, value, bound, sentence, remedies)
+    return Check(Code.KNOWN_TRUTH, level, value, bound, sentence, remedies)
 
 
 def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> FloatArray:
@@ -228,8 +224,7 @@ def one_camera(found: MixedCameras) -> Check:
     remedies = calibrated("command", frames=found.frames)
     sentence = f"{found.words[0].upper()}{found.words[1:]}."
     return Check(
-        "One camera",
-        Question.TRUSTWORTHY,
+        Code.ONE_CAMERA,
         Level.FAIL,
         f"{found.n} cameras",
         "1",
@@ -252,7 +247,7 @@ def misfit(
     """Is there structure in the residuals, and does it do more than is stated? `better` as for
     `lens_remedy`.
     """
-    name, bound = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
+    name, bound = Code.UNEXPLAINED_STRUCTURE, f"p ≥ {MISFIT_P:g}"
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
     value = (
         f"{p_words(min(patterns, default=1.0))}, corrected for {plural(len(found.tests), 'test')}"
@@ -262,7 +257,7 @@ def misfit(
         sentence = (
             "The residuals show no structure beyond noise, in any of the ways that were looked for."
         )
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
+        return Check(name, Level.PASS, value, bound, sentence)
     words = []
     for test in rejected[:3]:
         size = "" if np.isnan(test.size_px) else f", {significant(test.size_px)} px"
@@ -280,7 +275,7 @@ def misfit(
     advice = _NOT_OF_THE_LENS.get(rejected[0].against, _OF_FRAMES)
     if any(t.against in IN_FIELD for t in rejected):
         remedies, advice = lens_remedy(cal.camera.distortion, better)
-    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedies, advice)
+    return Check(name, level, value, bound, sentence, remedies, advice)
 
 
 def _hardly_told(test: MisfitTest) -> str:
@@ -300,31 +295,31 @@ def even_noise(found: Misfit, inflated: bool = False) -> Check:
     """Is the noise what the weights of the stars say?"""
     tests = [test for test in found.tests if test.is_of_noise]
     rejected = [test for test in found.found(MISFIT_P) if test.is_of_noise]
-    name, bound = "Evenness of the noise", f"p ≥ {MISFIT_P:g}"
+    name, bound = Code.EVENNESS_OF_THE_NOISE, f"p ≥ {MISFIT_P:g}"
     value = p_words(min((test.p_holm for test in tests), default=1.0))
     if not rejected:
         sentence = (
             "The noise does not change with radius, magnitude, time, frame or axis beyond what "
             "the weights know of it."
         )
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
+        return Check(name, Level.PASS, value, bound, sentence)
     changes = f"The residuals hold {join_words([test.name for test in rejected])}"
     if found.uneven is None and inflated:
         sentence = (
             f"{changes}, which the weights of the stars do not know; the accepted inflation "
             "holds it."
         )
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
+        return Check(name, Level.PASS, value, bound, sentence)
     if found.uneven is None:
         sentence = (
             f"{changes}, which the weights of the stars do not know: the stated sigmas may be "
             "wrong."
         )
-        return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, _INFLATE)
+        return Check(name, Level.WARN, value, bound, sentence, _INFLATE)
     uneven = found.uneven
     if not uneven.model.varies:
         sentence = f"{changes}, too little of it to change a stated sigma."
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
+        return Check(name, Level.PASS, value, bound, sentence)
     of_attitude = (
         "" if uneven.model.axes is None else " and the attitude noise of each axis is another"
     )
@@ -336,7 +331,7 @@ def even_noise(found: Misfit, inflated: bool = False) -> Check:
         "weights the estimate "
         "itself would be more precise."
     )
-    return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, NOISE)
+    return Check(name, Level.WARN, value, bound, sentence, NOISE)
 
 
 def sensitivity(diagnosis: Diagnosis) -> str:
@@ -400,9 +395,7 @@ def jackknife(found: Jackknife, inflated: bool = False, post: Posterior | None =
     else:
         sentence = "Frames scatter as the formal errors say."
     level = pass_or_warn(not remedies)
-    return Check(
-        "Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedies
-    )
+    return Check(Code.JACKKNIFE_OVER_FRAMES, level, value, bound, sentence, remedies)
 
 
 def _resample(post: Posterior) -> Remedies:
@@ -421,7 +414,7 @@ STAR_REMEDY = calibrated(star_errors=True)
 
 def stars(found: StarTest) -> Check:
     """Do stars bring errors of their own along?"""
-    name, bound = "Errors of the stars", f"p ≥ {STAR_P:g}"
+    name, bound = Code.ERRORS_OF_THE_STARS, f"p ≥ {STAR_P:g}"
     if found.included_px > PLAUSIBLE_NOISE_PX[1]:
         # What is wrong with the directions or the lens looks like this where all frames show one
         # field.
@@ -432,10 +425,10 @@ def stars(found: StarTest) -> Check:
             "hidden by it."
         )
         advice = "Leave --star-errors out (star_errors=False), and see which checks then fail."
-        return Check(name, Question.TRUSTWORTHY, Level.FAIL, value, bound, sentence, advice=advice)
+        return Check(name, Level.FAIL, value, bound, sentence, advice=advice)
     if not found.applicable:
         value = "too few stars recur"
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, star_sentence(found))
+        return Check(name, Level.PASS, value, bound, star_sentence(found))
     widest = int(np.argmax(found.widening))
     ratio = float(found.widening[widest])
     value = (
@@ -443,16 +436,16 @@ def stars(found: StarTest) -> Check:
         f"({found.parameter_names[widest]})"
     )
     if found.p_value >= STAR_P:
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, star_sentence(found))
+        return Check(name, Level.PASS, value, bound, star_sentence(found))
     if found.included_px > 0.0:
         value, bound = (
             f"{significant(found.included_px)} ± {significant(found.included_px_std)} px",
             "in the intervals",
         )
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, star_sentence(found))
+        return Check(name, Level.PASS, value, bound, star_sentence(found))
     added = Effect(found.parameter_names[widest], float(np.sqrt(max(ratio**2 - 1.0, 0.0))))
     level = added.level if found.p_value < STAR_FAIL_P else Level.WARN
-    return Check(name, Question.TRUSTWORTHY, level, value, bound, star_sentence(found), STAR_REMEDY)
+    return Check(name, level, value, bound, star_sentence(found), STAR_REMEDY)
 
 
 def star_sentence(found: StarTest) -> str:
@@ -510,9 +503,7 @@ def comparison(models: ModelComparison, attitude: AttitudeError | None = None) -
         effect = largest([bent, *on_attitudes(attitude)])
         level, remedies = effect.level, with_model(models.better)
         sentence = f"{sentence} {effect}"
-    return Check(
-        "Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", sentence, remedies
-    )
+    return Check(Code.DISTORTION_MODEL, level, value, "not rejected", sentence, remedies)
 
 
 def models_sentence(models: ModelComparison) -> str:
@@ -572,9 +563,9 @@ def predictive(found: PredictiveCheck) -> Check:
         sentence = (
             "Data made by the model have the same spread, tails and patterns as the measured ones."
         )
-    name = "Posterior predictive check"
+    name = Code.POSTERIOR_PREDICTIVE_CHECK
     level, remedies = pass_or_warn(not extreme), ROBUST if extreme else ()
-    return Check(name, Question.TRUSTWORTHY, level, value, "0.001 to 0.999", sentence, remedies)
+    return Check(name, level, value, "0.001 to 0.999", sentence, remedies)
 
 
 def starts(found: MultiStart) -> Check:
@@ -605,8 +596,7 @@ def starts(found: MultiStart) -> Check:
             "Starts scattered around the nominal camera all lead to this optimum.",
         )
     return Check(
-        "Other starts",
-        Question.CONVERGED,
+        Code.OTHER_STARTS,
         level,
         value,
         "all at the same optimum",

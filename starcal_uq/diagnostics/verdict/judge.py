@@ -51,7 +51,7 @@ class Verdict(Shown):
     """
 
     DOCUMENTED: ClassVar = ("level",)
-    WRITTEN_AS: ClassVar = {"to_try": "commands"}
+    WRITTEN_AS: ClassVar = {"to_try": ("commands",)}
 
     checks: tuple[Check, ...]
     headline: str

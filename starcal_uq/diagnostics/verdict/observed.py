@@ -22,8 +22,8 @@ from starcal_uq.core.remedy import (
 )
 from starcal_uq.core.status import (
     Check,
+    Code,
     Level,
-    Question,
     pass_or_warn,
 )
 from starcal_uq.core.times import TIMES_IN_NAMES
@@ -76,7 +76,7 @@ def directions(
     rests on.
     """
     declared = obs.origin.directions
-    name, bound = "Catalogue directions", "apparent"
+    name, bound = Code.CATALOGUE_DIRECTIONS, "apparent"
     seen = air(obs)
     wrong = [] if times is None else [_time_words(obs, times)]
     if found is not None and found.is_air:
@@ -100,7 +100,6 @@ def directions(
         level = Level.WARN if small else Level.FAIL
         return Check(
             name,
-            Question.TRUSTWORTHY,
             level,
             "; ".join(values),
             bound,
@@ -118,7 +117,6 @@ def directions(
         sentence = " ".join(filter(None, words))
         return Check(
             name,
-            Question.TRUSTWORTHY,
             Level.WARN,
             "without refraction",
             bound,
@@ -135,14 +133,14 @@ def directions(
                 "in the directions."
             )
         sentence = f"{sentence} {rests}".rstrip()
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, bound, sentence)
+        return Check(name, Level.PASS, declared, bound, sentence)
     sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
     time = _time_of(obs) if obs.origin.from_images else {}
     remedies = _again(obs, **(time or {"directions": "apparent"}))
     if seen == "unknown":
         sentence = f"{sentence} {_unsure(cal, found)} {REMEDY}"
         remedies += _about_air(obs)
-    return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedies)
+    return Check(name, Level.WARN, declared, bound, sentence, remedies)
 
 
 def rests_on_aberration(obs: Observations, found: UnseenAberration | None) -> str:
@@ -319,8 +317,8 @@ def residual_pattern(obs: Observations, cal: Calibration, better: str | None = N
     advice = ""
     if level is not Level.PASS:
         remedies, advice = lens_remedy(cal.camera.distortion, better)
-    name, bound = "Pattern in the residuals", f"p ≥ {PATTERN_P:g}"
-    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedies, advice)
+    name, bound = Code.PATTERN_IN_THE_RESIDUALS, f"p ≥ {PATTERN_P:g}"
+    return Check(name, level, value, bound, sentence, remedies, advice)
 
 
 def lens_remedy(fitted: str, better: str | None = None) -> tuple[Remedies, str]:
@@ -366,9 +364,7 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     value = f"{plural(found, 'star')} beyond {OUTLIER_SIGMA:g} sigma"
     bound = f"about {significant(expected)} expected"
     remedies = () if good else SCREEN
-    return Check(
-        "Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedies
-    )
+    return Check(Code.OUTLIERS, pass_or_warn(good), value, bound, sentence, remedies)
 
 
 def screening(obs: Observations) -> Check | None:
@@ -380,8 +376,7 @@ def screening(obs: Observations) -> Check | None:
     sentence, remedies = str(record["blame"]), calibrated("command", noise="model")
     sentence = sentence[0].upper() + sentence[1:]
     return Check(
-        "Screening",
-        Question.TRUSTWORTHY,
+        Code.SCREENING,
         Level.WARN,
         value,
         "wrong stars alone",
@@ -423,15 +418,13 @@ def noise(obs: Observations, cal: Calibration) -> Check:
         )
     if not good and scaled and fitted is None and (unlike := _stated_unit(obs, cal)):
         (sentence, advice), remedies = unlike, ()
-    name = (
-        f"Factor on the {'stated' if fitted is None else 'fitted'} noise"
-        if scaled
-        else "Centroid noise per axis"
-    )
+    name = Code.CENTROID_NOISE_PER_AXIS
+    if scaled:
+        name = Code.FACTOR_ON_THE_STATED_NOISE
+        if fitted is not None:
+            name = Code.FACTOR_ON_THE_FITTED_NOISE
     bound = f"{low:g} to {high:g}{unit}"
-    return Check(
-        name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedies, advice
-    )
+    return Check(name, pass_or_warn(good), value, bound, sentence, remedies, advice)
 
 
 def _stated_unit(obs: Observations, cal: Calibration) -> tuple[str, str] | None:
@@ -486,15 +479,17 @@ def partitions(cal: Calibration) -> Check | None:
         if good
         else f"The files scatter unequally ({place})."
     )
-    value, bound, name = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}", "Noise of the files"
+    value, bound, name = (
+        f"p = {significant(p_value)}",
+        f"p ≥ {PATTERN_P:g}",
+        Code.NOISE_OF_THE_FILES,
+    )
     advice = (
         ""
         if good
         else "Look for what changed in that file, or calibrate each by itself and compare the runs."
     )
-    return Check(
-        name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, advice=advice
-    )
+    return Check(name, pass_or_warn(good), value, bound, sentence, advice=advice)
 
 
 def terms(cal: Calibration) -> Check | None:
@@ -519,8 +514,7 @@ def terms(cal: Calibration) -> Check | None:
     value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
     remedies = () if good else calibrated("command", model=name)
     return Check(
-        "Terms of the distortion",
-        Question.TRUSTWORTHY,
+        Code.TERMS_OF_THE_DISTORTION,
         pass_or_warn(good),
         value,
         bound,
@@ -554,8 +548,7 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
         )
         remedies, advice = (), ""
     return Check(
-        "Coverage of the field",
-        Question.TRUSTWORTHY,
+        Code.COVERAGE_OF_THE_FIELD,
         level,
         value,
         bound,

@@ -22,7 +22,7 @@ from starcal_uq.core.conflicts import (
 )
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, SITE, SOME_IMAGES, UTC, Near, Remedies, Remedy
-from starcal_uq.core.status import Check, Level
+from starcal_uq.core.status import Check, Code, Level
 from starcal_uq.core.types import AnyDict
 
 MOST_COMMANDS = 3
@@ -45,25 +45,25 @@ _TELLING = {
     NUMERICS: "more frames, spread over the sky",
 }
 _CAUSES = {
-    "catalogue_directions": INPUT,
-    "one_camera": INPUT,
-    "screening": INPUT,
-    "outliers": INPUT,
-    "data_of_the_posterior": INPUT,
-    "noise_of_the_files": INPUT,
-    "pattern_in_the_residuals": LENS,
-    "unexplained_structure": LENS,
-    "distortion_model": LENS,
-    "terms_of_the_distortion": LENS,
-    "model_that_the_data_determine": LENS,
-    "two_estimators": NUMERICS,
-    "evenness_of_the_noise": NOISE,
-    "jackknife_over_frames": NOISE,
-    "errors_of_the_stars": NOISE,
-    "posterior_predictive_check": NOISE,
-    "centroid_noise_per_axis": NOISE,
-    "factor_on_the_stated_noise": NOISE,
-    "factor_on_the_fitted_noise": NOISE,
+    Code.CATALOGUE_DIRECTIONS: INPUT,
+    Code.ONE_CAMERA: INPUT,
+    Code.SCREENING: INPUT,
+    Code.OUTLIERS: INPUT,
+    Code.DATA_OF_THE_POSTERIOR: INPUT,
+    Code.NOISE_OF_THE_FILES: INPUT,
+    Code.PATTERN_IN_THE_RESIDUALS: LENS,
+    Code.UNEXPLAINED_STRUCTURE: LENS,
+    Code.DISTORTION_MODEL: LENS,
+    Code.TERMS_OF_THE_DISTORTION: LENS,
+    Code.MODEL_THAT_THE_DATA_DETERMINE: LENS,
+    Code.TWO_ESTIMATORS: NUMERICS,
+    Code.EVENNESS_OF_THE_NOISE: NOISE,
+    Code.JACKKNIFE_OVER_FRAMES: NOISE,
+    Code.ERRORS_OF_THE_STARS: NOISE,
+    Code.POSTERIOR_PREDICTIVE_CHECK: NOISE,
+    Code.CENTROID_NOISE_PER_AXIS: NOISE,
+    Code.FACTOR_ON_THE_STATED_NOISE: NOISE,
+    Code.FACTOR_ON_THE_FITTED_NOISE: NOISE,
 }
 _OF_OPTIONS = {
     INPUT: {"site", "in_space", "directions", "time", "frames", "screening"},
@@ -104,8 +104,8 @@ def cause_of(check: Check) -> str:
     """What a check that did not pass points to: the input, the lens, the noise, or the
     computation.
     """
-    if check.key in _CAUSES:
-        return _CAUSES[check.key]
+    if check.code in _CAUSES:
+        return _CAUSES[check.code]
     steps = [step for one in check.remedies for step in one.steps or (one,)]
     asked = {name for step in steps for name in step.arguments}
     return next((cause for cause, options in _OF_OPTIONS.items() if options & asked), NUMERICS)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.formatting import count, join_words
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.status import Check, Code, Level, Question, worst
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.presentation.html import template_environment
@@ -117,7 +117,8 @@ def context(results: Results) -> AnyDict:
         else tables.weak_directions(results.coupling),
         "diagnostics_table": None if post is None else tables.diagnostics_table(post),
         "agreement": next(
-            (check.value for check in verdict.checks if check.name == "Independent posterior"), ""
+            (check.value for check in verdict.checks if check.code is Code.INDEPENDENT_POSTERIOR),
+            "",
         ),
         "methods_rows": tables.methods_rows(results),
         "derived_table": None if post is None else model_tables.derived_table(post),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
+from starcal_uq.core.status import Code
 from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corrected_words
@@ -190,38 +191,38 @@ def attitude_sentence(results: Results) -> str:
 _ASSUMPTIONS = (
     (
         "Centroid errors are Gaussian, with the noise that is stated.",
-        ("Outliers", "Posterior predictive check"),
+        (Code.OUTLIERS, Code.POSTERIOR_PREDICTIVE_CHECK),
     ),
     (
         "The noise is the same over field, magnitude and time, or stated star by star.",
-        ("Evenness of the noise",),
+        (Code.EVENNESS_OF_THE_NOISE,),
     ),
     (
         "Stars of one frame share no error but the attitude (motion, refraction, temperature).",
-        ("Jackknife over frames", "Unexplained structure"),
+        (Code.JACKKNIFE_OVER_FRAMES, Code.UNEXPLAINED_STRUCTURE),
     ),
     (
         "A star brings no error along (catalogue position and motion, blend, colour).",
-        ("Errors of the stars",),
+        (Code.ERRORS_OF_THE_STARS,),
     ),
     (
         "Directions are those that the camera saw: aberration, and refraction in air.",
-        ("Catalogue directions",),
+        (Code.CATALOGUE_DIRECTIONS,),
     ),
     (
         "The lens follows the distortion model, the same in all frames.",
-        ("Pattern in the residuals", "Unexplained structure", "Distortion model"),
+        (Code.PATTERN_IN_THE_RESIDUALS, Code.UNEXPLAINED_STRUCTURE, Code.DISTORTION_MODEL),
     ),
-    ("Every star is the one that it is said to be.", ("Outliers", "Two estimators")),
+    ("Every star is the one that it is said to be.", (Code.OUTLIERS, Code.TWO_ESTIMATORS)),
 )
 
 
 def assumption_rows(verdict: Verdict) -> list[AnyDict]:
     """What is assumed, with the outcome of the checks that were made for it."""
-    made = {check.name: check for check in verdict.checks}
+    made = {check.code: check for check in verdict.checks}
     return [
-        {"assumed": words, "checks": [made[n] for n in names if n in made]}
-        for words, names in _ASSUMPTIONS
+        {"assumed": words, "checks": [made[code] for code in codes if code in made]}
+        for words, codes in _ASSUMPTIONS
     ]
 
 

@@ -14,7 +14,7 @@ from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
-from starcal_uq.core.status import Check, Level, Question
+from starcal_uq.core.status import Check, Code, Level
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
@@ -370,13 +370,13 @@ def _requirement_check(outcome: Outcome) -> Check:
     asked, total = outcome.requirement, outcome.total
     reached = outcome.least_arcsec if outcome.level is Level.FAIL else outcome.bound_arcsec
     return Check(
-        name=f"Requirement {asked.name!r}",
-        question=Question.REQUIRED,
+        Code.REQUIREMENT,
         level=outcome.level,
         value=NOT_RESOLVED if outcome.unresolved else f"{bound(reached, total.at_least)} arcsec",
         bound=f"at most {significant(asked.limit_arcsec, 3)} arcsec",
         sentence=outcome_text(outcome),
         advice=_requirement_advice(outcome),
+        title=f"Requirement {asked.name!r}",
     )
 
 
