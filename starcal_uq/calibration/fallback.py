@@ -78,12 +78,14 @@ def fit_determined(
             used = simpler.camera.distortion
             if asked:
                 raise CalibrationError(
-                    f"the calibration failed ({status.name}): {remedy_of(status, names)}; "
-                    f"{used!r} converges "
-                    f"(--model {used}, or model={used!r} in Python).",
+                    f"the calibration failed ({status.name})",
                     status,
                     names,
                     found,
+                    reason=(
+                        f"{remedy_of(status, names)}; {used!r} converges (--model {used}, or "
+                        f"model={used!r} in Python)"
+                    ),
                 ) from failure
             return _conditional(simpler, camera.distortion, status, names)
     if failure is not None:

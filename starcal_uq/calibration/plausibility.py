@@ -123,7 +123,7 @@ def explanation(
         obs = _head(obs)
     sentence = None if obs is None else find_reason(obs, camera, error.status, screened=screened)
     if sentence is not None:
-        return CalibrationError(f"{str(error).partition(':')[0]}: {sentence}.", error.status)
+        return CalibrationError(error.outcome, error.status, reason=sentence)
     return None
 
 
@@ -235,16 +235,16 @@ def _two_slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
     for text, other in _units(table):
         second, both = _mirrored(other, camera)
         yield f"{text}; and {second}", both
-        for more, again in _units(table):
+        for more, again in _units(table, ra_too=True):
             if other.dec is table.dec and again.ra is table.ra:
-                second = more.replace(", ra_deg does not", "")
                 yield (
-                    f"{text}; and {second}",
+                    f"{text}; and {more}",
                     _Table(table.pixel, other.ra, again.dec, table.starts),
                 )
 
 
-def _units(table: _Table) -> Iterator[tuple[str, _Table]]:
+def _units(table: _Table, *, ra_too: bool = False) -> Iterator[tuple[str, _Table]]:
+    """Slips of units; `ra_too` where dec_deg is not the only column with one."""
     ra, dec, starts = table.ra, table.dec, table.starts
     in_degrees = np.degrees
     if ra.max() <= 24.0:
@@ -264,8 +264,8 @@ def _units(table: _Table) -> Iterator[tuple[str, _Table]]:
         yield text, _Table(table.pixel, in_degrees(ra), dec, starts)
     if np.abs(dec).max() <= 0.5 * np.pi < ra.max():
         text = (
-            f"dec_deg looks like radians (up to {np.abs(dec).max():.3g}), ra_deg does not: "
-            "multiply it by 180/pi"
+            f"dec_deg looks like radians (up to {np.abs(dec).max():.3g})"
+            f"{'' if ra_too else ', ra_deg does not'}: multiply it by 180/pi"
         )
         yield text, _Table(table.pixel, ra, in_degrees(dec), starts)
     if ra.max() <= 90.0:

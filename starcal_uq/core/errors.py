@@ -122,7 +122,8 @@ class CalibrationError(StarcalError):
     """The estimate was not found; `status` says why and what to do, `undetermined` names what the
     data leave open.
 
-    `calibration` is what was found, where it has residuals to look at.
+    `calibration` is what was found, where it has residuals to look at. The message is the `outcome`,
+    and after it the reason or what to do, where that is given.
     """
 
     def __init__(
@@ -131,9 +132,11 @@ class CalibrationError(StarcalError):
         status: Status | None = None,
         undetermined: Sequence[str] = (),
         calibration: Any = None,
+        *,
+        reason: str = "",
     ) -> None:
-        super().__init__(message)
-        self.status = status
+        super().__init__(f"{message}: {reason}." if reason else message)
+        self.outcome, self.status = message, status
         self.undetermined = tuple(undetermined)
         self.calibration = calibration
 

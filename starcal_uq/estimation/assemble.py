@@ -155,7 +155,7 @@ def failed(
     names = min(filter(None, found), key=len, default=())
     status = Status.SINGULAR if names else status
     return CalibrationError(
-        f"the calibration failed ({status.name}): {remedy_of(status, names)}.", status, names
+        f"the calibration failed ({status.name})", status, names, reason=remedy_of(status, names)
     )
 
 
@@ -267,10 +267,9 @@ def check_count(likelihood: MarginalLikelihood, camera: Camera) -> None:
     if likelihood.dof <= p:
         raise CalibrationError(
             f"{frames.n_stars} stars in {frames.n_frames} frames give {likelihood.dof} "
-            f"independent numbers for {p} "
-            "parameters and the noise: add stars or frames, or choose a distortion model with "
-            "fewer coefficients.",
+            f"independent numbers for {p} parameters and the noise",
             Status.SINGULAR,
+            reason="add stars or frames, or choose a distortion model with fewer coefficients",
         )
 
 
@@ -279,5 +278,6 @@ def raise_unless_good(
 ) -> None:
     """Raise the `CalibrationError` of a status that is not CONVERGED."""
     if not status.ok:
-        message = f"the calibration did not end well ({status.name}): {remedy or status.remedy}."
-        raise CalibrationError(message, status, calibration=calibration)
+        outcome = f"the calibration did not end well ({status.name})"
+        reason = remedy or status.remedy
+        raise CalibrationError(outcome, status, calibration=calibration, reason=reason)

@@ -134,13 +134,15 @@ def star_residuals(
     in_use = in_use & rows
     if not active.any():
         raise CalibrationError(
-            "no frame is left with three stars that agree: " + Status.INCONSISTENT.remedy + "."
+            "no frame is left with three stars that agree", reason=Status.INCONSISTENT.remedy
         )
     likelihood = MarginalLikelihood(frames.select(in_use), model_name)
     state, cost = likelihood.profile(theta)
     if not np.isfinite(cost):
         raise CalibrationError(
-            f"the stars in use fit no attitude: {Status.INCONSISTENT.remedy}.", Status.INCONSISTENT
+            "the stars in use fit no attitude",
+            Status.INCONSISTENT,
+            reason=Status.INCONSISTENT.remedy,
         )
     seen = frames.select(rows)
     t, residual, offset = _compare(likelihood, state, seen, theta, in_use[rows])

@@ -282,7 +282,9 @@ def calibrate_partitions(
             if np.isfinite(normal.cost)
             else Status.NOT_FINITE
         )
-        raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
+        raise CalibrationError(
+            f"the calibration failed ({reason.name})", reason, reason=reason.remedy
+        )
     whitening = scaled_cholesky(scaled_inverse(normal.matrix) * normal.cost / dof)
     for _ in range(max_iterations):
         gram = total(partial(_gram, reader, model, theta, whitening), sum_of)

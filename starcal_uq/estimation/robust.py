@@ -137,20 +137,15 @@ def robust_start(
         if used.n_stars < _TRUSTED_SHARE * frames.n_stars:
             raise CalibrationError(
                 f"only {used.n_stars} of {frames.n_stars} stars agree with the others of their "
-                "frame: "
-                f"{Status.INCONSISTENT.remedy}.",
+                "frame",
                 Status.INCONSISTENT,
+                reason=Status.INCONSISTENT.remedy,
             )
         stages = fit(used, round_ >= _OPTICS_ROUNDS)
         at = stages[-1].theta
-        if not stages[-1].status.ok:
-            raise CalibrationError(
-                (
-                    f"the calibration did not end well ({stages[-1].status.name}): "
-                    f"{stages[-1].status.remedy}."
-                ),
-                stages[-1].status,
-            )
+        if not (status := stages[-1].status).ok:
+            outcome = f"the calibration did not end well ({status.name})"
+            raise CalibrationError(outcome, status, reason=status.remedy)
     weight = np.where(trusted | ~_in_threes(frames, trusted), 1.0, _NEGLIGIBLE_WEIGHT)
     if frames.weight is not None:
         weight = weight * frames.weight**2

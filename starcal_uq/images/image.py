@@ -88,6 +88,8 @@ class Image:
     mosaic : {"", "RGGB", "BGGR", "GRBG", "GBRG"}
         Colours of the 2 x 2 pixels in the first corner, row by row, where each pixel sees one
         colour; empty where all see the same.
+    of_colours : bool
+        Whether each pixel was put together from several colours in reading.
     """
 
     data: np.ndarray[Any, Any]
@@ -99,6 +101,7 @@ class Image:
     gain_e_per_count: float | None = None
     messages: tuple[str, ...] = ()
     mosaic: str = ""
+    of_colours: bool = False
 
     def __post_init__(self) -> None:
         data = np.asarray(self.data)
@@ -142,7 +145,7 @@ class Image:
         """
         if bayer is None:
             return self
-        if any(message.endswith(COLOURS_WORDS) for message in self.messages):
+        if self.of_colours:
             raise ImageError(
                 f"{self._label}: the colours of its mosaic were put together before; leave out "
                 "bayer."
@@ -428,7 +431,8 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> l
             # What is said of the file is said with its first frame.
             said = words if not found else []
             said = [f"{path.name}: {text}" for text in (*said, *(notes if number == 0 else []))]
-            found.append(_fits_image(path, name, plane, header, unit, said, (number, len(frames))))
+            image = _fits_image(path, name, plane, header, unit, said, (number, len(frames)))
+            found.append(replace(image, of_colours=COLOURS_WORDS in notes))
     return found
 
 
@@ -708,6 +712,7 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
                 saturation=saturation,
                 header={} if picture is None else exif_of(picture),
                 messages=tuple(messages),
+                of_colours=COLOURS_WORDS in notes,
             )
         )
     return found

@@ -252,18 +252,24 @@ EXAMPLES = {
     "diagnostics.verdict.observed.residual_pattern": lambda s: [
         observed.residual_pattern(s.bent, sc.calibrate(s.bent, s.sheet, model="none"))
     ],
-    "diagnostics.verdict.observed.noise": lambda s: [
-        observed.noise(
-            dataclasses.replace(s.obs, sigma_px=np.full(s.obs.n_stars, stated)),
-            dataclasses.replace(s.cal, **noise),
-        )
-        for stated, noise in (
-            (0.05, {"sigma": 9.0}),
-            (0.05, {"sigma": 1e-4}),
-            (0.05, {"sigma": 0.2, "sigma_name": "sigma_scale"}),
-            (1.0, {"sigma": s.cal.camera.focal_px / 206265.0, "sigma_name": "sigma_scale"}),
-        )
-    ],
+    "diagnostics.verdict.observed.noise": lambda s: (
+        [
+            observed.noise(
+                dataclasses.replace(s.obs, sigma_px=np.full(s.obs.n_stars, stated)),
+                dataclasses.replace(s.cal, **noise),
+            )
+            for stated, noise in (
+                (0.05, {"sigma": 9.0}),
+                (0.05, {"sigma": 1e-4}),
+                (0.05, {"sigma": 0.2, "sigma_name": "sigma_scale"}),
+                (1.0, {"sigma": s.cal.camera.focal_px / 206265.0, "sigma_name": "sigma_scale"}),
+            )
+        ]
+        + [
+            observed.noise(s.uneven, dataclasses.replace(cal, sigma=99.0))
+            for cal in (sc.calibrate(s.uneven, s.sheet, noise="model"),)
+        ]
+    ),
     "diagnostics.verdict.observed.partitions": lambda s: [
         observed.partitions(
             dataclasses.replace(
@@ -425,7 +431,7 @@ def remedies(small):
             small.codes.add(check.code)
             # Something to try: a command, a call, or an order of what to do with instrument or
             # data.
-            assert re.fullmatch(r"[A-Z].*\.", check.sentence), check.sentence
+            assert re.fullmatch(r"\S.*\.", check.sentence), check.sentence
             assert check.remedies or check.advice, f"{name} gives nothing to try: {check}"
             assert not check.advice or re.fullmatch(r"[A-Z].*\.", check.advice), check.advice
             typed = any(remedy.command for remedy in check.remedies)

@@ -158,10 +158,11 @@ def screen(
     use, start = pre_screen(camera, frames)
     if not use.any():
         raise CalibrationError(
-            "no three stars of any frame agree with their catalogue directions: check the star "
-            "identifications, "
-            "the parity of the axes and the nominal camera.",
+            "no three stars of any frame agree with their catalogue directions",
             Status.INCONSISTENT,
+            reason=(
+                "check the star identifications, the parity of the axes and the nominal camera"
+            ),
         )
     found_before = int(np.count_nonzero(~use))
     rounds: list[ScreeningRound] = []
@@ -331,9 +332,9 @@ def _round(
             raise
         raise CalibrationError(
             f"only {n_agree} of {obs.n_stars} stars agree on attitudes, and no calibration fits "
-            "them: "
-            f"{Status.INCONSISTENT.remedy}.",
+            "them",
             Status.INCONSISTENT,
+            reason=Status.INCONSISTENT.remedy,
         ) from error
 
 

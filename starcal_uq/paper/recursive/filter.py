@@ -312,9 +312,9 @@ class Recursion:
         if step is None:
             raise CalibrationError(
                 f"frame number {self.n_frames + 1} of the stream has no finite interstar angles "
-                "at the estimate: "
-                f"{Status.NOT_FINITE.remedy}.",
+                "at the estimate",
                 Status.NOT_FINITE,
+                reason=Status.NOT_FINITE.remedy,
             )
         grams, entries = self._about_origin(normals)
         self._accept(

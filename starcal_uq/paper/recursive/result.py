@@ -61,11 +61,9 @@ def joint_estimate(recursion: Recursion, sums: FrameSums | None = None) -> Joint
     if p > q:
         if is_singular(matrix[q:, q:]):
             raise CalibrationError(
-                (
-                    f"the distortion cannot be estimated ({Status.SINGULAR.name}): "
-                    f"{Status.SINGULAR.remedy}."
-                ),
+                f"the distortion cannot be estimated ({Status.SINGULAR.name})",
                 Status.SINGULAR,
+                reason=Status.SINGULAR.remedy,
             )
         inverse = np.linalg.inv(matrix[q:, q:])
         offset[q:] = inverse @ (gradient[q:] - matrix[q:, :q] @ recursion.offset)
@@ -227,9 +225,9 @@ def stream_calibration(
     if dof <= 0 or is_singular(matrix):
         raise CalibrationError(
             f"{recursion.n_stars} stars in {recursion.n_frames} frames do not determine {p} "
-            "parameters and the noise: "
-            f"{Status.SINGULAR.remedy}.",
+            "parameters and the noise",
             Status.SINGULAR,
+            reason=Status.SINGULAR.remedy,
         )
     sigma = float(np.sqrt(max(chi2, 0.0) / dof))
     frames = recursion.n_frames

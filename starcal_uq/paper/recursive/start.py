@@ -71,10 +71,12 @@ def begin(
         stage = optics_stage(first, camera, "lm", _START_ITERATIONS)
         if stage.status in (Status.NOT_FINITE, Status.SINGULAR):
             raise CalibrationError(
-                f"the least-squares start on {first.n_frames} frames failed ({stage.status.name}): "
-                "raise start_frames, or use method='griffith', which starts from the nominal "
-                "camera.",
+                f"the least-squares start on {first.n_frames} frames failed ({stage.status.name})",
                 stage.status,
+                reason=(
+                    "raise start_frames, or use method='griffith', which starts from the nominal "
+                    "camera"
+                ),
             )
         origin = stage.theta.copy()
     process = None

@@ -269,7 +269,7 @@ class RecursiveCalibration:
             self._filter(self._waiting)
         if self._recursion is None:
             raise CalibrationError(
-                "there is no frame yet: give frames to update() first.", Status.SINGULAR
+                "there is no frame yet", Status.SINGULAR, reason="give frames to update() first"
             )
         stage = filter_stage(self._recursion, self._seconds)
         stages = [stage] if self._start_stage is None else [self._start_stage, stage]

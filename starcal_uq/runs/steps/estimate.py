@@ -107,7 +107,7 @@ def calibrate(
     if undetermined and not calibration.status.ok and not calibration.undetermined:
         status = calibration.status
         raise CalibrationError(
-            f"the calibration did not end well ({status.name}): {calibration.remedy}.", status
+            f"the calibration did not end well ({status.name})", status, reason=calibration.remedy
         )
     if accept_inflation:
         from starcal_uq.diagnostics import jackknife
