@@ -65,6 +65,8 @@ _CAUSES = {
     Code.FACTOR_ON_THE_STATED_NOISE: NOISE,
     Code.FACTOR_ON_THE_FITTED_NOISE: NOISE,
 }
+# Actions whose options these are.
+_CALIBRATING = ("calibrate", "run")
 _OF_OPTIONS = {
     INPUT: {"site", "in_space", "directions", "time", "frames", "screening"},
     LENS: {"model"},
@@ -107,7 +109,7 @@ def cause_of(check: Check) -> str:
     if check.code in _CAUSES:
         return _CAUSES[check.code]
     steps = [step for one in check.remedies for step in one.steps or (one,)]
-    asked = {name for step in steps for name in step.arguments}
+    asked = {name for step in steps if step.action in _CALIBRATING for name in step.arguments}
     return next((cause for cause, options in _OF_OPTIONS.items() if options & asked), NUMERICS)
 
 
