@@ -12,6 +12,7 @@ from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
 from starcal_uq.budgeting.totals import covariance
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.formatting import plural, significant
+from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.figures import style
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
@@ -58,11 +59,12 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
     reaches = {name: _reach(rows, axis, budget.confidence) for name, rows in by_name.items()}
     sums = [budget.total(axis, scope) for scope in SCOPES]
     limits = [outcome for outcome in budget.comparable if outcome.requirement.axis == axis]
-    shown = [value for value in reaches.values() if value] + [
-        s.rule_arcsec for s in sums if s.rule_arcsec > 0.0
+    shown = [
+        *filter(None, reaches.values()),
+        *(s.rule_arcsec for s in sums if s.rule_arcsec > 0.0),
+        *(outcome.requirement.limit_arcsec for outcome in limits),
     ]
-    shown += [outcome.requirement.limit_arcsec for outcome in limits]
-    low, high = (min(shown), max(shown)) if shown else (0.1, 1.0)
+    low, high = min(shown, default=0.1), max(shown, default=1.0)
     left = 10.0 ** np.floor(np.log10(low * 0.7))
     # Room on the right for the numbers.
     ax.set_xlim(left, high * (high / left) ** 0.22)
@@ -81,15 +83,8 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
             continue
         hatch = "///" if row.absorbed_by_alignment == "yes" else ""
         source = next((r.source for r in by_name[name] if r.assessed), "file")
-        ax.barh(
-            place,
-            value - left,
-            left=left,
-            height=0.66,
-            color=_COLOURS[source],
-            hatch=hatch,
-            edgecolor="white",
-        )
+        look: AnyDict = {"color": _COLOURS[source], "hatch": hatch, "edgecolor": "white"}
+        ax.barh(place, value - left, left=left, height=0.66, **look)
         _write(ax, value, place, f"{significant(value)}″", style.INK)
     for offset, entry in enumerate(sums):
         at = len(names) + 0.7 + offset
@@ -146,18 +141,10 @@ def _reach(rows: list[Contributor], axis: str, confidence: float) -> float | Non
 def _write(
     ax: Axes, x: float, y: float, text: str, colour: str, *, italic: bool = False, shift: int = 4
 ) -> None:
-    ax.annotate(
-        text,
-        (x, y),
-        xytext=(shift, 0),
-        textcoords="offset points",
-        va="center",
-        fontsize=style.TICK_SIZE,
-        color=colour,
-        style="italic" if italic else "normal",
-        # The limits of the axis leave room for it.
-        in_layout=False,
-    )
+    slant = "italic" if italic else "normal"
+    # The limits of the axis leave room for it.
+    look = {"va": "center", "color": colour, "style": slant, "in_layout": False}
+    style.note(ax, text, (x, y), (shift, 0), **look)
 
 
 def _handles(budget: Budget) -> list[object]:

@@ -35,9 +35,7 @@ _LETTER_IN = 0.065
 
 def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = ALPHA) -> Axes:
     """Corrected p-value of every test on a logarithmic axis; beyond the line is more than noise."""
-    if ax is None:
-        ax = style.new_axes(7.2, 0.27 * len(misfit.tests) + 1.0)
-    style.dress(ax, grid=True)
+    ax = style.panel(ax, 7.2, 0.27 * len(misfit.tests) + 1.0, grid=True)
     tests = misfit.tests[::-1]
     p = np.maximum([test.p_holm for test in tests], SMALLEST_P)
     rows = np.arange(len(tests))
@@ -59,28 +57,19 @@ def plot_jackknife(jackknife: Jackknife, ax: Axes | None = None) -> Axes:
     """Cluster-robust and jackknife over formal sigma of every parameter, with the range that chance
     gives.
     """
-    if ax is None:
-        ax = style.new_axes(4.2, 3.2)
-    style.dress(ax, grid=True)
+    ax = style.panel(ax, 4.2, 3.2, grid=True)
     rows = np.arange(len(jackknife.ratio))
     low, high = jackknife.expected()
     ax.bar(rows, high - low, bottom=low, width=0.62, color=style.LIGHT, label="chance (95 %)")
-    ax.scatter(
-        rows - 0.08, jackknife.ratio, color=style.BLUE, s=32, zorder=3, label="cluster-robust"
-    )
-    ax.scatter(
-        rows + 0.08,
-        jackknife.jackknife_ratio,
-        color=style.ORANGE,
-        marker="s",
-        s=26,
-        zorder=3,
-        label="jackknife",
-    )
+    for ratio, aside, colour, marker, size, words in (
+        (jackknife.ratio, -0.08, style.BLUE, "o", 32, "cluster-robust"),
+        (jackknife.jackknife_ratio, 0.08, style.ORANGE, "s", 26, "jackknife"),
+    ):
+        ax.scatter(rows + aside, ratio, color=colour, marker=marker, s=size, zorder=3, label=words)
     ax.axhline(1.0, color=style.INK, linewidth=0.9)
     ax.set_xticks(rows, jackknife.parameter_names)
-    top = max(float(np.max([high, jackknife.ratio, jackknife.jackknife_ratio])), 1.2)
-    ax.set_ylim(min(0.5, float(low.min()) - 0.05), 1.0 + 1.8 * (top - 1.0))
+    top = np.max([high, jackknife.ratio, jackknife.jackknife_ratio], initial=1.2)
+    ax.set_ylim(min(0.5, low.min() - 0.05), 1.0 + 1.8 * (top - 1.0))
     style.legend(
         ax, loc="upper left", ncols=2, columnspacing=0.7, handletextpad=0.2, handlelength=1.0
     )
@@ -90,18 +79,14 @@ def plot_jackknife(jackknife: Jackknife, ax: Axes | None = None) -> Axes:
 
 def plot_comparison(models: ModelComparison, ax: Axes | None = None) -> Axes:
     """Loss in predicting left-out frames against the best model, with two standard errors."""
-    if ax is None:
-        ax = style.new_axes(4.6, 3.2)
-    style.dress(ax, grid=True)
+    ax = style.panel(ax, 4.6, 3.2, grid=True)
     scores = models.scores[::-1]
     rows = np.arange(len(scores))
     for row, score in zip(rows, scores, strict=True):
         colour = style.VERMILLION if score.rejected else style.BLUE
-        spread = 2.0 * score.difference_se
         ax.errorbar(
-            -score.difference,
-            row,
-            xerr=spread,
+            *(-score.difference, row),
+            xerr=2.0 * score.difference_se,
             color=colour,
             marker="o",
             markersize=5,
@@ -198,11 +183,9 @@ def plot_validation(validation: Validation) -> Figure:
 
 
 def _symbols(validation: Validation) -> list[str]:
-    known = {
-        p.name: symbol(p.name)
-        for p in (*parameters(validation.camera.distortion), sigma_parameter(False))
-    }
-    return [known.get(q, q.replace("_", " ")) for q in validation.quantities]
+    specs = (*parameters(validation.camera.distortion), sigma_parameter(False))
+    known = {p.name for p in specs}
+    return [symbol(q) if q in known else q.replace("_", " ") for q in validation.quantities]
 
 
 def _rank_panel(ax: Axes, validation: Validation, i: int, name: str) -> None:
@@ -215,11 +198,11 @@ def _rank_panel(ax: Axes, validation: Validation, i: int, name: str) -> None:
         return np.concatenate([[0.0], values - z, [0.0]])
 
     outside = bool(validation.rank_p_value[i] < 1.0 - _BAND)
-    ax.fill_between(at, ended(lower), ended(upper), color=style.LIGHT, linewidth=0)
+    style.band(ax, at, ended(lower), ended(upper), style.LIGHT)
     ax.axhline(0.0, color=style.GREY, linewidth=0.7)
     curve = ended(counts_below(validation.ranks[:, i], n_values) / n)
     ax.plot(at, curve, color=style.VERMILLION if outside else style.BLUE, linewidth=1.3)
-    reach = 1.15 * max(float(np.max(np.abs(curve))), float(np.max(upper - z)))
+    reach = 1.15 * max(np.max(np.abs(curve)), np.max(upper - z))
     ax.set_xlim(0.0, 1.0)
     ax.set_ylim(-reach, reach)
     style.label(ax, f"{name}:  p {_p(validation.rank_p_value[i])}", "rank of the truth / draws")
@@ -249,14 +232,8 @@ def _nees_panel(ax: Axes, validation: Validation) -> None:
     edges = np.linspace(0.0, end, _NEES_BINS + 1)
     counts, _ = np.histogram(np.minimum(validation.nees, end * (1.0 - 1e-9)), edges)
     width = edges[1]
-    ax.bar(
-        edges[:-1],
-        counts / (validation.n_replicates * width),
-        width,
-        align="edge",
-        color=style.SKY,
-        edgecolor="white",
-    )
+    heights = counts / (validation.n_replicates * width)
+    ax.bar(edges[:-1], heights, width, align="edge", color=style.SKY, edgecolor="white")
     grid = np.linspace(0.0, end, 200)
     ax.plot(
         grid, chi2.pdf(grid, p), color=style.INK, linewidth=1.2, label=f"chi-square, {p} d.o.f."

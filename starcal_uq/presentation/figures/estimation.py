@@ -9,7 +9,7 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters as camera_parameters
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import pretty_unit, significant
-from starcal_uq.core.types import FloatArray, floats
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import symbol
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
+_PATH: AnyDict = {"marker": "o", "markersize": 3.2, "linewidth": 1.2}
+_REFERENCE: AnyDict = {"linewidth": 1.0, "dashes": (4, 2)}
 _BANDS = ("#eef3f7", "#ffffff")
 
 
@@ -34,11 +36,8 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
     """
     parameters = camera_parameters(cal.camera.distortion)
     values, starts = _joined(cal)
-    reference = (
-        np.asarray(truth.theta)
-        if _comparable(truth, cal) and truth is not None
-        else np.asarray(cal.theta)
-    )
+    known = truth is not None and tuple(truth.parameter_names) == tuple(cal.parameter_names)
+    reference = truth.theta if known and truth is not None else cal.theta
     figure = style.new_figure(1.2 + 2.0 * len(parameters), 5.1)
     grid = style.panels(figure, 2, len(parameters), (0.9, 0.12, 0.5, 0.72), (0.56, 0.18))
     axes = grid.subplots(sharex=True, squeeze=False)
@@ -51,35 +50,20 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
             factor, unit = pixel_um / 1000.0, "mm"
         for ax in (upper, lower):
             _mark_stages(ax, starts, len(values))
-        upper.plot(
-            iteration,
-            values[:, i] * factor,
-            color=style.BLUE,
-            marker="o",
-            markersize=3.2,
-            linewidth=1.2,
-        )
-        upper.axhline(reference[i] * factor, color=style.VERMILLION, linewidth=1.0, dashes=(4, 2))
-        upper.set_title(
-            f"{symbol(parameter.name)} [{unit}]",
-            fontsize=style.TITLE_SIZE,
-            color=style.INK,
-            pad=16,
-            y=1.0,
-        )
+        upper.plot(iteration, values[:, i] * factor, color=style.BLUE, **_PATH)
+        upper.axhline(reference[i] * factor, color=style.VERMILLION, **_REFERENCE)
+        style.heading(upper, f"{symbol(parameter.name)} [{unit}]", pad=16)
         upper.ticklabel_format(axis="y", useOffset=False, style="plain")
         error = (values[:, i] - reference[i]) / cal.sigmas[i]
         lower.axhspan(-1.0, 1.0, color=style.GREEN, alpha=0.2, linewidth=0)
-        lower.axhline(0.0, color=style.VERMILLION, linewidth=1.0, dashes=(4, 2))
-        lower.plot(iteration, error, color=style.BLUE, marker="o", markersize=3.2, linewidth=1.2)
+        lower.axhline(0.0, color=style.VERMILLION, **_REFERENCE)
+        lower.plot(iteration, error, color=style.BLUE, **_PATH)
         _error_axis(lower, float(np.abs(error).max()))
-        lower.set_xlabel("iteration", fontsize=style.LABEL_SIZE, color=style.INK)
+        style.label(lower, x="iteration")
         style.label_distance(lower, x_in=0.23)
-    what = "truth" if _comparable(truth, cal) else "final estimate"
-    axes[0, 0].set_ylabel("value", fontsize=style.LABEL_SIZE, color=style.INK)
-    axes[1, 0].set_ylabel(
-        f"distance from {what}\n[final sigma]", fontsize=style.LABEL_SIZE, color=style.INK
-    )
+    what = "truth" if known else "final estimate"
+    style.label(axes[0, 0], y="value")
+    style.label(axes[1, 0], y=f"distance from {what}\n[final sigma]")
     for ax in axes[:, 0]:
         style.label_distance(ax, y_in=0.46)
     _key(figure, cal, what)
@@ -91,31 +75,21 @@ def _key(figure: Figure, cal: Calibration, what: str) -> None:
 
     stages = ", ".join(f"{i} {stage.name}" for i, stage in enumerate(cal.stages, 1))
     handles: list[object] = [
-        style.key("estimate", style.BLUE, marker="o", markersize=3.2, linewidth=1.2),
-        style.key(what, style.VERMILLION, dashes=(4, 2), linewidth=1.0),
+        style.key("estimate", style.BLUE, **_PATH),
+        style.key(what, style.VERMILLION, **_REFERENCE),
         Patch(facecolor=style.GREEN, alpha=0.2, label="within 1 sigma"),
         style.key(f"Stages: {stages}", style.INK, linestyle="none"),
     ]
-    options = {
-        "loc": "upper left",
-        "fontsize": style.LABEL_SIZE,
-        "columnspacing": 1.6,
-        "handlelength": 1.8,
-    }
-    style.legend_above(figure, handles, **options)
-
-
-def _comparable(truth: Camera | None, cal: Calibration) -> bool:
-    return truth is not None and tuple(truth.parameter_names) == tuple(cal.parameter_names)
+    size = style.LABEL_SIZE
+    style.legend_above(
+        figure, handles, loc="upper left", fontsize=size, columnspacing=1.6, handlelength=1.8
+    )
 
 
 def _joined(cal: Calibration) -> tuple[FloatArray, list[int]]:
     """All trajectories in a row, and the position at which each stage begins."""
-    starts, length = [], 0
-    for stage in cal.stages:
-        starts.append(length)
-        length += len(stage.trajectory)
-    return np.concatenate([floats(s.trajectory) for s in cal.stages]), starts
+    paths = [stage.trajectory for stage in cal.stages]
+    return np.concatenate(paths), np.cumsum([0, *map(len, paths)])[:-1].tolist()
 
 
 def _mark_stages(ax: Axes, starts: list[int], total: int) -> None:
@@ -123,15 +97,9 @@ def _mark_stages(ax: Axes, starts: list[int], total: int) -> None:
     for i, (first, last) in enumerate(zip(starts, ends, strict=True)):
         ax.axvspan(first - 0.5, last - 0.5, color=_BANDS[i % 2], linewidth=0, zorder=0)
         if ax.get_subplotspec().is_first_row():  # type: ignore[union-attr]
-            ax.text(
-                0.5 * (first + last - 1),
-                1.03,
-                str(i + 1),
-                transform=ax.get_xaxis_transform(),
-                ha="center",
-                fontsize=style.TICK_SIZE,
-                color=style.GREY,
-            )
+            at = (0.5 * (first + last - 1), 1.03)
+            place = {"xycoords": ax.get_xaxis_transform(), "ha": "center"}
+            style.note(ax, str(i + 1), at, color=style.GREY, **place)
     ax.set_xlim(-0.5, total - 0.5)
 
 
@@ -141,9 +109,9 @@ def _error_axis(ax: Axes, largest: float) -> None:
     decades = max(1, int(np.ceil(np.log10(max(largest, 2.0)))))
     style.log_scale(ax.yaxis, 1.0, linscale=0.6)
     ax.set_ylim(-(10.0 ** (decades + 0.15)), 10.0 ** (decades + 0.15))
-    step = 1 if decades <= 2 else int(np.ceil(decades / 2))
-    powers = [10.0**d for d in range(decades, 0, -step)]
-    ax.yaxis.set_major_locator(FixedLocator([-p for p in powers] + [0.0, *sorted(powers)]))
+    step = 1 if decades <= 2 else -(-decades // 2)
+    powers = 10.0 ** np.arange(decades, 0, -step)
+    ax.yaxis.set_major_locator(FixedLocator([*-powers, 0.0, *powers[::-1]]))
 
 
 # chi-square with 2 degrees of freedom at 99 %: a mean vector beyond it is drawn as significant.
@@ -179,34 +147,25 @@ def plot_residuals(cal: Calibration, obs: Observations) -> Figure:
 
 def plot_residual_map(cal: Calibration, obs: Observations, ax: Axes | None = None) -> Axes:
     """Mean residual vectors (observed minus predicted) in cells of the detector, with a key."""
-    if ax is None:
-        ax = style.new_axes(5.0, 4.6)
-    style.dress(ax)
+    ax = style.panel(ax, 5.0, 4.6)
     binned = bin_residuals(cal, obs)
     width, height = cal.camera.width_px, cal.camera.height_px
     style.label(ax, "Mean residuals", "x [px]", "y [px]")
     ax.set_xlim(-0.5, width - 0.5)
     ax.set_ylim(height - 0.5, -0.5)
     ax.set_aspect("equal")
-    for spine in ax.spines.values():
-        spine.set_visible(True)
+    ax.spines[:].set_visible(True)
     ax.scatter(
         obs.x_px,
         obs.y_px,
         s=1.0,
         color=style.GREY,
-        alpha=float(np.clip(4000 / obs.n_stars, 0.2, 0.6)),
+        alpha=np.clip(4000 / obs.n_stars, 0.2, 0.6),
         linewidths=0,
         rasterized=True,
     )
-    ax.plot(
-        [cal.camera.x0_px],
-        [cal.camera.y0_px],
-        marker="+",
-        color=style.INK,
-        markersize=10,
-        markeredgewidth=1.2,
-    )
+    cross: AnyDict = {"marker": "+", "markersize": 10, "markeredgewidth": 1.2}
+    ax.plot([cal.camera.x0_px], [cal.camera.y0_px], color=style.INK, **cross)
     if len(binned.counts) == 0:
         ax.text(
             0.5, 0.5, "too few stars per cell", transform=ax.transAxes, ha="center", color=style.INK
@@ -242,14 +201,8 @@ def plot_residual_map(cal: Calibration, obs: Observations, ax: Axes | None = Non
         labelcolor=style.INK,
         fontproperties={"size": style.TICK_SIZE},
     )
-    ax.set_xlabel(
-        (
-            f"x [px]\n{np.count_nonzero(strong)} of {strong.size} arrows bold: beyond 99 % of pure "
-            "noise"
-        ),
-        fontsize=style.LABEL_SIZE,
-        color=style.INK,
-    )
+    bold = f"{np.count_nonzero(strong)} of {strong.size} arrows bold"
+    style.label(ax, x=f"x [px]\n{bold}: beyond 99 % of pure noise")
     return ax
 
 
@@ -257,9 +210,7 @@ def plot_residual_radius(cal: Calibration, obs: Observations, ax: Axes | None = 
     """Radial and tangential residual against the distance from the principal point, with one
     standard error.
     """
-    if ax is None:
-        ax = style.new_axes(4.4, 3.8)
-    style.dress(ax, grid=True)
+    ax = style.panel(ax, 4.4, 3.8, grid=True)
     offset = np.stack([obs.x_px - cal.camera.x0_px, obs.y_px - cal.camera.y0_px], axis=1)
     radius = np.hypot(*offset.T)
     unit = offset / np.maximum(radius, 1e-9)[:, None]
@@ -289,9 +240,7 @@ def plot_residual_histogram(cal: Calibration, obs: Observations, ax: Axes | None
     """Residuals in units of their expected standard deviation, against the standard normal, on a
     log axis.
     """
-    if ax is None:
-        ax = style.new_axes(4.2, 3.8)
-    style.dress(ax)
+    ax = style.panel(ax, 4.2, 3.8)
     z = normalised_residuals(cal, obs).ravel()
     reach = float(np.clip(np.ceil(np.abs(z).max()), 4.0, 8.0))
     n_bins = int(np.clip(np.sqrt(z.size), 16, 60))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.core.formatting import pretty_unit
-from starcal_uq.core.types import FloatArray, floats
+from starcal_uq.core.types import AnyDict, FloatArray, floats
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import AxisScale, axis_scale, symbol
 
@@ -61,9 +61,7 @@ def plot_corner(
             ax = style.dress(figure.add_subplot(grid[row, column]))
             if row == column:
                 histogram(ax, columns[row], ends[row], gaussian, row, marks[row])
-                ax.set_title(
-                    scales[row].title, fontsize=style.TICK_SIZE, color=style.INK, pad=5, y=1.0
-                )
+                style.heading(ax, scales[row].title, style.TICK_SIZE)
             else:
                 _density(ax, columns[column], columns[row])
                 if gaussian is not None:
@@ -80,14 +78,13 @@ def _gaussian(
     """Mean and covariance of the Gaussian approximation, in plotted units; sigma is independent of
     the rest.
     """
-    mean, covariance = np.zeros(size), np.zeros((size, size))
-    p = len(cal.theta)
-    factors = np.array([s.factor for s in scales])
-    mean[:p], covariance[:p, :p] = cal.theta, cal.covariance
-    if size > p:
-        mean[p], covariance[p, p] = cal.sigma, cal.sigma_std**2
-    mean = (mean - np.array([s.reference for s in scales])) / factors
-    return mean, covariance / np.outer(factors, factors)
+    factors, references = np.transpose([(s.factor, s.reference) for s in scales])
+    # The noise, where it was sampled, is the last.
+    mean = np.append(cal.theta, cal.sigma)[:size]
+    covariance = np.zeros((len(cal.theta) + 1,) * 2)
+    covariance[:-1, :-1] = cal.covariance
+    covariance[-1, -1] = cal.sigma_std**2
+    return (mean - references) / factors, covariance[:size, :size] / np.outer(factors, factors)
 
 
 def _density(ax: Axes, x: FloatArray, y: FloatArray) -> None:
@@ -145,26 +142,14 @@ def _ellipses(ax: Axes, gaussian: tuple[FloatArray, FloatArray], i: int, j: int)
         np.sqrt(np.maximum(values, 0.0))[:, None] * np.stack([np.cos(angle), np.sin(angle)])
     )
     for n_sigma in (1.0, 2.0):
-        ax.plot(
-            mean[i] + n_sigma * ring[0],
-            mean[j] + n_sigma * ring[1],
-            color=style.INK,
-            linewidth=0.9,
-            dashes=(4, 2),
-        )
+        x, y = mean[[i, j]][:, None] + n_sigma * ring
+        ax.plot(x, y, color=style.INK, linewidth=0.9, dashes=(4, 2))
 
 
 def _mark(ax: Axes, x: float | None, y: float | None) -> None:
     if x is not None and y is not None:
-        ax.plot(
-            [x],
-            [y],
-            marker="+",
-            markersize=9,
-            markeredgewidth=1.8,
-            color=style.VERMILLION,
-            linestyle="none",
-        )
+        look: AnyDict = {"marker": "+", "markersize": 9, "markeredgewidth": 1.8}
+        ax.plot([x], [y], color=style.VERMILLION, linestyle="none", **look)
 
 
 def _ticks(
@@ -180,12 +165,12 @@ def _ticks(
         ax.set_ylim(*ends[row])
     sparse(ax, y=row != column)
     if row == size - 1:
-        ax.set_xlabel(scales[column].label, fontsize=style.TICK_SIZE, color=style.INK)
+        style.label(ax, x=scales[column].label, size=style.TICK_SIZE)
         style.label_distance(ax, x_in=0.25)
     else:
         ax.tick_params(labelbottom=False)
     if column == 0 and row > 0:
-        ax.set_ylabel(scales[row].label, fontsize=style.TICK_SIZE, color=style.INK)
+        style.label(ax, y=scales[row].label, size=style.TICK_SIZE)
         style.label_distance(ax, y_in=0.52)
     else:
         ax.tick_params(labelleft=False)
@@ -195,17 +180,16 @@ def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> No
     from matplotlib.patches import Patch
 
     handles: list[Patch | Line2D] = [
-        Patch(facecolor=_FILLS[1], edgecolor=style.BLUE, label="39 % of the draws (1 sigma)"),
-        Patch(facecolor=_FILLS[0], edgecolor=style.BLUE, label="86 % of the draws (2 sigma)"),
+        Patch(facecolor=fill, edgecolor=style.BLUE, label=words)
+        for fill, words in (
+            (_FILLS[1], "39 % of the draws (1 sigma)"),
+            (_FILLS[0], "86 % of the draws (2 sigma)"),
+        )
     ]
     if gaussian:
         handles.append(style.key("Gaussian approximation", style.INK, dashes=(4, 2), linewidth=1.0))
     if truth:
-        handles.append(
-            style.key(
-                "truth of the simulation", style.VERMILLION, marker="+", markersize=9, linewidth=1.3
-            )
-        )
+        handles.append(_truth_key(marker="+", markersize=9))
     figure.legend(
         handles=handles,
         loc="upper right",
@@ -216,6 +200,10 @@ def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> No
         title_fontsize=style.LABEL_SIZE,
         alignment="left",
     )
+
+
+def _truth_key(**look: Any) -> Line2D:
+    return style.key("truth of the simulation", style.VERMILLION, linewidth=1.3, **look)
 
 
 def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure:
@@ -235,16 +223,12 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
         upper = style.dress(figure.add_subplot(grid[0, i]))
         wide = _prior_grid(post.priors, name, columns[i], scales[i])
         density = _relative_prior(post.priors, name, wide)
-        upper.plot(
-            wide / parameter.scale, density, color=style.GREEN, linewidth=1.5, dashes=(4, 1.5)
-        )
+        upper.plot(wide / parameter.scale, density, color=style.GREEN, **_PRIOR)
         upper.axvline(
-            float(np.mean(columns[i]) * scales[i].factor + scales[i].reference) / parameter.scale,
-            color=style.BLUE,
-            linewidth=1.5,
+            _centre(columns[i], scales[i]) / parameter.scale, color=style.BLUE, linewidth=1.5
         )
-        upper.set_title(symbol(name), fontsize=style.TITLE_SIZE, color=style.INK, pad=5, y=1.0)
-        upper.set_xlabel(_unit(parameter.scaled_unit), fontsize=style.TICK_SIZE, color=style.INK)
+        style.heading(upper, symbol(name))
+        style.label(upper, x=_unit(parameter.scaled_unit), size=style.TICK_SIZE)
         sparse(upper, y=False)
         lower = style.dress(figure.add_subplot(grid[1, i]))
         ends = limits(columns[i])
@@ -252,15 +236,15 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
         near = np.linspace(*ends, 60)
         height = _relative_prior(post.priors, name, near * scales[i].factor + scales[i].reference)
         # The prior's own density in this unit would lie on the axis: only its slope can be shown.
-        lower.plot(near, 0.5 * height, color=style.GREEN, linewidth=1.5, dashes=(4, 1.5))
+        lower.plot(near, 0.5 * height, color=style.GREEN, **_PRIOR)
         lower.set_xlim(*ends)
-        lower.set_xlabel(scales[i].label, fontsize=style.TICK_SIZE, color=style.INK)
+        style.label(lower, x=scales[i].label, size=style.TICK_SIZE)
         sparse(lower, y=False)
         for ax in (upper, lower):
             style.label_distance(ax, x_in=0.25, y_in=0.08)
         if i == 0:
-            upper.set_ylabel("scale of\nthe prior", fontsize=style.LABEL_SIZE, color=style.INK)
-            lower.set_ylabel("scale of\nthe posterior", fontsize=style.LABEL_SIZE, color=style.INK)
+            style.label(upper, y="scale of\nthe prior")
+            style.label(lower, y="scale of\nthe posterior")
     _prior_key(figure, truth is not None)
     return figure
 
@@ -274,25 +258,27 @@ def _relative_prior(priors: Priors, name: str, values: FloatArray) -> FloatArray
 
 
 def _prior_grid(priors: Priors, name: str, column: FloatArray, scale: AxisScale) -> FloatArray:
-    centre = float(np.mean(column) * scale.factor + scale.reference)
+    centre = _centre(column, scale)
     if name.startswith("sigma"):
         top = max(1.4 * centre, priors.sigma_median * np.exp(1.2 * priors.sigma_log_sd))
-        return np.asarray(np.linspace(top / 400, top, 400))
-    mean, sd = float(priors.mean((name,))[0]), float(priors.sd((name,))[0])
-    return np.asarray(
-        np.linspace(
-            min(mean - 3 * sd, centre - 0.3 * sd), max(mean + 3 * sd, centre + 0.3 * sd), 300
-        )
-    )
+        return np.linspace(top / 400, top, 400)
+    mean, sd = priors.mean((name,))[0], priors.sd((name,))[0]
+    low = min(mean - 3 * sd, centre - 0.3 * sd)
+    return np.linspace(low, max(mean + 3 * sd, centre + 0.3 * sd), 300)
+
+
+def _centre(column: FloatArray, scale: AxisScale) -> float:
+    """Mean of the draws, in computation units."""
+    return float(np.mean(column) * scale.factor + scale.reference)
 
 
 def _prior_key(figure: Figure, truth: bool) -> None:
     handles = [
-        style.key("prior (below: its slope only)", style.GREEN, dashes=(4, 1.5), linewidth=1.5),
+        style.key("prior (below: its slope only)", style.GREEN, **_PRIOR),
         style.key("posterior", style.BLUE, linewidth=1.5),
     ]
     if truth:
-        handles.append(style.key("truth of the simulation", style.VERMILLION, linewidth=1.3))
+        handles.append(_truth_key())
     style.legend_above(figure, handles, loc="upper left", ncols=3, fontsize=style.LABEL_SIZE)
 
 
@@ -300,6 +286,7 @@ def _unit(text: str) -> str:
     return f"[{pretty_unit(text)}]" if pretty_unit(text) else ""
 
 
+_PRIOR: AnyDict = {"linewidth": 1.5, "dashes": (4, 1.5)}
 BINS = 44
 HALF_WIDTH_SD = 3.6
 # Share of an axis at either end without ticks: about half a label.
@@ -314,9 +301,9 @@ def scaled_draws(post: Posterior) -> tuple[list[AxisScale], list[FloatArray]]:
     """Axis scale and plotted draws of every sampled parameter."""
     draws = post.draws[:, list(post.sampled)]
     spreads, means = draws.std(axis=0, ddof=1), draws.mean(axis=0)
-    entries = [post.parameters[i] for i in post.sampled]
     scales = [
-        axis_scale(p, float(m), float(s)) for p, m, s in zip(entries, means, spreads, strict=True)
+        axis_scale(post.parameters[i], float(m), float(s))
+        for i, m, s in zip(post.sampled, means, spreads, strict=True)
     ]
     return scales, [scale(draws[:, i]) for i, scale in enumerate(scales)]
 
@@ -328,11 +315,9 @@ def sampled_names(post: Posterior) -> tuple[str, ...]:
 
 def limits(column: FloatArray) -> tuple[float, float]:
     """Ends of the axis of one parameter."""
-    centre, spread = float(np.median(column)), float(np.std(column))
-    low, high = np.quantile(column, (0.0005, 0.9995))
-    return min(centre - HALF_WIDTH_SD * spread, float(low)), max(
-        centre + HALF_WIDTH_SD * spread, float(high)
-    )
+    centre, reach = float(np.median(column)), HALF_WIDTH_SD * float(np.std(column))
+    low, high = map(float, np.quantile(column, (0.0005, 0.9995)))
+    return min(centre - reach, low), max(centre + reach, high)
 
 
 def truth_marks(
@@ -366,13 +351,8 @@ def histogram(
         mean, sd = gaussian[0][index], np.sqrt(gaussian[1][index, index])
         x = np.linspace(*limits, 200)
         height = column.size * (edges[1] - edges[0]) / (sd * np.sqrt(2 * np.pi)) / peak
-        ax.plot(
-            x,
-            height * np.exp(-0.5 * ((x - mean) / sd) ** 2),
-            color=style.INK,
-            linewidth=1.0,
-            dashes=(4, 2),
-        )
+        curve = height * np.exp(-0.5 * ((x - mean) / sd) ** 2)
+        ax.plot(x, curve, color=style.INK, linewidth=1.0, dashes=(4, 2))
     if mark is not None:
         ax.axvline(mark, color=style.VERMILLION, linewidth=1.3)
     ax.set_ylim(0.0, 1.12)

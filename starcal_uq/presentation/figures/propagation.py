@@ -42,9 +42,7 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
         ("calibration, common", style.ORANGE, "//"),
         ("calibration, rest", style.GREEN, ".."),
     )
-    held, values = (
-        np.asarray(v)[:3, :3] for v in (error.if_model_holds_arcsec, error.headline_arcsec)
-    )
+    held, values = (v[:3, :3] for v in (error.if_model_holds_arcsec, error.headline_arcsec))
     tested = error.misfit is not None
     positive = np.concatenate([values[values > 0], held[held > 0]])
     floor = 10.0 ** np.floor(np.log10(positive.min() * 0.7)) if positive.size else 1e-3

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, significant
-from starcal_uq.core.types import AnyMapping, FloatArray, floats
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, floats
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.words.axes import axis_label, capital, place, value_words
 from starcal_uq.studies.findings import Lines, Sweep
@@ -84,7 +84,7 @@ def _geometric(values: Sequence[Any]) -> bool:
 
 def positions(values: Sequence[Any]) -> FloatArray:
     """Where values stand on an axis: names side by side, numbers where they are."""
-    return floats(values) if numeric(values) else np.arange(len(values), dtype=np.float64)
+    return floats(values if numeric(values) else range(len(values)))
 
 
 def scale(axis: Any, values: Sequence[Any]) -> None:
@@ -128,6 +128,10 @@ def _line_colours(lines: Lines) -> dict[int, Any]:
     return {row: ramp(0.86 * i / max(1, len(rows) - 1)) for i, row in enumerate(rows)}
 
 
+def _marked(number: int) -> AnyDict:
+    return {"marker": MARKERS[number % len(MARKERS)], "markersize": 4.5}
+
+
 def draw_lines(ax: Axes, lines: Lines, *, dashed: bool = False) -> None:
     """A line with its band over seeds for some values of the second axis."""
     x = positions(lines.values)
@@ -136,23 +140,9 @@ def draw_lines(ax: Axes, lines: Lines, *, dashed: bool = False) -> None:
         if dashed:
             ax.plot(x[good], lines.median[row][good], color=colour, linewidth=1.2, dashes=(4, 2))
             continue
-        ax.fill_between(
-            x[good],
-            lines.low[row][good],
-            lines.high[row][good],
-            color=colour,
-            alpha=0.2,
-            linewidth=0,
-        )
-        marker = MARKERS[number % len(MARKERS)]
-        ax.plot(
-            x[good],
-            lines.median[row][good],
-            color=colour,
-            marker=marker,
-            markersize=4.5,
-            linewidth=1.5,
-        )
+        low, middle, high = (part[row][good] for part in (lines.low, lines.median, lines.high))
+        style.band(ax, x[good], low, high, colour, alpha=0.2)
+        ax.plot(x[good], middle, color=colour, linewidth=1.5, **_marked(number))
     scale(ax.xaxis, lines.values)
 
 
@@ -188,14 +178,10 @@ def legend(figure: Figure, lines: Lines, *, sampled: bool = False, dashed: str =
     keys = []
     if lines.by is not None:
         for number, (row, colour) in enumerate(_line_colours(lines).items()):
-            words = (
-                value_words(lines.by_values[row])
-                if number
-                else capital(f"{axis_label(lines.by)}: {value_words(lines.by_values[row])}")
-            )
-            keys.append(
-                style.key(words, colour, marker=MARKERS[number % len(MARKERS)], markersize=4.5)
-            )
+            words = value_words(lines.by_values[row])
+            if not number:
+                words = capital(f"{axis_label(lines.by)}: {words}")
+            keys.append(style.key(words, colour, **_marked(number)))
     if sampled:
         keys.append(
             style.key("posterior, range over seeds", style.GREY, marker="x", linestyle="none")

@@ -55,9 +55,7 @@ def parameter_rows(results: Results) -> list[Row]:
         mean, sd = post.draws.mean(axis=0), post.sd
         low, high = np.quantile(post.draws, (0.025, 0.975), axis=0)
         names = post.parameter_names
-        prior = list(
-            zip(post.priors.mean(names).tolist(), post.priors.sd(names).tolist(), strict=True)
-        )
+        prior = list(zip(post.priors.mean(names), post.priors.sd(names), strict=True))
     start: list[float | None] = [*cal.nominal.theta.tolist(), None]
     true: list[float | None] = [None] * len(mean)
     z = np.full(len(mean), np.nan)
@@ -364,46 +362,25 @@ def _round_rows(record: ImageRecord, cal: Calibration) -> list[Row]:
     first, last = record.rounds[0], record.rounds[-1]
     if last.n_stars and not (last.new or last.given_up):
         return []
-    rows: list[Row] = [
-        {
-            "name": "images identified",
-            "values": [count(r.n_frames) for r in (first, last)],
-            "change": "",
-            "unit": "",
-        },
-        {
-            "name": "stars calibrated",
-            "values": [count(r.n_stars) for r in (first, last)],
-            "change": f"{count(last.new)} identified anew, {count(last.given_up)} given up",
-            "unit": "",
-        },
+    both = (first, last)
+
+    def row(name: str, values: list[str], change: str = "", unit: str = "") -> Row:
+        return {"name": name, "values": values, "change": change, "unit": unit}
+
+    anew = f"{count(last.new)} identified anew, {count(last.given_up)} given up"
+    rows = [
+        row("images identified", [count(r.n_frames) for r in both]),
+        row("stars calibrated", [count(r.n_stars) for r in both], anew),
     ]
     for parameter in parameters(cal.camera.distortion):
         if parameter.name not in first.parameters or parameter.name not in last.parameters:
             continue
-        (old, old_sigma), (new, sigma) = (
-            first.parameters[parameter.name],
-            last.parameters[parameter.name],
-        )
+        (old, old_sigma), (new, sigma) = (r.parameters[parameter.name] for r in both)
         scale = parameter.scale
-        rows.append(
-            {
-                "name": symbol(parameter.name),
-                "values": [
-                    plus_minus(old / scale, old_sigma / scale),
-                    plus_minus(new / scale, sigma / scale),
-                ],
-                "change": f"{fixed((new - old) / sigma, 1)} σ" if sigma > 0.0 else "",
-                "unit": pretty_unit(parameter.scaled_unit),
-            }
-        )
+        values = [plus_minus(a / scale, b / scale) for a, b in ((old, old_sigma), (new, sigma))]
+        change = f"{fixed((new - old) / sigma, 1)} σ" if sigma > 0.0 else ""
+        unit = pretty_unit(parameter.scaled_unit)
+        rows.append(row(symbol(parameter.name), values, change, unit))
     unit = "times the stated noise" if last.sigma_name == "sigma_scale" else "px per axis"
-    rows.append(
-        {
-            "name": "noise",
-            "values": [significant(r.sigma, 3) for r in (first, last)],
-            "change": "",
-            "unit": unit,
-        }
-    )
+    rows.append(row("noise", [significant(r.sigma, 3) for r in both], unit=unit))
     return rows

@@ -62,23 +62,17 @@ def headline(budget: Budget) -> str:
         names = join_words([repr(outcome.requirement.name) for outcome in budget.violations])
         verb = "requirement is" if len(budget.violations) == 1 else "requirements are"
         parts.append(f"{len(budget.violations)} {verb} violated: {names}.")
-    met = [outcome for outcome in budget.outcomes if outcome.verdict == "met"]
-    if met:
-        parts.append(f"{plural(len(met), 'requirement')} met.")
-    unresolved = [outcome for outcome in budget.open_requirements if outcome.unresolved]
-    between = [outcome for outcome in budget.open_requirements if outcome.between]
-    missing = len(budget.open_requirements) - len(unresolved) - len(between)
-    if missing:
-        parts.append(f"{plural(missing, 'requirement')} open: contributors are missing.")
-    if between:
-        parts.append(
-            f"{plural(len(between), 'requirement')} open: only an upper bound exceeds the limit."
-        )
-    if unresolved:
-        parts.append(
-            f"{plural(len(unresolved), 'requirement')} open: the samples do not resolve so high "
-            "a confidence."
-        )
+    opened = budget.open_requirements
+    unresolved = sum(outcome.unresolved for outcome in opened)
+    between = sum(outcome.between for outcome in opened)
+    for number, became in (
+        (sum(outcome.verdict == "met" for outcome in budget.outcomes), "met."),
+        (len(opened) - unresolved - between, "open: contributors are missing."),
+        (between, "open: only an upper bound exceeds the limit."),
+        (unresolved, "open: the samples do not resolve so high a confidence."),
+    ):
+        if number:
+            parts.append(f"{plural(number, 'requirement')} {became}")
     if budget.not_assessed:
         every = len(by_contributor(budget.rows))
         parts.append(
@@ -203,6 +197,10 @@ def bound(value: float, at_least: bool, digits: int = 3) -> str:
     return ("≥ " if at_least else "") + significant(value, digits)
 
 
+def _known(value: float) -> str:
+    return "–" if math.isnan(value) else significant(value, 3)
+
+
 def total_rows(budget: Budget) -> list[Row]:
     """One row per scope and axis: mean, sigma, factor and the bounds of all interpretations."""
     rows = []
@@ -213,9 +211,7 @@ def total_rows(budget: Budget) -> list[Row]:
                 {
                     "scope": scope,
                     "axis": AXIS_LABELS[axis],
-                    "mean": "–"
-                    if math.isnan(mixed.mean_arcsec)
-                    else significant(mixed.mean_arcsec, 3),
+                    "mean": _known(mixed.mean_arcsec),
                     "sigma": bound(mixed.sigma_arcsec, mixed.at_least),
                     "factor": "–" if math.isnan(mixed.factor) else fixed(mixed.factor, 3),
                     "rule": bound(mixed.rule_arcsec, mixed.at_least),
@@ -259,9 +255,7 @@ def _requirement_row(outcome: Outcome) -> Row:
         "rule": bound(outcome.total.rule_arcsec, outcome.total.at_least),
         "sampled": _sampled(outcome.total),
         "least": bound(outcome.least_arcsec, outcome.total.at_least),
-        "margin": "–"
-        if math.isnan(outcome.margin_arcsec)
-        else significant(outcome.margin_arcsec, 3),
+        "margin": _known(outcome.margin_arcsec),
         "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),
         "verdict": outcome.verdict,
         "level": outcome.level.value,
@@ -320,43 +314,32 @@ def outcome_text(outcome: Outcome) -> str:
     asked, total = outcome.requirement, outcome.total
     axis = axis_label(asked)
     what = f"{axis}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
-    numbers = (
-        f"{significant(outcome.bound_arcsec, 3)} arcsec against a limit of "
-        f"{significant(asked.limit_arcsec, 3)}"
-    )
+    limit = f"against a limit of {significant(asked.limit_arcsec, 3)}"
+    numbers = f"{significant(outcome.bound_arcsec, 3)} arcsec {limit}"
+    named = f"{asked.name!r} ({what}) is"
     least = "at least " if total.at_least else ""
     if outcome.unresolved:
         return (
-            f"{asked.name!r} ({what}) is open: {total.explanation.removesuffix('.')}. The rule, "
-            "which knows "
-            f"Gaussian tails only, says {least}{significant(total.rule_arcsec, 3)} arcsec "
-            "against a limit of "
-            f"{significant(asked.limit_arcsec, 3)}; judged_by = 'rule' would let it judge alone."
+            f"{named} open: {total.explanation.removesuffix('.')}. The rule, which knows Gaussian "
+            f"tails only, says {least}{significant(total.rule_arcsec, 3)} arcsec {limit}; "
+            "judged_by = 'rule' would let it judge alone."
         )
     if math.isnan(outcome.bound_arcsec):
-        return f"{asked.name!r} ({what}) is open: no contributor is assessed."
+        return f"{named} open: no contributor is assessed."
+    lower = significant(outcome.least_arcsec, 3)
     if outcome.verdict == "violated":
         cause = f"; {total.dominant!r} dominates" if total.dominant else ""
-        reached = (
-            f"{significant(outcome.least_arcsec, 3)} arcsec against a limit of "
-            f"{significant(asked.limit_arcsec, 3)}"
-        )
-        least = least or ("at least " if outcome.least_arcsec < outcome.bound_arcsec else "")
-        return f"{asked.name!r} ({what}) is violated: {least}{reached}{cause}."
+        if outcome.least_arcsec < outcome.bound_arcsec:
+            least = "at least "
+        return f"{named} violated: {least}{lower} arcsec {limit}{cause}."
     if outcome.between:
         so_far = " so far" if total.at_least else ""
-        lower = significant(outcome.least_arcsec, 3)
-        return (
-            f"{asked.name!r} ({what}) is open: at the least {lower} and at most {numbers}{so_far}."
-        )
+        return f"{named} open: at the least {lower} and at most {numbers}{so_far}."
     if outcome.verdict == "open":
         count = len(total.not_assessed)
         missing = f"{count} contributors are" if count > 1 else "1 contributor is"
-        return f"{asked.name!r} ({what}) is open: {numbers} so far, but {missing} not assessed."
-    return (
-        f"{asked.name!r} ({what}) is met: {numbers}, margin "
-        f"{significant(outcome.margin_arcsec, 3)} arcsec."
-    )
+        return f"{named} open: {numbers} so far, but {missing} not assessed."
+    return f"{named} met: {numbers}, margin {significant(outcome.margin_arcsec, 3)} arcsec."
 
 
 def requirement_checks(budget: Budget | None) -> tuple[Check, ...]:
