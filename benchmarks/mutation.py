@@ -16,7 +16,7 @@ function gets its changed code; what stands outside functions is imported anew.
 
 Not mutated, because no test should care: sentences, annotations, decorators, what follows
 ``raise``, sizes of blocks, seeds, and -1 where it stands for the last axis of two or for a size to
-be found. `estimation/loops` is left out: its compiled code is cached by the file on the disk. Tests
+be found. `likelihood/loops` is left out: its compiled code is cached by the file on the disk. Tests
 hold it equal to `estimation/sums`.
 """
 

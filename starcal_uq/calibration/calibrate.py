@@ -11,7 +11,6 @@ import numpy as np
 from starcal_uq.calibration.fallback import fit_determined
 from starcal_uq.calibration.methods import offered
 from starcal_uq.calibration.plausibility import explained
-from starcal_uq.camera import compiled
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import CalibrationError
@@ -27,7 +26,7 @@ from starcal_uq.estimation.robust import with_tail_weights
 from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
 from starcal_uq.estimation.weights import weighed
-from starcal_uq.likelihood.loops import kernels
+from starcal_uq.likelihood import paths
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 
@@ -174,7 +173,7 @@ def _estimate(
     if isinstance(obs, PartitionedObservations) and settings.method not in RECURSIVE_METHODS:
         sample = obs.sample()
         # What is compiled is compiled here, before other processes ask for it.
-        with compiled.using(kernels(asked.distortion, obs.n_stars)):
+        with paths.using(paths.chosen(obs.n_stars)):
             start = calibrate(sample, asked, settings, model=asked.distortion)
         with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
             return calibrate_partitions(

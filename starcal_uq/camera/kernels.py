@@ -46,25 +46,18 @@ _BINARY = {
 }
 
 
-def emit_source(
-    function: Any,
-    name: str = "kernel",
-    arguments: str = "inputs, out",
-    read: Callable[[int, int], str] = "inputs[{}][{}]".format,
-    write: Callable[[int, int], str] = "out[{}][{}]".format,
-) -> str:
+def emit_source(function: Any, name: str) -> str:
     """Write the instruction list of a dense CasADi SX function as Python source, ``def name(inputs,
     out)``.
 
     `inputs` is a sequence (one entry per input) of sequences of scalars or (n,) arrays, one per
-    element; `out` is a sequence of (n_elements, n) arrays, one per output, which are filled. `read`
-    and `write` make what stands in the source for an input or output from its number and that of
-    its element. NotImplementedError for an operation without a NumPy counterpart in this module.
+    element; `out` is a sequence of (n_elements, n) arrays, one per output, which are filled.
+    NotImplementedError for an operation without a NumPy counterpart in this module.
     """
     import casadi as ca
 
     templates = {getattr(ca, key): value for key, value in (_UNARY | _BINARY).items()}
-    lines = [f"def {name}({arguments}):"]
+    lines = [f"def {name}(inputs, out):"]
     for index in range(function.n_instructions()):
         operation = function.instruction_id(index)
         sources = function.instruction_input(index)
@@ -72,9 +65,9 @@ def emit_source(
         if operation == ca.OP_CONST:
             lines.append(f"    w{targets[0]} = {float(function.instruction_constant(index))!r}")
         elif operation == ca.OP_INPUT:
-            lines.append(f"    w{targets[0]} = {read(sources[0], sources[1])}")
+            lines.append(f"    w{targets[0]} = inputs[{sources[0]}][{sources[1]}]")
         elif operation == ca.OP_OUTPUT:
-            lines.append(f"    {write(targets[0], targets[1])} = w{sources[0]}")
+            lines.append(f"    out[{targets[0]}][{targets[1]}] = w{sources[0]}")
         elif operation in templates:
             expression = templates[operation].format(*(f"w{source}" for source in sources))
             lines.append(f"    w{targets[0]} = {expression}")
@@ -94,7 +87,7 @@ class Kernel:
     """
 
     function: Any
-    run: Callable[[Sequence[Any], Sequence[FloatArray]], None]
+    run: Callable[[Sequence[Any], Sequence[Any]], None]
     shapes: tuple[tuple[int, ...], ...]
 
     def __call__(self, n: int, *inputs: Any) -> tuple[FloatArray, ...]:

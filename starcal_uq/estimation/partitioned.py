@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_uq.attitude.rotations import rotation_to_quaternion
-from starcal_uq.camera import compiled
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, model_names, simpler_models
 from starcal_uq.core.cluster import Cluster
@@ -40,7 +39,7 @@ from starcal_uq.estimation.residual_map import (
 )
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.likelihood import loops
+from starcal_uq.likelihood import paths
 from starcal_uq.likelihood.compressed import GramSums, gram_sums, optimum, settled
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.solvers import Normal, is_singular, levenberg_marquardt
@@ -74,7 +73,7 @@ class _Seen:
 
 
 def _with_kernels(kernels: str, one: Callable[[Partition], T], part: Partition) -> T:
-    with compiled.using(kernels):
+    with paths.using(kernels):
         return one(part)
 
 
@@ -175,7 +174,7 @@ def _residuals(
     )
     # Without their further terms these models are the camera's: the attitudes are known, and one
     # pass is enough.
-    with compiled.using("numpy"):
+    with paths.using("numpy"):
         richer = tuple(
             frame_sums(whole, other.distortion, other.theta, attitudes.at(theta))[0]
             for other in _richer(camera)
@@ -251,7 +250,7 @@ def calibrate_partitions(
     reader, model, began = obs.reader, start.camera.distortion, perf_counter()
     # Chosen here once: what one process has compiled in the meantime must not change the digits of
     # another.
-    kernels = loops.kernels(model, obs.n_stars)
+    kernels = paths.chosen(obs.n_stars)
     first = start.stages[-1].theta
 
     def total(one: Callable[[Partition], T], together: Callable[[Sequence[T]], T]) -> T:

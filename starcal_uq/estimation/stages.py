@@ -17,9 +17,9 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import monotonic_expression
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.likelihood.loops import attitude_loop, kernels
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
+from starcal_uq.likelihood.paths import loops_for
 from starcal_uq.likelihood.solvers import (
     Constraints,
     Last,
@@ -200,11 +200,8 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     model = get_model(camera.distortion)
     f = theta[2]
     offset = frames.pixel - theta[:2, None]
-    found = (
-        attitude_loop(frames, "none", theta[:3])
-        if kernels("none", frames.n_stars) == "numba"
-        else None
-    )
+    loops = loops_for(frames)
+    found = loops and loops.attitude_loop(frames, "none", theta[:3])
     if found is not None and found[1]:
         rotations = found[0]
     else:

@@ -22,8 +22,8 @@ from starcal_uq.camera.projection import bent_index, forward_kernel, forward_roo
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.likelihood.loops import gram_loop, kernels
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
+from starcal_uq.likelihood.paths import loops_for
 from starcal_uq.likelihood.sums import (
     ATTITUDE_STEPS,
     ATTITUDE_TOLERANCE_RAD,
@@ -299,11 +299,12 @@ def gram_sums(
     make them again.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    if frames.axes is None and kernels(model_name, frames.n_stars) == "numba":
+    loops = loops_for(frames)
+    if loops is not None:
         sums, at = settled_sums(frames, model_name, theta, rotations) if known is None else known
         # A nanoradian that is left would move the estimate by some 1e-8 sigma.
         moved = (np.zeros_like(at.shift), at.response, at.inverse)
-        gram, slope = gram_loop(frames, model_name, theta, whitening, at.at(theta), moved)
+        gram, slope = loops.gram_loop(frames, model_name, theta, whitening, at.at(theta), moved)
         return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)
     return _expanded(
         frames, model_name, theta, whitening, rotations, lambda part, block, stars: None

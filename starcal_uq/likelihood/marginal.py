@@ -24,7 +24,7 @@ from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.elimination import ByFrame
-from starcal_uq.likelihood.loops import kernels
+from starcal_uq.likelihood.paths import path_of
 from starcal_uq.likelihood.solvers import Normal
 from starcal_uq.likelihood.sums import (
     ATTITUDE_STEPS,
@@ -85,11 +85,7 @@ class MarginalLikelihood:
     @property
     def kernels(self) -> str:
         """``numpy`` or ``numba``: what sums over all frames are made with."""
-        return (
-            "numpy"
-            if self.frames.axes is not None
-            else kernels(self.model_name, self.frames.n_stars)
-        )
+        return path_of(self.frames)
 
     def start_rotations(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) by QUEST at theta."""

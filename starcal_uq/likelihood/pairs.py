@@ -20,7 +20,7 @@ from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import backward_kernel, backward_root, unproject_theta
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.likelihood.loops import attitude_loop, kernels, pair_loop
+from starcal_uq.likelihood.paths import loops_for
 from starcal_uq.likelihood.solvers import Normal, is_singular
 from starcal_uq.maths.linear import COLUMNS, ROWS, unit_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -91,7 +91,6 @@ class PairObjective:
         self.n_parameters = 3 + len(get_model(model_name).coefficients)
         self._turned_at: FloatArray | None = None
         self._turned, self._rotations = np.empty((3, 0)), np.empty((0, 3, 3))
-        self._compiled = kernels(model_name, frames.n_stars) == "numba"
         self._last: tuple[FloatArray, Normal, FloatArray] | None = None
 
     @cached_property
@@ -136,7 +135,8 @@ class PairObjective:
         ):
             return self._rotations
         frames = self.frames
-        found = attitude_loop(frames, self.model_name, theta) if self._compiled else None
+        loops = loops_for(frames)
+        found = loops and loops.attitude_loop(frames, self.model_name, theta)
         if found is None:
             b = unproject_theta(self.model_name, theta, frames.pixel.T)
             by_quest = quest(b, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
@@ -180,11 +180,8 @@ class PairObjective:
         cost, matrix, scores = 0.0, np.zeros((p, p)), []
         with np.errstate(all="ignore"):
             rotations = self._turn(theta)
-            whole = (
-                pair_loop(self.frames, self.model_name, theta, rotations)
-                if self._compiled
-                else None
-            )
+            loops = loops_for(self.frames)
+            whole = loops and loops.pair_loop(self.frames, self.model_name, theta, rotations)
             for part in self._parts(theta) if whole is None else [whole]:
                 cost += part[0]
                 matrix += part[1]

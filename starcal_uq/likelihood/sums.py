@@ -37,7 +37,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood import loops
+from starcal_uq.likelihood import paths
 from starcal_uq.likelihood.solvers import Normal
 from starcal_uq.maths.linear import inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
@@ -99,13 +99,14 @@ class Attitudes:
     response: FloatArray  # (3, p, K): derivative of the best ones with respect to theta
     inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
     log_determinant: FloatArray  # (K,): log |A^T A|
-    loops: str | None = None  # Distortion model whose loops made them; None where NumPy did
+    compiled: bool = False  # Whether loops made them, or NumPy
 
     def at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta (p,), to first order."""
         step = self.shift + np.einsum("ipk,p->ik", self.response, theta - self.theta)
-        if self.loops is not None:
-            return loops.turned_loop(self.loops, step, self.rotations)
+        if self.compiled:
+            turned: FloatArray = paths.load().turned_loop(step, self.rotations)
+            return turned
         return np.asarray(exp_rotation(step.T) @ self.rotations)
 
 
@@ -175,8 +176,8 @@ def frame_sums(
     over parts, not finite where the model is not, and what stays with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    fast = frames.axes is None and loops.kernels(model_name, frames.n_stars) == "numba"
-    path = loops.frame_loop if fast else _frame_blocks
+    loops = paths.loops_for(frames)
+    path = _frame_blocks if loops is None else loops.frame_loop
     with np.errstate(all="ignore"):
         gram, shift, response, inverse, volume = path(
             frames, model_name, theta, rotations, residuals
@@ -190,9 +191,7 @@ def frame_sums(
             n_stars=frames.n_stars,
             n_frames=frames.n_frames,
         )
-    return sums, Attitudes(
-        theta, rotations, shift, response, inverse, volume, model_name if fast else None
-    )
+    return sums, Attitudes(theta, rotations, shift, response, inverse, volume, loops is not None)
 
 
 def _frame_blocks(

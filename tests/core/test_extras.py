@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.camera import compiled
 from starcal_uq.cli.app import main
 from starcal_uq.core.cluster import cluster
 from starcal_uq.core.errors import MissingExtraError
 from starcal_uq.images.detection import DetectionOptions, find_stars
 from starcal_uq.images.image import Image
+from starcal_uq.likelihood import paths
 from starcal_uq.presentation.pages.budgeting import write_xlsx
 from starcal_uq.presentation.pages.notebook import executed
 
@@ -67,7 +67,7 @@ NEEDS: dict[str, tuple[str, str, Callable[[Path], Any]]] = {
     "Excel workbooks": ("openpyxl", "excel", lambda folder: write_xlsx(Any, folder / "a.xlsx")),
     "ASDF files": ("asdf", "asdf", partial(export, "asdf")),
     "cameras for tetra3rs": ("tetra3rs", "tetra3rs", partial(export, "tetra3rs")),
-    "compiled kernels": ("numba", "compiled", lambda _: compiled.use("numba")),
+    "compiled kernels": ("numba", "compiled", lambda _: paths.use("numba")),
     "Dask schedulers": (
         "distributed",
         "cluster",

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.camera import compiled
 from starcal_uq.camera.projection import forward_kernel
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.likelihood import sums
+from starcal_uq.likelihood import paths, sums
 from starcal_uq.likelihood.compressed import gram_sums
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
@@ -157,17 +156,19 @@ def _predicted(frames, theta, rotations):
 
 
 def test_switch_of_the_kernels(monkeypatch):
-    monkeypatch.setenv(compiled.SWITCH, "auto")
-    assert compiled.chosen(1000, lambda: "unused") == "numpy"
-    assert compiled.chosen(10**6, lambda: "never compiled") == "numpy"
-    monkeypatch.setenv(compiled.SWITCH, "numpy")
-    assert compiled.chosen(10**9, lambda: "") == "numpy"
+    monkeypatch.setenv(paths.SWITCH, "auto")
+    # The size decides, and nothing that was compiled before.
+    monkeypatch.setattr(paths, "installed", lambda: True)
+    assert paths.chosen(paths.WORTH_LOADING - 1) == "numpy"
+    assert paths.chosen(paths.WORTH_LOADING) == "numba"
+    monkeypatch.setenv(paths.SWITCH, "numpy")
+    assert paths.chosen(10**9) == "numpy"
     with pytest.raises(StarcalError, match="auto, numpy, numba"):
-        compiled.use("fortran")
-    monkeypatch.setattr(compiled, "installed", lambda: False)
-    assert compiled.SWITCH == "STARCAL_UQ_KERNELS"
+        paths.use("fortran")
+    monkeypatch.setattr(paths, "installed", lambda: False)
+    assert paths.SWITCH == "STARCAL_UQ_KERNELS"
     with pytest.raises(StarcalError, match=r"starcal-uq\[compiled\]"):
-        compiled.use("numba")
+        paths.use("numba")
 
 
 @needs_numba
@@ -179,10 +180,10 @@ def test_compiled_loops_equal_numpy(model, stated, monkeypatch):
     obs = observations(model, n_frames=60)
     likelihood = MarginalLikelihood(with_sigmas(obs) if stated else obs, model)
     theta = camera(model).theta
-    monkeypatch.setenv(compiled.SWITCH, "numpy")
+    monkeypatch.setenv(paths.SWITCH, "numpy")
     rotations = likelihood.start_rotations(theta)
     plain, where = frame_sums(likelihood.frames, model, theta, rotations)
-    monkeypatch.setenv(compiled.SWITCH, "numba")
+    monkeypatch.setenv(paths.SWITCH, "numba")
     residuals = np.empty((2, likelihood.frames.n_stars))
     fused, there = frame_sums(likelihood.frames, model, theta, rotations, residuals)
     assert fused.cost == pytest.approx(plain.cost, rel=1e-12)
@@ -210,7 +211,7 @@ def _compare_gram(likelihood, model, theta, rotations, matrix, monkeypatch):
     whitening = scaled_cholesky(scaled_inverse(matrix))
     both = []
     for path in ("numba", "numpy"):
-        monkeypatch.setenv(compiled.SWITCH, path)
+        monkeypatch.setenv(paths.SWITCH, path)
         both.append(gram_sums(likelihood.frames, model, theta, whitening, rotations))
     fused, plain = both
     p = len(theta)
@@ -221,13 +222,13 @@ def _compare_gram(likelihood, model, theta, rotations, matrix, monkeypatch):
     assert np.max(difference) < 1e-8
     assert np.max(np.abs(fused.gram - plain.gram)) < 1e-12 * np.max(plain.gram)
     assert np.allclose(fused.log_determinant_slope, plain.log_determinant_slope, rtol=0, atol=1e-12)
-    monkeypatch.setenv(compiled.SWITCH, "numba")
+    monkeypatch.setenv(paths.SWITCH, "numba")
 
 
 def _compare_pairs(frames, model, theta, monkeypatch):
     both = []
     for path in ("numba", "numpy"):
-        monkeypatch.setenv(compiled.SWITCH, path)
+        monkeypatch.setenv(paths.SWITCH, path)
         objective = PairObjective(frames, model)
         both.append((objective.evaluate(theta), objective.godambe(theta), objective.rotations))
         # Pixels beyond the fold of a strong distortion have no direction.
@@ -242,7 +243,7 @@ def _compare_pairs(frames, model, theta, monkeypatch):
     assert fused.cost == pytest.approx(plain.cost, rel=1e-11)
     assert np.max(np.abs(_scaled(fused.matrix - plain.matrix, plain.matrix))) < 1e-10
     assert np.max(np.abs(_scaled(fused_covariance - covariance, covariance))) < 1e-7
-    monkeypatch.setenv(compiled.SWITCH, "numba")
+    monkeypatch.setenv(paths.SWITCH, "numba")
 
 
 def _residuals(likelihood, model, theta, rotations):
@@ -259,17 +260,14 @@ def _residuals(likelihood, model, theta, rotations):
 @pytest.mark.slow
 def test_machine_code_is_kept_for_other_processes_and_not_needed(tmp_path, monkeypatch):
     script = (
-        "import time, numpy as np\n"
-        "from starcal_uq.camera import compiled\n"
-        "from starcal_uq.likelihood import loops\n"
-        "text = loops.source('none')\n"
-        "loops.compiled.load('none', text)\n"
-        "print(compiled.chosen(10**6, lambda: text), compiled._folder(text).exists())\n"
+        "import numpy as np\n"
+        "from starcal_uq.likelihood.loops import turned_loop\n"
+        "print(turned_loop(np.zeros((3, 1)), np.eye(3)[None]).trace(axis1=1, axis2=2)[0])\n"
     )
 
     def run(folder):
         environment = {
-            "XDG_CACHE_HOME": str(folder),
+            "NUMBA_CACHE_DIR": str(folder),
             "PATH": "",
             "HOME": str(tmp_path),
             "PYTHONPATH": sys.path[0],
@@ -278,13 +276,23 @@ def test_machine_code_is_kept_for_other_processes_and_not_needed(tmp_path, monke
             [sys.executable, "-c", script], env=environment, capture_output=True, text=True
         )
         assert done.returncode == 0, done.stderr
-        return done.stdout.split()
+        assert done.stdout.split() == ["3.0"]
 
-    assert run(tmp_path / "cache") == ["numba", "True"]
+    run(tmp_path / "cache")
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nbc")}
-    assert len(kept) > 0
-    assert run(tmp_path / "cache") == ["numba", "True"]
+    assert len(kept) == 1
+    run(tmp_path / "cache")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nbc")} == kept
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
-    assert run(blocked) == ["numpy", "False"]
+    run(blocked)
+
+
+@needs_numba
+def test_loops_are_compiled_for_the_process_where_nothing_can_be_kept(monkeypatch):
+    from numba.core import caching
+
+    from starcal_uq.likelihood.loops.common import compiled
+
+    monkeypatch.setattr(caching.CompileResultCacheImpl, "_locator_classes", [])
+    assert compiled(entry=True)(lambda x: x + 1.0)(2.0) == 3.0
