@@ -175,6 +175,7 @@ IMPORTED_AS = {
     "cv2": "opencv_python_headless",
     "erfa": "pyerfa",
     "h5py": "h5netcdf",
+    "llvmlite": "numba",
     "yaml": "pyyaml",
 }
 IMPORTED_AS |= {"arviz_base": "arviz", "arviz_plots": "arviz", "pydantic_core": "pydantic"}
