@@ -26,7 +26,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import plus_minus
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
 from starcal_uq.diagnostics.residuals import heard, of_heard
 from starcal_uq.diagnostics.shapes import (
@@ -34,14 +34,13 @@ from starcal_uq.diagnostics.shapes import (
     MAX_CELLS,
     Shape,
     View,
-    cell_columns,
     frame_shapes,
     run_clock,
     shapes,
 )
 from starcal_uq.estimation.noise_model import axis_noise, fit_noise, sigma_ratios
 from starcal_uq.estimation.weights import weighed
-from starcal_uq.likelihood.elimination import products_by_frame
+from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel, noise_model_of
 from starcal_uq.likelihood.star_errors import StarModel
@@ -299,87 +298,72 @@ def _detectable(test: MisfitTest, level: float) -> float:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Columns of some stars, the last of them the two axes of cells of the field, which are sums
-    and no columns.
+    """Whitened columns of some stars, the last of them the two axes of cells of the field, which
+    are zero but for few stars.
 
-    `dense` (q, 2, n) are the others; `cell` (n,) is of `n_cells`.
+    `dense` (d, 2, n) are the others; `cells` (q - d, 2 n) is sparse.
     """
 
     frames: StarFrames
     dense: FloatArray
-    cell: IntArray
-    n_cells: int
+    cells: Any
 
     @classmethod
     def of(cls, families: Sequence[Shape], view: View) -> _Columns:
+        from scipy.sparse import csr_array
+
         *others, last = families
         frames = view.part.frames
         dense = np.concatenate([family.columns(view) for family in others])
         frames.whiten(dense)
         assert last.cell is not None
-        return cls(frames, dense, last.cell(view), last.size // 2)
+        cell = last.cell(view)
+        # Shifts of every star along each axis.
+        shifts = np.repeat(np.eye(2)[:, :, None], len(cell), axis=2)
+        frames.whiten(shifts)
+        rows, stars = (
+            2 * cell + np.arange(2)[:, None, None],
+            np.arange(2 * len(cell)).reshape(2, -1),
+        )
+        place = np.broadcast_arrays(rows, stars)
+        cells = csr_array(
+            (shifts.ravel(), tuple(index.ravel() for index in place)),
+            shape=(last.size, stars.size),
+        )
+        return cls(frames, dense, cells)
 
     def all(self) -> FloatArray:
         """Every column (q, 2, n)."""
-        cells = cell_columns(self.cell, self.n_cells)
-        self.frames.whiten(cells)
-        return np.concatenate([self.dense, cells])
-
-    def _weight(self, values: Any) -> Any:
-        return values if self.frames.weight is None else values * self.frames.weight
+        return np.concatenate([self.dense, self.cells.toarray().reshape(-1, *self.dense.shape[1:])])
 
     def inner(self) -> FloatArray:
         """Products among themselves."""
-        d, q = len(self.dense), len(self.dense) + 2 * self.n_cells
-        found, cells = np.zeros((q, q)), np.arange(d, q)
-        flat = self.dense.reshape(d, -1)
-        found[:d, :d] = flat @ flat.T
-        found[d:, :d] = self._by_cell(self.dense)
-        found[:d, d:] = found[d:, :d].T
-        unit = self._weight(self._weight(np.ones(len(self.cell))))
-        squares = np.bincount(self.cell, unit, self.n_cells)
-        w = self.frames.whitening
-        axes = np.eye(2) if w is None else w.T @ w
-        for i in range(2):
-            for j in range(2):
-                found[cells[i::2], cells[j::2]] = axes[i, j] * squares
+        across = self.across(self.dense)
+        d, q = len(self.dense), len(across)
+        found = np.empty((q, q))
+        found[:, :d], found[:d] = across, across.T
+        found[d:, d:] = (self.cells @ self.cells.T).toarray()
         return found
-
-    def _turned(self, sums: FloatArray) -> FloatArray:
-        """Sums (c, 2, m) of whitened columns over cells, along the axes of the cells' own
-        shifts.
-        """
-        w = self.frames.whitening
-        return sums if w is None else np.einsum("ba,cbm->cam", w, sums)
 
     def across(self, columns: FloatArray) -> FloatArray:
         """Products (q, m) with columns (m, 2, n)."""
-        flat = self.dense.reshape(len(self.dense), -1)
-        return np.concatenate([flat @ columns.reshape(len(columns), -1).T, self._by_cell(columns)])
-
-    def _by_cell(self, columns: FloatArray) -> FloatArray:
-        """Sums (2 c, m) over the stars of each cell of columns (m, 2, n)."""
-        order = np.argsort(self.cell, kind="stable")
-        present, first = np.unique(self.cell[order], return_index=True)
-        sums = np.zeros((self.n_cells, 2, len(columns)))
-        sums[present] = np.add.reduceat(
-            np.take(self._weight(columns), order, axis=-1), first, axis=-1
-        ).T
-        return self._turned(sums).reshape(2 * self.n_cells, -1)
+        flat = columns.reshape(len(columns), -1).T
+        return np.concatenate([self.dense.reshape(len(self.dense), -1) @ flat, self.cells @ flat])
 
     def by_frame(self, few: FloatArray) -> FloatArray:
         """Products (i, q, K) with few columns (i, 2, n) over the stars of each frame."""
-        k = self.frames.n_frames
-        place = np.repeat(np.arange(k), self.frames.sizes) * self.n_cells + self.cell
-        found = np.empty((len(few), len(self.dense) + 2 * self.n_cells, k))
-        for column, into in zip(few, found, strict=True):
-            into[: len(self.dense)] = _frame_products(self.frames, column, self.dense)
-            cells = into[len(self.dense) :].reshape(self.n_cells, 2, k)
-            for axis in range(2):
-                sums = np.bincount(place, self._weight(column[axis]), k * self.n_cells)
-                cells[:, axis] = sums.reshape(k, self.n_cells).T
-            cells[:] = self._turned(cells)
-        return found
+        from scipy.sparse import csr_array
+
+        n, k = 2 * self.frames.n_stars, self.frames.n_frames
+        frame = np.tile(np.repeat(np.arange(k), self.frames.sizes), 2)
+        found = []
+        for column in few:
+            spread = csr_array((column.ravel(), frame, np.arange(n + 1)), shape=(n, k))
+            of_cells = (self.cells @ spread).toarray()
+            found.append(
+                np.concatenate([_frame_products(self.frames, column, self.dense), of_cells])
+            )
+        return np.stack(found)
 
 
 def _frame_products(frames: StarFrames, column: FloatArray, many: FloatArray) -> FloatArray:
@@ -646,25 +630,18 @@ class NoiseSums:
         self, frames: StarFrames, state: Any, h: FloatArray, e: FloatArray, rows: slice
     ) -> None:
         """Add some frames: h (p, 2, n) and e (2, n) with the attitudes removed."""
-        a, inverse = state.attitude, np.moveaxis(state.inverse, 2, 0)
+        a = ByFrame(frames, state.attitude, state.inverse).orthonormal
+        flat = h.reshape(len(h), -1)
         for i, values in enumerate(self.weights.values()):
             w = values[rows]
             self.squares[i] += float(np.sum(w * e**2))
-            weighted, doubly = h * w, h * w**2
-            flat = h.reshape(len(h), -1)
-            self.parameters1[i] += weighted.reshape(len(h), -1) @ flat.T
-            self.parameters2[i] += doubly.reshape(len(h), -1) @ flat.T
-            awa = products_by_frame(frames, a * w, a) @ inverse
-            aw2a = products_by_frame(frames, a * w**2, a) @ inverse
-            awh = products_by_frame(frames, a * w, h)
+            self.parameters1[i] += (h * w).reshape(len(h), -1) @ flat.T
+            self.parameters2[i] += (h * w**2).reshape(len(h), -1) @ flat.T
+            awa, awh = products_by_frame(frames, a * w, a), products_by_frame(frames, a * w, h)
             self.trace[i] += 2.0 * np.sum(w) - np.einsum("kaa->", awa)
             # tr(W W) - 2 tr(P W W) + tr(P W P W) for the attitudes' part of P.
-            self.trace2[i] += (
-                2.0 * np.sum(w**2)
-                - 2.0 * np.einsum("kaa->", aw2a)
-                + np.einsum("kab,kba->", awa, awa)
-            )
-            self.crossed[i] += np.einsum("kap,kab,kbq->pq", awh, inverse, awh)
+            self.trace2[i] += 2.0 * np.sum(w**2) - 2.0 * np.sum((a * w) ** 2) + np.sum(awa**2)
+            self.crossed[i] += np.tensordot(awh, awh, ((0, 1), (0, 1)))
 
     def tests(
         self, matrix: FloatArray, inverse: FloatArray, rss: float, dof: int
