@@ -18,7 +18,8 @@ from starcal_uq.estimation.residual_map import FrameScatter
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.sums import frame_normals
-from starcal_uq.likelihood.terms import add_by_group
+from starcal_uq.likelihood.terms import TermSums, add_by_group
+from starcal_uq.maths.linear import without_first
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -173,38 +174,33 @@ class StarNormals:
         """Sums over the stars that `numbers` (N,) tells apart, at the estimate of a calibration."""
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         frames, p = likelihood.frames, len(cal.theta)
-        term = star_term(numbers, frames.r, float(cal.theta[2]))
-        start = quaternion_to_rotation(cal.quaternions)
-        matrix, slope, squares = np.zeros((p, p)), np.zeros(p), 0.0
-        s = len(term.prior_scale)
-        scores, slopes, matrices, response = (
-            np.zeros((s, *shape)) for shape in ((p,), (p,), (p, p), (2, p))
-        )
+        sums = TermSums(star_term(numbers, frames.r, float(cal.theta[2])))
+        start, gram = quaternion_to_rotation(cal.quaternions), np.zeros((p + 1, p + 1))
+        s = sums.n_groups
+        scores, slopes, matrices = np.zeros((s, p)), np.zeros((s, p)), np.zeros((s, p, p))
         for part, state, rows in likelihood.pieces(cal.theta, start, _STARS_AT_ONCE):
             h = part.slopes(cal.theta, state) * cal.sigmas[:, None, None]
-            stars = numbers[rows]
+            flat = np.concatenate([h, state.e[None]]).reshape(p + 1, -1)
+            gram += flat @ flat.T
+            sums.add(part, state, h, rows)
             # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has
             # hidden.
-            a = part.attitudes(state).orthonormal
+            a, stars = part.attitudes(state).orthonormal, numbers[rows]
             free = np.linalg.inv(np.eye(2) - np.einsum("axn,ayn->nxy", a, a, optimize=True))
             raised = np.einsum("nxy,pyn->pxn", free, h, optimize=True)
-            matrix += np.einsum("axn,bxn->ab", h, h, optimize=True)
-            slope += np.einsum("axn,xn->a", h, state.e)
-            squares += float(np.sum(state.e**2))
             add_by_group(scores, np.sum(h * state.e, axis=1), stars)
             add_by_group(slopes, np.sum(raised * state.e, axis=1), stars)
             add_by_group(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
-            z = term.columns(part, state, rows)
-            add_by_group(response, np.einsum("ixn,pxn->ipn", z, h), stars)
+        matrix = gram[:p, :p]
         unit = 1.0 / np.sqrt(np.diag(matrix))
         return cls(
             scale=cal.sigmas * unit,
             matrix=matrix * np.outer(unit, unit),
-            squares=squares - float(slope @ np.linalg.solve(matrix, slope)),
+            squares=float(without_first(gram, p, 0.0, unit)[0][0, 0]),
             scores=scores * unit,
             matrices=matrices * np.outer(unit, unit),
             slopes=slopes * unit,
-            response=response * unit,
+            response=sums.cross.reshape(s, 2, p) * unit,
             dof=likelihood.dof - p,
         )
 
