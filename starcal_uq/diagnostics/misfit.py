@@ -330,6 +330,7 @@ class _Columns:
             (shifts.ravel(), tuple(index.ravel() for index in place)),
             shape=(last.size, stars.size),
         )
+        cells.eliminate_zeros()
         return cls(frames, dense, cells)
 
     def all(self) -> FloatArray:
