@@ -79,22 +79,22 @@ def test_steps_give_what_they_write_and_remove_what_is_stale(tmp_path: Path) -> 
         _ = run.calibration
     obs = observations(n_frames=60)
     cal = run.calibrate(obs, sc.paper.paper_start())
-    assert [part.command.split()[1] for part in run.missing] == ["sample", "propagate", "diagnose"]
+    assert [part.remedy.action for part in run.missing] == ["sample", "propagate", "diagnose"]
     assert run.best is cal
     assert run.results.posterior is None
     posterior = run.sample(n_steps=50, seed=1)
     run.couple()
     run.propagate(n_draws=60, seed=1)
-    assert [part.command.split()[1] for part in run.missing] == ["diagnose", "budget"]
+    assert [part.remedy.action for part in run.missing] == ["diagnose", "budget"]
     run.budget()
-    assert [part.command.split()[1] for part in run.missing] == ["diagnose"]
+    assert [part.remedy.action for part in run.missing] == ["diagnose"]
     again = sc.Run(tmp_path / "run")
     assert np.array_equal(again.posterior.draws, posterior.draws)
     assert again.error_budget.to_dict() == run.error_budget.to_dict()
     assert again.observations.data_hash == run.observations.data_hash
     assert again.verdict.headline == run.verdict.headline
     run.calibrate(obs, sc.paper.paper_start(), force=True)
-    assert [part.command.split()[1] for part in run.missing] == ["sample", "propagate", "diagnose"]
+    assert [part.remedy.action for part in run.missing] == ["sample", "propagate", "diagnose"]
     assert run.best is run.calibration
     with pytest.raises(sc.errors.RunFolderError, match=r"has no budget\.csv"):
         _ = run.error_budget
