@@ -193,17 +193,17 @@ def read_json(path: Path, data: bytes) -> tuple[AnyDict, AnyDict]:
     document: Any = json.loads(data)
     if isinstance(document, dict) and "frames" in document:
         document = document["frames"]
-    try:
-        return matched_columns(document, None)
-    except ObservationError as error:
-        raise ObservationError(f"{path}: {str(error).removeprefix('matches: ')}") from None
+    return matched_columns(document, None, where=str(path))
 
 
 def matched_columns(
-    solutions: Any, size_px: tuple[int, int] | None, times: Sequence[str] | None = None
+    solutions: Any,
+    size_px: tuple[int, int] | None,
+    times: Sequence[str] | None = None,
+    where: str = "matches",
 ) -> tuple[AnyDict, AnyDict]:
     """Columns and metadata of solutions; see
-    `starcal_uq.observations.table.Observations.from_matches`.
+    `starcal_uq.observations.table.Observations.from_matches`. `where` is what errors name.
     """
     given = [solutions] if isinstance(solutions, Mapping | tuple) else list(solutions)
     parts: dict[str, list[Any]] = {
@@ -211,7 +211,7 @@ def matched_columns(
     }
     unsolved = []
     for number, solution in enumerate(given):
-        found = _matches(number, solution, size_px)
+        found = _matches(f"{where}: solution {number}", solution, size_px)
         if found is None:
             unsolved.append(number)
             continue
@@ -231,7 +231,7 @@ def matched_columns(
         parts["time_utc"] += [str(time or "")] * len(xy)
     if not parts["frame"]:
         raise ObservationError(
-            "matches: no solution has matched stars; give solutions that were found."
+            f"{where}: no solution has matched stars; give solutions that were found."
         )
     xy, sky = np.concatenate(parts["xy"]), np.concatenate(parts["sky"])
     columns = {
@@ -257,7 +257,7 @@ _HOW = {
 
 
 def _matches(
-    number: int, solution: Any, size_px: tuple[int, int] | None
+    where: str, solution: Any, size_px: tuple[int, int] | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, list[str]] | None:
     """Pixels (n, 2), directions (n, 2) in degrees, magnitudes and names (n,) of a solution; None
     for a failed one.
@@ -267,7 +267,7 @@ def _matches(
     if not solution:
         return None
     if not isinstance(solution, Mapping):
-        raise ObservationError(f"matches: solution {number} is no dict; {_HOW['tetra3']}.")
+        raise ObservationError(f"{where} is no dict; {_HOW['tetra3']}.")
     by_place = "centroids" in solution
     how = _HOW["tetra3rs" if by_place else "tetra3"]
     if solution.get("RA", 0.0) is None:
@@ -275,7 +275,7 @@ def _matches(
     if missing := [
         key for key in ("matched_centroids", "matched_stars") if solution.get(key) is None
     ]:
-        raise ObservationError(f"matches: solution {number} has no {missing[0]}; {how}.")
+        raise ObservationError(f"{where} has no {missing[0]}; {how}.")
     try:
         stars = np.array(
             [[*map(float, star), np.nan][:3] for star in solution["matched_stars"]]
@@ -294,12 +294,10 @@ def _matches(
             if isinstance(error, KeyError)
             else "has matches of another form"
         )
-        raise ObservationError(f"matches: solution {number} {what}; {how}.") from None
+        raise ObservationError(f"{where} {what}; {how}.") from None
     ids = solution.get("matched_catID", solution.get("matched_catalog_ids"))
     if len(xy) != len(stars) or (ids is not None and len(ids) != len(stars)):
-        raise ObservationError(
-            f"matches: solution {number} pairs {len(xy)} centroids with {len(stars)} stars; {how}."
-        )
+        raise ObservationError(f"{where} pairs {len(xy)} centroids with {len(stars)} stars; {how}.")
     names = (
         [""] * len(xy)
         if ids is None
