@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any, TypeVar
 
 from starcal_uq.core.types import AnyDict
@@ -17,8 +16,7 @@ class Facts:
     @classmethod
     def of(cls: type[F], values: Mapping[str, Any]) -> F:
         """The facts among plain values; all others are the user's own."""
-        names = {field.name for field in fields(cls)}  # type: ignore[arg-type]
-        return cls(**{name: value for name, value in values.items() if name in names})
+        return cls(**{name: values[name] for name in cls.__annotations__ if name in values})
 
     def plain(self) -> AnyDict:
         """Inverse of `of`: the facts that are stated, for metadata."""

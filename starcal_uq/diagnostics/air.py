@@ -295,8 +295,7 @@ class _Air:
         seed: int,
         errors: tuple[StarErrors, float] | None,
     ) -> None:
-        timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
-        rest = Remainder(obs, cal, seed, errors, _FRAMES if timed else _FRAMES_APIECE)
+        rest = Remainder(obs, cal, seed, errors, _FRAMES if obs.timed else _FRAMES_APIECE)
         # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is
         # without these.
         likelihood, state, camera = rest.likelihood, rest.state, cal.camera

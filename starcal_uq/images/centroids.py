@@ -10,7 +10,6 @@ import csv
 import json
 import os
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,7 +162,7 @@ class Centroids(FrameRows, Shown):
         object.__setattr__(self, "messages", tuple(self.messages))
         object.__setattr__(self, "meta", dict(self.meta))
 
-    @cached_property
+    @property
     def origin(self) -> CentroidsOrigin:
         """The facts in `meta` that decide how the table is treated."""
         return CentroidsOrigin.of(self.meta)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Literal, TypeVar, get_args
 
 from starcal_uq.core.errors import ObservationError
@@ -158,9 +157,9 @@ class Sourced:
 
     meta: AnyDict
 
-    @cached_property
+    @property
     def origin(self) -> Origin:
-        """The facts in `meta` that decide how the table is treated."""
+        """The facts in `meta` that decide how the table is treated, as it is now."""
         return Origin.of(self.meta)
 
     @property

@@ -147,6 +147,11 @@ class Observations(FrameRows, Sourced, Shown):
         return locked(np.column_stack([level * np.cos(ra), level * np.sin(ra), np.sin(dec)]))
 
     @cached_property
+    def timed(self) -> bool:
+        """Whether every row has a time."""
+        return self.time_utc is not None and bool((self.time_utc != "").all())
+
+    @cached_property
     def data_hash(self) -> str:
         """SHA-256 (hex) of the columns that are present; the same for the same table from any file
         format.

@@ -288,8 +288,7 @@ def observations_from_centroids(
         obs = without_disturbed(obs, neighbours, first.nominal, psf_sigma_px)
         if in_space or centroids.origin.rendered:
             obs = obs.with_origin(observer="space" if in_space else "rendered")
-        timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
-        if not motion or (directions is None and not timed):
+        if not motion or (directions is None and not obs.timed):
             return obs.with_origin(directions=directions or "undeclared")
         obs = obs.with_origin(directions="catalogue")
         if stated is not None:

@@ -102,7 +102,7 @@ def _refuse_timed(path: Path, tables: Iterable[Observations]) -> None:
     """Refuse a time for rows all of which have one; no table is asked for beyond the first that
     lacks some.
     """
-    if all(table.time_utc is not None and (table.time_utc != "").all() for table in tables):
+    if all(table.timed for table in tables):
         raise ObservationError(
             f"{path}: every row has a time (column time_utc): leave out --time.", column="time_utc"
         )

@@ -67,6 +67,9 @@ def test_facts_come_from_metadata_and_the_rest_is_the_users_own():
     assert moved.meta == {**obs.meta, "directions": "apparent", "low_stars": 0}
     assert dataclasses.replace(obs, meta={}).origin == Origin()
     assert moved.data_hash == obs.data_hash
+    # What a message advises, to set an entry, has its effect too.
+    moved.meta["directions"] = "catalogue"
+    assert moved.origin.directions == "catalogue"
 
 
 @pytest.mark.parametrize("ending", [".ecsv", ".parquet", ".fits"])

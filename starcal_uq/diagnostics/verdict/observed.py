@@ -250,8 +250,7 @@ def wrong_time(obs: Observations, cal: Calibration) -> str | None:
 
 def _time_of(obs: Observations) -> dict[str, str]:
     """The option that gives a time to what has none."""
-    timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
-    return {} if timed else {"time": UTC}
+    return {} if obs.timed else {"time": UTC}
 
 
 def _again(obs: Observations, **options: Any) -> Remedies:
