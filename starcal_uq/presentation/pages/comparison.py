@@ -123,7 +123,7 @@ def _parameter_table(found: CameraComparison) -> TextTable:
     rows = []
     for i, name in enumerate(found.parameter_names):
         spec = specs[name]
-        a, b, sd_a, sd_b, sd = (float(values[i]) / spec.scale for values in estimates)
+        a, b, sd_a, sd_b, sd = (values[i] / spec.scale for values in estimates)
         known = np.isfinite(sd) and sd > 0.0
         rows.append(
             (

@@ -175,7 +175,7 @@ def cells_table(study: Study, n: int) -> TextTable:
     rows = []
     for cell in range(min(n, len(sweep.ok))):
         where = [value_words(_plain(study.data[axis].values[cell])) for axis in sweep.axes]
-        numbers = [form(float(values[cell])) for _, values, form in columns]
+        numbers = [form(values[cell]) for _, values, form in columns]
         status = str(study.data["status"].values[cell])
         rows.append(
             (*where, value_words(int(study.data["seed_index"].values[cell])), *numbers, status)

@@ -82,8 +82,8 @@ def uses(results: Results) -> tuple[list[str], list[str]]:
     if error is not None:
         common, rest = (
             two_figures(
-                float(error.with_misfit_found_arcsec[row, 3]),
-                float(error.if_model_holds_arcsec[row, 3]),
+                error.with_misfit_found_arcsec[row, 3],
+                error.if_model_holds_arcsec[row, 3],
             )
             for row in (1, 2)
         )
@@ -122,7 +122,7 @@ def attitude_summary(error: AttitudeError) -> TextTable:
         IF_MODEL_HOLDS: error.if_model_holds_arcsec,
     }
     rows = tuple(
-        (name, *(significant(float(values[kind][row, axis])) for axis in (3, 2) for kind in kinds))
+        (name, *(significant(values[kind][row, axis]) for axis in (3, 2) for kind in kinds))
         for row, name in _PARTS
     )
     heads = tuple(f"{where}, {kind}" for where in ("Across", "Roll") for kind in kinds)
@@ -234,7 +234,7 @@ def methods_paragraph(results: Results) -> str:
             f"{post.n_ensembles} separate ensembles of {post.n_walkers} walkers, {post.n_steps} "
             "kept steps"
             f"{seed}, likelihood “{record.settings.get('likelihood', d.likelihood)}”; R-hat is at most "
-            f"{fixed(float(np.max(d.rhat[list(post.sampled)])), 4)} and the effective sample "
+            f"{fixed(np.max(d.rhat[list(post.sampled)]), 4)} and the effective sample "
             "size at least "
             f"{count(fewest)} (Vehtari et al. 2021), and Pareto-smoothed importance sampling "
             "(Vehtari et al. 2024) "
@@ -375,12 +375,8 @@ _COUNTED = ((Level.PASS, "passed"), (Level.WARN, "gave a warning"), (Level.FAIL,
 
 
 def _both(error: AttitudeError, row: int, axis: int) -> str:
-    held = significant(float(error.if_model_holds_arcsec[row, axis]))
-    found = (
-        held
-        if error.misfit is None
-        else significant(float(error.with_misfit_found_arcsec[row, axis]))
-    )
+    held = significant(error.if_model_holds_arcsec[row, axis])
+    found = held if error.misfit is None else significant(error.with_misfit_found_arcsec[row, axis])
     return held if found == held else f"{found} ({held})"
 
 

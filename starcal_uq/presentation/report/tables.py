@@ -198,14 +198,14 @@ def diagnostics_table(post: Posterior) -> TextTable:
     rows = []
     for i in post.sampled:
         parameter = post.parameters[i]
-        mcse = float(d.mcse[i]) / parameter.scale
+        mcse = d.mcse[i] / parameter.scale
         rows.append(
             (
                 parameter.name,
                 fixed(d.rhat[i], 4),
                 count(int(d.ess_bulk[i])),
                 count(int(d.ess_tail[i])),
-                mean_to_mcse(float(post.draws[:, i].mean()) / parameter.scale, mcse),
+                mean_to_mcse(post.draws[:, i].mean() / parameter.scale, mcse),
                 _with_unit(significant(mcse), parameter),
                 percent(d.mcse[i] / post.sd[i]),
                 fixed(d.autocorrelation[i], 1),
@@ -253,11 +253,11 @@ def methods_rows(results: Results) -> list[Row]:
     for i in post.sampled:
         parameter = post.parameters[i]
         # One digit more than elsewhere: the table is there to show small differences.
-        decimals = decimals_for(float(post.sd[i]) / parameter.scale, 3)
+        decimals = decimals_for(post.sd[i] / parameter.scale, 3)
         cells = [
             (
-                f"{fixed(float(m[i]) / parameter.scale, decimals)} ± "
-                f"{fixed(float(s[i]) / parameter.scale, decimals)}"
+                f"{fixed(m[i] / parameter.scale, decimals)} ± "
+                f"{fixed(s[i] / parameter.scale, decimals)}"
             )
             for m, s in sources
         ]
@@ -296,9 +296,9 @@ def pair_table(cal: Calibration) -> TextTable:
     rows = tuple(
         (
             p.name,
-            plus_minus(float(cal.pair_theta[i]) / p.scale, float(pair_sigmas[i]) / p.scale),
-            plus_minus(float(cal.theta[i]) / p.scale, float(cal.sigmas[i]) / p.scale),
-            fixed(float(pair_sigmas[i] / cal.sigmas[i]) ** 2, 2),
+            plus_minus(cal.pair_theta[i] / p.scale, pair_sigmas[i] / p.scale),
+            plus_minus(cal.theta[i] / p.scale, cal.sigmas[i] / p.scale),
+            fixed((pair_sigmas[i] / cal.sigmas[i]) ** 2, 2),
         )
         for i, p in enumerate(specs)
     )

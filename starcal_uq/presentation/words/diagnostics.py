@@ -22,6 +22,7 @@ from starcal_uq.core.formatting import (
     plural,
     significant,
 )
+from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.diagnose import Diagnosis
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
@@ -97,7 +98,7 @@ def misfit_table(found: Misfit, *, found_only: bool = False) -> TextTable:
 
 def jackknife_text(found: Jackknife) -> str:
     """By how much frames scatter more than the formal errors say."""
-    low, high = float(found.ratio.min()), float(found.ratio.max())
+    low, high = found.ratio.min(), found.ratio.max()
     frames = plural(found.n_frames, "frame")
     return (
         f"Sigmas from the scatter of {frames} are {fixed(low, 2)} to {fixed(high, 2)} times the "
@@ -105,13 +106,18 @@ def jackknife_text(found: Jackknife) -> str:
     )
 
 
+def _sigmas(covariance: FloatArray, specs: Sequence[Parameter]) -> list[str]:
+    """Sigmas in the units of `specs`, or in px units."""
+    scales = [spec.scale for spec in specs] or 1.0
+    return [significant(v) for v in np.sqrt(np.diag(covariance)) / scales]
+
+
 def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTable:
     """One row per parameter; sigmas in the units of `specs`, or in px units."""
     low, high = found.expected()
-    scales = np.array([spec.scale for spec in specs]) if specs else np.ones(len(low))
     columns = (
-        [significant(v) for v in np.sqrt(np.diag(found.formal_covariance)) / scales],
-        [significant(v) for v in np.sqrt(np.diag(found.sandwich_covariance)) / scales],
+        _sigmas(found.formal_covariance, specs),
+        _sigmas(found.sandwich_covariance, specs),
         [fixed(v, 2) for v in found.ratio],
         [f"{fixed(a, 2)} to {fixed(b, 2)}" for a, b in zip(low, high, strict=True)],
         [fixed(v, 2) for v in found.jackknife_ratio],
@@ -134,16 +140,13 @@ def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTa
 
 def star_table(found: StarTest, specs: Sequence[Parameter] = ()) -> TextTable:
     """One row per parameter: sigmas with the star as the unit of what is independent."""
-    scales = (
-        np.array([spec.scale for spec in specs]) if specs else np.ones(len(found.parameter_names))
-    )
     covariances = (
         found.formal_covariance,
         found.model_covariance,
         found.sandwich_covariance,
         found.jackknife_covariance,
     )
-    columns = [[significant(v) for v in np.sqrt(np.diag(c)) / scales] for c in covariances]
+    columns = [_sigmas(c, specs) for c in covariances]
     heads = ("Formal σ", "With star errors", "Ratio", "Cluster-robust σ", "Jackknife σ")
     ratio = [fixed(v, 2) for v in found.widening]
     rows = tuple(zip(found.parameter_names, *columns[:2], ratio, *columns[2:], strict=True))

@@ -25,7 +25,7 @@ _SHOWN_ROWS = 30
 
 def focal_length(cal: Calibration) -> str:
     """The focal length with its sigma, mm, or px where the pixel pitch is unknown."""
-    focal, sigma, unit = cal.camera.focal_px, float(cal.sigmas[2]), "px"
+    focal, sigma, unit = cal.camera.focal_px, cal.sigmas[2], "px"
     if cal.camera.pixel_um is not None and cal.camera.focal_mm is not None:
         focal, sigma, unit = cal.camera.focal_mm, sigma * cal.camera.pixel_um * 1e-3, "mm"
     decimals = decimals_for(sigma)

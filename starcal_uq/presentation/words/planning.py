@@ -103,7 +103,7 @@ def distortion_sentence(plan: Plan) -> str:
     open_words = f"The sheet leaves the distortion open ({span(found)} at the corner)."
     if np.max(radius) < LITTLE * np.min(radius):
         return f"{open_words} It hardly matters for the {SCOPE_NAMES[plan.scope]}."
-    worst = corner(float(found.percent[np.argmax(radius)]))
+    worst = corner(found.percent[np.argmax(radius)])
     point, focal = (_px_range(sigmas) for sigmas in (found.principal_point_px, found.focal_px))
     return (
         f"{open_words} The worst is {worst}. What decides is how well the principal point can be "
@@ -211,7 +211,7 @@ def check_text(check: ForecastCheck) -> str:
         int(n) for n, bad in zip(check.forecast.n_frames, check.nees_rejected, strict=True) if bad
     ]
     g, q = np.unravel_index(int(np.argmax(np.abs(check.ratio - 1.0))), check.ratio.shape)
-    ratio = float(check.ratio[g, q] - 1.0)
+    ratio = check.ratio[g, q] - 1.0
     sign = "+" if ratio > 0.0 else MINUS
     sentence = (
         f"{count(check.n_campaigns)} simulated campaigns of each size: the sigmas they state "

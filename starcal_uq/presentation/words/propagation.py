@@ -233,7 +233,7 @@ def correlation_table(coupling: Coupling) -> TextTable:
 def field_text(field: FieldMap) -> str:
     """The middle of both maps, and the common rotation as an error of the principal point."""
     absolute, rest = (
-        float(np.median(m)) for m in (field.sigma_absolute_arcsec, field.sigma_compensated_arcsec)
+        np.median(m) for m in (field.sigma_absolute_arcsec, field.sigma_compensated_arcsec)
     )
     text = (
         "If the model holds, half of the detector knows its directions to "
@@ -288,8 +288,8 @@ def field_table(field: FieldMap) -> TextTable:
 def corner_sentence(curve: DistortionCurve) -> str:
     """Displacement at the largest radius, with its standard deviation."""
     row = int(np.argmax(np.abs(curve.mean_px[:, -1])))
-    value, sd = float(curve.mean_px[row, -1]), float(curve.sd_px[row, -1])
-    scale = float(curve.arcsec_per_px[-1])
+    value, sd = curve.mean_px[row, -1], curve.sd_px[row, -1]
+    scale = curve.arcsec_per_px[-1]
     where = "" if len(curve.mean_px) == 1 else f" at {curve.azimuth_deg[row]:g}° from the x axis"
     return (
         f"At {curve.radius_px[-1]:.0f} px{where} the distortion is {plus_minus(value, sd)} px "
@@ -310,7 +310,7 @@ def spectrum_text(spectrum: ErrorSpectrum) -> str:
     rest, tau, nyquist = (
         spectrum.rest_arcsec,
         spectrum.correlation_time_s,
-        float(spectrum.frequency_hz[-1]),
+        spectrum.frequency_hz[-1],
     )
     share = spectrum.share_below(0.1 * nyquist)
     if not np.all(rest > _ROUNDING_ARCSEC):
