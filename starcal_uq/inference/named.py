@@ -81,7 +81,8 @@ def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bo
             f"likelihood={likelihood!r} says how a likelihood is evaluated, not which: use "
             f"evaluation={likelihood!r}."
         )
-    check_known("likelihood", likelihood, LIKELIHOODS, SamplingError)
+    else:
+        check_known("likelihood", likelihood, LIKELIHOODS, SamplingError)
     check_known("evaluation", evaluation, EVALUATIONS, SamplingError)
     if dof is not None and likelihood != "student_t":
         raise SamplingError(
