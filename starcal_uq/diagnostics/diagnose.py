@@ -38,7 +38,7 @@ from starcal_uq.diagnostics.times import (
 )
 from starcal_uq.estimation.fit import fit
 from starcal_uq.estimation.result import Calibration
-from starcal_uq.estimation.weights import weighed
+from starcal_uq.estimation.weights import by_noise_model, weighed
 from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:
@@ -289,6 +289,10 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     reference, lowest = (
         (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
     )
+    obs = by_noise_model(obs, cal)
+    if reached is not None and cal.tail_factors is not None:
+        # Tails have another cost than the sum of squares that their weights leave.
+        reference, lowest = _optimum(obs, cal, cal.nominal)
     some, sigmas = _few(obs), cal.sigmas
     if some is not obs:
         sigmas = sigmas * np.sqrt(obs.n_stars / some.n_stars)

@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_uq.core.types import BoolArray, FloatArray, floats
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, ResidualMap
-from starcal_uq.estimation.weights import weighed
+from starcal_uq.estimation.weights import by_noise_model, weighed
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
@@ -105,10 +105,12 @@ def heard(obs: Observations, cal: Calibration) -> BoolArray:
     """
     if cal.provenance.likelihood != "student_t":
         return np.ones(obs.n_stars, dtype=bool)
-    stated = 1.0 if obs.sigma_px is None else np.asarray(obs.sigma_px)[:, None]
+    # By the scale of the tails: beside their own weights even wrong stars look right.
+    plain = by_noise_model(obs, cal)
+    stated = 1.0 if plain.sigma_px is None else np.asarray(plain.sigma_px)[:, None]
     size = np.max(np.abs(cal.residuals_px / stated), axis=1)
     # Stars that the likelihood leaves out, such as those of a frame without an attitude, have none.
-    use = np.asarray((size > 0.0) & (size < OUTLIER_SIGMA * cal.sigma))
+    use = np.asarray((size > 0.0) & (size < OUTLIER_SIGMA * cal.tail_scale))
     order = np.searchsorted(cal.frame_ids, obs.frame)
     return np.asarray(use & (np.bincount(order, use, len(cal.frame_ids)) >= 3)[order])
 

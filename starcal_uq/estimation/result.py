@@ -372,6 +372,14 @@ class Calibration(Shown, Traced):
         return None if record is None else in_order(record["factors"], self.parameter_names)
 
     @property
+    def tail_scale(self) -> float:
+        """Scale of the residuals' tails, as `sigma`, which is that of the weighted residuals where
+        stars keep the weights of tails.
+        """
+        record = self.provenance.get("tail_weights")
+        return self.sigma if record is None else float(record["sigma"])
+
+    @property
     def width_factors(self) -> FloatArray:
         """Factors (p,) on the sigmas of the likelihood that `covariance` holds, but for inflation."""
         widths = np.ones(len(self.theta))

@@ -13,7 +13,6 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.attitude.wahba import quest
-from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
@@ -401,7 +400,6 @@ def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
     return replace(
         cal,
         sigma=sigma,
-        sigma_name=sigma_parameter(True).name,
         provenance=cal.provenance.adding(tail_weights=record),
     )
 
@@ -421,6 +419,7 @@ def tail_weighted(obs: Observations, cal: Calibration) -> Observations:
         usable_stars(frames, model, cal.pair_theta),
     )
     state = likelihood.state(np.array(record["theta"]), record["sigma"], record["dof"])
-    sigma_px = np.full(obs.n_stars, record["sigma"]) if obs.sigma_px is None else obs.sigma_px
+    # Where they state none, weights alone, so that the noise of the estimate stays in px.
+    sigma_px = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px
     weight = np.where(state.seen, np.maximum(state.weight, _LEAST_WEIGHT), _NO_WEIGHT)
     return obs.weighted(sigma_px / np.sqrt(weight), obs.noise_axes)

@@ -30,8 +30,8 @@ def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observa
     if left_out.any():
         obs = obs.select(~left_out)
     if "tail_weights" not in result.provenance:
-        return _by_noise_model(obs, result)
-    obs = _by_noise_model(obs.unweighted, result)
+        return by_noise_model(obs, result)
+    obs = by_noise_model(obs, result)
     if len(getattr(result, "residuals_px", ())) != len(obs):
         # Of a mission's stars no tails are known.
         return obs
@@ -40,7 +40,10 @@ def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observa
     return tail_weighted(obs, result)
 
 
-def _by_noise_model(obs: Observations, result: Any) -> Observations:
+def by_noise_model(obs: Observations, result: Any) -> Observations:
+    """Observations with the noise of a result's model, without the weights of its tails."""
+    if "tail_weights" in result.provenance:
+        obs = obs.unweighted
     model = noise_model_of(result)
     if model is None or not model.varies:
         return obs if obs.stated_px is None else replace(obs, stated_px=None, noise_axes=None)
