@@ -335,7 +335,7 @@ def calibrate_partitions(
         rotation_per_theta=rest.response / n_frames,
         attitude_noise=rest.inverse / n_frames * sigma**2,
         compressed=compressed,
-        provenance=record.adding(partitions=partitions),
+        provenance=record.adding(partitions=partitions, kernels=kernels),
         fingerprints=None,
         partitions=replace(
             rest.sums, richer=_stepped(camera, rest.richer, sigma**2), scatter=scatter
