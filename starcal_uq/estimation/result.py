@@ -376,7 +376,7 @@ class Calibration(Shown, Traced):
         """Scale of the residuals' tails, as `sigma`, which is that of the weighted residuals where
         stars keep the weights of tails.
         """
-        record = self.provenance.get("tail_weights")
+        record = self.provenance.tail_weights
         return self.sigma if record is None else float(record["sigma"])
 
     @property
