@@ -130,6 +130,11 @@ class Facts:
     def add(self, name: str, values: Any) -> None:
         """A column or array, numbers or words."""
         array = np.asarray(values)
+        if array.dtype == object and any(isinstance(value, np.ndarray) for value in array.flat):
+            # A column of lists; they may have different lengths.
+            lists = [np.asarray([] if value is None else value).ravel() for value in array.flat]
+            self.add(f"{name} (lengths)", [len(part) for part in lists])
+            array = np.concatenate(lists)
         if array.dtype.kind in "iufcb":
             self.arrays[name] = array
             return

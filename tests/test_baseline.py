@@ -135,3 +135,11 @@ def test_numbers_in_a_sentence_may_differ_by_rounding_and_its_words_may_not():
     ):
         assert {counts for counts, _ in baseline.changed(before, [after], 1e-12)} == {not within}
         assert {counts for counts, _ in baseline.changed(before, [after])} == {True}
+
+
+def test_lists_in_a_column_are_compared_number_by_number():
+    column = np.array([np.array([1.0, 2.0]), None, np.array([3.0])], dtype=object)
+    facts = baseline.Facts()
+    facts.add("curve", column)
+    np.testing.assert_array_equal(facts.arrays["curve"], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(facts.arrays["curve (lengths)"], [2, 0, 1])
