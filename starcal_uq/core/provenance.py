@@ -65,6 +65,8 @@ class Provenance(dict[str, Any]):
         Estimate and factors on sigmas of stars that keep the weights of their tails.
     merge : dict
         Runs that a calibration was merged from, and their consistency.
+    kernels : str or None
+        What made sums over all stars: ``numpy``, or ``numba`` for compiled loops.
     """
 
     created_utc: str
@@ -81,6 +83,7 @@ class Provenance(dict[str, Any]):
     student_t: AnyDict
     tail_weights: AnyDict | None
     merge: AnyDict
+    kernels: str | None
 
     def __getattr__(self, name: str) -> Any:
         if name not in Provenance.__annotations__:

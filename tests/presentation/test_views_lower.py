@@ -16,6 +16,7 @@ from starcal_uq.inference.prior_draws import PriorPredictive
 from starcal_uq.inference.update import ShiftTest
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.presentation.views import VIEWS
+from starcal_uq.presentation.words.estimation import calibration_table
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +110,10 @@ def test_at_the_prompt_a_result_fits_the_screen(paper_calibration: sc.Calibratio
     assert repr(couplings) == f"Coupling: {couplings.text}"
     # What has few fields is printed as it is.
     assert repr(paper_calibration.camera).startswith("Camera(width_px=1024, ")
+
+
+def test_a_truth_of_another_model_has_no_column(paper_calibration):
+    truth = sc.paper.paper_camera()
+    assert "truth" in calibration_table(paper_calibration, truth).heads
+    other = truth.replace(distortion="brown_tangential", coefficients=(*truth.coefficients, 0, 0))
+    assert "truth" not in calibration_table(paper_calibration, other).heads

@@ -253,6 +253,10 @@ def sampling_sentence(results: Results) -> str:
     )
 
 
+# What makes sums over all stars, by the name that a provenance has for it.
+_PATHS = {"numpy": "NumPy", "numba": "compiled loops (Numba)"}
+
+
 def provenance_rows(results: Results) -> list[tuple[str, str]]:
     """What is needed to repeat the run."""
     rows: list[tuple[str, str]] = [
@@ -273,12 +277,10 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
         if step.seed is not None:
             rows.append((f"{name}, seed", str(step.seed)))
         rows.append((f"{name}, settings", _settings_text(step.settings)))
-    rows.append(
-        (
-            "Versions",
-            steps[-1][1].software(),
-        )
-    )
+    path = results.calibration.provenance.kernels
+    if path:
+        rows.append(("Sums over stars", _PATHS[path]))
+    rows.append(("Versions", steps[-1][1].software()))
     return rows
 
 

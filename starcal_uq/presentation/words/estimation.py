@@ -56,7 +56,11 @@ def calibration_text(cal: Calibration) -> str:
 
 
 def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTable:
-    """Start, estimate and sigma of every parameter; with a truth, also truth and z."""
+    """Start, estimate and sigma of every parameter; with a truth of the same parameters, also truth
+    and z.
+    """
+    if truth is not None and truth.parameter_names != cal.parameter_names:
+        truth = None
     known = () if truth is None else ("truth", "z")
     rows = []
     specs = parameters(cal.camera.distortion)
