@@ -99,28 +99,22 @@ def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSetting
         "left",
     )
     pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
-    covariance = _pair_covariance(pairs, likelihood, pair_theta)
-    return assemble(
-        obs,
-        camera,
-        likelihood,
-        stages,
-        status,
-        PairEstimate(pair_theta, covariance),
-        {"method": settings.method, "solver": settings.solver},
-    )
+    estimate = _pair_estimate(pairs, likelihood, pair_theta)
+    made = {"method": settings.method, "solver": settings.solver}
+    return assemble(obs, camera, likelihood, stages, status, estimate, made)
 
 
-def _pair_covariance(
+def _pair_estimate(
     pairs: PairObjective, likelihood: MarginalLikelihood, pair_theta: FloatArray
-) -> FloatArray:
+) -> PairEstimate:
     # The scatter of many frames needs no noise.
     chi2 = (
         np.nan if enough_frames(pairs) else likelihood.profile(pair_theta, likelihood.rotations)[1]
     )
     # The last step was not followed by an evaluation.
     near = _gain(likelihood, _LAST_PAIR_STEP)
-    return pair_covariance(pairs, pair_theta, chi2, likelihood.dof - len(pair_theta), near)
+    covariance = pair_covariance(pairs, pair_theta, chi2, likelihood.dof - len(pair_theta), near)
+    return PairEstimate(pair_theta, covariance)
 
 
 @dataclass(frozen=True)
@@ -275,20 +269,10 @@ def _with_noise_model(
         likelihood.use_rotations(likelihood.start_rotations(theta))
         # The estimate from interstar angles has no weights; its covariance and the refinement do.
         stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]
-        pair_theta = calibration.pair_theta
-        covariance = _pair_covariance(
-            PairObjective(likelihood.frames, camera.distortion), likelihood, pair_theta
-        )
-        status = stages[-1].status
-        calibration = assemble(
-            obs,
-            camera,
-            likelihood,
-            stages,
-            status,
-            PairEstimate(pair_theta, covariance),
-            {"method": calibration.method, "solver": settings.solver},
-        )
+        pairs = PairObjective(likelihood.frames, camera.distortion)
+        estimate = _pair_estimate(pairs, likelihood, calibration.pair_theta)
+        made = {"method": settings.method, "solver": settings.solver}
+        calibration = assemble(obs, camera, likelihood, stages, stages[-1].status, estimate, made)
     return model, calibration
 
 
@@ -371,6 +355,7 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
         "dof_std": found.nu_std,
         "stars_out_of_field": int(np.sum(~state.seen)),
     }
+    pairs = PairObjective(start.frames, model)
     return Calibration.of(
         camera,
         KeptFrames.of(obs, frames, state.rotations, state.e, camera),
@@ -389,7 +374,7 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
         rotation_per_theta=information.rotation_per_theta,
         attitude_noise=information.attitude_noise,
         pair_theta=pair_theta,
-        pair_covariance=_pair_covariance(PairObjective(start.frames, model), gaussian, pair_theta),
+        pair_covariance=_pair_estimate(pairs, gaussian, pair_theta).covariance,
         compressed=compress_reweighted(found),
     )
 
