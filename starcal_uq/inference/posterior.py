@@ -467,6 +467,12 @@ class Posterior(Shown, Traced):
         ensure_new(path, force)
         arrays: Arrays = {}
         record = to_plain(self, arrays, _ARRAYS)
+        for kept, check in zip(
+            record["diagnostics"]["checks"], self.diagnostics.checks, strict=True
+        ):
+            # What readers of earlier versions look for.
+            words = (check.name, check.question, check.remedy)
+            kept |= dict(zip(("name", "question", "remedy"), to_plain(words), strict=True))
         # The draws themselves are in px units, one column a parameter; those of ArviZ's group are
         # scaled.
         own = {
@@ -515,8 +521,8 @@ class Posterior(Shown, Traced):
                     if name in file.variables
                 }
             for check in record["diagnostics"]["checks"]:
-                # Files of earlier versions have titles and commands.
-                if "remedy" in check:
+                # Files of earlier versions have titles and commands alone.
+                if "code" not in check:
                     check["code"] = CODES[check["name"]].name
                     check["remedies"] = to_plain(read_remedies(check["remedy"]))
             made = from_plain(cls, record, arrays)
