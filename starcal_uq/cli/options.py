@@ -256,23 +256,23 @@ def declared(owner: str, name: str, kind: Any, panel: str | None = None) -> Any:
     """The type of a parameter of a command, or of a record, as Typer takes it; `panel` is where it
     stands in the help.
     """
-    told = _DECLARED.get(owner, {}).get(name) or _DECLARED["shared"][name]
-    low, high = told.get("range", (None, None))
-    if "limit" in told:
-        limit = (KEYS | LIMITS)[told["limit"]]
-        low, high = told.get("least", limit.low), limit.high
+    entry = _DECLARED.get(owner, {}).get(name) or _DECLARED["shared"][name]
+    low, high = entry.get("range", (None, None))
+    if "limit" in entry:
+        limit = (KEYS | LIMITS)[entry["limit"]]
+        low, high = entry.get("least", limit.low), limit.high
     settings = {
-        "help": told.get("help"),
-        "metavar": told.get("metavar"),
+        "help": entry.get("help"),
+        "metavar": entry.get("metavar"),
         "min": low,
         "max": high,
-        "parser": _PATHS.get(told.get("path")),
-        "callback": checked(_CHECKS[told["check"]]) if "check" in told else None,
+        "parser": _PATHS.get(entry.get("path")),
+        "callback": checked(_CHECKS[entry["check"]]) if "check" in entry else None,
         "rich_help_panel": panel,
     }
-    if told.get("argument"):
+    if entry.get("argument"):
         return Annotated[kind, typer.Argument(**settings)]
-    names = told.get("names", [f"--{name.replace('_', '-')}"])
+    names = entry.get("names", [f"--{name.replace('_', '-')}"])
     return Annotated[kind, typer.Option(*names, **settings)]
 
 

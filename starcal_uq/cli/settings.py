@@ -1,4 +1,4 @@
-"""What the steps of a run are told: every option declared once, for all commands that have it."""
+"""Settings of the steps of a run: every option declared once, for all commands that have it."""
 
 from __future__ import annotations
 
@@ -241,17 +241,17 @@ def typed_words(arguments: Sequence[str]) -> list[str]:
 
 
 def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]) -> AnyDict:
-    """All that the result of a command depends on: what it was told, and hashes of the files that
+    """All that the result of a command depends on: its settings, and hashes of the files that
     it reads.
     """
     from starcal_uq.core.manifest import identity
 
-    told: AnyDict = {}
+    plain: AnyDict = {}
     for key, value in settings.items():
         given = (
             asdict(value) if is_dataclass(value) and not isinstance(value, type) else {key: value}
         )
-        told |= {
+        plain |= {
             key: str(content) if isinstance(content, Path) else content
             for key, content in given.items()
         }
@@ -259,9 +259,9 @@ def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]
             **files,
             **{name: content for name, content in given.items() if isinstance(content, Path)},
         }
-    aligned = Path(str(settings.get("alignment")))
+    aligned = Path(str(plain.get("alignment")))
     files = {**files, "alignment": aligned} if aligned.is_file() else files
-    return {"command": name, "settings": told, "inputs": identity(files)}
+    return {"command": name, "settings": plain, "inputs": identity(files)}
 
 
 def _option(
