@@ -71,7 +71,6 @@ def fit_composed(obs: Observations, camera: Camera, settings: EstimationSettings
     Weights that the table has from another result's noise model are what its stars state.
     CalibrationError when there is no estimate.
     """
-    check_count(MarginalLikelihood(obs, camera.distortion), camera)
     fitted = _gaussian_fit if settings.composed.tails is None else _robust_fit
     if settings.composed.noise == "common":
         return fitted(obs, camera, settings)
@@ -86,6 +85,7 @@ def fit_composed(obs: Observations, camera: Camera, settings: EstimationSettings
 
 def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
     likelihood = MarginalLikelihood(obs, camera.distortion)
+    check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
     last = _gain(likelihood, _LAST_STEP)
     stages, status = _stages(
@@ -301,6 +301,7 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
     tails = settings.composed.tails
     assert tails is not None
     nu, frames = tails.dof, StarFrames.from_observations(obs, axes=True)
+    check_count(MarginalLikelihood(frames, camera.distortion), camera)
     model = camera.distortion
 
     def fit(trusted: StarFrames, all_parameters: bool) -> list[Stage]:

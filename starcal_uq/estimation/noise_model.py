@@ -20,12 +20,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.settings import NoiseKind
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.stages import refinement_stage
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
 
 from starcal_uq.likelihood.noise_model import QUANTITIES, NoiseModel, log_variance_columns
 
-NOISES = get_args(NoiseKind)
 _HIGHEST_POWER = 2
 _ROUNDS, _CHOOSING_ROUNDS, _SETTLED = 10, 2, 1e-3
 _NEWTON_STEPS, _LONGEST_STEP, _STEP_SETTLED = 50, 2.0, 1e-8
