@@ -129,13 +129,13 @@ def calibrate(
         One noise for all stars (or one factor on what they state), or a variance that is fitted as
         a function of radius, magnitude, frame and axis, as far as the residuals ask for it:
         `Calibration.noise_model`. Everything that takes the result then weighs the stars by it, and
-        `sigma` is a factor on it. It needs the ``efficient`` method and the ``marginal``
-        likelihood.
+        `sigma` is a factor on it. With ``student_t`` it is the scale of the t that varies. It needs
+        the ``efficient`` method.
     star_errors : bool
         Take into account that a star's direction errs alike in every frame (catalogue, blend,
         colour): the size of such errors is estimated, beyond what the column ``direction_mas`` of
-        the table states, and they are marginalised in estimate, covariance and `compressed`. For
-        ``efficient`` with ``marginal``.
+        the table states, and they are marginalised in estimate, covariance and `compressed`. With
+        ``student_t`` the stars keep the weights of their tails. It needs the ``efficient`` method.
     recursion : RecursionOptions, optional
         Options of ``samaan`` and ``griffith`` (`starcal_uq.paper.RecursionOptions`).
     duplicates : {"refuse", "drop", "keep"}
