@@ -8,10 +8,12 @@ every wing.
 """
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import lazy_loader
 
 from starcal_uq.core.display import View, register
+from starcal_uq.core.findings import Finding, register_wording
 from starcal_uq.core.remedy import Remedy, register_commands
 
 __version__ = "0.1.0"
@@ -35,3 +37,12 @@ def _commands() -> Callable[[Remedy], str]:
 
 
 register_commands(_commands)
+
+
+def _wording() -> Callable[[Finding], Any]:
+    from starcal_uq.presentation.sentences import wording
+
+    return wording
+
+
+register_wording(_wording)

@@ -127,3 +127,12 @@ def exp_rotation(phi: FloatArray) -> FloatArray:
 def random_rotations(n: int, rng: np.random.Generator) -> FloatArray:
     """Draw `n` rotation matrices (n, 3, 3) uniformly on SO(3): normalised Gaussian quaternions."""
     return quaternion_to_rotation(rng.standard_normal((n, 4)))
+
+
+def unit_vectors(ra_deg: FloatArray | float, dec_deg: FloatArray | float) -> FloatArray:
+    """Unit vectors (n, 3) of directions, deg: x towards (0, 0), y towards (90, 0), z towards
+    declination 90.
+    """
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    cos_dec = np.cos(dec)
+    return np.stack([cos_dec * np.cos(ra), cos_dec * np.sin(ra), np.sin(dec)], axis=-1)

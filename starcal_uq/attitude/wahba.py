@@ -40,6 +40,8 @@ _BLOCK = 32_768
 # arcsec.
 DEGENERATE = 1e-12
 _NEWTON_STEPS = 60
+# Frames whose temporaries stay in the processor's cache.
+_PROFILES = 4096
 
 
 class DegenerateFrameError(StarcalError):
@@ -192,6 +194,18 @@ def quest(
         covariance=None if covariances is None else _full(covariances)[first],
         taste=None if chi2 is None else chi2[first],
     )
+
+
+def solve_profiles(profiles: FloatArray) -> FloatArray:
+    """Rotations (K, 3, 3) of attitude profile matrices (3, 3, K) with weights of sum one; NaN where
+    one does not determine an attitude.
+    """
+    q = np.empty((4, profiles.shape[2]))
+    for first in range(0, profiles.shape[2], _PROFILES):
+        some = slice(first, first + _PROFILES)
+        q[:, some], lam, gap = _solve([list(row) for row in profiles[..., some]])
+        q[:, some][:, ~(np.isfinite(lam) & (gap > DEGENERATE))] = np.nan
+    return quaternion_to_rotation(q.T)
 
 
 def _check_shapes(b: FloatArray, r: FloatArray, starts: IntArray) -> None:
@@ -462,3 +476,17 @@ def _squared_residuals(
         total *= w
     result: FloatArray = np.add.reduceat(total, local, axis=-1)
     return result
+
+
+def aligned(
+    estimated: FloatArray, true: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Turn directions (N, 3) by the rotation that brings them closest to others, in weighted least
+    squares.
+
+    Returns the turned directions, and the rotation (3, 3) taken off.
+    """
+    rotation = quest(estimated, true, np.array([0, len(true)]), weight, covariance=False).rotations[
+        0
+    ]
+    return estimated @ rotation, rotation

@@ -23,7 +23,8 @@ from starcal_uq.budgeting.rows import (
     Expected,
     not_assessed,
 )
-from starcal_uq.budgeting.totals import N_SAMPLES, totals
+from starcal_uq.budgeting.sampling import N_SAMPLES
+from starcal_uq.budgeting.totals import totals
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import join_words

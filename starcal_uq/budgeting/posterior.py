@@ -30,7 +30,7 @@ from starcal_uq.propagation.attitude_error import (
     CONTRIBUTORS,
     IF_MODEL_HOLDS,
     WITH_MISFIT_FOUND,
-    choice_words,
+    choice,
 )
 
 if TYPE_CHECKING:
@@ -118,7 +118,8 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
         "The tests of the model found nothing that inflates the calibration rows; what they "
         "cannot see is not in them."
     )
-    return tuple(filter(None, (note if rows else none, choice_words(attitude), *found.notes)))
+    other = (one.sentence for one in choice(attitude))
+    return (note if rows else none, *other, *filter(None, found.notes))
 
 
 def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[float, ...], ...]:

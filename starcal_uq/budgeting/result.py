@@ -15,14 +15,17 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.file import SENSOR, Requirement
 from starcal_uq.budgeting.rows import AXIS_LABELS, ECSS_CLASSES, SCOPES, Contributor
-from starcal_uq.budgeting.totals import Samples, Total, grouped_sigma, total
+from starcal_uq.budgeting.sampling import Samples
+from starcal_uq.budgeting.totals import Difference, Total, grouped_sigma, read_difference, total
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, cell_content, cell_text, reading
+from starcal_uq.core.findings import Finding
 from starcal_uq.core.provenance import Provenance
+from starcal_uq.core.records import to_plain
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.status import Level
+from starcal_uq.core.status import Advice, Check, Code, Level, Order
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
 if TYPE_CHECKING:
@@ -102,6 +105,32 @@ class Outcome(Shown):
     def unresolved(self) -> bool:
         """True if it is open because the samples do not resolve its confidence."""
         return self.total.unresolved and math.isnan(self.bound_arcsec)
+
+
+def requirement_checks(budget: Budget | None) -> tuple[Check, ...]:
+    """The requirements of a budget as checks of a run's verdict; none without a budget."""
+    return tuple(
+        _requirement_check(outcome) for outcome in (() if budget is None else budget.outcomes)
+    )
+
+
+def _requirement_check(outcome: Outcome) -> Check:
+    asked, total = outcome.requirement, outcome.total
+    orders: tuple[Order, ...] = (Order(Advice.REDUCE_OR_RELAX, {"row": total.dominant}),)
+    if outcome.level is Level.PASS:
+        orders = ()
+    elif outcome.unresolved:
+        orders = (Order(Advice.LET_THE_RULE_JUDGE),)
+    elif outcome.level is Level.WARN and not outcome.between:
+        orders = (Order(Advice.STATE_WHAT_IS_MISSING, {"missing": total.not_assessed}),)
+    return Check(
+        Code.REQUIREMENT,
+        {"outcome": outcome},
+        outcome.level,
+        {"limit_arcsec": asked.limit_arcsec},
+        orders=orders,
+        title=f"Requirement {asked.name!r}",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,8 +247,7 @@ class Budget(Shown):
         import pandas as pd
 
         rows = [
-            {**{f.name: getattr(entry, f.name) for f in fields(Total)}, "at_least": entry.at_least}
-            for entry in self.totals
+            {name: getattr(entry, name) for name in (*_TOTAL, "at_least")} for entry in self.totals
         ]
         return pd.DataFrame(rows).assign(
             not_assessed=["; ".join(entry.not_assessed) for entry in self.totals]
@@ -360,6 +388,10 @@ class Budget(Shown):
                         "if_model_holds_arcsec": before,
                         "with_misfit_found_arcsec": record["sigma_arcsec"],
                     }
+                if told := "difference" not in record and record["explanation"]:
+                    # A version before wrote words alone.
+                    words = Finding(Difference.IN_WORDS, {"words": told})
+                    record["difference"] = json.dumps(to_plain(words))
                 by_kind.setdefault(record["record"], []).append(record)
             settings = {
                 record["name"]: json.loads(record["value"]) for record in by_kind["setting"]
@@ -429,15 +461,20 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "tuple[float, ...]": lambda text: tuple(
         float(value) for value in re.findall(r"[^][,|\s]+", text)
     ),
+    "Finding | None": lambda text: read_difference(json.loads(text)) if text else None,
 }
 
 _DERIVED = ("combination", "margin_arcsec", "verdict")
 
+# Columns of a total that readers look for.
+_TOTAL = (*(f.name for f in fields(Total) if f.name != "difference"), "explanation")
 _COLUMNS = tuple(
     dict.fromkeys(
         [
             "record",
-            *(f.name for kind in (Contributor, Requirement, Total) for f in fields(kind)),
+            *(f.name for kind in (Contributor, Requirement) for f in fields(kind)),
+            *_TOTAL,
+            "difference",
             *_DERIVED,
             "value",
         ]
@@ -446,7 +483,9 @@ _COLUMNS = tuple(
 
 
 def _plain(entry: Contributor | Total | Requirement) -> dict[str, str]:
-    return {f.name: _text(getattr(entry, f.name)) for f in fields(entry)}
+    names = [f.name for f in fields(entry)]
+    names += ["explanation"] if isinstance(entry, Total) else []
+    return {name: _text(getattr(entry, name)) for name in names}
 
 
 def _text(value: Any) -> str:
@@ -454,6 +493,10 @@ def _text(value: Any) -> str:
         # Numbers in brackets: a minus in front of a cell would be that of a formula.
         texts = all(isinstance(entry, str) for entry in value)
         return _SEPARATOR.join(value) if texts else json.dumps(value)
+    if isinstance(value, Finding):
+        return json.dumps(to_plain(value))
+    if value is None:
+        return ""
     return repr(float(value)) if isinstance(value, float) else str(value)
 
 

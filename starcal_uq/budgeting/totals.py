@@ -27,7 +27,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from enum import Enum, auto
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -37,23 +38,13 @@ from starcal_uq.budgeting.rows import (
     INTERPRETATIONS,
     SCOPES,
     Contributor,
-    confidence_text,
 )
+from starcal_uq.budgeting.sampling import N_SAMPLES, Samples, draw, one_of_many, quantile, size_of
 from starcal_uq.budgeting.shapes import deviates, half_width, mixture_spread, two_axis_radius
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT, TOTAL_AXES
-from starcal_uq.core.formatting import join_words, percent, significant
+from starcal_uq.core.findings import Finding
 from starcal_uq.core.types import FloatArray
 
-N_SAMPLES = 200_000
-# Two standard errors of a quantile, as order statistics.
-_SPREAD = 2.0
-# Samples beyond a quantile with fewer say little about it: its standard error is unknown, or the
-# samples end before it.
-_RESOLVED = 20.0
-# A bound that is surely below a quantile: of every so manyth sample, at a share so much smaller.
-_EVERY, _BELOW = 20, 0.01
-# Cases on either side of a quantile that stand for it where they point in different directions.
-_NEIGHBOURS = 4
 _DOMINANT = 0.5
 # Bounds that differ by less agree.
 _AGREE = 0.02
@@ -103,11 +94,12 @@ class Total:
         Row with more than half of the squared half-widths, or empty.
     dominant_share : float
         Share of the dominant row; of the largest row if none has more than half.
-    explanation : str
+    difference : Finding, optional
         Why the two bounds differ, or that they agree.
     """
 
     DOCUMENTED: ClassVar = ("at_least",)
+    WRITTEN_AS: ClassVar = {"difference": ("explanation",)}
 
     scope: str
     axis: str
@@ -125,7 +117,12 @@ class Total:
     not_assessed: tuple[str, ...] = field(default=())
     dominant: str = ""
     dominant_share: float = math.nan
-    explanation: str = ""
+    difference: Finding | None = None
+
+    @property
+    def explanation(self) -> str:
+        """Why the two bounds differ, or that they agree."""
+        return "" if self.difference is None else self.difference.sentence
 
     @property
     def at_least(self) -> bool:
@@ -145,79 +142,6 @@ class Total:
     def unresolved(self) -> bool:
         """True if rows are assessed, but the samples do not reach as far as the confidence."""
         return math.isnan(self.sampled_arcsec) and not math.isnan(self.rule_arcsec)
-
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Sums of sampled rows per scope and kind of randomness, arcsec: ``sums[scope,
-    interpretation]`` is (3, n).
-    """
-
-    sums: dict[tuple[str, str], FloatArray]
-
-    def along(self, axes: FloatArray, scope: str, kinds: Sequence[str]) -> FloatArray:
-        """What rows of these kinds add up to along axes (k, 3): (k, n), or (k, 1) zeros without
-        kinds.
-        """
-        return axes @ sum((self.sums[scope, kind] for kind in kinds), start=np.zeros((3, 1)))
-
-
-def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0) -> Samples:
-    """Sample every assessed row around its mean and add up what has the same kind of randomness.
-
-    Rows of one correlation group share their probabilities, and axes of one contributor are
-    correlated as it states. A sigma that changes from frame to frame is the same for all axes of a
-    contributor.
-    """
-    from scipy.special import ndtr
-
-    scopes = (
-        (*SCOPES, AFTER_AT_LEAST)
-        if any(row.absorbed_by_alignment == "in part" for row in rows)
-        else SCOPES
-    )
-    sums = {(scope, kind): np.zeros((3, n_samples)) for scope in scopes for kind in INTERPRETATIONS}
-    shared: dict[str, FloatArray] = {}
-    scales: dict[str, FloatArray] = {}
-    joint = {
-        name: _joint(rows, name, n_samples, seed)
-        for name in {row.name for row in rows if row.axis_correlation}
-    }
-    for index, row in enumerate(rows):
-        if not (row.assessed and row.applies and row.sigma_arcsec > 0.0):
-            continue
-        group, sign = row.group
-        if group and group in shared:
-            uniform = shared[group]
-        elif row.axis_correlation:
-            uniform = ndtr(joint[row.name][AXES.index(row.axis)])
-        else:
-            uniform = np.random.default_rng((seed, 1, index)).random(n_samples)
-        if group:
-            shared[group] = uniform
-        if row.tail_997 > GAUSSIAN_997 and row.name not in scales:
-            scales[row.name] = np.random.default_rng((seed, 2, index)).standard_normal(n_samples)
-        log_scale = scales.get(row.name, uniform)
-        errors = (
-            sign * row.sigma_arcsec * deviates(row.distribution, uniform, log_scale, row.tail_997)
-        )
-        for scope in scopes:
-            if row.counts(scope):
-                sums[scope, row.interpretation][AXES.index(row.axis)] += errors
-    return Samples(sums)
-
-
-def _joint(rows: Sequence[Contributor], name: str, n_samples: int, seed: int) -> FloatArray:
-    """Standard normal deviates (3, n) with the correlations of a contributor's axes."""
-    own = {row.axis: row for row in rows if row.name == name and row.axis_correlation}
-    matrix = np.eye(3)
-    for axis, row in own.items():
-        matrix[AXES.index(axis)] = row.axis_correlation
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    index = next(place for place, row in enumerate(rows) if row.name == name)
-    plain = np.random.default_rng((seed, 1, index)).standard_normal((n_samples, 3))
-    deviate: FloatArray = plain @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    return np.ascontiguousarray(deviate.T)
 
 
 def covariance(rows: Sequence[Contributor]) -> FloatArray:
@@ -301,13 +225,10 @@ def total(
     )
     if result.unresolved:
         n = next(iter(samples.sums.values())).shape[1]
-        text = (
-            f"{n} samples do not resolve a confidence of {confidence_text(confidence)}: there is "
-            "no sampled bound."
-        )
-        return replace(result, explanation=text)
+        facts = {"n_samples": n, "confidence": confidence}
+        return replace(result, difference=Finding(Difference.NOT_RESOLVED, facts))
     return replace(
-        result, explanation=explain(result, counted, _spread(counted, interpretation), dominant)
+        result, difference=explain(result, counted, _spread(counted, interpretation), dominant)
     )
 
 
@@ -342,11 +263,11 @@ def _bounds(
     together, apart = _worst(worst, along, confidence, by_shape=False)
     by_shape, _ = _worst(worst, along, confidence, by_shape=True)
     chance = samples.along(along, scope, _random(interpretation))
-    sampled, error = _quantile(_meeting(mean, by_shape, chance)[:, None] + chance, confidence)
+    sampled, error = quantile(_meeting(mean, by_shape, chance)[:, None] + chance, confidence)
     least = sampled
     if by_shape > 0.0:
         rest = mean[:, None] + samples.along(along, scope, _worst_kinds(interpretation))
-        least = min(_one_of_many(rest, chance, confidence), sampled)
+        least = min(one_of_many(rest, chance, confidence), sampled)
     length = float(np.linalg.norm(mean))
     return _Bounds(
         mean=length if len(mean) > 1 else float(mean[0]),
@@ -365,25 +286,59 @@ def _spread(rows: Sequence[Contributor], interpretation: str) -> list[Contributo
     return [row for row in rows if row.interpretation in _random(interpretation)]
 
 
+class Difference(Enum):
+    """Why the bound by the rule and that from the samples differ."""
+
+    NOT_RESOLVED = auto()
+    NO_ERROR = auto()
+    AGREE = auto()
+    DIFFER = auto()
+    CHANGING_SIGMA = auto()
+    SMALL_MOSTLY = auto()
+    ONE_SIDED = auto()
+    GROUP = auto()
+    REACHES_FURTHER = auto()
+    ENDS = auto()
+    MEAN_ADDED = auto()
+    MEAN_SHIFTS = auto()
+    WORST_CASE = auto()
+    CORNERS = auto()
+    BOUNDED = auto()
+    IN_WORDS = auto()  # In a file of an earlier version
+
+
+def read_difference(plain: Any) -> Any:
+    """A difference of its plain values, or a value of it."""
+    if isinstance(plain, list):
+        return tuple(map(read_difference, plain))
+    if not isinstance(plain, dict):
+        return plain
+    values = {name: read_difference(value) for name, value in plain["values"].items()}
+    return Finding(Difference[plain["code"]], values)
+
+
 def explain(
     total: Total,
     counted: Sequence[Contributor],
     random: Sequence[Contributor],
     dominant: Contributor,
-) -> str:
-    """One sentence or two on rule against sampling; empty if no error is random."""
+) -> Finding:
+    """Compare the rule with sampling."""
     if not total.rule_arcsec > 0.0:
-        return "No error is left: all rows are zero."
+        return Finding(Difference.NO_ERROR)
     difference = total.rule_arcsec / total.sampled_arcsec - 1.0
-    within = 3.0 * total.sampled_se_arcsec / total.sampled_arcsec
-    if abs(difference) <= max(_AGREE, within):
-        return f"Both bounds agree within {percent(max(_AGREE, within), 1)}."
-    size = percent(abs(difference), 2)
-    head = f"The rule is {size} {'above' if difference > 0 else 'below'} the sampled bound"
-    reasons = (_below if difference < 0.0 else _above)(total, counted, random, dominant)
-    return (
-        f"{head}: "
-        f"{'; '.join(reasons) or 'the rows together are not Gaussian, as the rule takes them to be'}."
+    within = max(_AGREE, 3.0 * total.sampled_se_arcsec / total.sampled_arcsec)
+    if abs(difference) <= within:
+        return Finding(Difference.AGREE, {"within": within})
+    return Finding(
+        Difference.DIFFER,
+        {
+            "size": abs(difference),
+            "side": "above" if difference > 0.0 else "below",
+            "reasons": tuple(
+                (_below if difference < 0.0 else _above)(total, counted, random, dominant)
+            ),
+        },
     )
 
 
@@ -392,35 +347,19 @@ def _below(
     counted: Sequence[Contributor],
     random: Sequence[Contributor],
     dominant: Contributor,
-) -> list[str]:
+) -> list[Finding]:
     """Why the rule says less."""
     tailed = dominant if dominant.tail_997 > _TAILED else _heaviest(counted)
     if tailed is not None:
-        return [
-            f"the sigma of {tailed.name!r} changes from frame to frame, so that 99.7 % of its "
-            "errors reach "
-            f"{significant(tailed.tail_997, 3)} sigma where a Gaussian error reaches 2.97"
-        ]
+        tail = {"row": tailed.name, "tail_sigma": tailed.tail_997}
+        return [Finding(Difference.CHANGING_SIGMA, tail)]
+    share = {"row": dominant.name, "share": total.dominant_share}
     if dominant.distribution == "rayleigh":
-        return [
-            (
-                f"{_share(total, dominant)} and is one-sided (Rayleigh), with a longer tail than a "
-                "Gaussian error"
-            )
-        ]
+        return [Finding(Difference.ONE_SIDED, share)]
     if _grouped(random):
-        return [
-            (
-                "rows of a correlation group that are not Gaussian add to a longer tail than their "
-                "sigmas say"
-            )
-        ]
+        return [Finding(Difference.GROUP)]
     if dominant.distribution in _BOUNDED and dominant in random:
-        return [
-            f"{_share(total, dominant)}; its distribution is {dominant.distribution}, and at "
-            "this confidence reaches "
-            "further than a Gaussian error of the same sigma"
-        ]
+        return [Finding(Difference.REACHES_FURTHER, share | {"shape": dominant.distribution})]
     return []
 
 
@@ -429,31 +368,24 @@ def _above(
     counted: Sequence[Contributor],
     random: Sequence[Contributor],
     dominant: Contributor,
-) -> list[str]:
+) -> list[Finding]:
     """Why the rule says more; the first reason weighs most."""
     shape = dominant.distribution
     if shape in _BOUNDED and dominant in random:
-        return [
-            f"{_share(total, dominant)}; its distribution is {shape} and ends at "
-            f"{significant(half_width(shape, total.confidence), 3)} sigma, where the rule takes "
-            f"{significant(total.factor, 3)}"
-        ]
+        end = half_width(shape, total.confidence)
+        share = {"row": dominant.name, "share": total.dominant_share, "shape": shape}
+        return [Finding(Difference.ENDS, share | {"end_sigma": end, "factor": total.factor})]
     reasons = []
     if abs(total.mean_arcsec) > _MEAN_COUNTS * total.sigma_arcsec:
         reasons.append(
-            "the rule adds the whole mean to the spread, as if both always pointed the same way"
-            if total.axis == CROSS_BORESIGHT
-            else (
-                "a mean shifts the errors to one side, where fewer sigmas hold the same share "
-                "than on both sides"
+            Finding(
+                Difference.MEAN_ADDED if total.axis == CROSS_BORESIGHT else Difference.MEAN_SHIFTS
             )
         )
         if abs(total.mean_arcsec) > total.sigma_arcsec:
             return reasons
     if total.worst_arcsec > _MEAN_COUNTS * total.sigma_arcsec > 0.0:
-        reasons.append(
-            "a worst case points one way, where fewer sigmas hold the same share than on both sides"
-        )
+        reasons.append(Finding(Difference.WORST_CASE))
     # Small bounded rows explain nothing.
     bounded = [row for row in random if row.distribution in _BOUNDED]
     bounded = [
@@ -466,31 +398,16 @@ def _above(
         >= _WORTH_NAMING * total.sigma_arcsec
         > 0.0
     ):
-        if total.axis == CROSS_BORESIGHT:
-            reasons.append(
-                "bounded distributions on two axes leave less in the corners than Gaussian "
-                "errors do"
-            )
-        else:
-            names = list(dict.fromkeys(repr(row.name) for row in bounded))
-            each = "" if len(names) == 1 else " of each"
-            factor = significant(total.factor, 3)
-            reasons.append(
-                f"{join_words(names)} cannot exceed a fixed size, while the rule takes {factor} "
-                f"sigma{each}"
-            )
+        rows = tuple(dict.fromkeys(row.name for row in bounded))
+        reasons.append(
+            Finding(Difference.CORNERS)
+            if total.axis == CROSS_BORESIGHT
+            else Finding(Difference.BOUNDED, {"rows": rows, "factor": total.factor})
+        )
     tailed = _heaviest(random)
     if not reasons and tailed is not None:
-        reasons.append(
-            f"the sigma of {tailed.name!r} changes from frame to frame, so that at this "
-            "confidence more of its errors "
-            "are small than of a Gaussian error"
-        )
+        reasons.append(Finding(Difference.SMALL_MOSTLY, {"row": tailed.name}))
     return reasons
-
-
-def _share(total: Total, dominant: Contributor) -> str:
-    return f"{dominant.name!r} has {percent(total.dominant_share, 2)} of the squared half-widths"
 
 
 def _heaviest(rows: Sequence[Contributor]) -> Contributor | None:
@@ -590,7 +507,7 @@ def _reach_together(
         errors[AXES.index(row.axis)] += (
             row.group[1] * row.sigma_arcsec * np.clip(deviate, -end, end)
         )
-    return float(_size(along @ errors).max())
+    return float(size_of(along @ errors).max())
 
 
 def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
@@ -610,64 +527,6 @@ def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
     along = np.sqrt(np.einsum("ni,ij,nj->n", reached, spread, reached)) / np.maximum(size, 1e-300)
     furthest: FloatArray = reached[int(np.argmax(size + 2.0 * along))]
     return furthest
-
-
-def _one_of_many(rest: FloatArray, chance: FloatArray, confidence: float) -> float:
-    """What chance reaches at the confidence where the rest is as large as it is in one case of 1 /
-    (1 - confidence).
-    """
-    size = _size(rest)
-    at = math.ceil(confidence * len(size)) - 1
-    near = (
-        range(max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS + 1, len(size)))
-        if len(rest) > 1
-        else (at,)
-    )
-    order = np.argpartition(size, list(near))
-    return float(
-        np.mean([_quantile(rest[:, order[place], None] + chance, confidence)[0] for place in near])
-    )
-
-
-def _size(errors: FloatArray) -> FloatArray:
-    """Size (n,) of errors (axes, n)."""
-    size: FloatArray = (
-        np.abs(errors[0])
-        if len(errors) == 1
-        else np.sqrt(np.square(errors[0]) + np.square(errors[1]))
-    )
-    return size
-
-
-def _quantile(errors: FloatArray, confidence: float) -> tuple[float, float]:
-    """Quantile of the size of errors (axes, n), and its standard error; NaN if unresolved."""
-    size = _size(errors)
-    n = len(size)
-    if size.min() == size.max():
-        return float(size[0]), 0.0
-    if n * min(confidence, 1.0 - confidence) < _RESOLVED * (1.0 - 1e-9):
-        return math.nan, math.nan
-    step = _SPREAD * math.sqrt(n * confidence * (1.0 - confidence))
-    places = [
-        min(max(math.ceil(confidence * n + shift) - 1, 0), n - 1) for shift in (-step, 0.0, step)
-    ]
-    low, here, high = _ranked(size, places)
-    return here, (high - low) / (2.0 * _SPREAD)
-
-
-def _ranked(values: FloatArray, places: Sequence[int]) -> list[float]:
-    """The values at these places of their order; what is surely below the first place is not put
-    into order.
-    """
-    some = values[::_EVERY]
-    first = int((places[0] / len(values) - _BELOW) * len(some))
-    if first > 0:
-        upper = values[values >= np.partition(some, first)[first]]
-        if len(values) - len(upper) <= places[0]:
-            places = [place - len(values) + len(upper) for place in places]
-            values = upper
-    ranked: list[float] = np.partition(values, places)[places].tolist()
-    return ranked
 
 
 def _dominant(

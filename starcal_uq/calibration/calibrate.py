@@ -19,6 +19,7 @@ from starcal_uq.core.tasks import one_thread, processors
 from starcal_uq.core.types import Progress
 from starcal_uq.estimation.assemble import raise_unless_good, with_star_errors
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
+from starcal_uq.estimation.effects import with_effects, without_effects
 from starcal_uq.estimation.fit import fit_composed
 from starcal_uq.estimation.partitioned import calibrate_partitions
 from starcal_uq.estimation.result import Calibration
@@ -27,11 +28,13 @@ from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood import paths
+from starcal_uq.likelihood.composed import Likelihood
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 
 RECURSIVE_METHODS = get_args(RecursiveMethod)
 OWN_METHODS = ("efficient", "three_stage")
+_Stars = Observations | PartitionedObservations | Iterable[Observations]
 # Starting processes takes two seconds.
 _STARS_WORTH_PROCESSES = 1_000_000
 
@@ -136,6 +139,12 @@ def calibrate(
         colour): the size of such errors is estimated, beyond what the column ``direction_mas`` of
         the table states, and they are marginalised in estimate, covariance and `compressed`. With
         ``student_t`` the stars keep the weights of their tails. It needs the ``efficient`` method.
+    effects : {"none", "auto"} or sequence of str
+        Effects beyond the camera, by name or joined by commas: ``axes``, ``field``, ``frame``,
+        ``temperature``, ``time``, ``epoch``, ``star``, ``phase``, ``magnitude``. Their scales are estimated
+        by restricted likelihood and marginalised in estimate, covariance and `compressed`;
+        ``auto`` takes up those that the data ask for (`Calibration.effects`). With ``student_t``
+        the stars keep the weights of their tails. It needs the ``efficient`` method.
     recursion : RecursionOptions, optional
         Options of ``samaan`` and ``griffith`` (`starcal_uq.paper.RecursionOptions`).
     duplicates : {"refuse", "drop", "keep"}
@@ -160,7 +169,7 @@ def calibrate(
 
 
 def _estimate(
-    obs: Observations | PartitionedObservations | Iterable[Observations],
+    obs: _Stars,
     camera: Camera,
     settings: EstimationSettings,
     throw: bool,
@@ -169,56 +178,88 @@ def _estimate(
     progress: Progress | None,
 ) -> Calibration:
     """The calibration of all frames, whether it ended well or not."""
-    asked = camera if settings.model is None else camera.replace(distortion=settings.model)
-    if isinstance(obs, PartitionedObservations) and settings.method not in RECURSIVE_METHODS:
-        sample = obs.sample()
-        # What is compiled is compiled here, before other processes ask for it.
-        with paths.using(paths.chosen(obs.n_stars)):
-            start = calibrate(sample, asked, settings, model=asked.distortion)
-        with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
-            return calibrate_partitions(
-                obs,
-                sample,
-                start,
-                processes,
-                max_iterations=settings.max_iterations,
-                duplicates=settings.duplicates,
-                progress=progress,
+    method, sheet = settings.method, camera.distortion
+    if settings.model is not None:
+        camera = camera.replace(distortion=settings.model)
+    if method not in RECURSIVE_METHODS:
+        if isinstance(obs, PartitionedObservations):
+            return _of_partitions(obs, camera, settings, scheduler, workers, progress)
+        if not isinstance(obs, Observations):
+            raise CalibrationError(
+                f"method {method!r} needs all frames at once, as Observations: load them, or use "
+                "samaan or griffith."
             )
-    if settings.method not in OWN_METHODS:
-        if settings.method not in RECURSIVE_METHODS:
-            obs = _in_memory(obs, settings.method)
-        estimate = offered(settings.method)
-        return estimate(obs, asked, settings.recursion, settings.solver, settings.max_iterations)
-    obs = _in_memory(obs, settings.method)
-    if obs.stated_px is not None and settings.composed.noise == "common":
+        if method in OWN_METHODS:
+            return _of_table(obs, camera, settings, sheet, throw)
+    estimate = offered(method)
+    return estimate(obs, camera, settings.recursion, settings.solver, settings.max_iterations)
+
+
+def _of_partitions(
+    obs: PartitionedObservations,
+    camera: Camera,
+    settings: EstimationSettings,
+    scheduler: Scheduler,
+    workers: int | None,
+    progress: Progress | None,
+) -> Calibration:
+    """The calibration of all partitions, from that of a sample of their frames."""
+    sample = obs.sample()
+    # What is compiled is compiled here, before other processes ask for it.
+    with paths.using(paths.chosen(obs.n_stars)):
+        start = calibrate(sample, camera, settings, model=camera.distortion)
+    with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
+        return calibrate_partitions(
+            obs,
+            sample,
+            start,
+            processes,
+            max_iterations=settings.max_iterations,
+            duplicates=settings.duplicates,
+            progress=progress,
+        )
+
+
+def _of_table(
+    obs: Observations, camera: Camera, settings: EstimationSettings, sheet: str, throw: bool
+) -> Calibration:
+    """The calibration of a table with the model that it determines, and the terms of the
+    likelihood; `sheet` is the model of the camera's sheet.
+    """
+    composed = settings.composed
+    if obs.stated_px is not None and composed.noise == "common":
         # Weights of another calibration's noise model are what this table states.
         obs = replace(obs, stated_px=None, noise_axes=None)
-    table = obs
     calibration = fit_determined(
-        table,
-        asked,
-        lambda start: fit_composed(table, start, settings),
-        sheet=camera.distortion,
+        obs,
+        camera,
+        lambda start: fit_composed(obs, start, settings),
+        sheet=sheet,
         asked=settings.model is not None,
         throw=throw,
     )
-    if not (settings.composed.star_errors and calibration.status.ok):
+    if not (composed.terms and calibration.status.ok):
         return calibration
-    if settings.composed.tails is not None:
-        calibration = with_tail_weights(weighed(obs, calibration), calibration)
-    return with_star_errors(weighed(obs, calibration), calibration)
+    found = _with_terms(obs, obs, calibration, composed)
+    if not (found.effects and found.effects.names and settings.weighs):
+        return found
+    # Noise and tails of a camera without its effects hold these, too.
+    again = fit_composed(without_effects(obs, found), calibration.nominal, settings)
+    if not again.status.ok:
+        return found
+    return _with_terms(obs, without_effects(obs, found), again, composed)
 
 
-def _in_memory(
-    obs: Observations | PartitionedObservations | Iterable[Observations], method: str
-) -> Observations:
-    if not isinstance(obs, Observations):
-        raise CalibrationError(
-            f"method {method!r} needs all frames at once, as Observations: load them, or use "
-            "samaan or griffith."
-        )
-    return obs
+def _with_terms(
+    obs: Observations, seen: Observations, calibration: Calibration, composed: Likelihood
+) -> Calibration:
+    """The calibration with the terms of its likelihood; tails weigh the stars as they are `seen`."""
+    if composed.tails is not None:
+        calibration = with_tail_weights(weighed(seen, calibration), calibration)
+    obs = weighed(obs, calibration)
+    if composed.effects is not None:
+        return with_effects(obs, calibration, composed.effects.names)
+    return with_star_errors(obs, calibration)
 
 
 def _enough(workers: int | None, obs: PartitionedObservations) -> int | None:

@@ -8,7 +8,7 @@ values of one camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from starcal_uq.core.formatting import join_words, plural
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.consensus import frame_focal_ratios, measured_directions
+from starcal_uq.estimation.consensus import focal_lengths, ideal_frames
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import one_of_each
@@ -115,40 +115,48 @@ def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFo
     `camera`: principal point and distortion, and the focal length to start from.
     `seed`: seed of the draws that the split is held against.
     """
+    numbers, frames = frames_with_focals(obs, seed)
+    return focals_of(numbers, ideal_frames(camera, frames), camera.focal_px, seed=seed)
+
+
+def frames_with_focals(obs: Observations, seed: int = 0) -> tuple[IntArray, StarFrames]:
+    """Numbers (K,) and stars of the frames that have enough of them; of many frames, a sample."""
     enough = np.flatnonzero(obs.stars_per_frame >= _LEAST_STARS)
-    chosen = enough[one_of_each(len(enough), _FRAMES, seed)]
+    chosen = np.zeros(obs.n_frames, dtype=bool)
+    chosen[enough[one_of_each(len(enough), _FRAMES, seed)]] = True
+    frames = StarFrames.from_observations(obs)
+    return obs.frame_ids[chosen], frames.select(np.repeat(chosen, frames.sizes))
+
+
+def focals_of(
+    numbers: IntArray, ideal: StarFrames, start_px: float, *, seed: int = 0
+) -> FrameFocals:
+    """The same of frames with these numbers (K,) by their ideal points, from a focal length in
+    px.
+    """
     none = FrameFocals(
         np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), 1.0
     )
-    if not len(chosen):
+    if not len(numbers):
         return none
-    some = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
-    frames = StarFrames.from_observations(some)
-    b = measured_directions(camera, frames)
-    if not np.isfinite(b).all():
-        camera = camera.replace(distortion="none", coefficients=())
-        b = measured_directions(camera, frames)
-    tangent = b[:2] / b[2]
-    theta = np.array([0.0, 0.0, camera.focal_px])
-    log_scale = -np.log(frame_focal_ratios(tangent, frames))
+    theta = np.array([0.0, 0.0, start_px])
+    log_scale = np.log(start_px / focal_lengths(ideal, start_px, by_frame=True))
     for _ in range(_STEPS):
-        pixel = np.ascontiguousarray(camera.focal_px * tangent * frames.spread(np.exp(log_scale)))
-        likelihood = MarginalLikelihood(
-            StarFrames(pixel, frames.r, frames.weight, frames.starts), "none"
-        )
+        pixel = np.ascontiguousarray(ideal.pixel * ideal.spread(np.exp(log_scale)))
+        likelihood = MarginalLikelihood(replace(ideal, pixel=pixel), "none")
         state, cost = likelihood.profile(theta)
         if not np.isfinite(cost):
             return none
         # A focal length that is longer by one per cent is a pattern that is larger by as much.
-        slope = likelihood.slopes(theta, state)[2] * camera.focal_px
-        curvature = frames.sum(np.sum(slope**2, axis=0))
-        step = frames.sum(np.sum(slope * state.e, axis=0)) / curvature
+        slope = likelihood.slopes(theta, state)[2] * start_px
+        curvature = ideal.sum(np.sum(slope**2, axis=0))
+        step = ideal.sum(np.sum(slope * state.e, axis=0)) / curvature
         log_scale -= np.clip(step, -0.2, 0.2)
-    left = frames.sum(np.sum(state.e**2, axis=0))
-    sigma = np.sqrt(left / np.maximum(2 * frames.sizes - 4, 1) / curvature)
+    left = ideal.sum(np.sum(state.e**2, axis=0))
+    sigma = np.sqrt(left / np.maximum(2 * ideal.sizes - 4, 1) / curvature)
     group, p_value = _grouped(-log_scale, sigma, seed)
-    focal = camera.focal_px * np.exp(-log_scale)
-    return FrameFocals(some.frame_ids, focal, sigma * focal, group, p_value)
+    focal = start_px * np.exp(-log_scale)
+    return FrameFocals(numbers, focal, sigma * focal, group, p_value)
 
 
 def _grouped(value: FloatArray, sigma: FloatArray, seed: int) -> tuple[IntArray, float]:

@@ -19,7 +19,6 @@ from starcal_uq.calibration.plausibility import find_reason
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, simpler_models
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.formatting import join_words, significant
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.result import Calibration
@@ -193,31 +192,20 @@ def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:
     return bool(fdtrc(terms, dof, gain / terms / ((normal.cost - gain) / dof)) < _WANTED_P)
 
 
-def fallback_words(cal: Calibration) -> str:
+def fallback_facts(cal: Calibration) -> AnyDict:
     """What the data do not determine of the camera's model, and what the sigmas rest on; empty
     where they do.
     """
-    record = cal.provenance.fallback
-    if not record:
-        return _coma_words(cal)
-    left_out = [c.name for c in get_model(record["model"]).coefficients]
-    left_out = [name for name in left_out if name not in cal.parameter_names]
-    verb = "is" if len(left_out) == 1 else "are"
-    return (
-        f"Distortion model {record['used']!r} in place of {record['model']!r}: "
-        f"{record['because']}. The sigmas hold if "
-        f"{join_words(left_out)} {verb} zero."
-    )
-
-
-def _coma_words(cal: Calibration) -> str:
-    factors = cal.coma_factors
+    record, factors = cal.provenance.fallback, cal.coma_factors
+    if record:
+        left_out = [c.name for c in get_model(record["model"]).coefficients]
+        return {
+            "used": str(record["used"]),
+            "model": str(record["model"]),
+            "because": str(record["because"]),
+            "left_out": tuple(name for name in left_out if name not in cal.parameter_names),
+        }
     if factors is None or np.max(factors) < COMA_MATTERS:
-        return ""
-    x0, y0 = (significant(float(sigma)) for sigma in cal.sigmas[:2])
-    return (
-        "The distortion may be none, and without its coma the stars tell the principal point to "
-        f"{x0} and {y0} px "
-        f"only: sigmas hold that, and are up to {significant(float(np.max(factors)))} times as "
-        "large as with it."
-    )
+        return {}
+    x0, y0 = (float(sigma) for sigma in cal.sigmas[:2])
+    return {"x0_px": x0, "y0_px": y0, "times": float(np.max(factors))}

@@ -11,21 +11,22 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
-from itertools import islice
+from itertools import islice, pairwise
 from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from starcal_uq.calibration.cameras import frame_focals
+from starcal_uq.attitude.rotations import unit_vectors
+from starcal_uq.calibration.cameras import focals_of, frames_with_focals
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, Remedy
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
-from starcal_uq.estimation.consensus import consensus, focal_ratio, measured_directions
+from starcal_uq.estimation.consensus import consensus, directions, focal_lengths
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.table import Observations
 
@@ -51,40 +52,62 @@ _NEIGHBOURS = 8
 # anything.
 _NOISY, _QUIET = 0.2, 0.1
 _FEW_WRONG = 0.02
+_ONE_FRAME_NUMBER = (
+    "all rows have one frame number, but are stars of several images: give each image its own in "
+    "column frame"
+)
 
 
 @dataclass(frozen=True)
 class _Table:
-    """Rows of some frames: pixels (2, N), directions (N,) in degrees, first rows of the frames (K +
-    1,).
+    """What is known of the stars of some frames, as given or without a slip.
+
+    Pixels (2, N), directions (N,) in degrees, first rows of the frames (K + 1,); principal point
+    (2,), width and height (2,) and focal length of the camera in px.
     """
 
     pixel: FloatArray
     ra: FloatArray
     dec: FloatArray
     starts: IntArray
+    centre: FloatArray
+    detector: IntArray
+    focal_px: float
 
     @property
     def frames(self) -> StarFrames:
-        ra, dec = np.radians(self.ra), np.radians(self.dec)
-        r = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-        return StarFrames(self.pixel, r, None, self.starts)
+        """The stars, in pixels from the principal point."""
+        r = unit_vectors(self.ra, self.dec).T
+        return StarFrames(self.pixel - self.centre[:, None], r, None, self.starts)
+
+    @property
+    def tolerance_px(self) -> float:
+        return _TOLERANCE * float(self.detector.max())
+
+    @property
+    def field_rad(self) -> float:
+        return float(2.0 * np.arctan(0.5 * np.hypot(*self.detector) / self.focal_px))
+
+
+# Tables without a slip, each with a clause that names slip and remedy.
+_Slips = Iterator[tuple[str, _Table]]
 
 
 @dataclass(frozen=True)
 class _Fit:
     """How well stars agree: mean truncated square, share that agrees, its scatter and the focal
-    length in px.
+    length over the camera's.
     """
 
     cost: float
     share: float
     scatter_px: float
-    focal_px: float
+    focal_ratio: float
 
-    def badness(self, camera: Camera) -> float:
+    @property
+    def badness(self) -> float:
         """Less is better; among what fits alike, the focal length nearest to the camera's."""
-        return self.cost + 0.02 * abs(float(np.log(self.focal_px / camera.focal_px)))
+        return self.cost + 0.02 * abs(float(np.log(self.focal_ratio)))
 
 
 def explained(function: Callable[P, R]) -> Callable[P, R]:
@@ -152,38 +175,34 @@ def find_reason(
     None where the stars agree, so that the status has said all there is: too few of them, or the
     wrong model.
     """
-    # The attitudes come without distortion, which bends them less than the slips do.
-    camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))
-    table = _sample(obs)
-    plain = _fit(table, camera)
+    table = _sample(obs, camera)
+    plain = _fit(table)
     if plain.cost > _EXPLAINED:
-        tried = [(_fit(other, camera), text) for text, other in _slips(table, camera)]
-        centred = camera.replace(
-            x0_px=0.5 * (camera.width_px - 1), y0_px=0.5 * (camera.height_px - 1)
-        )
-        tried.append((_fit(table, centred), _off_centre(camera)))
-        tried += _regrouped(obs, camera)
         enough = min(_EXPLAINED, _CLEARLY * plain.cost)
-        if all(fit.cost >= enough for fit, _ in tried):
-            tried = [(_fit(other, camera), text) for text, other in _two_slips(table, camera)]
-        good = [one for one in tried if one[0].cost < enough]
-        if good:
-            fit, text = min(good, key=lambda one: one[0].badness(camera))
-            focal = _wrong_focal(fit, camera)
-            return text if focal is None else f"{text}; and {focal}"
-        if _far_apart(table, camera):
-            return _far_apart_words(obs, camera)
-    focals = frame_focals(obs, camera)
+        for slips in (_one_slip(table, obs), _two_slips(table)):
+            tried = [(_fit(other), text) for text, other in slips]
+            good = [one for one in tried if one[0].cost < enough]
+            if good:
+                fit, text = min(good, key=lambda one: one[0].badness)
+                focal = _wrong_focal(fit, camera)
+                return text if focal is None else f"{text}; and {focal}"
+        if _far_apart(table):
+            return _far_apart_words(obs, table)
+    # Distortion bends attitudes and focal lengths less than slips and other cameras do.
+    numbers, frames = frames_with_focals(obs)
+    pinhole = replace(frames, pixel=frames.pixel - table.centre[:, None])
+    focals = focals_of(numbers, pinhole, table.focal_px)
     if focals.n_groups > 1:
         return focals.words(camera)
-    if plain.share < 1.0 - _FEW_WRONG and plain.scatter_px > _NOISY * _tolerance_px(camera):
+    if plain.share < 1.0 - _FEW_WRONG and plain.scatter_px > _NOISY * table.tolerance_px:
         # Stars that noise throws beyond the tolerance are not wrong ones.
-        wider = (_fit(table, camera, by) for by in (3.0, 9.0))
+        wider = (_fit(table, by) for by in (3.0, 9.0))
         plain = next((fit for fit in wider if fit.share >= 1.0 - _FEW_WRONG), plain)
-    return _wrong_focal(plain, camera) or _as_it_is(plain, camera, status, screened)
+    quiet = plain.scatter_px < _QUIET * table.tolerance_px
+    return _wrong_focal(plain, camera) or _as_it_is(plain, quiet, status, screened)
 
 
-def _sample(obs: Observations) -> _Table:
+def _sample(obs: Observations, camera: Camera) -> _Table:
     """Some frames, spread over the table, of those with the most stars, and some stars of each."""
     sizes = np.diff(obs.frame_starts)
     most = np.flatnonzero(sizes >= np.median(sizes))
@@ -192,121 +211,137 @@ def _sample(obs: Observations) -> _Table:
     for frame in chosen:
         first, n = int(obs.frame_starts[frame]), int(sizes[frame])
         rows.append(first + np.unique(np.linspace(0, n - 1, min(n, _STARS)).astype(np.int64)))
-    return _of_rows(obs, rows)
+    return _Table(
+        **_columns(obs, rows),
+        centre=camera.theta[:2],
+        detector=np.array([camera.width_px, camera.height_px]),
+        focal_px=camera.focal_px,
+    )
 
 
-def _of_rows(obs: Observations, frames: list[IntArray]) -> _Table:
+def _columns(obs: Observations, frames: list[IntArray]) -> AnyDict:
+    """The rows of each frame, as fields of `_Table`."""
     rows = np.concatenate(frames)
-    starts = np.cumsum([0, *map(len, frames)])
-    return _Table(np.ascontiguousarray(obs.xy[rows].T), obs.ra_deg[rows], obs.dec_deg[rows], starts)
+    return {
+        "pixel": np.ascontiguousarray(obs.xy[rows].T),
+        "ra": obs.ra_deg[rows],
+        "dec": obs.dec_deg[rows],
+        "starts": np.cumsum([0, *map(len, frames)]),
+    }
 
 
-def _tolerance_px(camera: Camera) -> float:
-    return _TOLERANCE * max(camera.width_px, camera.height_px)
-
-
-def _fit(table: _Table, camera: Camera, wider: float = 1.0) -> _Fit:
-    """How well the stars of each frame agree on an attitude, with the focal length that their
-    angles ask for.
+def _fit(table: _Table, wider: float = 1.0) -> _Fit:
+    """How well the stars of each frame agree on an attitude, without distortion, with the focal
+    length that their angles ask for.
     """
-    frames = table.frames
-    size = max(camera.width_px, camera.height_px)
-    focal_px = 0.5 * size / np.tan(0.5 * _FIELD_RAD)
-    found = camera.replace(focal_px=focal_px)
-    found = found.replace(focal_px=focal_px * focal_ratio(found, frames))
-    tolerance_px = wider * _tolerance_px(camera)
-    b = measured_directions(found, frames)
-    best = consensus(b, frames.r, frames.starts, tolerance_px / found.focal_px)
-    offset_px = np.where(np.isfinite(best.offset_rad), best.offset_rad, np.inf) * found.focal_px
+    frames, tolerance_px = table.frames, wider * table.tolerance_px
+    start_px = 0.5 * float(table.detector.max()) / np.tan(0.5 * _FIELD_RAD)
+    focal_px = float(focal_lengths(frames, start_px)[0])
+    b = directions(frames.pixel, focal_px)
+    best = consensus(b, frames.r, frames.starts, tolerance_px / focal_px)
+    offset_px = np.where(np.isfinite(best.offset_rad), best.offset_rad, np.inf) * focal_px
     cost = float(np.mean(np.minimum((offset_px / tolerance_px) ** 2, 1.0)))
     # Of two axes, with as many degrees of freedom as three stars more than an attitude has.
     scatter = float(np.median(offset_px[best.agree])) / 1.1774 if best.agree.any() else np.inf
-    return _Fit(cost, float(np.mean(best.agree)), scatter, found.focal_px)
+    return _Fit(cost, float(np.mean(best.agree)), scatter, focal_px / table.focal_px)
 
 
-def _slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
-    """Slips that the numbers allow, each as a clause with its remedy, and the table without it."""
+def _one_slip(table: _Table, obs: Observations) -> _Slips:
+    """Slips that the numbers allow."""
     yield from _units(table)
-    yield _mirrored(table, camera)
+    yield _mirrored(table)
+    yield _off_centre(table)
+    yield from _regrouped(table, obs)
 
 
-def _two_slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
+def _two_slips(table: _Table) -> _Slips:
     """Two of them at once."""
     for text, other in _units(table):
-        second, both = _mirrored(other, camera)
+        second, both = _mirrored(other)
         yield f"{text}; and {second}", both
-        for more, again in _units(table, ra_too=True):
-            if other.dec is table.dec and again.ra is table.ra:
-                yield (
-                    f"{text}; and {more}",
-                    _Table(table.pixel, other.ra, again.dec, table.starts),
-                )
+        if other.dec is table.dec and _dec_in_radians(table):
+            second, both = _dec_words(table, ""), replace(other, dec=np.degrees(table.dec))
+            yield f"{text}; and {second}", both
 
 
-def _units(table: _Table, *, ra_too: bool = False) -> Iterator[tuple[str, _Table]]:
-    """Slips of units; `ra_too` where dec_deg is not the only column with one."""
-    ra, dec, starts = table.ra, table.dec, table.starts
-    in_degrees = np.degrees
-    if ra.max() <= 24.0:
-        text = f"ra_deg looks like hours ({ra.min():.3g} to {ra.max():.3g}): multiply it by 15"
-        yield text, _Table(table.pixel, 15.0 * ra, dec, starts)
-    if ra.max() <= 2.0 * np.pi:
-        if np.abs(dec).max() <= 0.5 * np.pi:
-            text = (
-                f"ra_deg and dec_deg look like radians (ra_deg up to {ra.max():.3g}): multiply "
-                "them by 180/pi"
-            )
-            yield text, _Table(table.pixel, in_degrees(ra), in_degrees(dec), starts)
-        text = (
-            f"ra_deg looks like radians (up to {ra.max():.3g}), dec_deg does not: multiply "
-            "ra_deg by 180/pi"
-        )
-        yield text, _Table(table.pixel, in_degrees(ra), dec, starts)
-    if np.abs(dec).max() <= 0.5 * np.pi < ra.max():
-        text = (
-            f"dec_deg looks like radians (up to {np.abs(dec).max():.3g})"
-            f"{'' if ra_too else ', ra_deg does not'}: multiply it by 180/pi"
-        )
-        yield text, _Table(table.pixel, ra, in_degrees(dec), starts)
-    if ra.max() <= 90.0:
-        yield (
+def _units(table: _Table) -> _Slips:
+    """Columns in other units or exchanged."""
+    ra, dec, most = table.ra, table.dec, table.ra.max()
+    in_radians = most <= 2.0 * np.pi
+    slips = (
+        (
+            most <= 24.0,
+            f"ra_deg looks like hours ({ra.min():.3g} to {most:.3g}): multiply it by 15",
+            (15.0 * ra, dec),
+        ),
+        (
+            in_radians and _within_radians(dec),
+            f"ra_deg and dec_deg look like radians (ra_deg up to {most:.3g}): multiply them by "
+            "180/pi",
+            (np.degrees(ra), np.degrees(dec)),
+        ),
+        (
+            in_radians,
+            f"ra_deg looks like radians (up to {most:.3g}), dec_deg does not: multiply ra_deg by "
+            "180/pi",
+            (np.degrees(ra), dec),
+        ),
+        (
+            _dec_in_radians(table),
+            _dec_words(table, ", ra_deg does not"),
+            (ra, np.degrees(dec)),
+        ),
+        (
+            most <= 90.0,
             "ra_deg and dec_deg look swapped: exchange the two columns",
-            _Table(table.pixel, dec % 360.0, ra, starts),
-        )
+            (dec % 360.0, ra),
+        ),
+    )
+    for possible, text, (right_ra, right_dec) in slips:
+        if possible:
+            yield text, replace(table, ra=right_ra, dec=right_dec)
 
 
-def _mirrored(table: _Table, camera: Camera) -> tuple[str, _Table]:
-    x, y = table.pixel
-    ways = f"count x_px from the right edge ({camera.width_px - 1} - x_px), or y_px from the bottom"
-    if x.max() <= camera.height_px - 0.5 and y.max() <= camera.width_px - 0.5:
+def _within_radians(dec: FloatArray) -> bool:
+    return bool(np.abs(dec).max() <= 0.5 * np.pi)
+
+
+def _dec_in_radians(table: _Table) -> bool:
+    return _within_radians(table.dec) and bool(table.ra.max() > 0.5 * np.pi)
+
+
+def _dec_words(table: _Table, but: str) -> str:
+    most = np.abs(table.dec).max()
+    return f"dec_deg looks like radians (up to {most:.3g}){but}: multiply it by 180/pi"
+
+
+def _mirrored(table: _Table) -> tuple[str, _Table]:
+    (x, y), (width, height) = table.pixel, table.detector
+    ways = f"count x_px from the right edge ({width - 1} - x_px), or y_px from the bottom"
+    if x.max() <= height - 0.5 and y.max() <= width - 0.5:
         ways += ", or exchange x_px and y_px"
     text = f"the image is mirrored: {ways}; a wrong sign of ra_deg or dec_deg looks the same"
-    return text, _Table(np.array([camera.width_px - 1.0 - x, y]), table.ra, table.dec, table.starts)
+    return text, replace(table, pixel=np.array([width - 1.0 - x, y]))
 
 
-def _off_centre(camera: Camera) -> str:
-    given = (
-        f"the principal point of the camera, ({camera.x0_px:g}, {camera.y0_px:g}) px, is far off"
+def _off_centre(table: _Table) -> tuple[str, _Table]:
+    middle: FloatArray = (table.detector - 1) / 2.0
+    (x0, y0), (x, y) = table.centre, middle
+    text = (
+        f"the principal point of the camera, ({x0:g}, {y0:g}) px, is far off: start from the "
+        f"detector's centre, ({x:g}, {y:g})"
     )
-    centre = f"({0.5 * (camera.width_px - 1):g}, {0.5 * (camera.height_px - 1):g})"
-    return f"{given}: start from the detector's centre, {centre}"
+    return text, replace(table, centre=middle)
 
 
-def _one_frame_number() -> str:
-    return (
-        "all rows have one frame number, but are stars of several images: give each image its "
-        "own in column frame"
-    )
-
-
-def _regrouped(obs: Observations, camera: Camera) -> list[tuple[_Fit, str]]:
+def _regrouped(table: _Table, obs: Observations) -> _Slips:
     """Whether stars that are neighbours in the sky are so in an image, whatever frame they are said
     to be of.
     """
     from scipy.spatial import cKDTree
 
     if obs.n_stars < 2 * _NEIGHBOURS:
-        return []
+        return
     sky = cKDTree(obs.directions_icrs)
     seeds = np.unique(np.linspace(0, obs.n_stars - 1, _FRAMES).astype(np.int64))
     near = [np.sort(rows) for rows in sky.query(obs.directions_icrs[seeds], k=_NEIGHBOURS)[1]]
@@ -314,33 +349,29 @@ def _regrouped(obs: Observations, camera: Camera) -> list[tuple[_Fit, str]]:
         "the stars fit each other but not their frame numbers: check column frame, which is "
         "mixed up"
     )
-    return [(_fit(_of_rows(obs, near), camera), _one_frame_number() if obs.n_frames == 1 else text)]
-
-
-def _far_apart(table: _Table, camera: Camera) -> bool:
-    """Whether most frames hold stars that cannot be in one field."""
-    r = table.frames.r
-    spans = []
-    for start, stop in zip(table.starts[:-1], table.starts[1:], strict=True):
-        chord = np.linalg.norm(r[:, start:stop, None] - r[:, None, start:stop], axis=0).max()
-        spans.append(2.0 * np.arcsin(min(0.5 * chord, 1.0)))
-    return float(np.median(spans)) > 2.0 * _field_rad(camera)
-
-
-def _field_rad(camera: Camera) -> float:
-    return float(
-        2.0 * np.arctan(0.5 * np.hypot(camera.width_px, camera.height_px) / camera.focal_px)
+    yield (
+        _ONE_FRAME_NUMBER if obs.n_frames == 1 else text,
+        replace(table, **_columns(obs, near)),
     )
 
 
-def _far_apart_words(obs: Observations, camera: Camera) -> str:
+def _far_apart(table: _Table) -> bool:
+    """Whether most frames hold stars that cannot be in one field."""
+    r = table.frames.r
+    spans = []
+    for start, stop in pairwise(table.starts):
+        chord = np.linalg.norm(r[:, start:stop, None] - r[:, None, start:stop], axis=0).max()
+        spans.append(2.0 * np.arcsin(min(0.5 * chord, 1.0)))
+    return float(np.median(spans)) > 2.0 * table.field_rad
+
+
+def _far_apart_words(obs: Observations, table: _Table) -> str:
     if obs.n_frames == 1:
-        return _one_frame_number()
-    field = significant(float(np.degrees(_field_rad(camera))), 2)
+        return _ONE_FRAME_NUMBER
+    field = significant(float(np.degrees(table.field_rad)), 2)
     return (
         f"frames hold stars that lie farther apart in the sky than the camera sees ({field} "
-        "degrees): their frame "
-        "numbers or directions belong to other rows"
+        "degrees): their frame numbers or directions belong to other rows"
     )
 
 
@@ -348,14 +379,14 @@ def _wrong_focal(plain: _Fit, camera: Camera) -> str | None:
     """A focal length that the stars contradict, with the unit that would explain it."""
     if plain.cost > _EXPLAINED:
         return None
-    ratio = plain.focal_px / camera.focal_px
+    ratio = plain.focal_ratio
     if 1.0 / _SAME_CAMERA < ratio < _SAME_CAMERA:
         return None
     for unit, reason in _other_units(camera).items():
         if 1.0 / _SAME_UNIT < ratio / unit < _SAME_UNIT:
             return reason
     return (
-        f"the stars ask for a focal length of about {camera.length_text(plain.focal_px, 3)}, not "
+        f"the stars ask for a focal length of about {camera.length_text(ratio * camera.focal_px, 3)}, not "
         f"{camera.length_text(camera.focal_px, 6)}: start from that, or give the camera that "
         "took the images"
     )
@@ -371,21 +402,21 @@ def _other_units(camera: Camera) -> dict[float, str]:
     return {
         1e-3: short,
         1e3: f"focal_mm looks like metres ({camera.focal_mm:g}): multiply it by 1000",
-        1e-3
-        * camera.pixel_um: f"focal_mm looks like pixels ({camera.focal_mm:g}): multiply it by the pixel pitch, "
-        f"{1e-3 * camera.pixel_um:g} mm",
+        1e-3 * camera.pixel_um: (
+            f"focal_mm looks like pixels ({camera.focal_mm:g}): multiply it by the pixel pitch, "
+            f"{1e-3 * camera.pixel_um:g} mm"
+        ),
         25.4: f"focal_mm looks like inches ({camera.focal_mm:g}): multiply it by 25.4",
     }
 
 
-def _as_it_is(plain: _Fit, camera: Camera, status: Status, screened: bool) -> str | None:
+def _as_it_is(plain: _Fit, quiet: bool, status: Status, screened: bool) -> str | None:
     """What is known of stars that no slip explains."""
     wrong = 1.0 - plain.share
     if wrong > 0.8:
         return (
             "the stars of a frame fit no common attitude, whatever units, axes and focal length: "
-            "check their "
-            "identification and the frame numbers"
+            "check their identification and the frame numbers"
         )
     if wrong > _FEW_WRONG:
         told = f"about {100.0 * wrong:.0f} % of the stars do not fit the others of their frame"
@@ -393,7 +424,6 @@ def _as_it_is(plain: _Fit, camera: Camera, status: Status, screened: bool) -> st
             return f"{told}: identify them again"
         screened_out = Remedy("calibrate", (OBS, CAMERA), {"out": RUN, "screening": True})
         return f"{told}: leave out wrong identifications (`{screened_out.words}`)"
-    quiet = plain.scatter_px < _QUIET * _tolerance_px(camera)
     if quiet or status in (Status.SINGULAR, Status.FOLDED, Status.OUTSIDE_DETECTOR):
         return None
     return (

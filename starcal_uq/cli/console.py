@@ -14,7 +14,7 @@ from rich.table import Table
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import plural, significant
-from starcal_uq.core.status import Level
+from starcal_uq.core.status import Advice, Level, Order
 from starcal_uq.core.types import AnyDict, Progress
 from starcal_uq.presentation.tables import TextTable
 
@@ -72,9 +72,10 @@ def quiet(wanted: bool) -> Iterator[None]:
 
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
     """Table of start, estimate and sigma; with a truth, also truth and z."""
-    from starcal_uq.calibration.fallback import fallback_words
+    from starcal_uq.presentation.words.effects import effects_table
     from starcal_uq.presentation.words.estimation import (
         calibration_table,
+        decided,
         fitted_noise_text,
         focal_length,
     )
@@ -84,9 +85,10 @@ def show_calibration(calibration: Calibration, truth: Camera | None = None) -> N
     say(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
     if calibration.camera.pixel_um is None:
         say(PITCH_UNKNOWN)
-    for words in filter(
-        None, (fitted_noise_text(calibration).strip(), fallback_words(calibration))
-    ):
+    effects = None if calibration.effects is None else effects_table(calibration.effects)
+    if effects is not None:
+        print_table(effects)
+    for words in filter(None, (fitted_noise_text(calibration).strip(), *decided(calibration))):
         say(words)
 
 
@@ -149,9 +151,11 @@ def show_coupling(coupling: Coupling) -> None:
 
 def show_attitude(error: AttitudeError) -> None:
     """Attitude error by contributor and axis, 1 sigma, and what follows."""
-    from starcal_uq.presentation.words.propagation import attitude_table
+    from starcal_uq.presentation.words.propagation import attitude_table, onboard_table
 
     print_table(attitude_table(error))
+    if error.variants:
+        print_table(onboard_table(error))
 
 
 def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = None) -> None:
@@ -180,22 +184,23 @@ def show_summary(run: Run, page: Path) -> None:
 
 def warn_air(obs: Observations | PartitionedObservations, cal: Calibration) -> None:
     """Say what refraction does to the focal length where nothing is known of the air."""
-    from starcal_uq.diagnostics.verdict.observed import REMEDY, air, conditional_words
+    from starcal_uq.diagnostics.verdict.observed import air, conditional
 
     if air(obs) == "unknown":
-        tell(f"warning: {conditional_words(cal)} {REMEDY}")
+        site = Order(Advice.STATE_THE_SITE)
+        tell(f"warning: {conditional(cal).sentence} {site.sentence}")
 
 
 def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera) -> None:
     """Say what follows for this camera when nothing is known of the observer's motion, and what was
     left out.
     """
-    from starcal_uq.diagnostics.verdict.observed import aberration_size
+    from starcal_uq.presentation.sentences.observed import aberration_words
 
     if not obs.directions_declared:
         words = (
             "warning: Neither time nor observer velocity was declared: annual aberration "
-            f"{aberration_size(camera)}. "
+            f"{aberration_words(camera)}. "
             "Declare --directions apparent, or --directions catalogue with a time_utc column."
         )
         tell(words)

@@ -151,6 +151,18 @@ def parse_dof(text: str | None) -> float | Literal["free"] | None:
     return student.parse_dof(value, typer.BadParameter)
 
 
+def check_effects(text: str) -> None:
+    """Refuse what is neither ``auto`` nor ``none`` nor names of effects with commas."""
+    from starcal_uq.likelihood.composed import EffectTerms
+
+    if not _is_name(text):
+        raise typer.BadParameter(f"{shown(text)} is no list of effects, such as field,frame.")
+    try:
+        EffectTerms.parsed(text)
+    except StarcalError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
 def parse_frames(text: str | None) -> list[tuple[int, int]] | None:
     """``0-4,7`` as first and last number of each stretch of frames."""
     if text is None:
@@ -240,6 +252,7 @@ _CHECKS: Mapping[str, Callable[[Any], object]] = {
     "address": _check_text,
     "columns": parse_columns,
     "degrees of freedom": parse_dof,
+    "effects": check_effects,
     "frames": parse_frames,
     "labels": parse_labels,
     "names": check_names,

@@ -12,8 +12,7 @@ from starcal_uq.core.types import AnyDict
 
 
 def _calibration(result: Any) -> AnyDict:
-    from starcal_uq.calibration.fallback import fallback_words
-    from starcal_uq.presentation.words.estimation import fitted_noise_text
+    from starcal_uq.presentation.words.estimation import fallback_words, fitted_noise_text
 
     cal, truth = result if isinstance(result, tuple) else (result, None)
     table = cal.to_dataframe()
@@ -33,7 +32,12 @@ def _calibration(result: Any) -> AnyDict:
         "notes": [
             words for words in (fitted_noise_text(cal).strip(), fallback_words(cal)) if words
         ],
+        "effects": cal.effects,
     }
+
+
+def _effects(result: Any) -> AnyDict:
+    return {"refused": [{"name": name, "gain_nat": gain} for name, gain in result.refused]}
 
 
 def _posterior(result: Any) -> AnyDict:
@@ -130,6 +134,7 @@ def _table_as(key: str) -> Callable[[Any], AnyDict]:
 
 TAKEN: Mapping[str, Callable[[Any], Mapping[str, Any]]] = {
     "Calibration": _calibration,
+    "Effects": _effects,
     "Posterior": _posterior,
     "Coupling": _coupling,
     "Attitude": _table_as("contributors"),

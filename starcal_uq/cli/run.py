@@ -37,6 +37,7 @@ from starcal_uq.cli.settings import (
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.settings import OnboardModel
 from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.toml import read_section
@@ -93,6 +94,7 @@ def run_command(
     draws: int = 300,
     alignment: str = "random",
     alignment_frames: int | None = None,
+    onboard: OnboardModel = "model",
     budget: Path | None = None,
     force: bool = False,
 ) -> Answer:
@@ -127,7 +129,11 @@ def run_command(
         raise typer.BadParameter(
             "a table of stars needs the nominal camera (TOML) after it; only images do without."
         )
-    aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
+    aligning = {
+        "alignment": alignment,
+        "alignment_frames": alignment_frames,
+        "onboard": onboard,
+    }
     refuse_conflicts(settings_of(estimation, sky, sampling, partitioned=folder, **aligning))
     settings = {
         "estimation": estimation,

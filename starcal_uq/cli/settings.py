@@ -41,6 +41,7 @@ class EstimationSettings:
 
     star_errors: bool = False
     noise: settings.NoiseKind = "common"
+    effects: str = "none"
     start: str | None = None
     pixel_um: float | None = None
     max_iterations: int | None = None
@@ -54,6 +55,7 @@ class EstimationSettings:
         own = vars(self) | {"screening": self.screen}
         for name in ("screen", "robust", "start", "pixel_um"):
             del own[name]
+        own["effects"] = None if self.effects == "none" else self.effects
         # No workers (0) are a choice, and no absence of one.
         options = {
             name: value for name, value in own.items() if value is not None and value is not False

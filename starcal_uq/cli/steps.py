@@ -237,6 +237,7 @@ def propagate_command(
     sense: settings.Sense = "icrs_to_camera",
     alignment: str = "random",
     alignment_frames: int | None = None,
+    onboard: settings.OnboardModel = "model",
     draws: int = 300,
     seed: int = 0,
     force: bool = False,
@@ -267,6 +268,7 @@ def propagate_command(
         sky=sky,
         alignment=alignment,
         alignment_frames=alignment_frames,
+        onboard=onboard,
         force=force,
     )
     show_attitude(error)

@@ -49,8 +49,9 @@ def study_command(
 
 
 def _show(found: sc.studies.Study, page: Path | None) -> None:
-    from starcal_uq.presentation.words.studies import study_answer, study_table
+    from starcal_uq.presentation.words.studies import study_answer
     from starcal_uq.presentation.words.study_advice import study_advice
+    from starcal_uq.presentation.words.study_tables import study_table
 
     table = study_table(found)
     if table is not None:

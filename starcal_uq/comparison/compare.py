@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.attitude.rotations import rotation_vector
-from starcal_uq.attitude.wahba import quest
+from starcal_uq.attitude.wahba import aligned
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.camera.fields import area_weights, detector_axes, grid_points, tangent_axes
@@ -49,7 +49,7 @@ from starcal_uq.core.errors import ComparisonError
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.splits import split_frames, split_labels
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def compare(
     x, y = detector_axes(first.camera, n)
     xy, weight = grid_points(x, y), area_weights(n)
     direction = unproject(first.camera, xy)
-    turned, rotation = _aligned(unproject(second.camera, xy), direction, weight)
+    turned, rotation = aligned(unproject(second.camera, xy), direction, weight)
     axes = tangent_axes(direction)
     e = np.einsum("nij,nj->ni", axes, turned - direction)
     difference_px = project(first.camera, turned) - xy
@@ -229,18 +229,6 @@ def _check(a: Any, b: Any, labels: tuple[str, str], level: float) -> None:
             "compared "
             "pixel by pixel, so compare runs of one detector, with the same windowing."
         )
-
-
-def _aligned(
-    moved: FloatArray, reference: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Directions (N, 3) turned back by the rotation that brings them closest to others, and the
-    rotation.
-    """
-    rotation = quest(
-        moved, reference, np.array([0, len(reference)]), weight, covariance=False
-    ).rotations[0]
-    return moved @ rotation, rotation
 
 
 def _shared_parameters(a: Estimate, b: Estimate, rule: Rule) -> AnyDict:

@@ -43,8 +43,14 @@ class Rule:
         given.
         """
         value = settings.get(self.name)
-        concerned = value in self.values if self.values else value not in (None, False)
-        return concerned and settings.get(self.other) not in self.allowed
+        concerned = value in self.values if self.values else is_given(value)
+        other = settings.get(self.other)
+        return concerned and (other if is_given(other) else None) not in self.allowed
+
+
+def is_given(value: object) -> bool:
+    """Whether a value of an option asks for anything."""
+    return value not in (None, False, "none")
 
 
 # "likelihood" and "dof" are those of the estimate; "sampled" and "sampled_dof" those of the draws.
@@ -52,25 +58,29 @@ RULES = (
     Rule("likelihood", ("student_t",), "method", (None, "efficient")),
     Rule("noise", ("model",), "method", (None, "efficient")),
     Rule("star_errors", (True,), "method", (None, "efficient")),
+    Rule("effects", (), "method", (None, "efficient")),
+    Rule("effects", (), "star_errors", (None,)),
+    Rule("effects", (), "partitioned", (None,)),
     Rule("accept_inflation", (True,), "method", (None, "efficient", *_IN_MEMORY)),
     Rule("dof", (), "likelihood", ("student_t",)),
     Rule("recursion", (), "method", _RECURSIVE),
-    Rule("method", _IN_MEMORY, "partitioned", (None, False)),
-    Rule("likelihood", ("student_t",), "partitioned", (None, False)),
-    Rule("noise", ("model",), "partitioned", (None, False)),
-    Rule("star_errors", (True,), "partitioned", (None, False)),
-    Rule("duplicates", ("drop",), "partitioned", (None, False)),
-    Rule("screening", (True,), "partitioned", (None, False)),
-    Rule("frames", (), "partitioned", (None, False)),
+    Rule("method", _IN_MEMORY, "partitioned", (None,)),
+    Rule("likelihood", ("student_t",), "partitioned", (None,)),
+    Rule("noise", ("model",), "partitioned", (None,)),
+    Rule("star_errors", (True,), "partitioned", (None,)),
+    Rule("duplicates", ("drop",), "partitioned", (None,)),
+    Rule("screening", (True,), "partitioned", (None,)),
+    Rule("frames", (), "partitioned", (None,)),
     Rule("scheduler", (), "partitioned", (True,)),
     Rule("workers", (), "partitioned", (True,)),
     Rule("sampled_dof", (), "sampled", ("student_t",)),
     Rule("sampled", ("marginal",), "likelihood", (None, "marginal")),
-    Rule("sampled", (*_COMPOSITE, "student_t"), "star_errors", (None, False)),
-    Rule("sampled", (*_COMPOSITE, "student_t"), "partitioned", (None, False)),
-    Rule("evaluation", ("exact",), "partitioned", (None, False)),
+    Rule("sampled", (*_COMPOSITE, "student_t"), "star_errors", (None,)),
+    Rule("sampled", (*_COMPOSITE, "student_t"), "effects", (None,)),
+    Rule("sampled", (*_COMPOSITE, "student_t"), "partitioned", (None,)),
+    Rule("evaluation", ("exact",), "partitioned", (None,)),
     Rule("sampled", _COMPOSITE, "method", (None, "efficient", *_IN_MEMORY)),
-    Rule("site", (), "in_space", (None, False)),
+    Rule("site", (), "in_space", (None,)),
     Rule("site", (), "observer_velocity", (None,)),
     Rule("site", (), "directions", (None, "catalogue")),
     Rule("alignment_frames", (), "alignment", (None, "random")),
@@ -107,10 +117,11 @@ def parsed(words: Sequence[str]) -> tuple[list[str], Options]:
 
 
 def sampled_by_default(settings: Mapping[str, object]) -> object:
-    """The likelihood of the draws: that of the estimate, unless star errors give its stars known
-    weights.
+    """The likelihood of the draws: that of the estimate, unless star errors or effects give its
+    stars known weights.
     """
-    return None if settings.get("star_errors") else settings.get("likelihood")
+    known = settings.get("star_errors") or is_given(settings.get("effects"))
+    return None if known else settings.get("likelihood")
 
 
 def arguments_of(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:

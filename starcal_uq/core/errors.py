@@ -49,6 +49,13 @@ def check_known(what: str, name: str, known: Collection[str], error: type[Except
         raise error(f"{what} {name!r} is unknown: use one of {', '.join(known)}.")
 
 
+def require(error: type[Exception], *conditions: tuple[bool, str]) -> None:
+    """Raise an error with the text of the first condition that does not hold."""
+    for good, text in conditions:
+        if not good:
+            raise error(text)
+
+
 class SettingError(StarcalError, ValueError):
     """A setting lies outside its limits."""
 

@@ -85,7 +85,7 @@ def _plain(
         if not isinstance(key, str):
             raise TypeError(f"a file cannot hold the key {key!r} of {name}")
         place = _below(name, key)
-        wanted = apart is None or key in apart
+        wanted = apart is None or key in apart or place in apart
         if arrays is not None and wanted and isinstance(item, np.ndarray):
             arrays[place] = item
         else:

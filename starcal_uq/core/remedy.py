@@ -181,4 +181,3 @@ def read_remedies(text: str) -> Remedies:
 
 
 PLAN: Remedies = (Remedy("plan", (CAMERA,), {"after": RUN, "choose": 10}, form="command"),)
-MORE = "Take more frames: the command names those that help most."

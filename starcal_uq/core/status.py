@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
-from enum import Enum
-from typing import ClassVar
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from functools import cached_property
+from typing import Any, ClassVar
 
+from starcal_uq.core.findings import Finding, worded
 from starcal_uq.core.remedy import Remedies
 
 
@@ -132,42 +134,154 @@ class Code(Enum):
 CODES = {code.value[0]: code for code in Code}
 
 
+class Advice(Enum):
+    """What to do with the instrument or the data."""
+
+    FRAMES_THAT_HELP = auto()
+    ANOTHER_PRIOR = auto()
+    SAMPLE_WITH_OBSERVATIONS = auto()
+    LOOK_FOR_THE_CAUSE = auto()
+    MEND_THE_ESTIMATE = auto()
+    NEARER_START = auto()
+    ACCEPT_THE_FOCAL_LENGTH = auto()
+    FRAMES_APART = auto()
+    ACCEPT_THE_PHASE = auto()
+    LEAVE_OUT_MAGNITUDES = auto()
+    CHECK_THE_DIRECTIONS = auto()
+    WITHOUT_STAR_ERRORS = auto()
+    COUNT_THE_PATTERN = auto()
+    STATE_THE_SITE = auto()
+    GIVE_THE_DIRECTIONS = auto()
+    CORRECT_THE_EPOCH = auto()
+    CORRECT_THE_TIMES = auto()
+    GIVE_MEASURED_CENTROIDS = auto()
+    STATE_NOISE_IN_PX = auto()
+    DIVIDE_THE_NOISE = auto()
+    ACCEPT_THE_FACTOR = auto()
+    LOOK_AT_THE_FILE = auto()
+    LET_THE_RULE_JUDGE = auto()
+    STATE_WHAT_IS_MISSING = auto()
+    REDUCE_OR_RELAX = auto()
+
+
+class Note(Enum):
+    """What is worth telling beside checks."""
+
+    PAIRS_AS_INDEPENDENT = auto()
+    WRONG_TIMES = auto()
+    REFRACTION_IN_THE_RESIDUALS = auto()
+    REFRACTION_CORRECTED = auto()
+    CONDITIONAL_ON_REFRACTION = auto()
+    LIKE_REFRACTION = auto()
+    WITHOUT_REFRACTION = auto()
+    APPARENT_DIRECTIONS = auto()
+    DIRECTIONS_WITHOUT_ABERRATION = auto()
+    RESTS_ON_ABERRATION = auto()
+    ABERRATION = auto()
+    ADDED_NOISE_TOO_LARGE = auto()
+    NOISE_IS_THE_MAGNITUDES = auto()
+    NOISE_LIKE_MAGNITUDES = auto()
+    NOISE_LIKE_ARCSECONDS = auto()
+    CHOICE_OF_MODEL = auto()
+    MODEL_IS_WRONG = auto()
+    HEADLINE = auto()
+    NO_MODEL_EXPLAINS = auto()
+
+
 @dataclass(frozen=True)
-class Check:
+class Order(Finding):
+    """A piece of advice: an order, with its values."""
+
+    code: Advice
+
+
+# What goes with the command that plans frames.
+MORE = (Order(Advice.FRAMES_THAT_HELP),)
+
+
+@dataclass(frozen=True)
+class Words:
+    """The words of a check: value, bound, meaning, and what to do with instrument or data."""
+
+    value: str
+    bound: str
+    sentence: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class Check(Finding):
     """One check: what was measured, what was asked for, and what follows.
 
     Attributes
     ----------
     code : Code
         What it asks.
+    values : dict
+        What was found, by names that end in the unit.
     level : Level
         Outcome.
-    value : str
-        What was found, with its unit.
-    bound : str
-        What was asked for, with its unit.
-    sentence : str
-        Meaning, in plain words.
+    bounds : dict
+        What was asked for, by such names.
     remedies : tuple of Remedy
         What may mend it; empty where it passed or nothing of the kind helps.
-    advice : str
-        What to do with the instrument or the data, an order: before the command, or where none
-        helps; else empty. Of a check that did not pass, remedy and advice are never both empty.
+    orders : tuple of Order
+        What to do with the instrument or the data: before the command, or where none helps; else
+        empty. Of a check that did not pass, remedies and orders are never both empty.
     title : str
         Name of what has one of its own, such as a requirement; else empty.
+    told : Words, optional
+        Words of a check in a file of an earlier version, which has no values.
     """
 
     DOCUMENTED: ClassVar = ("key",)
-    WRITTEN_AS: ClassVar = {"code": ("name", "question"), "remedies": ("remedy",), "title": ()}
+    WRITTEN_AS: ClassVar = {
+        "code": ("name", "question"),
+        "values": (),
+        "bounds": ("value", "bound", "sentence"),
+        "remedies": ("remedy",),
+        "orders": ("advice",),
+        "title": (),
+        "told": (),
+    }
 
     code: Code
-    level: Level
-    value: str
-    bound: str
-    sentence: str
+    level: Level = Level.PASS
+    bounds: dict[str, Any] = field(default_factory=dict)
     remedies: Remedies = ()
-    advice: str = ""
+    orders: tuple[Order, ...] = ()
     title: str = ""
+    told: Words | None = None
+
+    __hash__ = Finding.__hash__
+
+    @cached_property
+    def words(self) -> Words:
+        """The check in words."""
+        return self.told or Words(*worded(self))
+
+    @property
+    def value(self) -> str:
+        """What was found, with its unit."""
+        return self.words.value
+
+    @property
+    def bound(self) -> str:
+        """What was asked for, with its unit."""
+        return self.words.bound
+
+    @property
+    def sentence(self) -> str:
+        """Meaning, in plain words."""
+        return self.words.sentence
+
+    @property
+    def advice(self) -> str:
+        """What to do with the instrument or the data, an order: before the command, or where none
+        helps; else empty. Of a check that did not pass, remedy and advice are never both empty.
+        """
+        told = "" if self.told is None else self.told.advice
+        return " ".join(filter(None, (told, *(order.sentence for order in self.orders))))
 
     @property
     def name(self) -> str:

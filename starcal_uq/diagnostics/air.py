@@ -15,6 +15,7 @@ lack are fitted beside the air. What these explain as well as air does cannot be
 
 from __future__ import annotations
 
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,13 +28,14 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.diagnostics.beside import has_effects, with_effects_of, without_effects
 from starcal_uq.diagnostics.residuals import of_heard
-from starcal_uq.diagnostics.shapes import View, focal_drift, frame_shapes, lens_shapes
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.noise_model import fit_noise
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
+from starcal_uq.likelihood.shapes import View, focal_drift, frame_shapes, lens_shapes
 from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood, star_numbers
 from starcal_uq.maths.linear import principal
 from starcal_uq.observations.splits import one_of_each
@@ -172,10 +174,11 @@ def _star_noise(
     """
     if cal.star_errors is not None:
         return cal.star_errors, cal.sigma
-    if not found.tau_px > 0.0:
+    # Effects hold what stars bring along, where the data ask for that.
+    if not found.tau_px > 0.0 or has_effects(cal):
         return None
     # The estimate's noise holds both.
-    of_stars = found.tau_px**2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0))
+    of_stars = found.tau_px**2 * float(np.mean(obs.sigma_or_one**-2.0))
     own = float(np.sqrt(max(cal.sigma**2 - of_stars, 0.1 * cal.sigma**2)))
     numbers = found.n_stars, found.n_recurring
     return StarErrors(found.tau_px, found.tau_px_std, 0.0, float(cal.theta[2]), *numbers), own
@@ -187,7 +190,9 @@ class Remainder:
 
     `obs` has the noise of its stars as the estimate weighs them. `residuals` (m,) are whitened,
     with `dof` degrees of freedom and scatter `sigma`: m = 2 N, x of all stars before y, and where
-    stars bring errors along, which `errors` holds with the noise of images, two more for each star.
+    stars bring errors along, which `errors` holds with the noise of images, two more for each star;
+    or one more for each coefficient of the effects of the calibration. `clean` are the images
+    without these.
     """
 
     def __init__(
@@ -201,12 +206,18 @@ class Remainder:
         chosen = one_of_each(
             obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed
         )
-        self.obs = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
+        clean = without_effects(obs, cal)
+        self.obs, self.clean = (
+            one if len(chosen) == obs.n_frames else one.select_frames(obs.frame_ids[chosen])
+            for one in (obs, clean)
+        )
         model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
         self.focal_px = cal.camera.focal_px
         self.likelihood = MarginalLikelihood(self.obs, model, axes=True)
         if errors is not None:
             self.likelihood = StarLikelihood(self.obs, model, cal.theta, rotations, *errors)
+        elif has_effects(cal):
+            self.likelihood = with_effects_of(self.obs, cal, rotations, obs)
         self.state, _ = self.likelihood.profile(cal.theta, rotations)
         slopes = self.likelihood.whitened(
             self.state, self.likelihood.derivatives(cal.theta, self.state)
@@ -340,7 +351,7 @@ class _Air:
         shifts, taken = self._taken(self.seen_px)
         left = shifts[0] - np.tensordot(taken, rest.likelihood.derivatives(theta, rest.state), 1)
         x, y = rest.likelihood.frames.in_pixels(left)
-        clean = replace(rest.obs, x_px=rest.obs.x_px - x, y_px=rest.obs.y_px - y)
+        clean = replace(rest.clean, x_px=rest.clean.x_px - x, y_px=rest.clean.y_px - y)
         return fit_noise(clean, self._cal.camera, rounds=1)[0]
 
     def _apart(self, shifts: FloatArray) -> FloatArray:
@@ -619,17 +630,14 @@ def _earth(obs: Observations) -> tuple[FloatArray, bool]:
     Without times of all frames one moment's will do, whose Earth is turned as if it did not matter.
     """
     first = obs.frame_starts[:-1]
-    if obs.time_utc is None or (obs.time_utc[first] == "").any():
-        return np.broadcast_to(np.eye(3), (obs.n_frames, 3, 3)), False
-    ways = ((0.0, 0.0), (0.0, 90.0), (90.0, 0.0))
-    try:
-        axes = [
-            site_among_stars(Site(latitude, longitude), obs.time_utc[first])[0]
-            for latitude, longitude in ways
-        ]
-    except StarcalError:
-        return np.broadcast_to(np.eye(3), (obs.n_frames, 3, 3)), False
-    return np.stack(axes, axis=1), True
+    if obs.time_utc is not None and not (obs.time_utc[first] == "").any():
+        with suppress(StarcalError):
+            axes = [
+                site_among_stars(Site(latitude, longitude), obs.time_utc[first])[0]
+                for latitude, longitude in ((0.0, 0.0), (0.0, 90.0), (90.0, 0.0))
+            ]
+            return np.stack(axes, axis=1), True
+    return np.broadcast_to(np.eye(3), (obs.n_frames, 3, 3)), False
 
 
 def _sphere(n: int) -> FloatArray:

@@ -24,6 +24,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, Progress
 from starcal_uq.diagnostics.air import AirTest, air_test
+from starcal_uq.diagnostics.beside import has_effects
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
@@ -234,10 +235,9 @@ def diagnose(
     step(1, 4)
     predictive = predictive_check(obs, whole, post, seed=seed)
     step(2, 4)
-    # A single frame cannot be left out.
-    comparison = (
-        compare_models(obs, cal, models, seed=seed) if models and obs.n_frames > 1 else None
-    )
+    # A single frame cannot be left out, and a field holds what other models would add to the lens.
+    asked = obs.n_frames > 1 and not (cal.effects is not None and "field" in cal.effects.names)
+    comparison = compare_models(obs, cal, models, seed=seed) if models and asked else None
     if comparison is not None:
         comparison = of_all_stars(comparison, obs, whole)
     step(3, 4)
@@ -283,9 +283,10 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     same = better = failed = 0
     largest = 0.0
     best: tuple[float, tuple[float, ...]] = (np.inf, ())
-    # Errors of the stars weigh an estimate that was found without them: that is what a start leads
-    # to.
-    reached = None if cal.star_errors is None else cal.stages[-2]
+    # Errors of the stars and effects weigh an estimate that was found without them: that is what a
+    # start leads to.
+    weighed_again = cal.star_errors is not None or has_effects(cal)
+    reached = cal.stages[-2] if weighed_again else None
     reference, lowest = (
         (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
     )
@@ -344,7 +345,7 @@ def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatA
         )
         return other.theta, other.chi2
     found = fit(obs, start, method=method)
-    if cal.star_errors is not None:
+    if cal.star_errors is not None or has_effects(cal):
         return found.theta, found.chi2
     # The last, small step of a calibration, which is the same for all that end in its optimum.
     step = (

@@ -17,6 +17,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import FloatArray, Shapes, floats
+from starcal_uq.diagnostics.beside import has_effects, normals_beside
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.weights import weighed
 
@@ -201,15 +202,17 @@ def jackknife_frames(
         raise CalibrationError(
             f"a jackknife over {plural(obs.n_frames, 'frame')} says nothing: use three or more."
         )
-    found = FrameNormals.at(weighed(obs, cal), cal) if normals is None else normals
-    z, _ = found.left_out()
+    if normals is None:
+        at = normals_beside if has_effects(cal) else FrameNormals.at
+        normals = at(weighed(obs, cal), cal)
+    z, _ = normals.left_out()
     if not np.isfinite(z).all():
         frame = obs.frame_ids[int(np.argmin(np.isfinite(z).all(axis=1)))]
         raise CalibrationError(
             f"without frame {frame} the parameters are not determined: a jackknife needs more "
             "frames like it."
         )
-    return _jackknife(found.scatter(), cal, found.theta + z * found.scale)
+    return _jackknife(normals.scatter(), cal, normals.theta + z * normals.scale)
 
 
 def jackknife_of_all(cal: Calibration) -> Jackknife | None:

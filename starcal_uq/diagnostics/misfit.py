@@ -27,32 +27,44 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import plus_minus
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
+from starcal_uq.diagnostics.beside import (
+    Freed,
+    by_frame,
+    effects_beside,
+    has_effects,
+    without_effects,
+)
+from starcal_uq.diagnostics.noise_tests import NoiseSums, noise_weights
 from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
 from starcal_uq.diagnostics.residuals import heard, of_heard
-from starcal_uq.diagnostics.shapes import (
+from starcal_uq.estimation.noise_model import (
+    axis_noise,
+    axis_noise_beside,
+    fit_noise,
+    sigma_ratios,
+)
+from starcal_uq.estimation.weights import weighed
+from starcal_uq.likelihood.effects import Effect, EffectSums
+from starcal_uq.likelihood.elimination import products_by_frame
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.noise_model import NoiseModel, noise_model_of
+from starcal_uq.likelihood.shapes import (
     FRAME_BY_FRAME,
     MAX_CELLS,
     Shape,
     View,
     frame_shapes,
-    run_clock,
     shapes,
 )
-from starcal_uq.estimation.noise_model import axis_noise, fit_noise, sigma_ratios
-from starcal_uq.estimation.weights import weighed
-from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
-from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.noise_model import NoiseModel, noise_model_of
 from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.likelihood.terms import TermSums
 from starcal_uq.maths.intervals import holm
-from starcal_uq.maths.linear import principal, scaled_inverse, without_first
+from starcal_uq.maths.linear import scaled_inverse, without_first
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
@@ -63,6 +75,8 @@ _LEAST_DOF = 10
 # Frames with less than one degree of freedom have no noise of their own to compare.
 _LEAST_FRAMES, _LEAST_FRAME_DOF = 3, 1.0
 _NOISE_ROUNDS = 3
+# Square of a scale that is none, in units of the noise and of the columns.
+_FREE = 1e10
 # Level of all tests together, of the verdict's 5 % for all of its checks.
 ALPHA = 0.01
 POWER = 0.9
@@ -248,17 +262,22 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
         tests.append(test)
     of_noise = [
         (f"noise that changes with {name}", name, z, p)
-        for name, z, p in sums.noise.tests(*sums.independent, sums.dof)
+        for name, z, p in sums.noise.tests(*(sums.freed or sums.independent), sums.noise_dof)
+        if sums.noise_dof >= _LEAST_DOF
     ]
     if (frames := sums.noise_by_frame()) is not None:
         of_noise.append(("noise that differs from frame to frame", "frame", *frames))
-    axes = axis_noise(MarginalLikelihood(obs, cal.camera.distortion), cal.theta)
+    if has_effects(cal):
+        free = Freed.of(obs, cal, axes=False)
+        axes = axis_noise_beside(free.own.frames, free.own.columns, free.h, free.e, free.dof)
+    else:
+        axes = axis_noise(MarginalLikelihood(obs, cal.camera.distortion), cal.theta)
     names = "noise that differs between the axes", "noise whose axes correlate"
     for name, z in zip(names, axes.z(noise_model_of(cal)), strict=True):
         of_noise.append((name, "axis", z, float(2.0 * ndtr(-abs(z)))))
     nothing = float("nan")
     tests += [
-        MisfitTest(name, against, z, 0, sums.dof, p, 1.0, nothing, nothing)
+        MisfitTest(name, against, z, 0, sums.noise_dof, p, 1.0, nothing, nothing)
         for name, against, z, p in of_noise
     ]
     corrected = holm([test.p_value for test in tests])
@@ -271,15 +290,17 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     ]
     uneven = None
     if any(test.is_of_noise and test.p_holm < ALPHA for test in tests) and cal.noise_model is None:
-        model, _ = fit_noise(obs, cal.camera, rounds=_NOISE_ROUNDS)
+        clean = without_effects(obs, cal)
+        model, _ = fit_noise(clean, cal.camera, rounds=_NOISE_ROUNDS)
         uneven = UnevenNoise(
-            model, cal.parameter_names, sigma_ratios(obs, cal.camera, model, cal.sigma)
+            model, cal.parameter_names, sigma_ratios(clean, cal.camera, model, cal.sigma)
         )
     found = [test.name for test in tests if test.dof > 0 and test.p_holm < ALPHA]
     pattern = sums.pattern(found, ALPHA / len(tests))
     pattern = replace(pattern, n_frames=obs.n_frames, max_cells=max_cells, left_out=left_out)
     if FRAME_BY_FRAME in pattern.families:
-        pattern = replace(pattern, frame_covariance=frame_covariance(pattern, families, obs, cal))
+        clean = without_effects(obs, cal)
+        pattern = replace(pattern, frame_covariance=frame_covariance(pattern, families, clean, cal))
     sigma = float(np.sqrt(sums.rss / sums.dof))
     return Misfit(tuple(tests), sigma, obs.n_stars, obs.n_frames, uneven, pattern)
 
@@ -378,9 +399,10 @@ class _Sums(Fit):
     """Sums over all stars from which every test follows; the table is visited once, some frames at
     a time.
 
-    Where stars bring errors along, `gram` is weighted by them. `plain` is of the parameters and the
-    residuals that are left after each star's offset, which are independent: frame by frame, and for
-    unequal noise.
+    Where stars bring errors along, or there are effects, `gram` is weighted by them. `plain` is of
+    the parameters and the residuals that are left after each star's offset, which are independent:
+    frame by frame, and for unequal noise. Beside effects it is that part of `gram`, and noise is
+    that of residuals for which they are free.
     """
 
     def __init__(self, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> None:
@@ -389,6 +411,9 @@ class _Sums(Fit):
         super().__init__(families, p, likelihood.dof - p)
         self.names, self.n_stars = cal.parameter_names, obs.n_stars
         self.noise = NoiseSums(noise_weights(obs, cal.camera), p)
+        self.noise_dof = self.dof
+        # What `independent` is of residuals for which effects are free, where there are any
+        self.freed: tuple[FloatArray, FloatArray, float] | None = None
         self.noise_px = 1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2)))
         self.plain, self.own = np.zeros((p + 1, p + 1)), frame_shapes(cal.camera)
         # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their
@@ -398,8 +423,20 @@ class _Sums(Fit):
         if cal.star_errors is not None:
             model = StarModel(obs, cal.star_errors.focal_px)
             stars = TermSums(model.term(cal.star_errors.tau_px))
+        effects, sums = effects_beside(obs, cal), None
+        if effects:
+            held = {effect.name for effect in effects}
+            frame = Effect("frame", "frame", self.own, np.ones(3))
+            every = effects if "frame" in held else [*effects, frame]
+            sums = EffectSums(every, theta, cal.sigma)
         for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
             fitted, columns, view = self._add(part, state, theta, rows)
+            if sums is not None:
+                every_one = np.concatenate([fitted, part.project_out(state, columns.all())])
+                own = sums.add(part, state, every_one, rows).frame[-3:]
+                if "frame" not in held:
+                    self.block_rank += int(by_frame(part.frames, own)[1].sum())
+                continue
             if stars is not None:
                 stars.add(
                     part,
@@ -414,12 +451,33 @@ class _Sums(Fit):
             self.plain += flat @ flat.T
             self._add_blocks(part, state, view, fitted, columns)
             h, e = fitted[:p], fitted[p]
-            self.noise.add(part.frames, state, h, e, rows)
+            self.noise.add(part.attitudes(state), h, e, rows)
             matrices = products_by_frame(part.frames, h, h)
             squares = part.frames.sum(np.sum(e**2, axis=0))
             self.frames.append((squares, np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
         if stars is not None:
             self.gram -= stars.eliminated(stars.term.ratio(cal.sigma)).correction()
+        if sums is not None:
+            self._with_effects(sums, obs, cal)
+
+    def _with_effects(self, sums: EffectSums, obs: Observations, cal: Calibration) -> None:
+        """Weigh everything by the effects of a calibration, and take them for free where the noise
+        is looked at.
+        """
+        assert cal.effects is not None
+        ratio, p = cal.effects.ratio(cal.sigma), self.p
+        self.before, self.gram = self.gram, sums.solved(ratio).gram
+        if "frame" not in ratio:
+            size = np.mean(np.einsum("kaa->ka", sums.sums[2].frame[:, -3:, -3:]))
+            self.blocks = self.gram - sums.solved(ratio | {"frame": _FREE / float(size)}).gram
+        self.plain = self.gram[: p + 1, : p + 1]
+        free = Freed.of(obs, cal, axes=True)
+        frames, h, e = free.own.frames, free.h, free.e
+        self.noise, self.noise_dof = NoiseSums(self.noise.weights, len(h)), free.dof
+        self.noise.add(free.own, h, e, slice(None))
+        self.freed = np.eye(len(h)), np.eye(len(h)), float(np.sum(e**2))
+        squares = frames.sum(np.sum(e**2, axis=0))
+        self.frames = [(squares, free.frame_dof, products_by_frame(frames, h, h))]
 
     def _add(
         self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice
@@ -498,7 +556,7 @@ class _Sums(Fit):
         norm, present = self.norms(at), np.count_nonzero(self.raw[self.p + 1 :][at])
         cross = self.gram[self.p + 1 :, : self.p][at]
         slope, left = system[1:, 0][at] / norm, system[1:, 1:][at, at] / np.outer(norm, norm)
-        values, vectors = principal(left, _ABSORBED)
+        values, vectors = self.seen(left, at)
         rank = len(values)
         if rank == 0 or self.dof - rank < _LEAST_DOF:
             return None
@@ -548,14 +606,15 @@ class _Sums(Fit):
         With d_k degrees of freedom of the frames' sums of squares S_k, nu in all, the statistic is
         T = nu log(S / nu) - sum d_k log(S_k / d_k). Shares of S are independent of S, so that mean
         and variance of T follow exactly from those of logarithms of chi-squares; T is then taken as
-        gamma-distributed.
+        gamma-distributed. Many coefficients of effects that frames share couple their sums: mean
+        and variance are then those of independent ones times what that does to them to first order.
         """
         from scipy.special import digamma, gammaincc, ndtri, polygamma
 
         squares, dof, matrices = (
             np.concatenate(column) for column in zip(*self.frames, strict=True)
         )
-        dof = dof - np.einsum("kab,ba->k", matrices, self.independent[1])
+        dof = dof - np.einsum("kab,ba->k", matrices, (self.freed or self.independent)[1])
         nu = float(dof.sum())
         if (
             len(dof) < _LEAST_FRAMES
@@ -569,6 +628,9 @@ class _Sums(Fit):
             dof * (digamma(dof / 2) - np.log(dof / 2))
         )
         variance = np.sum(dof**2 * polygamma(1, dof / 2)) - nu**2 * float(polygamma(1, nu / 2))
+        if self.freed is not None:
+            by_mean, by_variance = _coupled(matrices, dof)
+            mean, variance = mean * by_mean, variance * by_variance
         p = float(gammaincc(mean**2 / variance, found * mean / variance))
         return float(-ndtri(np.clip(p, 1e-300, 1.0 - 1e-16))), p
 
@@ -595,68 +657,15 @@ class _Sums(Fit):
         )
 
 
-def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:
-    """What the noise could change with: standardised values (N,) by name."""
-    radius2 = (obs.x_px - camera.x0_px) ** 2 + (obs.y_px - camera.y0_px) ** 2
-    candidates: dict[str, FloatArray] = {"radius": radius2}
-    if obs.mag is not None:
-        candidates["magnitude"] = obs.mag
-    clock, called = run_clock(obs)
-    if clock is not None:
-        candidates[called] = clock
-    found = {}
-    for name, values in candidates.items():
-        spread = float(np.nanstd(values))
-        if spread > 1e-9:
-            found[name] = np.nan_to_num((values - np.nanmean(values)) / spread)
-    return found
+def _coupled(matrices: FloatArray, dof: FloatArray) -> tuple[float, float]:
+    """Factors on mean and variance of Bartlett's statistic where frames share what is fitted.
 
-
-class NoiseSums:
-    """Sums over stars that the moments need, for several weights (N,) by name, with p
-    parameters.
+    `matrices` (K, r, r): products over each frame of what is orthonormal over all. `dof` (K,):
+    degrees of freedom of the frames' sums of squares, whose covariance is twice G: T is near
+    ``s^T K s / 2`` with s their departures from `dof` and ``K = diag(1 / d) - 1 1^T / nu``.
     """
-
-    def __init__(self, weights: dict[str, FloatArray], p: int) -> None:
-        self.weights = weights
-        n = len(weights)
-        self.squares = np.zeros(n)
-        self.trace = np.zeros(n)
-        self.trace2 = np.zeros(n)
-        self.parameters1 = np.zeros((n, p, p))
-        self.parameters2 = np.zeros((n, p, p))
-        self.crossed = np.zeros((n, p, p))
-
-    def add(
-        self, frames: StarFrames, state: Any, h: FloatArray, e: FloatArray, rows: slice
-    ) -> None:
-        """Add some frames: h (p, 2, n) and e (2, n) with the attitudes removed."""
-        a = ByFrame(frames, state.attitude, state.inverse).orthonormal
-        flat = h.reshape(len(h), -1)
-        for i, values in enumerate(self.weights.values()):
-            w = values[rows]
-            self.squares[i] += float(np.sum(w * e**2))
-            self.parameters1[i] += (h * w).reshape(len(h), -1) @ flat.T
-            self.parameters2[i] += (h * w**2).reshape(len(h), -1) @ flat.T
-            awa, awh = products_by_frame(frames, a * w, a), products_by_frame(frames, a * w, h)
-            self.trace[i] += 2.0 * np.sum(w) - np.einsum("kaa->", awa)
-            # tr(W W) - 2 tr(P W W) + tr(P W P W) for the attitudes' part of P.
-            self.trace2[i] += 2.0 * np.sum(w**2) - 2.0 * np.sum((a * w) ** 2) + np.sum(awa**2)
-            self.crossed[i] += np.tensordot(awh, awh, ((0, 1), (0, 1)))
-
-    def tests(
-        self, matrix: FloatArray, inverse: FloatArray, rss: float, dof: int
-    ) -> list[tuple[str, float, float]]:
-        """Name, z and two-sided p-value of every weight."""
-        from scipy.special import erfc
-
-        found = []
-        for i, name in enumerate(self.weights):
-            by_h = inverse @ self.parameters1[i]
-            trace = self.trace[i] - np.trace(by_h)
-            trace2 = self.trace2[i] - 2.0 * np.trace(inverse @ self.parameters2[i])
-            trace2 += 2.0 * np.trace(inverse @ self.crossed[i]) + np.sum(by_h * by_h.T)
-            variance = 2.0 * (trace2 - trace**2 / dof) / (dof * (dof + 2.0))
-            z = float((self.squares[i] / rss - trace / dof) / np.sqrt(variance))
-            found.append((name, z, float(erfc(abs(z) / np.sqrt(2.0)))))
-        return found
+    among = np.einsum("kab,lab->kl", matrices, matrices)
+    among += np.diag(dof - np.einsum("kaa->k", matrices))
+    by = among / dof[:, None] - among.sum(axis=0) / dof.sum()
+    free = len(dof) - 1.0
+    return float(np.trace(by)) / free, float(np.sum(by * by.T)) / free

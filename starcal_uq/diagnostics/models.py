@@ -25,6 +25,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
+from starcal_uq.diagnostics.beside import without_effects
 from starcal_uq.estimation.fit import refit
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.weights import weighed
@@ -187,7 +188,7 @@ def compare_models(
     ----------
     obs, cal
         The data and the calibration whose model is in question; its own model is always among those
-        compared.
+        compared. Images are compared without its effects.
     models : sequence of str
         Names of the registry.
     n_draws : int
@@ -201,6 +202,7 @@ def compare_models(
         When no model can be calibrated.
     """
     obs = weighed(obs, cal)
+    obs = without_effects(obs, cal)
     if cal.star_errors is not None:
         cal = _without_star_errors(obs, cal)
     names = tuple(dict.fromkeys((cal.camera.distortion, *models)))

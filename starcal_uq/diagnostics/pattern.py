@@ -29,7 +29,9 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray, Shapes, floats
-from starcal_uq.diagnostics.shapes import (
+from starcal_uq.likelihood.elimination import products_by_frame
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.shapes import (
     FRAME_BY_FRAME,
     MAX_CELLS,
     OVER_FIELD,
@@ -38,11 +40,9 @@ from starcal_uq.diagnostics.shapes import (
     frame_shapes,
     shapes,
 )
-from starcal_uq.likelihood.elimination import products_by_frame
-from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import principal, scaled_inverse, truncated_inverse, without_first
 from starcal_uq.propagation.alignment import alignment_weights
-from starcal_uq.propagation.propagate import FrameGeometry
+from starcal_uq.propagation.geometry import FrameGeometry
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -58,7 +58,8 @@ _UPPER = 1.645
 _ABSORBED = 1e-8
 _DIRECTION_P = 0.05
 # Share of the square of a shape that attitudes and parameters must leave in sight for its amplitude
-# to set a prior.
+# to set a prior, and effects for it to be looked for: one that these explain almost as large as the
+# data could show it says how well their prior describes them, and not what they leave.
 _SEEN = 0.1
 # Standard errors that a variance over frames has to exceed.
 _SAID = 3.0
@@ -218,20 +219,17 @@ class _Turned:
     ) -> _Turned:
         chosen = pattern.among(shapes(obs, camera, max_cells=pattern.max_cells, seen=frames))
         geometry = FrameGeometry.of(post, frames)
-        turns = geometry.noise_response / geometry.noise_px[:, None]
-        likelihood = MarginalLikelihood(frames, camera.distortion)
-        turned = []
-        for part, state, rows in likelihood.pieces(camera.theta, None, _STARS_AT_ONCE):
-            view = View.of(part, state, camera.theta, rows)
-            columns = frame_shapes(camera).columns(view)
-            if chosen:
-                found = np.concatenate([family.columns(view) for family in chosen])
-                columns = np.concatenate(
-                    [columns, np.einsum("qj,qan->jan", pattern.directions, found)]
-                )
-            products = np.einsum("jan,ani->nij", columns, turns[:, rows])
-            turned.append(np.add.reduceat(products, part.frames.starts[:-1], axis=0))
-        moving, direct = np.split(np.concatenate(turned), [3], axis=2)
+        own = frame_shapes(camera)
+
+        def columns(view: View) -> FloatArray:
+            found = own.columns(view)
+            if not chosen:
+                return found
+            shifts = np.concatenate([family.columns(view) for family in chosen])
+            return np.concatenate([found, np.einsum("qj,qan->jan", pattern.directions, shifts)])
+
+        turned = geometry.turned(frames, camera, columns)
+        moving, direct = np.split(turned, [3], axis=2)
         if chosen:
             direct = direct + geometry.response @ pattern.parameters.T
         return cls(direct, moving, geometry.noise_covariance)
@@ -260,6 +258,8 @@ class Fit:
     dof: int  # Degrees of freedom of the residuals
     # Those that scale and shape of every frame by itself take
     block_rank: int = field(default=0, init=False)
+    # What `gram` would be without effects, where there are any
+    before: FloatArray | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         q = sum(family.size for family in self.families)
@@ -299,6 +299,19 @@ class Fit:
     @property
     def _unit(self) -> FloatArray:
         return np.asarray(1.0 / np.sqrt(np.diag(self.gram)[: self.p]))
+
+    def seen(self, left: FloatArray, at: slice) -> tuple[FloatArray, FloatArray]:
+        """Directions (j, r) of some columns, in units of their lengths, and squares (r,) of what
+        `left` (j, j), their products, leaves of each.
+        """
+        if self.before is None:
+            return principal(left, _ABSORBED)
+        norm = self.norms(at)
+        plain, _ = without_first(self.before, self.p, _ABSORBED, self._unit)
+        values, vectors = principal(plain[1:, 1:][at, at] / np.outer(norm, norm), _ABSORBED)
+        unit = vectors / np.sqrt(values)
+        shares, turn = principal(unit.T @ left @ unit, _SEEN)
+        return shares, unit @ turn
 
     def norms(self, at: slice) -> FloatArray:
         """Lengths of some columns before attitudes were removed; 1 where there is none."""
@@ -364,7 +377,7 @@ class Fit:
         from scipy.special import fdtrc
 
         norm = self.norms(at)
-        values, vectors = principal(rest[1:, 1:][at, at] / np.outer(norm, norm), _ABSORBED)
+        values, vectors = self.seen(rest[1:, 1:][at, at] / np.outer(norm, norm), at)
         rank = len(values)
         if rank == 0 or dof - rank < 1:
             return None

@@ -17,7 +17,9 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
+from starcal_uq.diagnostics.beside import has_effects, with_effects_of
 from starcal_uq.estimation.weights import weighed
+from starcal_uq.likelihood.effects import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.star_errors import StarLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
@@ -32,6 +34,10 @@ if TYPE_CHECKING:
 
 _RINGS = 10
 _MAX_STARS = 20_000
+
+
+# Probabilities beyond which a statistic is not that of replicated data.
+EXTREME_P = (0.001, 0.999)
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,7 @@ class PredictiveStatistic:
     @property
     def extreme(self) -> bool:
         """True if hardly a replicate is as large, or as small."""
-        return not 0.001 <= self.p_value <= 0.999
+        return not EXTREME_P[0] <= self.p_value <= EXTREME_P[1]
 
 
 @dataclass(frozen=True)
@@ -117,19 +123,23 @@ def predictive_check(
     rng = np.random.default_rng(seed)
     # The statistics settle long before: of very many stars, those of some frames do.
     limit = max(1, min(obs.n_frames, _MAX_STARS * obs.n_frames // obs.n_stars))
-    some, places = frame_sample(weighed(obs, cal), limit, seed)
+    used = weighed(obs, cal)
+    some, places = frame_sample(used, limit, seed)
     part = MarginalLikelihood(some, cal.camera.distortion, axes=cal.star_errors is None)
     frames = part.frames
+    shared: StarLikelihood | EffectLikelihood | None = None
     state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[places]))
     e, h = state.e, part.slopes(cal.theta, state)
-    stars = None
+    # Residuals after each star's offset and after effects, as they follow the parameters; replicates
+    # go the same way.
     if cal.star_errors is not None:
-        # Residuals after each star's offset, as they follow the parameters; replicates go the same
-        # way.
-        stars = StarLikelihood(
+        shared = StarLikelihood(
             some, part.model_name, cal.theta, state.rotations, cal.star_errors, cal.sigma
         )
-        columns, _ = stars.conditioned(state, np.concatenate([h, e[None]]))
+    elif has_effects(cal):
+        shared = with_effects_of(some, cal, state.rotations, used)
+    if shared is not None:
+        columns, _ = shared.conditioned(state, np.concatenate([h, e[None]]))
         h, e = columns[:-1], columns[-1]
     theta, sigma = _draws(cal, post, n_draws, rng)
     summary = _Summary(part, cal)
@@ -138,13 +148,13 @@ def predictive_check(
     for shift, noise in zip(theta - cal.theta, sigma, strict=True):
         measured.append(summary((e - (shift @ flat).reshape(e.shape)) / noise))
         fresh = rng.standard_normal((1, 2, frames.n_stars))
-        if stars is None:
+        if shared is None:
             fresh = fresh.ravel()
             fresh -= turns @ (turns.T @ fresh)
             replicated.append(summary(fresh.reshape(e.shape)))
         else:
             replicated.append(
-                summary(stars.conditioned(state, fresh + stars.random_shifts(state, rng))[0][0])
+                summary(shared.conditioned(state, fresh + shared.random_shifts(state, rng))[0][0])
             )
     data, fake = np.array(measured), np.array(replicated)
     low, middle, high = np.quantile(fake, (0.025, 0.5, 0.975), axis=0)

@@ -72,7 +72,7 @@ def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
         found, scale2 = cal.partitions.residuals, _unit_scale(cal, cal.n_stars) ** 2
     else:
         obs = weighed(obs, cal)
-        stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
+        stated = obs.sigma_or_one
         residuals, use = np.asarray(cal.residuals_px), heard(obs, cal)
         scale2 = _unit_scale(cal, obs.n_stars) ** 2
         if not use.all():
@@ -107,8 +107,7 @@ def heard(obs: Observations, cal: Calibration) -> BoolArray:
         return np.ones(obs.n_stars, dtype=bool)
     # By the scale of the tails: beside their own weights even wrong stars look right.
     plain = by_noise_model(obs, cal)
-    stated = 1.0 if plain.sigma_px is None else np.asarray(plain.sigma_px)[:, None]
-    size = np.max(np.abs(cal.residuals_px / stated), axis=1)
+    size = np.max(np.abs(cal.residuals_px / plain.sigma_or_one[:, None]), axis=1)
     # Stars that the likelihood leaves out, such as those of a frame without an attitude, have none.
     use = np.asarray((size > 0.0) & (size < OUTLIER_SIGMA * cal.tail_scale))
     order = np.searchsorted(cal.frame_ids, obs.frame)
@@ -123,7 +122,11 @@ def of_heard(obs: Observations, cal: Calibration) -> tuple[Observations, Calibra
     left = np.isin(cal.frame_ids, obs.frame[use])
     frames, quaternions = cal.frame_ids[left], cal.quaternions[left]
     kept = replace(
-        cal, residuals_px=cal.residuals_px[use], frame_ids=frames, quaternions=quaternions
+        cal,
+        residuals_px=cal.residuals_px[use],
+        frame_ids=frames,
+        quaternions=quaternions,
+        star_weights=None if cal.star_weights is None else cal.star_weights[use],
     )
     return obs.select(use), kept
 
@@ -135,9 +138,8 @@ def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
     smaller than the noise by sqrt(d / 2N) on average.
     """
     obs = weighed(obs, cal)
-    stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
     n_stars = obs.n_stars if cal.partitions is None else cal.n_stars
-    return floats(_unit_scale(cal, n_stars) * stated)
+    return floats(_unit_scale(cal, n_stars) * obs.sigma_or_one)
 
 
 def _unit_scale(cal: Calibration, n_stars: int) -> float:

@@ -24,6 +24,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
+from starcal_uq.diagnostics.beside import without_effects
 from starcal_uq.estimation.normals import StarNormals
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -146,7 +147,7 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
         The data and the estimate made from them. Stars are told apart by `star_id` where all have
         one, else by direction.
     """
-    obs, focal = weighed(obs, cal), float(cal.theta[2])
+    obs, focal = without_effects(weighed(obs, cal), cal), float(cal.theta[2])
     numbers = star_numbers(obs, focal)
     normals = StarNormals.at(obs, cal, numbers)
     found = _likeness(obs, cal, numbers)
@@ -158,12 +159,13 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
     # The images' own noise is what is left when the stars' errors are taken off.
     noise = normals.squares / normals.dof
     own = max(
-        noise - found.tau2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0)),
+        noise - found.tau2 * float(np.mean(obs.sigma_or_one**-2.0)),
         0.1 * noise,
     )
     steps = normals.left_out()
     spread = steps - steps.mean(axis=0)
     scores = normals.scores @ inverse
+    included = _included(cal)
     return StarTest(
         parameter_names=cal.parameter_names,
         n_stars=s,
@@ -180,9 +182,21 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
         else inverse * noise * unit,
         sandwich_covariance=scores.T @ scores * s / (s - 1.0) * unit,
         jackknife_covariance=spread.T @ spread * (s - 1.0) / s * unit,
-        included_px=0.0 if cal.star_errors is None else cal.star_errors.tau_px,
-        included_px_std=0.0 if cal.star_errors is None else cal.star_errors.tau_px_std,
+        included_px=included[0],
+        included_px_std=included[1],
     )
+
+
+def _included(cal: Calibration) -> tuple[float, float]:
+    """Error of the stars that a calibration has marginalised, and its standard error, px."""
+    if cal.star_errors is not None:
+        return cal.star_errors.tau_px, cal.star_errors.tau_px_std
+    fitted = () if cal.effects is None else cal.effects.fitted
+    own = next((effect for effect in fitted if effect.name == "star"), None)
+    if own is None:
+        return 0.0, 0.0
+    # The interval is that of the logarithm.
+    return own.scale_px, own.scale_px * float(np.log(own.high_px / own.low_px)) / (2.0 * 1.96)
 
 
 @dataclass(frozen=True)

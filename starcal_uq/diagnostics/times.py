@@ -210,7 +210,9 @@ def _fitted(
     """
     from scipy.special import stdtrit
 
-    residuals, groups = rest.residuals if residuals is None else residuals, rest.groups
+    groups, n = rest.groups, 2 * rest.obs.n_stars
+    # Coefficients of effects have no star.
+    column, residuals = column[:n], (rest.residuals if residuals is None else residuals)[:n]
     own = (column**2).reshape(2, -1).sum(axis=0)
     by_star = np.bincount(groups[0], own)
     most = float(by_star.sum())

@@ -9,7 +9,7 @@ ratios of catalogue angle to measured angle over pairs of all frames.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -153,33 +153,41 @@ def measured_directions(camera: Camera, frames: StarFrames) -> FloatArray:
     return unproject_theta(camera.distortion, camera.theta, frames.pixel.T).T
 
 
-def focal_ratio(camera: Camera, frames: StarFrames) -> float:
-    """Focal length that the interstar angles ask for over that of the camera, wrong identifications
-    or not.
+def ideal_frames(camera: Camera, frames: StarFrames) -> StarFrames:
+    """Frames with ideal points from the principal point in place of measured pixels, which stay
+    where the distortion cannot be inverted at one of them.
+
+    The displacement is one of pixels, so that ideal points are the same for every focal length.
+    """
+    b = measured_directions(camera, frames)
+    point = camera.focal_px * b[:2] / b[2]
+    if not np.isfinite(point).all():
+        point = frames.pixel - camera.theta[:2, None]
+    return replace(frames, pixel=point)
+
+
+def directions(point: FloatArray, focal_px: FloatArray | float) -> FloatArray:
+    """Unit vectors (3, N) of ideal points (2, N), for one focal length or one of each star."""
+    b = np.vstack([point, np.broadcast_to(focal_px, point.shape[1:])])
+    unit: FloatArray = b / np.linalg.norm(b, axis=0)
+    return unit
+
+
+def focal_lengths(ideal: StarFrames, start_px: float, *, by_frame: bool = False) -> FloatArray:
+    """Focal length, px, that the angles between ideal points ask for, wrong identifications or not:
+    one of all frames (1,), or one of each (K,).
 
     The mode over pairs of the ratio of measured to catalogue angle: at least a quarter of the pairs
     must be right, so that half of the stars may be wrong.
     """
-    first, second = np.array(pair_trials(frames.starts)).transpose(1, 0, 2).reshape(2, 1, -1)
-    catalogue = _angle(frames.r, first, second)
-    ratio = 1.0
+    pairs = np.array(pair_trials(ideal.starts)).transpose(1, 2, 0)
+    first, second = pairs if by_frame else pairs.reshape(2, 1, -1)
+    catalogue = _angle(ideal.r, first, second)
+    focal_px = np.full(len(first), start_px)
     for _ in range(3):
-        scaled = camera.replace(focal_px=camera.focal_px * ratio)
-        ratio *= float(
-            _factors(_angle(measured_directions(scaled, frames), first, second), catalogue)[0]
-        )
-    return ratio
-
-
-def frame_focal_ratios(tangent: FloatArray, frames: StarFrames) -> FloatArray:
-    """The same of each frame by itself, (K,), from the tangents (2, N) that a camera measures."""
-    first, second = np.array(pair_trials(frames.starts)).transpose(1, 2, 0)
-    catalogue = _angle(frames.r, first, second)
-    ratio = np.ones(frames.n_frames)
-    for _ in range(3):
-        b = np.concatenate([tangent / frames.spread(ratio), np.ones((1, tangent.shape[1]))])
-        ratio *= _factors(_angle(b / np.linalg.norm(b, axis=0), first, second), catalogue)
-    return ratio
+        b = directions(ideal.pixel, ideal.spread(focal_px) if by_frame else focal_px)
+        focal_px *= _factors(_angle(b, first, second), catalogue)
+    return focal_px
 
 
 def _angle(vectors: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
@@ -231,12 +239,13 @@ def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
 
     The stars (N,) agree on their frame's attitude within what the uncalibrated camera allows. The
     nominal focal length may be tens of per cent off; the camera that comes back has that of
-    `focal_ratio`.
+    `focal_lengths`.
     """
     if not np.isfinite(measured_directions(camera, frames)).all():
         camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))
-    camera = camera.replace(focal_px=camera.focal_px * focal_ratio(camera, frames))
-    b = measured_directions(camera, frames)
+    ideal = ideal_frames(camera, frames)
+    camera = camera.replace(focal_px=float(focal_lengths(ideal, camera.focal_px)[0]))
+    b = directions(ideal.pixel, camera.focal_px)
     wide_rad = _WIDE_FRACTION * max(camera.width_px, camera.height_px) / camera.focal_px
     wide = consensus(b, frames.r, frames.starts, wide_rad)
     if not wide.agree.any():

@@ -27,10 +27,10 @@ from starcal_uq.estimation.assemble import (
 from starcal_uq.estimation.noise_model import Refit, fit_noise, fit_noise_of_tails
 from starcal_uq.estimation.result import Calibration, KeptFrames, check_camera
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
-from starcal_uq.estimation.settings import ITERATIONS, EstimationSettings
+from starcal_uq.estimation.settings import EstimationSettings
 from starcal_uq.estimation.stages import (
-    PAIR_TOLERANCE,
     REFINEMENT_TOLERANCE,
+    Search,
     Stage,
     begun_on_sample,
     direct_stage,
@@ -45,7 +45,7 @@ from starcal_uq.likelihood.composite import enough_frames, pair_covariance
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.pairs import PairObjective
-from starcal_uq.likelihood.solvers import Last, is_singular
+from starcal_uq.likelihood.solvers import is_singular
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import one_of_each
@@ -54,11 +54,10 @@ from starcal_uq.observations.table import Observations
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong
 # distortion.
 _FAR = 0.05
-# From the nominal optics positions take some fifteen.
-_DIRECT_ITERATIONS = 60
-# Frames and stars of a sample that is near enough to the minimum of all, and the relative gain of
-# its last steps.
-_SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-4
+# Frames and stars of a sample that is near enough to the minimum of all.
+_SAMPLE_FRAMES, _SAMPLE_STARS = 150, 2500
+# Stages that nobody reads need only lead to the next.
+_LEADING = Search(tolerance=1e-4, last="unseen")
 # Standard deviations of the last step: of the estimate from interstar angles of all frames, which
 # is then known to a thousandth of that, and of the refinement, which is left to Newton's method on
 # the expansion: a few 1e-9 of them.
@@ -87,17 +86,11 @@ def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSetting
     likelihood = MarginalLikelihood(obs, camera.distortion)
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
-    last = _gain(likelihood, _LAST_STEP)
-    stages, status = _stages(
-        pairs,
-        camera,
-        likelihood,
-        settings.method,
-        settings.solver,
-        settings.max_iterations,
-        last,
-        "left",
-    )
+    search = Search(settings.solver, settings.max_iterations)
+    refinement = None
+    if settings.method == "efficient":
+        refinement = replace(search, tolerance=_gain(likelihood, _LAST_STEP), last="left")
+    stages, status = _stages(pairs, camera, likelihood, search, refinement)
     pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
     estimate = _pair_estimate(pairs, likelihood, pair_theta)
     made = {"method": settings.method, "solver": settings.solver}
@@ -136,9 +129,10 @@ def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
     likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
-    stages, status = _stages(
-        pairs, camera, likelihood, method, "lm", ITERATIONS, pairs_read=method != "efficient"
-    )
+    search, refinement = Search(), None
+    if method == "efficient":
+        search, refinement = _LEADING, Search(tolerance=REFINEMENT_TOLERANCE)
+    stages, status = _stages(pairs, camera, likelihood, search, refinement)
     return _fitted(likelihood, camera, stages[-1].theta, status)
 
 
@@ -158,7 +152,8 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
         known = dict(list(known.items())[:3])
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     theta = np.array([known.get(name, 0.0) for name in start.parameter_names])
-    stage = refinement_stage(likelihood, theta, ITERATIONS, _gain(likelihood, _LAST_STEP), "unseen")
+    search = Search(tolerance=_gain(likelihood, _LAST_STEP), last="unseen")
+    stage = refinement_stage(likelihood, theta, search)
     try:
         return _fitted(likelihood, start, stage.theta, stage.status)
     except CalibrationError:
@@ -185,28 +180,17 @@ def _stages(
     pairs: PairObjective,
     camera: Camera,
     likelihood: MarginalLikelihood,
-    method: str,
-    solver: str,
-    max_iterations: int,
-    tolerance: float = REFINEMENT_TOLERANCE,
-    last: Last = "seen",
-    pairs_read: bool = True,
+    search: Search,
+    refinement: Search | None,
 ) -> tuple[list[Stage], Status]:
-    """All stages of a Gaussian fit, and how they ended; `tolerance` and `last` are those of the
-    refinement.
-
-    Where nobody reads the estimate from interstar angles, it need only lead to the refinement.
+    """All stages of a Gaussian fit, and how they ended: those on interstar angles by one search,
+    the refinement, if there is one, by another.
     """
-    sampled = method == "efficient" and solver == "lm"
-    stages = (
-        _sampled_stages(pairs, camera, max_iterations, _gain(likelihood, _LAST_PAIR_STEP))
-        if sampled
-        else []
-    )
-    ending: tuple[float, Last] = (
-        (PAIR_TOLERANCE, "seen") if pairs_read else (_SAMPLE_TOLERANCE, "unseen")
-    )
-    stages = stages or _pair_stages(pairs, camera, solver, max_iterations, *ending)
+    stages: list[Stage] = []
+    if refinement is not None and search.solver == "lm":
+        near = replace(search, tolerance=_gain(likelihood, _LAST_PAIR_STEP), last="unseen")
+        stages = _sampled_stages(pairs, camera, near)
+    stages = stages or _pair_stages(pairs, camera, search)
     most = IMPLAUSIBLE_NOISE * camera.width_px
     noise = _noise_at(pairs, likelihood, stages[-1].theta)
     if _strayed(stages[-1], camera) or noise > most:
@@ -214,22 +198,20 @@ def _stages(
         # state very unequal noise they go by the worst ones; positions lead to the estimate from
         # the nominal optics in a few steps.
         own = MarginalLikelihood(likelihood.frames, camera.distortion)
-        direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
+        direct = direct_stage(own, camera, search.max_iterations)
         if direct.status.ok:
-            if pairs_read or noise_px(own, direct.theta) > noise:
-                again = joint_stage(pairs, camera, direct.theta, solver, max_iterations, *ending)
+            if search.last == "seen" or noise_px(own, direct.theta) > noise:
+                again = joint_stage(pairs, camera, direct.theta, search)
                 stages[-1] = min(stages[-1], again, key=_badness)
                 noise = _noise_at(pairs, likelihood, stages[-1].theta)
-            if method == "efficient" and noise_px(own, direct.theta) <= min(noise, most):
+            if refinement is not None and noise_px(own, direct.theta) <= min(noise, most):
                 likelihood.use_sums(*own.sums(direct.theta))
                 return [*stages, direct], direct.status
     # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions
     # do.
     status = check_noise(noise, camera, stages[-1].status)
-    if status.ok and method == "efficient":
-        stages.append(
-            refinement_stage(likelihood, stages[-1].theta, max_iterations, tolerance, last)
-        )
+    if status.ok and refinement is not None:
+        stages.append(refinement_stage(likelihood, stages[-1].theta, refinement))
         status = stages[-1].status
     return stages, status
 
@@ -268,7 +250,8 @@ def _with_noise_model(
         likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
         likelihood.use_rotations(likelihood.start_rotations(theta))
         # The estimate from interstar angles has no weights; its covariance and the refinement do.
-        stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]
+        search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
+        stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, search)]
         pairs = PairObjective(likelihood.frames, camera.distortion)
         estimate = _pair_estimate(pairs, likelihood, calibration.pair_theta)
         made = {"method": settings.method, "solver": settings.solver}
@@ -297,7 +280,7 @@ def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) ->
 
 
 def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
-    solver, max_iterations = settings.solver, settings.max_iterations
+    search = Search(settings.solver, settings.max_iterations)
     tails = settings.composed.tails
     assert tails is not None
     nu, frames = tails.dof, StarFrames.from_observations(obs, axes=True)
@@ -306,13 +289,14 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
 
     def fit(trusted: StarFrames, all_parameters: bool) -> list[Stage]:
         if not all_parameters:
-            stage = optics_stage(trusted, camera, solver, max_iterations)
-            return [stage if stage.status.ok else focal_stage(trusted, camera, max_iterations)]
+            stage = optics_stage(trusted, camera, search)
+            most = search.max_iterations
+            return [stage if stage.status.ok else focal_stage(trusted, camera, most)]
         pairs = PairObjective(trusted, model)
-        stages = _pair_stages(pairs, camera, solver, max_iterations)
+        stages = _pair_stages(pairs, camera, search)
         if _strayed(stages[-1], camera):
             own = MarginalLikelihood(trusted, model)
-            direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
+            direct = direct_stage(own, camera, search.max_iterations)
             noise = _noise_at(pairs, MarginalLikelihood(trusted, model), stages[-1].theta)
             if direct.status.ok and not (
                 stages[-1].status.ok and noise < noise_px(own, direct.theta)
@@ -329,7 +313,7 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
             MarginalLikelihood(frames, model), camera.theta, camera, error.status
         ) from None
     pair_theta = start.stages[-1].theta
-    found = refine(frames, model, pair_theta, start.rotations, nu, max_iterations)
+    found = refine(frames, model, pair_theta, start.rotations, nu, search.max_iterations)
     theta, sigma, state, information = (
         found.stage.theta,
         found.sigma,
@@ -350,7 +334,7 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
         scaled_inverse(found.covariance) * sigma**2,
     )
     names, factors = undetermined(gaussian, theta, matrix, sigma, camera, status)
-    made: AnyDict = {"method": "efficient", "solver": solver, "distortion": model}
+    made: AnyDict = {"method": "efficient", "solver": search.solver, "distortion": model}
     student: AnyDict = {
         "dof": found.nu,
         "dof_std": found.nu_std,
@@ -380,13 +364,11 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
     )
 
 
-def _sampled_stages(
-    pairs: PairObjective, camera: Camera, max_iterations: int, tolerance: float
-) -> list[Stage]:
+def _sampled_stages(pairs: PairObjective, camera: Camera, search: Search) -> list[Stage]:
     """The stages on interstar angles, from their start values near to the minimum on a sample of
     the frames alone.
 
-    The last stage ends on all frames, so that the estimate is theirs. Empty where there are not so
+    The last stage ends on all frames, by `search`, so that the estimate is theirs. Empty where there are not so
     many frames that it saves time, or where the sample or all frames from its estimate do not
     converge.
     """
@@ -397,10 +379,11 @@ def _sampled_stages(
     chosen = np.zeros(frames.n_frames, dtype=bool)
     chosen[one_of_each(frames.n_frames, wanted)] = True
     sample = PairObjective(frames.select(np.repeat(chosen, frames.sizes)), pairs.model_name)
-    stages = _pair_stages(sample, camera, "lm", max_iterations, _SAMPLE_TOLERANCE, "unseen")
+    leading = replace(_LEADING, max_iterations=search.max_iterations)
+    stages = _pair_stages(sample, camera, leading)
     if not stages[-1].status.ok:
         return []
-    last = joint_stage(pairs, camera, stages[-1].theta, "lm", max_iterations, tolerance, "unseen")
+    last = joint_stage(pairs, camera, stages[-1].theta, search)
     if not last.status.ok:
         return []
     scales = {"distortion": frames.n_stars / sample.frames.n_stars}
@@ -411,29 +394,20 @@ def _sampled_stages(
     return [*first, begun_on_sample(stages[-1], last, by_pair)]
 
 
-def _pair_stages(
-    pairs: PairObjective,
-    camera: Camera,
-    solver: str,
-    max_iterations: int,
-    tolerance: float = PAIR_TOLERANCE,
-    last: Last = "seen",
-) -> list[Stage]:
+def _pair_stages(pairs: PairObjective, camera: Camera, search: Search) -> list[Stage]:
     frames = pairs.frames
-    stages = [optics_stage(frames, camera, solver, max_iterations, tolerance, last)]
+    stages = [optics_stage(frames, camera, search)]
     # Without an optical axis there is nothing to attach the distortion to; later stages would only
     # hide it.
     if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
-        stages.append(
-            joint_stage(pairs, camera, stages[1].theta, solver, max_iterations, tolerance, last)
-        )
+        stages.append(joint_stage(pairs, camera, stages[1].theta, search))
         if not stages[-1].status.ok or _far(stages[0], camera):
             # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the
             # linear stage may then lead to another minimum or into a fold; the nominal optics
             # without distortion are the safer start.
             start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
-            again = joint_stage(pairs, camera, start, solver, max_iterations, tolerance, last)
+            again = joint_stage(pairs, camera, start, search)
             stages[-1] = min(stages[-1], again, key=_badness)
     return stages
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.stages import refinement_stage
+from starcal_uq.estimation.stages import REFINEMENT_TOLERANCE, Search, refinement_stage
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -100,11 +100,22 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     `theta` (p,): estimate, px units.
     """
     state, _ = likelihood.profile(theta)
-    frames, n = likelihood.frames, likelihood.frames.n_stars
-    h = likelihood.slopes(theta, state)
+    frames, h = likelihood.frames, likelihood.slopes(theta, state)
     flat = h.reshape(len(h), -1)
     camera = np.tensordot(scaled_cholesky(scaled_inverse(flat @ flat.T)).T, h, axes=1)
     attitude = likelihood.attitudes(state).orthonormal
+    return axis_noise_beside(frames, attitude, camera, state.e, likelihood.dof)
+
+
+def axis_noise_beside(
+    frames: StarFrames, attitude: FloatArray, camera: FloatArray, e: FloatArray, left: int
+) -> AxisNoise:
+    """The same of residuals e (2, N), where these are the orthonormal columns of every frame (a, 2,
+    N) and of all stars (p, 2, N).
+
+    `left`: degrees of freedom that these leave; where those of all stars are few, with or without.
+    """
+    n = frames.n_stars
 
     def products(one: int, other: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """U^T U over the stars of the axes: attitudes of each frame, both ways of attitudes with
@@ -131,7 +142,6 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
             [across, n - 2.0 * taken[1] + squared(yy, yy)],
         ]
     )
-    e = state.e
     variances = np.linalg.solve(free, np.sum(e**2, axis=1))
     both_ways = float(
         np.sum(xy[0] ** 2) + np.sum(xy[1] ** 2) + np.sum(xy[2] ** 2) + np.sum(xy[3] ** 2)
@@ -150,7 +160,7 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     scatter = scatter - np.mean(scatter)
     # Residuals are smaller than errors: the scatter of their products grows by the square of the
     # share that is left.
-    grown = 2.0 * n / likelihood.dof
+    grown = 2.0 * n / left
     log_ratio_std = 0.5 * float(np.sqrt(grown * np.sum(scatter**2)))
     mixed = e[0] * e[1] / (sigma[0] * sigma[1])
     correlation_std = float(np.sqrt(grown * np.sum((mixed - np.mean(mixed)) ** 2))) / dof
@@ -178,7 +188,8 @@ def fit_noise(
         likelihood = MarginalLikelihood(frames, camera.distortion)
         if turn > 0:
             likelihood.use_rotations(likelihood.start_rotations(theta))
-            stage = refinement_stage(likelihood, theta, max_iterations)
+            search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
+            stage = refinement_stage(likelihood, theta, search)
             if not stage.status.ok:
                 break
             theta = stage.theta
@@ -288,7 +299,7 @@ def _settled(found: _Round, last: _Round | None, now: FloatArray, before: FloatA
 
 def _stated(obs: Observations) -> FloatArray:
     """Noise (N,) that the stars state; 1 where they do not."""
-    return np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
+    return obs.sigma_or_one
 
 
 def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: float) -> FloatArray:

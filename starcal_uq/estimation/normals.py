@@ -79,6 +79,20 @@ class FrameNormals:
             obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes=True)
         )
         gram, attitudes = frame_normals(frames, model, theta, start)
+        own = attitudes.log_determinant, attitudes.rotations, 2 * frames.sizes - 3
+        return cls.of(theta, gram, *own, scale)
+
+    @classmethod
+    def of(
+        cls,
+        theta: FloatArray,
+        gram: FloatArray,
+        log_determinant: FloatArray,
+        rotations: FloatArray,
+        dof: IntArray,
+        scale: FloatArray | None = None,
+    ) -> FrameNormals:
+        """Normal equations from the products (K, 1 + p, 1 + p) of residuals and parameters."""
         matrix = gram[:, 1:, 1:]
         scale = 1.0 / np.sqrt(np.einsum("kaa->a", matrix)) if scale is None else scale
         return cls(
@@ -87,9 +101,9 @@ class FrameNormals:
             matrices=matrix * np.outer(scale, scale),
             slopes=gram[:, 0, 1:] * scale,
             squares=gram[:, 0, 0],
-            log_determinant=attitudes.log_determinant,
-            rotations=attitudes.rotations,
-            dof=2 * frames.sizes - 3,
+            log_determinant=log_determinant,
+            rotations=rotations,
+            dof=dof,
         )
 
     def scatter(self, whole: tuple[FloatArray, FloatArray] | None = None) -> FrameScatter:

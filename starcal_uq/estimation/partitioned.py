@@ -104,15 +104,14 @@ def _normal(reader: PartitionReader, model: str, theta: FloatArray, part: Partit
 
 
 def _sums(obs: Observations, model: str, theta: FloatArray) -> NormalSums:
-    likelihood = MarginalLikelihood(obs, model)
-    return settled_sums(likelihood.frames, model, theta, likelihood.start_rotations(theta))[0]
+    return MarginalLikelihood(obs, model).sums(theta)[0]
 
 
 def _gram(
     reader: PartitionReader, model: str, theta: FloatArray, whitening: FloatArray, part: Partition
 ) -> GramSums:
     likelihood = MarginalLikelihood(reader.load(part), model)
-    return gram_sums(likelihood.frames, model, theta, whitening, likelihood.start_rotations(theta))
+    return gram_sums(likelihood.frames, model, theta, whitening, likelihood.sums(theta))
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ def _residuals(
     normal, attitudes = settled_sums(
         whole, camera.distortion, theta, likelihood.start_rotations(theta), e
     )
-    stated = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px
+    stated = obs.sigma_or_one
     size = np.max(np.abs(e), axis=0) / scale
     worst = int(np.argmax(size))
     sums = PartitionSums(

@@ -14,7 +14,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters, sigma_parameter
-from starcal_uq.camera.projection import fold_radius_px
+from starcal_uq.camera.projection import fold_radius_px, unproject
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, reading
@@ -24,10 +24,12 @@ from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, w
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
+from starcal_uq.estimation.prediction import PredictedCamera, displacement, predicted
 from starcal_uq.estimation.residual_map import PartitionSums
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.undetermined import remedy_of
 from starcal_uq.likelihood.compressed import CompressedLikelihood
+from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.likelihood.star_errors import StarErrors
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, is_positive
@@ -35,6 +37,7 @@ from starcal_uq.observations.repeats import Fingerprints
 
 if TYPE_CHECKING:
     import pandas as pd
+    from numpy.typing import ArrayLike
 
     from starcal_uq.likelihood.noise_model import NoiseModel
     from starcal_uq.observations.frames import StarFrames
@@ -52,6 +55,7 @@ _APART = (
     "sizes",
     "xy_px",
     "error_px",
+    "star_weights",
 )
 # Fields of the document, in the order in which it is read.
 _DOCUMENT = (
@@ -85,6 +89,7 @@ _DOCUMENT = (
         "star_errors",
         "partitions",
         "undetermined",
+        "effects",
     ),
 )
 # Hash of the archive that belongs to the document.
@@ -209,6 +214,11 @@ class Calibration(Shown, Traced):
         Of a calibration of partitioned observations, sums over all of their residuals: `frame_ids`,
         `quaternions`, `residuals_px`, `pair_theta` and `pair_covariance` are those of a sample of
         frames, everything else of all.
+    star_weights : (N,) array or None
+        Weights that tails leave the stars, where a Gaussian likelihood keeps them.
+    effects : Effects or None
+        Effects beyond the camera, where they were asked for: `covariance`, `information` and
+        `compressed` hold them, and residuals and attitudes are those after them.
     undetermined : tuple of str
         Names of parameters that the data leave open; `status` is then SINGULAR.
     """
@@ -240,6 +250,8 @@ class Calibration(Shown, Traced):
     star_errors: StarErrors | None = None
     partitions: PartitionSums | None = None
     undetermined: tuple[str, ...] = ()
+    effects: Effects | None = None
+    star_weights: FloatArray | None = None
 
     SHAPES: ClassVar[Shapes] = {
         **{
@@ -394,6 +406,70 @@ class Calibration(Shown, Traced):
         stars have the weights of their tails.
         """
         return "marginal" if self.provenance.tail_weights else self.provenance.likelihood
+
+    def at(
+        self,
+        *,
+        temperature_c: float | None = None,
+        time_utc: str | None = None,
+        new_night: bool = False,
+    ) -> PredictedCamera:
+        """The camera at a temperature, at a time or on another night.
+
+        Parameters
+        ----------
+        temperature_c : float, optional
+            Temperature, degC; needs the effect ``temperature``. By default the mean of the table.
+        time_utc : str, optional
+            Time, ISO 8601, UTC; needs the effect ``time``. By default the middle of the run.
+        new_night : bool
+            Whether it is a night that the table does not hold; needs the effect ``epoch``.
+
+        Returns
+        -------
+        PredictedCamera
+            With a covariance that holds what is not known of the effects.
+
+        Raises
+        ------
+        CalibrationError
+            When the calibration holds no such effect.
+        """
+        estimate = PredictedCamera(self.camera, self.covariance)
+        return predicted(estimate, self.effects, temperature_c, time_utc, new_night)
+
+    def displacement(self, xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """What effects of the place on the detector do beyond the camera: axes, field, pixel phase.
+
+        Parameters
+        ----------
+        xy : (n, 2) array
+            Pixels.
+
+        Returns
+        -------
+        shift : (n, 2) array
+            Measured minus what `camera` predicts, px; zero without such effects.
+        covariance : (n, 2, 2) array
+            Its covariance, px^2.
+        """
+        pixels = np.atleast_2d(np.asarray(xy, dtype=np.float64))
+        return displacement(PredictedCamera(self.camera, self.covariance), self.effects, pixels)
+
+    def directions(self, xy: ArrayLike) -> FloatArray:
+        """Unit vectors (n, 3) in the camera frame of what is seen at pixels (n, 2), by the camera
+        and the effects of the place.
+        """
+        pixels = np.atleast_2d(np.asarray(xy, dtype=np.float64))
+        return unproject(self.camera, pixels - self.displacement(pixels)[0])
+
+    def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Log likelihood (n,) of the whole data set at theta (n, p), px units, and sigma (n,), the
+        scales of effects integrated.
+        """
+        if self.effects is None or not self.effects.names:
+            return self.compressed.log_likelihood(theta, sigma)
+        return self.effects.mixed(self.compressed, theta, sigma)
 
     @property
     def n_stars(self) -> int:

@@ -388,9 +388,9 @@ def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
         "sigma": cal.sigma,
         "dof": cal.provenance.student_t["dof"],
     }
-    plain = dict.fromkeys(cal.parameter_names, 1.0)
-    known = replace(cal, provenance=cal.provenance.adding(tail_weights=record | {"factors": plain}))
-    likelihood = MarginalLikelihood(tail_weighted(obs, known), cal.camera.distortion, axes=True)
+    weights = tail_weights(obs, cal, record)
+    weighted = by_weights(obs, weights)
+    likelihood = MarginalLikelihood(weighted, cal.camera.distortion, axes=True)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     normal = likelihood.evaluate(cal.theta)
     sigma = float(np.sqrt(normal.cost / (likelihood.dof - len(cal.theta))))
@@ -401,15 +401,17 @@ def with_tail_weights(obs: Observations, cal: Calibration) -> Calibration:
         cal,
         sigma=sigma,
         provenance=cal.provenance.adding(tail_weights=record),
+        star_weights=weights,
     )
 
 
-def tail_weighted(obs: Observations, cal: Calibration) -> Observations:
-    """Stars with the noise that the weights of a calibration's tails leave them, (N,) px.
+def tail_weights(obs: Observations, cal: Calibration, record: AnyDict) -> FloatArray:
+    """Weights (N,) that the tails of a calibration leave its stars.
 
-    `obs`: with the noise that the calibration has without them.
+    `obs`: with the noise that the calibration has without them. `record`: parameters, scale and
+    degrees of freedom.
     """
-    record, model = cal.provenance.tail_weights or {}, cal.camera.distortion
+    model = cal.camera.distortion
     frames = StarFrames.from_observations(obs, axes=True)
     likelihood = StudentLikelihood(
         frames,
@@ -419,7 +421,10 @@ def tail_weighted(obs: Observations, cal: Calibration) -> Observations:
         usable_stars(frames, model, cal.pair_theta),
     )
     state = likelihood.state(np.array(record["theta"]), record["sigma"], record["dof"])
+    return np.where(state.seen, np.maximum(state.weight, _LEAST_WEIGHT), _NO_WEIGHT)
+
+
+def by_weights(obs: Observations, weights: FloatArray) -> Observations:
+    """Stars with the noise that weights (N,) leave them, px."""
     # Where they state none, weights alone, so that the noise of the estimate stays in px.
-    sigma_px = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px
-    weight = np.where(state.seen, np.maximum(state.weight, _LEAST_WEIGHT), _NO_WEIGHT)
-    return obs.weighted(sigma_px / np.sqrt(weight), obs.noise_axes)
+    return obs.weighted(obs.sigma_or_one / np.sqrt(weights), obs.noise_axes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Protocol, TypedDict, get_args
@@ -9,7 +10,7 @@ from typing import Any, Protocol, TypedDict, get_args
 from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import Duplicates, Method, NoiseKind, Solver
-from starcal_uq.likelihood.composed import Likelihood, StarDirections, StudentTails
+from starcal_uq.likelihood.composed import EffectTerms, Likelihood, StarDirections, StudentTails
 from starcal_uq.likelihood.student import parse_dof
 
 METHODS = get_args(Method)
@@ -41,6 +42,7 @@ class EstimationOptions(TypedDict, total=False):
     dof: float | str | None
     noise: str
     star_errors: bool
+    effects: str | Sequence[str]
     recursion: MethodOptions | None
     duplicates: str
 
@@ -49,7 +51,8 @@ class EstimationOptions(TypedDict, total=False):
 class EstimationSettings:
     """How a calibration is made; `calibrate` describes the fields, which are its keywords.
 
-    `likelihood` is a composed one, or its name, to which `dof`, `noise` and `star_errors` add parts.
+    `likelihood` is a composed one, or its name, to which `dof`, `noise`, `star_errors`
+    and `effects` add parts.
 
     Raises
     ------
@@ -65,6 +68,7 @@ class EstimationSettings:
     dof: float | str | None = None
     noise: str = "common"
     star_errors: bool = False
+    effects: str | Sequence[str] = "none"
     recursion: MethodOptions | None = None
     duplicates: Duplicates | str = "refuse"
 
@@ -86,6 +90,7 @@ class EstimationSettings:
                 "likelihood": self.composed.name,
                 "noise": self.composed.noise,
                 "star_errors": self.composed.star_errors,
+                "effects": self.composed.effects,
                 **others,
             }
         )
@@ -99,7 +104,14 @@ class EstimationSettings:
         if self.likelihood == "student_t":
             tails = StudentTails(parse_dof(self.dof, CalibrationError))
         noise: NoiseKind = "model" if self.noise == "model" else "common"
-        return Likelihood(noise, tails, (StarDirections(),) if self.star_errors else ())
+        effects = EffectTerms.parsed(self.effects)
+        terms = (StarDirections(),) if self.star_errors else ()
+        return Likelihood(noise, tails, terms if effects is None else (*terms, effects))
+
+    @property
+    def weighs(self) -> bool:
+        """Whether residuals decide how much stars count: by tails, or a model of the noise."""
+        return self.composed.tails is not None or self.composed.noise == "model"
 
     def changed(self, **options: Any) -> EstimationSettings:
         """The settings with some of their fields changed.

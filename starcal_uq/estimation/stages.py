@@ -11,17 +11,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from starcal_uq.attitude.wahba import quest
+from starcal_uq.attitude.wahba import DegenerateFrameError
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import monotonic_expression
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.estimation.settings import ITERATIONS
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
-from starcal_uq.likelihood.paths import loops_for
+from starcal_uq.likelihood.paths import sums_for
 from starcal_uq.likelihood.solvers import (
     Constraints,
+    Evaluate,
     Last,
     Normal,
     Solution,
@@ -41,8 +43,31 @@ REFINEMENT_TOLERANCE = 1e-18
 _HELD_TOLERANCE = 1e-6
 _GRID = 0.25 * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
 _GRID_STARS, _GRID_ITERATIONS = 20_000, 12
+# From the nominal optics positions take some fifteen.
+_DIRECT_ITERATIONS = 60
 # Explicit pairs need about 100 bytes each and parameter; beyond this the normal equations serve.
 MAX_EXPLICIT_PAIRS = 500_000
+
+
+@dataclass(frozen=True)
+class Search:
+    """How a stage looks for its minimum, and how well it ends there."""
+
+    solver: str = "lm"
+    max_iterations: int = ITERATIONS
+    # Relative gain of the last step, and what becomes of that step, both of Levenberg-Marquardt.
+    tolerance: float = PAIR_TOLERANCE
+    last: Last = "seen"
+
+    def minimum(self, evaluate: Evaluate, start: FloatArray) -> Solution:
+        """Levenberg-Marquardt from a start (p,)."""
+        return levenberg_marquardt(
+            evaluate,
+            start,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+            last=self.last,
+        )
 
 
 @dataclass(frozen=True)
@@ -110,34 +135,24 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
     )
 
 
-def _solve(
-    objective: PairObjective,
-    start: FloatArray,
-    camera: Camera,
-    solver: str,
-    max_iterations: int,
-    tolerance: float,
-    last: Last,
-) -> Solution:
-    if solver == "ipopt":
+def _solve(objective: PairObjective, start: FloatArray, camera: Camera, search: Search) -> Solution:
+    most = search.max_iterations
+    if search.solver == "ipopt":
         # CasADi takes a while to load, and few need it.
         from starcal_uq.likelihood.ipopt import ipopt
 
         constraints = constraints_for(camera, objective.n_parameters)
-        return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)
-    if solver == "minpack" and objective.n_pairs <= MAX_EXPLICIT_PAIRS:
-        return minpack(
-            objective.residuals, objective.evaluate, start, max_iterations=max_iterations
-        )
-    return levenberg_marquardt(
-        objective.evaluate, start, max_iterations=max_iterations, tolerance=tolerance, last=last
-    )
+        return ipopt(objective.evaluate, start, constraints, max_iterations=most)
+    if search.solver == "minpack" and objective.n_pairs <= MAX_EXPLICIT_PAIRS:
+        return minpack(objective.residuals, objective.evaluate, start, max_iterations=most)
+    return search.minimum(objective.evaluate, start)
 
 
-def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
+def _timed(name: str, run: Callable[[], Solution], zeros: int = 0) -> Stage:
+    """The stage of a solver's run, which leaves the last so many parameters at zero."""
     began = perf_counter()
     solution = run()
-    padding = np.tile(tail, (len(solution.trajectory), 1))
+    padding = np.zeros((len(solution.trajectory), zeros))
     return Stage(
         name=name,
         trajectory=np.hstack([solution.trajectory, padding]),
@@ -162,32 +177,19 @@ def begun_on_sample(sample: Stage, whole: Stage, scale: float) -> Stage:
     )
 
 
-def optics_stage(
-    frames: StarFrames,
-    camera: Camera,
-    solver: str,
-    max_iterations: int,
-    tolerance: float = PAIR_TOLERANCE,
-    last: Last = "seen",
-) -> Stage:
+def optics_stage(frames: StarFrames, camera: Camera, search: Search) -> Stage:
     """Stage 1: x0, y0 and f on interstar angles, distortion ignored (the paper's section 2.1)."""
     objective = PairObjective(frames, "none")
     start = np.array(camera.theta[:3])
-    zeros = np.zeros(len(camera.theta) - 3)
-    return _timed(
-        "optics",
-        lambda: _solve(objective, start, camera, solver, max_iterations, tolerance, last),
-        zeros,
-    )
+    return _timed("optics", lambda: _solve(objective, start, camera, search), len(camera.theta) - 3)
 
 
 def focal_stage(frames: StarFrames, camera: Camera, max_iterations: int) -> Stage:
     """Stage 1 for stars that do not determine the principal point without distortion: f alone, on
     positions.
     """
-    own = MarginalLikelihood(frames, "none")
-    zeros = np.zeros(len(camera.theta) - 3)
-    return _timed("optics", lambda: _held(own, camera.theta[:3], max_iterations), zeros)
+    own, start = MarginalLikelihood(frames, "none"), camera.theta[:3]
+    return _timed("optics", lambda: _held(own, start, max_iterations), len(camera.theta) - 3)
 
 
 def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> Stage:
@@ -200,14 +202,9 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     model = get_model(camera.distortion)
     f = theta[2]
     offset = frames.pixel - theta[:2, None]
-    loops = loops_for(frames)
-    found = loops and loops.attitude_loop(frames, "none", theta[:3])
-    if found is not None and found[1]:
-        rotations = found[0]
-    else:
-        direction = np.vstack([offset, np.full(frames.n_stars, f)])
-        b = (direction / np.linalg.norm(direction, axis=0)).T
-        rotations = quest(b, frames.r.T, frames.starts, covariance=False).rotations
+    rotations = sums_for(frames).attitudes(frames, "none", theta[:3])
+    if not np.isfinite(rotations).all():
+        raise DegenerateFrameError(np.flatnonzero(np.isnan(rotations[:, 0, 0])))
     b = frames.rotated(rotations)
     ideal = f * b[:2] / b[2]
     # Every model is linear in its coefficients; forward models act on ideal points, inverse ones on
@@ -231,39 +228,20 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
 
 
 def joint_stage(
-    objective: PairObjective,
-    camera: Camera,
-    theta: FloatArray,
-    solver: str,
-    max_iterations: int,
-    tolerance: float = PAIR_TOLERANCE,
-    last: Last = "seen",
+    objective: PairObjective, camera: Camera, theta: FloatArray, search: Search
 ) -> Stage:
     """Stage 3: all parameters on interstar angles (the paper's section 2.3)."""
-
-    def run() -> Solution:
-        return _solve(objective, theta, camera, solver, max_iterations, tolerance, last)
-
-    return _timed("all", run, np.zeros(0))
+    return _timed("all", lambda: _solve(objective, theta, camera, search))
 
 
-def refinement_stage(
-    likelihood: MarginalLikelihood,
-    theta: FloatArray,
-    max_iterations: int,
-    tolerance: float = REFINEMENT_TOLERANCE,
-    last: Last = "seen",
-) -> Stage:
+def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, search: Search) -> Stage:
     """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao
     bound.
 
-    The attitudes move along; `likelihood` starts its later searches from where they end.
+    The attitudes move along; `likelihood` starts its later searches from where they end. The solver
+    is Levenberg-Marquardt, whichever the other stages have.
     """
-    return _timed(
-        "refinement",
-        lambda: _descended(likelihood, theta, max_iterations, tolerance, last),
-        np.zeros(0),
-    )
+    return _timed("refinement", lambda: _descended(likelihood, theta, search))
 
 
 def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations: int) -> Stage:
@@ -276,6 +254,8 @@ def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations:
     held where the data sheet has it and at eight places around; where they fit best, all are set
     free.
     """
+
+    max_iterations = min(max_iterations, _DIRECT_ITERATIONS)
 
     def run() -> Solution:
         theta = camera.theta
@@ -295,7 +275,8 @@ def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations:
             if costs[-1] == min(costs):
                 best = there
         likelihood.use_rotations(likelihood.start_rotations(best.theta))
-        last = _descended(likelihood, best.theta, max_iterations, REFINEMENT_TOLERANCE)
+        search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
+        last = _descended(likelihood, best.theta, search)
         return replace(
             last,
             trajectory=np.concatenate([first.trajectory, last.trajectory]),
@@ -303,7 +284,7 @@ def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations:
             evaluations=first.evaluations + last.evaluations,
         )
 
-    return _timed("refinement", run, np.zeros(0))
+    return _timed("refinement", run)
 
 
 def _held(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Solution:
@@ -316,20 +297,13 @@ def _held(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int
         normal = descent.evaluate(np.concatenate([theta[:2], rest]))
         return Normal(normal.cost, normal.gradient[2:], normal.matrix[2:, 2:])
 
-    found = levenberg_marquardt(
-        evaluate, theta[2:], max_iterations=max_iterations, tolerance=_HELD_TOLERANCE
-    )
+    search = Search(max_iterations=max_iterations, tolerance=_HELD_TOLERANCE)
+    found = search.minimum(evaluate, theta[2:])
     trajectory = np.hstack([np.tile(theta[:2], (len(found.costs), 1)), found.trajectory])
     return replace(found, theta=trajectory[-1], trajectory=trajectory)
 
 
-def _descended(
-    likelihood: MarginalLikelihood,
-    theta: FloatArray,
-    max_iterations: int,
-    tolerance: float,
-    last: Last = "seen",
-) -> Solution:
+def _descended(likelihood: MarginalLikelihood, theta: FloatArray, search: Search) -> Solution:
     """The minimum of the likelihood's sum of squares, near whose attitudes its later searches
     start.
     """
@@ -337,9 +311,7 @@ def _descended(
     start = best[1].rotations if best is not None else likelihood.rotations
     start = likelihood.start_rotations(theta) if start is None else start
     descent = Descent(likelihood.frames, likelihood.model_name, start, best)
-    solution = levenberg_marquardt(
-        descent.evaluate, theta, max_iterations=max_iterations, tolerance=tolerance, last=last
-    )
+    solution = search.minimum(descent.evaluate, theta)
     if descent.best is not None:
         likelihood.use_sums(*descent.best)
     return solution

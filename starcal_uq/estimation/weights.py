@@ -35,9 +35,13 @@ def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observa
     if len(getattr(result, "residuals_px", ())) != len(obs):
         # Of a mission's stars no tails are known.
         return obs
-    from starcal_uq.estimation.robust import tail_weighted
+    from starcal_uq.estimation.robust import by_weights, tail_weights
 
-    return tail_weighted(obs, result)
+    weights = result.star_weights
+    if weights is None:
+        # Of a version that did not keep them.
+        weights = tail_weights(obs, result, result.provenance.tail_weights)
+    return by_weights(obs, weights)
 
 
 def by_noise_model(obs: Observations, result: Any) -> Observations:

@@ -35,6 +35,7 @@ from starcal_uq.identification.pyramid import (
     FieldGeometry,
     Hypothesis,
     axes_of,
+    unit_directions,
 )
 from starcal_uq.identification.result import FoundOptics
 from starcal_uq.sky.catalogue import StarCatalogue
@@ -280,7 +281,7 @@ class BlindSearch:
         """For each level, its patterns and the frame's that are alike, and the focal lengths that
         follow.
         """
-        rays = _rays(u, np.array([focal]))[0]
+        rays = unit_directions(u, np.array([focal]))[0]
         codes, quads, size = codes_of(rays, quads)
         faintest = quads.max(axis=1) + 1
         for n in sizes:
@@ -319,7 +320,7 @@ class BlindSearch:
         by chance.
         """
         m = min(len(u), _EXPLAINED)
-        b = _rays(u, focal)
+        b = unit_directions(u, focal)
         rows = np.arange(len(mine))[:, None]
         rotation = axes_of(b[rows, mine], 0, 1).transpose(0, 2, 1) @ axes_of(
             level.directions[theirs], 0, 1
@@ -365,7 +366,7 @@ class BlindSearch:
             ):
                 continue
             tried.append((focal, rotation))
-            solved = self._match(u, tree, sigma_px, focal, rotation)
+            solved = self._match(tree, sigma_px, focal, rotation)
             if solved is None and seen.log10_chance[row] < _WORTH_GROWING:
                 solved = self._grow(
                     u, sigma_px, Patch(rotation, focal, seen.points[row], seen.directions[row])
@@ -377,13 +378,13 @@ class BlindSearch:
         return best if best is not None and best.log10_false < _COUNTS else None
 
     def _match(
-        self, u: FloatArray, tree: cKDTree, sigma_px: FloatArray, focal: float, rotation: FloatArray
+        self, tree: cKDTree, sigma_px: FloatArray, focal: float, rotation: FloatArray
     ) -> Solved | None:
         """What a lens that hardly bends explains."""
         sky = self.sky.seen_by(replace(self.geometry, focal_px=focal))
         start = start_state(Hypothesis(rotation, 1.0))
         match = match_frame(
-            u, tree, sigma_px, sky, start, self.tolerance, log10_wanted=_COUNTS - _ANYWHERE
+            tree, sigma_px, sky, start, self.tolerance, log10_wanted=_COUNTS - _ANYWHERE
         )
         if match is None:
             return None
@@ -420,15 +421,6 @@ def _frame_quads(u: FloatArray) -> IntArray:
     for m in sorted({min(m, len(u)) for m in _BRIGHTEST}):
         parts.append(quads_of(cKDTree(u[:m]).query(u[:m], min(_FRAME_NEAREST + 1, m))[1]))
     return np.unique(np.concatenate(parts), axis=0)
-
-
-def _rays(u: FloatArray, focal_px: FloatArray) -> FloatArray:
-    """Unit vectors (m, n, 3) of points (n, 2) for focal lengths (m,)."""
-    b = np.empty((len(focal_px), len(u), 3))
-    b[..., :2] = u
-    b[..., 2] = focal_px[:, None]
-    b /= np.sqrt(np.einsum("mni,mni->mn", b, b))[..., None]
-    return b
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,8 @@ from typing import Protocol
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import rotation_to_quaternion
-from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.tasks import one_thread
@@ -36,16 +33,15 @@ from starcal_uq.identification.blind import (
 from starcal_uq.identification.growth import GrownField, Patch, grow
 from starcal_uq.identification.match import CameraState, Match
 from starcal_uq.identification.nearby import NearbyStars
+from starcal_uq.identification.outcome import identification, moved
 from starcal_uq.identification.proposers import Proposer, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.result import (
     FoundOptics,
-    FrameIdentification,
     Identification,
     Parity,
 )
 from starcal_uq.identification.search import (
-    LEAST_SIGMA_PX,
     MIN_STARS,
     NOT_SEARCHED,
     CentroidTable,
@@ -54,10 +50,8 @@ from starcal_uq.identification.search import (
     Search,
     field_geometry,
     flipped,
-    has_radial,
 )
-from starcal_uq.observations.origin import CentroidsOrigin, Origin
-from starcal_uq.observations.table import Observations
+from starcal_uq.observations.origin import CentroidsOrigin
 from starcal_uq.sky.catalogue import StarCatalogue
 
 # Where few frames are found, the others are tried with a lens this much worse.
@@ -416,7 +410,7 @@ class _Attempt:
         differs.
         """
         shared, covariance = self.search.common_camera(useful)
-        camera = _moved(self.field.camera, shared)
+        camera = moved(self.field.camera, shared)
         return self.search.narrowed(camera, covariance), self.field.seen_by(camera), shared
 
     def finish(self, progress: Progress | None, hopeless: bool = False) -> None:
@@ -478,11 +472,11 @@ class _Attempt:
             ]
             refined, useful = again.camera, _useful(results)
             if useful:
-                refined = _moved(refined, second.common_camera(useful)[0])
+                refined = moved(refined, second.common_camera(useful)[0])
         elif useful:
-            refined = _moved(refined, self.search.common_camera(useful)[0])
+            refined = moved(refined, self.search.common_camera(useful)[0])
         nominal = flipped(self.nominal) if self.parity == "mirrored" else self.nominal
-        return _result(
+        return identification(
             self.field, results, refined, nominal, self.stars, self.parity, self.centroids, optics
         )
 
@@ -608,104 +602,6 @@ def _retry(
     if _solved(result.values()):
         result |= {k: search.frame(field, k) for k in frames[probes:]}
     return result
-
-
-def _moved(camera: Camera, shared: FloatArray) -> Camera:
-    """The camera with shared parameters (ln f, d, kappa) added."""
-    log_scale, dx, dy, kappa = (float(v) for v in shared)
-    coefficients = list(camera.coefficients)
-    if has_radial(camera):
-        names = [c.name for c in get_model(camera.distortion).coefficients]
-        coefficients[names.index("k1")] += kappa / camera.corner_radius_px**3
-    return camera.replace(
-        focal_px=camera.focal_px * float(np.exp(log_scale)),
-        x0_px=camera.x0_px + dx,
-        y0_px=camera.y0_px + dy,
-        coefficients=tuple(coefficients),
-    )
-
-
-def _result(
-    field: FrameTable,
-    results: list[Found],
-    camera: Camera,
-    nominal: Camera,
-    stars: StarCatalogue,
-    parity: Parity,
-    table: CentroidTable,
-    optics: FoundOptics | None,
-) -> Identification:
-    """Attitudes and TASTE with the common camera, and the tables."""
-    from scipy.special import chdtrc
-
-    solved = [k for k, f in enumerate(results) if f.match is not None]
-    matches = [m for f in results if (m := f.match) is not None]
-    records, star = (
-        [],
-        np.concatenate([m.star for m in matches]) if matches else np.empty(0, dtype=np.int64),
-    )
-    rows = np.concatenate(
-        [field.rows[k][m.centroid] for k, m in zip(solved, matches, strict=True)] or [star]
-    )
-    xy = np.concatenate(
-        [field.xy[k][m.centroid] for k, m in zip(solved, matches, strict=True)]
-        or [np.empty((0, 2))]
-    )
-    sigma = floats(table.sigma_px)[rows]
-    taste, p_value = np.empty((2, 0))
-    if matches:
-        starts = np.concatenate([[0], np.cumsum([len(m) for m in matches])])
-        floor = np.hypot(sigma, LEAST_SIGMA_PX)
-        b, r = unproject(camera, xy), stars.directions_icrs[star]
-        wahba = quest(b, r, starts, sigma_rad=floor / camera.focal_px, covariance=False)
-        taste = np.asarray(wahba.taste)
-        p_value = chdtrc(wahba.dof, taste)
-        rotations = wahba.rotations
-    place = {k: i for i, k in enumerate(solved)}
-    for k, f in enumerate(results):
-        i = place.get(k)
-        records.append(
-            FrameIdentification(
-                frame=field.ids[k],
-                image=str(table.image[k]),
-                status=f.status,
-                n_centroids=len(field.xy[k]),
-                n_identified=0 if f.match is None else len(f.match),
-                n_ambiguous=0 if f.match is None else f.match.n_ambiguous,
-                n_unlike_brightness=0 if f.match is None else f.match.n_unlike_brightness,
-                log10_expected_false=float("nan") if f.match is None else f.match.log10_false,
-                quaternion=None if i is None else rotation_to_quaternion(rotations[i]),
-                noise_scale=float("nan") if f.match is None else f.match.noise_scale,
-                taste=float("nan") if i is None else float(taste[i]),
-                taste_p_value=float("nan") if i is None else float(p_value[i]),
-                milliseconds=1e3 * f.seconds,
-            )
-        )
-    times = [table.time_utc[k] for k, m in zip(solved, matches, strict=True) for _ in range(len(m))]
-    origin = Origin.identified(
-        stars.source,
-        directions="apparent" if stars.apparent else "catalogue",
-        epoch=float(stars.epoch),
-        max_mag=float(stars.mag.max()),
-    )
-    observations = Observations(
-        frame=np.repeat([field.ids[k] for k in solved], [len(m) for m in matches]).astype(np.int64),
-        x_px=xy[:, 0],
-        y_px=xy[:, 1],
-        ra_deg=stars.ra_deg[star],
-        dec_deg=stars.dec_deg[star],
-        sigma_px=sigma,
-        star_id=stars.star_id[star],
-        mag=stars.mag[star],
-        time_utc=np.array([str(t) for t in times]) if times and all(times) else None,
-        meta={**origin.plain(), "parity": parity},
-    )
-    # Not every table says which frames were left out.
-    problems = getattr(table, "problem", [""] * len(records))
-    n_left_out = sum(
-        bool(problems[k]) and record.status == "too few stars" for k, record in enumerate(records)
-    )
-    return Identification(observations, tuple(records), camera, nominal, parity, n_left_out, optics)
 
 
 def _check(table: CentroidTable, camera: Camera, stars: StarCatalogue) -> None:

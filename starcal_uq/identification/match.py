@@ -89,7 +89,6 @@ def start_state(hypothesis: Hypothesis) -> CameraState:
 
 
 def match_frame(
-    u: FloatArray,
     tree: cKDTree,
     sigma_px: FloatArray,
     sky: NearbyStars,
@@ -101,7 +100,7 @@ def match_frame(
     radial: bool = True,
     polished: bool = False,
 ) -> Match | None:
-    """Match all centroids of a frame, ideal pixels u (n, 2) and their `tree`, with a gate that
+    """Match all centroids of a frame, the `tree` of their ideal pixels (n, 2), with a gate that
     shrinks to the noise.
 
     With instrumental magnitudes (n,), NaN where not known, doubtful matches of unlike brightness
@@ -110,7 +109,7 @@ def match_frame(
     where it shows on the way that there will be too few for less than ten to the `log10_wanted`
     false matches.
     """
-    g = sky.geometry
+    g, u = sky.geometry, tree.data
     focal = g.focal_px * float(np.exp(start.shared[0]))
     radius = float(np.arctan(1.03 * g.corner_px / focal)) + 1e-3
     depth = sky.depth(len(u))
@@ -140,7 +139,7 @@ def match_frame(
     for number, gate in enumerate(gates):
         predicted, _ = _predict(state, r, g)
         limit = np.maximum(gate, final * noise_scale)
-        centroid, star, _ = _mutual(tree, u, predicted, limit)
+        centroid, star, _ = _mutual(tree, predicted, limit)
         if len(star) < (enough if number else 4):
             return None
         state, e = _fit(state, _linearised(state, u, sigma_px, r, centroid, star, g), prior)
@@ -149,7 +148,7 @@ def match_frame(
     predicted, _ = _predict(state, r, g)
     limit = final * noise_scale
     centroid, star, ambiguous = _mutual(
-        tree, u, predicted, limit, (sigma_px * noise_scale) ** 2 * _DISTINCT
+        tree, predicted, limit, (sigma_px * noise_scale) ** 2 * _DISTINCT
     )
     if len(star) < 4:
         return None
@@ -366,7 +365,6 @@ def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
 
 def _mutual(
     tree: cKDTree,
-    u: FloatArray,
     predicted: FloatArray,
     limit_px: FloatArray,
     distinct_px2: FloatArray | None = None,
@@ -374,10 +372,10 @@ def _mutual(
     """Nearest mutual neighbours within limits (n,): centroids, stars, and how many were left out as
     ambiguous.
 
-    `tree` is that of the centroids u (n, 2), of which only those nearest to a star are looked at
+    `tree` is that of the centroids (n, 2), of which only those nearest to a star are looked at
     further.
     """
-    farthest = float(limit_px.max()) * (1.0 + 1e-9)
+    u, farthest = tree.data, float(limit_px.max()) * (1.0 + 1e-9)
     nearest_centroid = tree.query(predicted, distance_upper_bound=farthest)[1]
     # A star without a centroid near it is not the nearest one of any, but may make another
     # ambiguous.

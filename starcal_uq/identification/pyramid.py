@@ -135,7 +135,7 @@ def hypotheses(
         return
     triangles = remaining_order(n, searched) if searched else first_order(n, len(points) > n)
     u, sigma = points[:n], sigma_px[:n]
-    b = _directions(u, np.array([geometry.focal_px]))[0]
+    b = unit_directions(u, np.array([geometry.focal_px]))[0]
     angle = angle_between(b[:, None], b[None])
     length = np.hypot(*(u[:, None] - u[None]).transpose(2, 0, 1))
     bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]] = {}
@@ -248,7 +248,7 @@ def _supported(
         + angle_between(r[:, 2], r[:, 0])
     ) / perimeter
     scale = 1.0 / measured
-    b = _directions(u, geometry.focal_px * scale)
+    b = unit_directions(u, geometry.focal_px * scale)
     # Roll from the longest side.
     p, q = max(((0, 1), (1, 2), (2, 0)), key=lambda side: length[corner[side[0]], corner[side[1]]])
     camera_axes = axes_of(b[:, corner], p, q)
@@ -269,10 +269,9 @@ def _supported(
     return [Hypothesis(rotation[m], float(scale[m])) for m in best]
 
 
-def _directions(u: FloatArray, focal_px: FloatArray) -> FloatArray:
+def unit_directions(u: FloatArray, focal_px: FloatArray) -> FloatArray:
     """Unit vectors (m, n, 3) of ideal pixels (n, 2) for focal lengths (m,)."""
-    m, n = len(focal_px), len(u)
-    b = np.empty((m, n, 3))
+    b = np.empty((len(focal_px), len(u), 3))
     b[..., :2] = u
     b[..., 2] = focal_px[:, None]
     b /= np.sqrt(np.einsum("mni,mni->mn", b, b))[..., None]

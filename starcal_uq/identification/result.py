@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -59,15 +60,15 @@ class FrameIdentification:
     image: str
     status: FrameStatus
     n_centroids: int
-    n_identified: int
-    n_ambiguous: int
-    n_unlike_brightness: int
-    log10_expected_false: float
-    quaternion: FloatArray | None
-    noise_scale: float
-    taste: float
-    taste_p_value: float
-    milliseconds: float
+    n_identified: int = 0
+    n_ambiguous: int = 0
+    n_unlike_brightness: int = 0
+    log10_expected_false: float = math.nan
+    quaternion: FloatArray | None = None
+    noise_scale: float = math.nan
+    taste: float = math.nan
+    taste_p_value: float = math.nan
+    milliseconds: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -214,7 +214,6 @@ class Search:
         self, field: FrameTable, k: int, start: CameraState, polished: bool = False
     ) -> Match | None:
         return match_frame(
-            field.points[k],
             field.tree(k),
             field.sigma[k],
             self.sky,

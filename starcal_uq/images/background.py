@@ -12,7 +12,8 @@ import numpy as np
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.types import BoolArray, FloatArray
-from starcal_uq.images.image import LARGEST_COUNTS, Image
+from starcal_uq.images.image import Image
+from starcal_uq.images.pixels import LARGEST_COUNTS
 from starcal_uq.maths.intervals import median_of
 
 # SExtractor's clipping at 3 sigma takes this part of Gaussian noise.
@@ -159,13 +160,18 @@ def _at_their_places(pixels: Any, parity: int, shape: tuple[int, ...]) -> Any:
     return whole
 
 
+def of_neighbours(padded: Any) -> Any:
+    """Sum of the four neighbours of each pixel, from pixels with one more on every side."""
+    return padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
+
+
 def _filled(counts: Any, parity: int) -> Any:
     """`counts` with the mean of the neighbours, which have been measured, where they are zero for a
     mosaic.
     """
     height, width = counts.shape
     padded = np.pad(counts, 1, mode="reflect") if min(height, width) > 1 else np.pad(counts, 1)
-    means = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
+    means = of_neighbours(padded)
     means *= np.float32(0.25)
     for row in (0, 1):
         counts[row::2, (parity + row + 1) % 2 :: 2] = means[row::2, (parity + row + 1) % 2 :: 2]

@@ -15,7 +15,7 @@ from starcal_uq.core.errors import ImageError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import AnyDict, BoolArray, IntArray
-from starcal_uq.images.background import PreparedImage, prepare_image
+from starcal_uq.images.background import PreparedImage, of_neighbours, prepare_image
 from starcal_uq.images.fits import (
     Stamps,
     StarFit,
@@ -126,7 +126,7 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
         )
     keep = np.flatnonzero(kind == 0)
     order = keep[np.argsort(-fit.flux[keep], kind="stable")][: options.max_stars]
-    columns = _columns(image, frame, fit, stamps, sigma, gain, order)
+    columns = _columns(image, frame, fit, sigma, gain, order)
     if not len(order):
         messages.append("no star was found.")
     measured_gain = 1.0 / frame.counts_per_e if frame.gain_is_measured else None
@@ -198,10 +198,7 @@ def _mosaic_noise(line: Any) -> float:
     weights of these.
     """
     weights = np.pad(np.outer(line, line), 2)
-    own = weights[1:-1, 1:-1]
-    own = own + 0.25 * (
-        weights[:-2, 1:-1] + weights[2:, 1:-1] + weights[1:-1, :-2] + weights[1:-1, 2:]
-    )
+    own = weights[1:-1, 1:-1] + 0.25 * of_neighbours(weights)
     place = np.add.outer(np.arange(len(own)), np.arange(len(own))) % 2
     worst = max(np.sum(own[place == parity] ** 2) for parity in (0, 1))
     return float(np.sqrt(worst / np.sum(weights**2)))
@@ -329,9 +326,7 @@ def _fit(frame: PreparedImage, objects: Any, sigma: float) -> tuple[Stamps, Star
     """Windowed centroids as a start, then the fit of the pixel-integrated star image."""
     half = half_stamp_px(sigma)
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
-    stamps = cut_stamps(
-        frame.counts, frame.usable, x, y, half, frame.noise, frame.counts_per_e, frame.parity
-    )
+    stamps = cut_stamps(frame, x, y, half)
     width = np.full(len(x), sigma)
     xw, yw, good = window_positions(
         stamps, frame.counts.shape, x, y, np.hypot(width, 12.0**-0.5), width, _START_STEP_PX
@@ -381,7 +376,6 @@ def _columns(
     image: Image,
     frame: PreparedImage,
     fit: StarFit,
-    stamps: Stamps,
     sigma: float,
     gain: float | None,
     order: IntArray,
@@ -395,16 +389,13 @@ def _columns(
         fit.covariance[order],
     )
     rows, columns = pixel_at(y, height), pixel_at(x, width)
-    steps = np.arange(-1, 2)
-    box = (
-        (rows[:, None] + steps).clip(0, height - 1)[:, :, None],
-        (columns[:, None] + steps).clip(0, width - 1)[:, None],
-    )
-    reach = max(1, int(np.ceil(2.0 * sigma)))
-    wide = np.arange(-reach, reach + 1)
-    core = (
-        (rows[:, None] + wide).clip(0, height - 1)[:, :, None],
-        (columns[:, None] + wide).clip(0, width - 1)[:, None],
+    box, core = (
+        (
+            (rows[:, None] + steps).clip(0, height - 1)[:, :, None],
+            (columns[:, None] + steps).clip(0, width - 1)[:, None],
+        )
+        for reach in (1, max(1, int(np.ceil(2.0 * sigma))))
+        for steps in (np.arange(-reach, reach + 1),)
     )
     margin = np.minimum.reduce([x, width - 1 - x, y, height - 1 - y]) + 0.5
     blended = np.zeros(len(order), dtype=np.bool_)

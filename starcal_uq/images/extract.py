@@ -24,9 +24,10 @@ from starcal_uq.core.tasks import one_thread, processors, run_tasks
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
-from starcal_uq.images.image import IMAGE_ENDINGS, Image, read_images
+from starcal_uq.images.image import Image
 from starcal_uq.images.optics import common_optics, common_place, optics_of, other_sizes, place_of
 from starcal_uq.images.pixel_phase import phase_error, without_phase_error
+from starcal_uq.images.read import IMAGE_ENDINGS, read_images
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

@@ -80,25 +80,15 @@ class StarFit:
     residual: FloatArray
 
 
-def cut_stamps(
-    counts: Any,
-    usable: BoolArray | None,
-    x: FloatArray,
-    y: FloatArray,
-    half_px: int,
-    noise: Any,
-    counts_per_e: float,
-    parity: int | None = None,
-) -> Stamps:
-    """Cut the pixels around positions; what lies outside the image or is not `usable` is marked as
+def cut_stamps(frame: PreparedImage, x: FloatArray, y: FloatArray, half_px: int) -> Stamps:
+    """Cut the pixels around positions; what lies outside the image or is not usable is marked as
     not good.
-
-    Of a mosaic, the pixels with this `parity` were measured.
     """
+    counts, usable, parity = frame.counts, frame.usable, frame.parity
     height, width = counts.shape
     size = 2 * half_px + 1
     x0, y0 = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
-    variance = floats(noise[y0.clip(0, height - 1), x0.clip(0, width - 1)]) ** 2
+    variance = floats(frame.noise[y0.clip(0, height - 1), x0.clip(0, width - 1)]) ** 2
     x0, y0 = x0 - half_px, y0 - half_px
     inside = (x0 >= 0) & (x0 <= width - size) & (y0 >= 0) & (y0 <= height - size)
     stamp, good = np.zeros((len(x0), size, size)), np.ones((len(x0), size, size), dtype=np.bool_)
@@ -127,7 +117,7 @@ def cut_stamps(
         fine = good | (on_image & ((at_x + at_y) % 2 != parity))
     if usable is not None or not inside.all():
         stamp[~fine] = 0.0
-    return Stamps(x0, y0, stamp, good, fine, variance, counts_per_e)
+    return Stamps(x0, y0, stamp, good, fine, variance, frame.counts_per_e)
 
 
 def _profiles(
@@ -508,9 +498,7 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     """`fit` with windowed centroids and their covariance for the stars that stand alone."""
     window = np.maximum(_WINDOW_SIGMA_PX, 1.2 * fit.sigma_px)
     half = int(np.ceil(_WINDOW_SIGMAS * window.max(initial=_WINDOW_SIGMA_PX)))
-    stamps = cut_stamps(
-        frame.counts, None, fit.x_px, fit.y_px, half, frame.noise, frame.counts_per_e, frame.parity
-    )
+    stamps = cut_stamps(replace(frame, usable=None), fit.x_px, fit.y_px, half)
     steps_px = np.maximum(_WINDOW_STEP_PX, _WINDOW_STEP_SIGMAS * np.sqrt(fit.covariance[:, 0, 0]))
     x, y, whole = window_positions(
         stamps, frame.counts.shape, fit.x_px, fit.y_px, window, fit.sigma_px, steps_px

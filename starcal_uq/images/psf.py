@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -100,9 +100,7 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
         widths = np.where(good, widths, sigma)
     # All pixels with the same weight, so that what counts as core and wings does not hang on
     # whether the gain is known.
-    stamps = cut_stamps(
-        frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, 0.0, frame.parity
-    )
+    stamps = cut_stamps(replace(frame, counts_per_e=0.0), x, y, half_stamp_px(sigma))
     width = sigma
     if frame.counts_per_e:
         x, y, _, widths = fit_widths(stamps, x, y, widths, _LEFT_MOVING[0])
@@ -183,16 +181,7 @@ def _clean_stamps(
 ) -> tuple[IntArray, Stamps]:
     """Which detections have all their pixels and no hot pixel, and their stamps."""
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
-    stamps = cut_stamps(
-        frame.counts,
-        frame.usable,
-        x,
-        y,
-        half_stamp_px(sigma),
-        frame.noise,
-        frame.counts_per_e,
-        frame.parity,
-    )
+    stamps = cut_stamps(frame, x, y, half_stamp_px(sigma))
     clean = np.flatnonzero(stamps.fine.all((1, 2)) & ~_single_pixels(stamps))[:most]
     return clean.astype(np.int64), stamps.subset(clean)
 

@@ -5,34 +5,20 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.settings import Mosaic
+from starcal_uq.images.image import MOSAICS, Image
+from starcal_uq.images.pixels import check_declared
 
 _SIZE_TAGS = 256, 257
 
 
-@dataclass(frozen=True)
-class RawFrame:
-    """Counts of a raw file, the pattern of its colours ("" for none), and what else it says, None
-    where it does not.
-    """
-
-    pixels: Any
-    mosaic: str
-    saturation: float | None
-    exposure_s: float | None
-    focal_mm: float | None
-
-
-def read_raw(path: Path, data: bytes) -> RawFrame:
+def read_raw(path: Path, data: bytes) -> Image:
     """A raw file as the detector gave it, black borders left out.
 
     Its clock is the camera's own, of no stated zone, and is not taken for a time.
@@ -56,22 +42,28 @@ def read_raw(path: Path, data: bytes) -> RawFrame:
             "save it as FITS."
         ) from error
     mosaic = "" if pattern is None else colours
-    if pixels.ndim != 2 or (mosaic and (pattern.shape != (2, 2) or mosaic not in get_args(Mosaic))):
+    if pixels.ndim != 2 or (mosaic and (pattern.shape != (2, 2) or mosaic not in MOSAICS)):
         raise ImageError(
             f"{path}: its mosaic of colours is not red, green, green and blue; save a grey image "
             "as FITS."
         )
-    return RawFrame(pixels, mosaic, white, exposure, focal)
+    header = {"EXPTIME": exposure, "FOCALLEN": focal}
+    return Image(
+        pixels,
+        path.name,
+        exposure_s=exposure,
+        saturation=white,
+        header={key: value for key, value in header.items() if value is not None},
+        mosaic=mosaic,
+    )
 
 
-def deep_colours(
-    path: Path, data: bytes, check_declared: Callable[[Path, int, int], None]
-) -> list[Any] | None:
+def deep_colours(path: Path, data: bytes) -> list[Any] | None:
     """Pages (height, width, 3) of 16 bits of a colour PNG or TIFF file, red first; None where it is
     none.
     """
     is_png = data.startswith(b"\x89PNG")
-    if not is_png and not _is_deep_tiff(path, data, check_declared):
+    if not is_png and not _is_deep_tiff(path, data):
         return None
     with extra(
         "raw", f"{path}: colours of 16 bits", "save the image as FITS, or as a grey TIFF or PNG"
@@ -99,9 +91,7 @@ def deep_colours(
     return [page[..., 2::-1] for page in pages]
 
 
-def _is_deep_tiff(
-    path: Path, data: bytes, check_declared: Callable[[Path, int, int], None]
-) -> bool:
+def _is_deep_tiff(path: Path, data: bytes) -> bool:
     """Whether a file is a TIFF of three or four colours of 16 bits that can hold the pixels that it
     declares.
     """

@@ -15,20 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.camera.distortion import Parameter, next_simpler
-from starcal_uq.core.formatting import (
-    count,
-    decimals_for,
-    fixed,
-    join_words,
-    percent,
-    plural,
-    significant,
-)
-from starcal_uq.core.remedy import MORE, PLAN, RUN, Remedies, Remedy, with_model
+from starcal_uq.core.formatting import decimals_for
+from starcal_uq.core.remedy import PLAN, RUN, Remedies, Remedy, with_model
 from starcal_uq.core.status import (
+    MORE,
+    Advice,
     Check,
     Code,
     Level,
+    Order,
     pass_or_fail,
     pass_or_warn,
 )
@@ -262,10 +257,12 @@ def measure(
 
 
 def check_draws(
-    post: Posterior, notes: Sequence[str] = (), derived: tuple[Derived, ...] | None = None
+    post: Posterior,
+    about: AnyDict | None = None,
+    derived: tuple[Derived, ...] | None = None,
 ) -> tuple[Check, ...]:
     """Hold everything that is known of draws against its bound; checks that they have already are
-    not looked at.
+    not looked at. `about` are facts of the likelihood.
     """
     derived = derived_quantities(post) if derived is None else derived
     checks = [_rhat(post), _effective_draws(post), _acceptance(post), _derived(post, derived)]
@@ -274,7 +271,7 @@ def check_draws(
         _degrees_of_freedom(post),
         _independent(post),
         _evaluation(post),
-        _likelihood(post, notes),
+        _likelihood(post, about or {}),
     )
     return (*checks, *(check for check in several if check is not None), _priors(post))
 
@@ -283,14 +280,12 @@ def _rhat(post: Posterior) -> Check:
     """Do separately seeded ensembles agree?"""
     values = post.diagnostics.rhat[list(post.sampled)]
     bad = _names(post, ~(values < RHAT_BOUND))
-    sentence = (
-        f"The ensembles disagree in {join_words(bad)}: raise n_steps before using any interval."
-        if bad
-        else f"The {post.n_ensembles} separately seeded ensembles sampled the same distribution."
-    )
-    return _sampling(
-        post, Code.R_HAT, not bad, fixed(float(np.max(values)), 4), f"< {RHAT_BOUND}", sentence
-    )
+    found = {
+        "rhat": float(np.max(values)),
+        "disagreeing": bad,
+        "n_ensembles": post.n_ensembles,
+    }
+    return _sampling(post, Code.R_HAT, not bad, found, {"rhat_below": RHAT_BOUND})
 
 
 def _effective_draws(post: Posterior) -> Check:
@@ -301,16 +296,10 @@ def _effective_draws(post: Posterior) -> Check:
     )
     fewest = np.minimum(bulk, tail)
     bad = _names(post, ~(fewest > ESS_BOUND))
-    sentence = (
-        f"Too few effective draws of {join_words(bad)} for stable interval ends: raise n_steps."
-        if bad
-        else "Enough effective draws for stable means and interval ends."
-    )
-    value = f"{count(int(np.min(bulk)))} bulk, {count(int(np.min(tail)))} tail"
+    found = {"bulk": float(np.min(bulk)), "tail": float(np.min(tail)), "too_few": bad}
     longer = ESS_BOUND / float(np.min(fewest))
-    return _sampling(
-        post, Code.EFFECTIVE_DRAWS, not bad, value, f"> {ESS_BOUND:g} each", sentence, longer
-    )
+    bounds = {"draws_above": ESS_BOUND}
+    return _sampling(post, Code.EFFECTIVE_DRAWS, not bad, found, bounds, longer)
 
 
 def _acceptance(post: Posterior) -> Check:
@@ -318,35 +307,25 @@ def _acceptance(post: Posterior) -> Check:
     low, high = ACCEPTANCE_RANGE
     rates = post.diagnostics.acceptance
     good = bool(np.all((rates > low) & (rates < high)))
-    sentence = (
-        "The sampler moves freely."
-        if good
-        else (
-            "The sampler hardly moves, or moves in tiny steps: the posterior is far from its "
-            "Gaussian approximation."
-        )
+    return Check(
+        Code.ACCEPTANCE,
+        {"least": float(np.min(rates)), "most": float(np.max(rates))},
+        pass_or_fail(good),
+        {"above": low, "below": high},
+        () if good else resample(post, moves="stretch", n_steps=10 * post.n_steps),
     )
-    value = f"{fixed(float(np.min(rates)), 2)} to {fixed(float(np.max(rates)), 2)}"
-    remedies = () if good else resample(post, moves="stretch", n_steps=10 * post.n_steps)
-    level = pass_or_fail(good)
-    return Check(Code.ACCEPTANCE, level, value, f"{low:g} to {high:g}", sentence, remedies)
 
 
 def _derived(post: Posterior, derived: Sequence[Derived]) -> Check:
     """Did what follows from the parameters converge, too?"""
     derived = sorted(derived, key=lambda d: -d.rhat)
     rhat, ess = max(d.rhat for d in derived), min(min(d.ess_bulk, d.ess_tail) for d in derived)
-    late = [
+    late = tuple(
         d.name
         for d in derived
         if not (d.rhat < RHAT_BOUND and min(d.ess_bulk, d.ess_tail) > ESS_BOUND)
-    ]
-    sentence = (
-        f"{late[0].capitalize()} has not converged: raise n_steps."
-        if late
-        else "Focal length, displacement at the corner and common rotation have converged too."
     )
-    return _converged(post, Code.DERIVED_QUANTITIES, rhat, ess, sentence)
+    return _converged(post, Code.DERIVED_QUANTITIES, rhat, ess, {"late": late})
 
 
 def _digits(post: Posterior) -> Check:
@@ -362,17 +341,13 @@ def _digits(post: Posterior) -> Check:
         if share > largest:
             worst, largest = names[i], share
     good = largest <= 1.0
-    sentence = (
-        "Monte Carlo error does not reach the last printed digit of any mean."
-        if good
-        else (
-            f"Monte Carlo error reaches the last printed digit of {worst}: raise n_steps before "
-            "quoting it."
-        )
+    return Check(
+        Code.DIGITS,
+        {"last_digits": largest, "parameter": worst},
+        pass_or_warn(good),
+        {"last_digits_most": 1.0},
+        () if good else _longer(post, largest**2),
     )
-    value = f"{fixed(largest, 2)} units of the last digit ({worst})"
-    remedies = () if good else _longer(post, largest**2)
-    return Check(Code.DIGITS, pass_or_warn(good), value, "≤ 1", sentence, remedies)
 
 
 def _degrees_of_freedom(post: Posterior) -> Check | None:
@@ -382,15 +357,10 @@ def _degrees_of_freedom(post: Posterior) -> Check | None:
     if post.dof_draws is None:
         return None
     values = post.dof_draws.reshape(post.n_ensembles, -1)
-    low, middle, high = np.quantile(values, (0.025, 0.5, 0.975))
-    sentence = f"dof has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
-    return _converged(
-        post,
-        Code.DEGREES_OF_FREEDOM,
-        arviz_compat.rhat(values),
-        arviz_compat.ess_bulk(values),
-        sentence,
-    )
+    quantiles = map(float, np.quantile(values, (0.025, 0.5, 0.975)))
+    found = dict(zip(("low", "median", "high"), quantiles, strict=True))
+    rhat, ess = arviz_compat.rhat(values), arviz_compat.ess_bulk(values)
+    return _converged(post, Code.DEGREES_OF_FREEDOM, rhat, ess, found)
 
 
 def _bounds(post: Posterior) -> Check:
@@ -410,27 +380,12 @@ def _bounds(post: Posterior) -> Check:
         [(post.mean[:2] + 0.5) / sd[:2], (edges - post.mean[:2]) / sd[:2], post.mean[2:3] / sd[2:3]]
     )
     good = outside <= _BOUNDS_SHARE and folded == 0.0
-    remedies, advice = () if good else PLAN, ""
-    if good:
-        sentence = (
-            "No draw has its principal point off the detector, f below zero or a distortion that "
-            "folds."
-        )
-    elif folded > 0.0:
-        sentence = (
-            "The distortion of some draws folds over within the field: the data do not determine "
-            "it."
-        )
-        remedies = _simpler(post)
-    else:
-        sentence = (
-            f"{percent(outside)} of the draws have their principal point off the detector or f "
-            "below zero."
-        )
-        advice = MORE
-    value = f"nearest bound {significant(float(np.min(room)))} sigma away"
-    bound = f"≤ {percent(_BOUNDS_SHARE, 1)} of draws outside"
-    return Check(Code.BOUNDS, pass_or_fail(good), value, bound, sentence, remedies, advice)
+    remedies, orders = () if good else PLAN, () if good else MORE
+    if folded > 0.0:
+        remedies, orders = _simpler(post), ()
+    found = {"outside": outside, "folded": folded, "nearest_sigma": float(np.min(room))}
+    bounds = {"outside_most": _BOUNDS_SHARE}
+    return Check(Code.BOUNDS, found, pass_or_fail(good), bounds, remedies, orders)
 
 
 def _independent(post: Posterior) -> Check:
@@ -441,36 +396,23 @@ def _independent(post: Posterior) -> Check:
     fewest = float(np.min(d.ess_bulk[list(post.sampled)]))
     tolerance = AGREEMENT_BOUND + AGREEMENT_ERRORS * math.sqrt(1.0 / fewest + 1.0 / d.psis_ess)
     light, agree = d.psis_khat < KHAT_BOUND, max(d.agreement_mean, d.agreement_sd) <= tolerance
-    if not light:
-        sentence = (
-            "The posterior is far from Gaussian, so the independent check by importance sampling "
-            "says nothing."
-        )
-    elif agree:
-        sentence = (
-            "Importance sampling, which uses no Markov chain, gives the same means and sigmas."
-        )
-    else:
-        sentence = (
-            "Importance sampling gives other means or sigmas: at least one of the two is wrong."
-        )
-    if not post.laplace.converged:
-        sentence += (
-            " Newton's method did not settle on the mode; importance sampling starts from its "
-            "last step."
-        )
-    value = (
-        f"means {fixed(d.agreement_mean, 3)} sigma, sigmas {percent(d.agreement_sd)}, k-hat "
-        f"{fixed(d.psis_khat, 2)}"
-    )
-    bound = f"{fixed(tolerance, 3)} sigma, {percent(tolerance)}, {KHAT_BOUND:g}"
     remedies: Remedies = ()
     if not light:
         remedies = _simpler(post)
     elif not agree:
         remedies = _longer(post)
-    level = pass_or_fail(light and agree)
-    return Check(Code.INDEPENDENT_POSTERIOR, level, value, bound, sentence, remedies)
+    return Check(
+        Code.INDEPENDENT_POSTERIOR,
+        {
+            "means_sigma": d.agreement_mean,
+            "sigmas": d.agreement_sd,
+            "khat": d.psis_khat,
+            "mode_found": post.laplace.converged,
+        },
+        pass_or_fail(light and agree),
+        {"means_sigma_most": tolerance, "sigmas_most": tolerance, "khat_below": KHAT_BOUND},
+        remedies,
+    )
 
 
 def _evaluation(post: Posterior) -> Check | None:
@@ -483,65 +425,37 @@ def _evaluation(post: Posterior) -> Check | None:
     )
     if not compressed and not compared:
         return None
-    level, advice = Level.PASS, ""
+    level = Level.PASS
+    orders: tuple[Order, ...] = ()
     remedies: Remedies = ()
-    value = (
-        f"{significant(compression.max_difference)} nat, k-hat {fixed(compression.khat, 2)}"
-        if compared
-        else ""
-    )
-    if not compressed:
-        sentence = (
-            f"The exact likelihood was sampled, because the fast one departs from it by {value}."
-        )
-        value = "exact"
-    elif not compared:
-        level, value = Level.WARN, "not checked"
-        sentence = (
-            "The compressed likelihood was not compared with the exact one: the observations "
-            "were not at hand."
-        )
-        remedies = (Remedy("sample", (RUN,), form="call"),)
-        advice = "Sample where the observations are at hand."
-    elif compression.good:
-        sentence = "The fast likelihood equals the exact one wherever the posterior is."
-        n_frames, of_frames = d.compressed_frames
-        if n_frames:
-            sentence = (
-                "The fast likelihood equals the exact one wherever the posterior is, as "
-                f"{count(n_frames)} of "
-                f"{plural(of_frames, 'frame')} tell with {_SAMPLE_ERRORS:g} standard errors "
-                "counted in."
-            )
-    else:
+    if not compared:
+        level, remedies = Level.WARN, (Remedy("sample", (RUN,), form="call"),)
+        orders = (Order(Advice.SAMPLE_WITH_OBSERVATIONS),)
+    elif compressed and not compression.good:
         level, remedies = Level.FAIL, resample(post, evaluation="exact")
-        sentence = "The fast likelihood departs from the exact one: sample the exact one."
-    bound = f"≤ {COMPRESSED_BOUND:g} nat, ≤ {KHAT_BOUND:g}"
-    return Check(Code.LIKELIHOOD, level, value, bound, sentence, remedies, advice)
+    n_frames, of_frames = d.compressed_frames
+    found = {
+        "used": "compressed" if compressed else "exact",
+        "difference_nat": compression.max_difference if compared else None,
+        "khat": compression.khat if compared else None,
+        "n_frames": n_frames,
+        "of_frames": of_frames,
+        "standard_errors": _SAMPLE_ERRORS,
+    }
+    bounds = {"difference_most_nat": COMPRESSED_BOUND, "khat_most": KHAT_BOUND}
+    return Check(Code.LIKELIHOOD, found, level, bounds, remedies, orders)
 
 
-def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
+def _likelihood(post: Posterior, about: AnyDict) -> Check | None:
     """Was a likelihood sampled whose intervals are known to be wrong?"""
     kind = post.diagnostics.likelihood
     if kind == "marginal":
         return None
     good = kind != "pairs_naive"
-    sentence = (
-        f"The posterior is that of the likelihood {kind!r}."
-        if good
-        else "Pairs of stars were taken as independent, which they are not."
-    )
-    sentence = " ".join([sentence, *notes])
     remedies = () if good else resample(post, likelihood="pairs")
-    level = pass_or_fail(good)
-    return Check(
-        Code.KIND_OF_LIKELIHOOD,
-        level,
-        kind,
-        "not 'pairs_naive'",
-        sentence,
-        remedies,
-    )
+    found = {"likelihood": kind, **about}
+    bounds = {"refused": "pairs_naive"}
+    return Check(Code.KIND_OF_LIKELIHOOD, found, pass_or_fail(good), bounds, remedies)
 
 
 def _priors(post: Posterior) -> Check:
@@ -553,31 +467,20 @@ def _priors(post: Posterior) -> Check:
     limited, pulled = _names(post, share > _PRIOR_SHARE), _names(post, pull > _PRIOR_PULL)
     largest = int(np.argmax(share))
     remedies: Remedies = ()
-    advice = ""
+    orders: tuple[Order, ...] = ()
     if limited:
-        sentence = f"The prior, not the data, decides {join_words(limited)}."
-        remedies, advice = PLAN, MORE
+        remedies, orders = PLAN, MORE
     elif pulled:
-        furthest = fixed(float(np.max(pull)), 1)
-        sentence = (
-            f"The data put {join_words(pulled)} {furthest} prior standard deviations away from "
-            "the prior's mean."
-        )
-        advice = "Correct the nominal camera, or state a wider prior in a TOML file (--priors)."
-    else:
-        sentence = "The data decide every parameter; the priors hardly matter."
-    value = f"sigma {percent(float(share[largest]))} of the prior's ({names[largest]})"
-    level = pass_or_warn(not limited and not pulled)
-    bound = f"≤ {percent(_PRIOR_SHARE)}"
-    return Check(
-        Code.INFLUENCE_OF_THE_PRIORS,
-        level,
-        value,
-        bound,
-        sentence,
-        remedies,
-        advice,
-    )
+        orders = (Order(Advice.ANOTHER_PRIOR),)
+    found = {
+        "share": float(share[largest]),
+        "parameter": names[largest],
+        "limited": limited,
+        "pulled": pulled,
+        "furthest_sd": float(np.max(pull)),
+    }
+    level, bounds = pass_or_warn(not limited and not pulled), {"share_most": _PRIOR_SHARE}
+    return Check(Code.INFLUENCE_OF_THE_PRIORS, found, level, bounds, remedies, orders)
 
 
 def _simpler(post: Posterior) -> Remedies:
@@ -588,31 +491,25 @@ def _simpler(post: Posterior) -> Remedies:
     return with_model(name) + PLAN if name else PLAN
 
 
-def _names(post: Posterior, which: BoolArray) -> list[str]:
-    return [post.parameter_names[i] for i, flag in zip(post.sampled, which, strict=True) if flag]
+def _names(post: Posterior, which: BoolArray) -> tuple[str, ...]:
+    return tuple(
+        post.parameter_names[i] for i, flag in zip(post.sampled, which, strict=True) if flag
+    )
 
 
-def _converged(post: Posterior, code: Code, rhat: float, ess: float, sentence: str) -> Check:
-    value, bound = (
-        f"R-hat {fixed(rhat, 4)}, {count(int(ess))} draws",
-        f"< {RHAT_BOUND}, > {ESS_BOUND:g}",
+def _converged(post: Posterior, code: Code, rhat: float, ess: float, found: AnyDict) -> Check:
+    good, bounds = (
+        rhat < RHAT_BOUND and ess > ESS_BOUND,
+        {"rhat_below": RHAT_BOUND, "draws_above": ESS_BOUND},
     )
-    return _sampling(
-        post, code, rhat < RHAT_BOUND and ess > ESS_BOUND, value, bound, sentence, ESS_BOUND / ess
-    )
+    found = {"rhat": rhat, "draws": ess, **found}
+    return _sampling(post, code, good, found, bounds, ESS_BOUND / ess)
 
 
 def _sampling(
-    post: Posterior,
-    code: Code,
-    good: bool,
-    value: str,
-    bound: str,
-    sentence: str,
-    longer: float = 1.0,
+    post: Posterior, code: Code, good: bool, found: AnyDict, bounds: AnyDict, longer: float = 1.0
 ) -> Check:
-    remedies = () if good else _longer(post, longer)
-    return Check(code, pass_or_fail(good), value, bound, sentence, remedies)
+    return Check(code, found, pass_or_fail(good), bounds, () if good else _longer(post, longer))
 
 
 def _longer(post: Posterior, factor: float = 1.0) -> Remedies:

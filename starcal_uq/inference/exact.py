@@ -18,6 +18,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.compressed import compress
+from starcal_uq.likelihood.effects import EffectLikelihood, effects_of
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarLikelihood
 from starcal_uq.observations.frames import StarFrames
@@ -32,7 +33,8 @@ SAMPLED_FRAMES, BATCHES = 1000, 10
 
 
 class ExactMarginal:
-    """The exact Gaussian likelihood around a calibration, point by point.
+    """The exact Gaussian likelihood around a calibration, point by point, effects at their best
+    scales.
 
     Attitudes are those that follow from the ones at the estimate to first order, so that a pass
     over the stars is enough for a point.
@@ -48,6 +50,12 @@ class ExactMarginal:
                 obs, model, theta, start, cal.star_errors, cal.sigma
             )
             self._one.use_rotations(self._one.rotations_at(theta))
+            return
+        if cal.effects and cal.effects.names and not isinstance(obs, StarFrames):
+            effects = cal.effects.of(effects_of(obs, cal.camera))
+            frames = StarFrames.from_observations(obs, axes=True)
+            at = (theta, quaternion_to_rotation(cal.quaternions), cal.sigma)
+            self._one = EffectLikelihood(frames, model, effects, cal.effects.ratio(cal.sigma), *at)
             return
         self._one = MarginalLikelihood(obs, model, axes=True)
         if rotations is None and len(cal.quaternions) == self._one.frames.n_frames:
@@ -74,8 +82,8 @@ class FrameSample:
             some.n_frames,
             obs.n_frames if of_frames is None else of_frames,
         )
-        self._whole = cal.compressed
-        covariance = self._whole.whitening @ self._whole.whitening.T
+        self._summed, whole = cal.log_likelihood, cal.compressed
+        covariance = whole.whitening @ whole.whitening.T
         rotations = (
             quaternion_to_rotation(cal.quaternions)[places]
             if len(cal.quaternions) == obs.n_frames
@@ -83,14 +91,14 @@ class FrameSample:
         )
         frames = StarFrames.from_observations(some, axes=True)
         frame = np.repeat(np.arange(some.n_frames), frames.sizes)
-        plain = replace(cal, star_errors=None)
+        plain = replace(cal, star_errors=None, effects=None)
         self._batches = []
         for first in range(min(BATCHES, some.n_frames)):
             batch = frames.select(frame % BATCHES == first)
             start = None if rotations is None else rotations[first::BATCHES]
             exact = ExactMarginal(batch, plain, start)
             likelihood = MarginalLikelihood(batch, cal.camera.distortion)
-            expanded = compress(likelihood, self._whole.theta_hat, covariance, start)
+            expanded = compress(likelihood, whole.theta_hat, covariance, start)
             self._batches.append((exact, expanded, self.of_frames / batch.n_frames))
         self._at: Callable[[FloatArray], FloatArray] = np.asarray
 
@@ -116,4 +124,4 @@ class FrameSample:
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """The compressed log likelihood of all frames, and what it leaves out (n,)."""
         left_out: FloatArray = self.left_out(theta, sigma).mean(axis=0)
-        return self._whole.log_likelihood(self._at(theta), sigma) + left_out
+        return self._summed(self._at(theta), sigma) + left_out

@@ -12,17 +12,18 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import SamplingError, check_known
+from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import calibrated
 from starcal_uq.core.settings import Evaluation, LikelihoodName
-from starcal_uq.core.status import Check, Code, Level
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.status import Check, Code, Level, Note
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
 from starcal_uq.likelihood.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
@@ -57,7 +58,7 @@ class Source:
     # At a cost independent of the number of stars; None where a polynomial has to be fitted first.
     fast: LogLikelihood | None
     extra: Extra | None = None  # A further parameter
-    notes: tuple[str, ...] = ()  # Sentences on the likelihood, for the check of its kind
+    about: AnyDict = field(default_factory=dict)  # Facts for the check of its kind
     checks: tuple[Check, ...] = ()  # Checks that need no draws
     # What `fast` leaves out, told by some of the frames; None where `exact` itself is compared.
     sample: FrameSample | None = None
@@ -128,19 +129,11 @@ def find_source(
         source = replace(wider, inflation=accepted)
     if (ignored := cal.provenance.settings.get("ignored_distortion")) is None:
         return source
-    sentence = (
-        f"The method {cal.method!r} ignores the distortion (model {ignored!r} was given): this "
-        "posterior is that of a "
-        "camera without any, and neither its centre nor its width holds otherwise; use "
-        "method='efficient'."
-    )
     check = Check(
         Code.METHOD_OF_THE_CALIBRATION,
+        {"method": cal.method, "ignored": ignored},
         Level.FAIL,
-        cal.method,
-        "one that fits the distortion",
-        sentence,
-        calibrated(),
+        remedies=calibrated(),
     )
     return replace(source, checks=(check,))
 
@@ -177,10 +170,15 @@ def _named_source(
         raise SamplingError(
             "a stream leaves only the quadratic likelihood around the estimate, and samaan's is "
             "far from its maximum: "
-            "give obs, or calibrate with method='griffith' and parameters='all'."
+            "give the observations, or calibrate by griffith with all parameters."
         )
     if likelihood == "marginal":
         return _marginal(obs, cal)
+    if cal.effects and cal.effects.names:
+        raise SamplingError(
+            f"the calibration holds effects, which the likelihood {likelihood!r} does not know: "
+            "sample with likelihood='marginal', or calibrate with effects='none'."
+        )
     if cal.star_errors is not None:
         raise SamplingError(
             f"the calibration holds errors of the stars, which the likelihood {likelihood!r} "
@@ -237,12 +235,26 @@ def _marginal(obs: Observations | None, cal: Calibration) -> Source:
             sample = FrameSample(obs, cal, cal.n_frames)
             exact = sample.log_likelihood
         else:
-            exact = ExactMarginal(obs, cal).log_likelihood
+            exact = _scales_integrated(cal, ExactMarginal(obs, cal).log_likelihood)
             # Stars that bring errors along make frames depend on each other.
             if obs.n_frames > _MANY * SAMPLED_FRAMES and cal.star_errors is None:
                 sample = FrameSample(obs, cal)
     at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
-    return Source("marginal", *at, exact=exact, fast=cal.compressed.log_likelihood, sample=sample)
+    return Source("marginal", *at, exact=exact, fast=cal.log_likelihood, sample=sample)
+
+
+def _scales_integrated(cal: Calibration, exact: LogLikelihood) -> LogLikelihood:
+    """An exact likelihood at the best scales of effects with what integrating over the scales
+    changes.
+    """
+    if not (cal.effects and cal.effects.names):
+        return exact
+
+    def integrated(theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        best = cal.compressed.log_likelihood(theta, sigma)
+        return np.asarray(exact(theta, sigma) + cal.log_likelihood(theta, sigma) - best)
+
+    return integrated
 
 
 def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
@@ -256,32 +268,13 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
         residual_dof=cal.dof,
         adjusted=adjusted,
     )
-    variability = (
-        "the noise of every star"
-        if expanded.variability == "expected"
-        else "the scatter between frames"
-    )
-    notes: tuple[str, ...] = (
-        "It is the composite one over pairs of stars, with Godambe's curvature; its variability "
-        "comes from "
-        f"{variability}.",
-        (
-            "sigma is estimated from the pixel residuals at the best attitudes; pairs have no "
-            "say in "
-            "it."
-        ),
-    )
+    about: AnyDict = {"variability": expanded.variability}
     sigma, dof = expanded.sigma, float(expanded.dof)
     if not adjusted:
         sigma, dof = expanded.tau / expanded.pair_noise, float(expanded.n_pairs)
-        failure = (
-            f"The {expanded.n_pairs} pairs of stars are treated as independent (pairs_naive): "
-            "the intervals are about "
-            f"{expanded.narrowness:.1f} times too narrow and must not be used; use "
-            "likelihood='pairs' or 'marginal'."
-        )
-        warnings.warn(failure, NaivePairsWarning, stacklevel=5)
-        notes = (failure,)
+        about = {"n_pairs": expanded.n_pairs, "narrowness": float(expanded.narrowness)}
+        warning = Finding(Note.PAIRS_AS_INDEPENDENT, about).sentence
+        warnings.warn(warning, NaivePairsWarning, stacklevel=5)
     return Source(
         name="pairs" if adjusted else "pairs_naive",
         theta=expanded.theta_hat,
@@ -290,7 +283,7 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
         dof=dof,
         exact=expanded.exact_log_likelihood,
         fast=expanded.log_likelihood,
-        notes=notes,
+        about=about,
         scatters=adjusted and expanded.variability == "empirical",
     )
 
@@ -347,14 +340,4 @@ def _student(obs: Observations, cal: Calibration, dof: float | str | None) -> So
         exact=_AdjustedStudent(fit, nu).log_likelihood,
         fast=None,
         extra=extra,
-        notes=(
-            (
-                "It is a bivariate Student t per star, with the curvature that the scatter of the "
-                "stars' scores shows."
-            ),
-            (
-                "sigma is the scale of the Student t, which is below the standard deviation of its "
-                "residuals."
-            ),
-        ),
     )

@@ -6,7 +6,7 @@ Opening a saved posterior needs neither the sampler nor the symbolic model nor a
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -23,9 +23,10 @@ from starcal_uq.core.provenance import Provenance, Traced, in_order
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy, read_remedies
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.status import CODES, Check, Level, worst
+from starcal_uq.core.status import CODES, Check, Level, Words, worst
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Shapes
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
+from starcal_uq.likelihood.fitted_effects import Effects
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -248,6 +249,9 @@ class Posterior(Shown, Traced):
     star_error_px : float
         Direction error of a star per axis, px, where the calibration holds such errors; a frame's
         attitude has it, too.
+    effects : Effects or None
+        Effects of the calibration, as they are jointly known with the draws of the parameters; None
+        where it holds none.
     """
 
     parameter_names: tuple[str, ...]
@@ -267,6 +271,7 @@ class Posterior(Shown, Traced):
     provenance: Provenance
     dof_draws: FloatArray | None = None
     star_error_px: float = 0.0
+    effects: Effects | None = None
 
     SHAPES: ClassVar[Shapes] = {
         **{
@@ -470,20 +475,24 @@ class Posterior(Shown, Traced):
         for kept, check in zip(
             record["diagnostics"]["checks"], self.diagnostics.checks, strict=True
         ):
-            # What readers of earlier versions look for.
-            words = (check.name, check.question, check.remedy)
-            kept |= dict(zip(("name", "question", "remedy"), to_plain(words), strict=True))
+            # For readers.
+            kept |= {name: to_plain(getattr(check, name)) for name in _IN_WORDS}
         # The draws themselves are in px units, one column a parameter; those of ArviZ's group are
         # scaled.
         own = {
             "units": ", ".join(p.unit for p in self.parameters),
             "columns": ", ".join(self.parameter_names),
         }
-        attrs = {"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})}
+        kept_record = {name: record[name] for name in _RECORD}
+        kept_record |= {} if self.effects is None else {"effects": record["effects"]}
+        attrs = {"format": _FORMAT, "record": json.dumps(kept_record)}
 
         # xarray would do it, but loads Dask for a lock, which takes longer than sampling.
         def fill(file: Any) -> None:
-            held: Variables = {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}
+            # An empty dimension is an unlimited one.
+            held: Variables = {
+                name: (_ARRAYS[name], value, {}) for name, value in arrays.items() if value.size
+            }
             held["draws"][2].update(own)
             write_group(file, held, attrs)
             for group, (variables, coords, about) in self._groups().items():
@@ -521,10 +530,22 @@ class Posterior(Shown, Traced):
                     if name in file.variables
                 }
             for check in record["diagnostics"]["checks"]:
-                # Files of earlier versions have titles and commands alone.
+                # Files of earlier versions have titles and commands alone, or words alone.
                 if "code" not in check:
                     check["code"] = CODES[check["name"]].name
                     check["remedies"] = to_plain(read_remedies(check["remedy"]))
+                if "values" not in check:
+                    check["told"] = {
+                        field.name: check[field.name]
+                        for field in fields(Words)
+                        if field.name in check
+                    }
+                for facts in (check.get("values", {}), check.get("bounds", {})):
+                    facts |= {
+                        name: tuple(value)
+                        for name, value in facts.items()
+                        if isinstance(value, list)
+                    }
             made = from_plain(cls, record, arrays)
             if made.n_ensembles * made.n_walkers * made.n_steps != len(made.draws):
                 raise ValueError("it holds another number of draws than it says")
@@ -552,6 +573,8 @@ def write_group(group: Any, variables: Variables, attrs: AnyDict) -> None:
 
 
 _FORMAT = "starcal_uq posterior 2"
+# What a file tells of each check beside its facts.
+_IN_WORDS = ("name", "question", "value", "bound", "sentence", "advice", "remedy")
 _WORTH_PACKING = 10_000
 
 _ARRAYS = {
@@ -562,6 +585,9 @@ _ARRAYS = {
     "attitude_noise": ("axis", "axis_2"),
     # Present only where the likelihood has such a parameter.
     "dof_draws": ("sample",),
+    "effects_coefficients": ("coefficient",),
+    "effects_covariance": ("coefficient", "coefficient_2"),
+    "effects_cross": ("camera_parameter", "coefficient"),
 }
 
 _RECORD = (

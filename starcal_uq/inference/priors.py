@@ -179,10 +179,14 @@ class Priors(Shown, ABC):
             positive = np.where(values > 0.0, values, 1.0)
             density = np.exp(self.log_density_log_sigma(np.log(positive))) / positive
             return np.where(values > 0.0, density, 0.0)
-        mean, sd = float(self.mean([name])[0]), float(self.sd([name])[0])
+        mean, sd = self._moments_of(name)
         return np.asarray(
             np.exp(-0.5 * ((values - mean) / sd) ** 2) / (sd * math.sqrt(2.0 * math.pi))
         )
+
+    def _moments_of(self, name: str) -> tuple[float, float]:
+        """Mean and standard deviation of one parameter."""
+        return float(self.mean([name])[0]), float(self.sd([name])[0])
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw (n, p+1) parameters from the prior, the noise in the last column."""
@@ -457,6 +461,6 @@ class GaussianPriors(Priors):
         return {"kind": KIND, **values, **arrays, "source": dict(self.source)}
 
     def _statement(self, name: str) -> str:
-        mean, sd = float(self.mean([name])[0]), float(self.sd([name])[0])
+        mean, sd = self._moments_of(name)
         origin = f", from {self.source['name']}" if "name" in self.source else ""
         return f"normal, {mean:.8g} with sd {sd:.3g}, correlated with the others{origin}"

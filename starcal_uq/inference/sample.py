@@ -6,14 +6,15 @@ import hashlib
 import json
 import os
 import secrets
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from starcal_uq.camera.distortion import parameters, sigma_parameter
-from starcal_uq.core.errors import SamplingError, check_known
+from starcal_uq.core.errors import SamplingError, check_known, require
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import Provenance, data_hashes, provenance
 from starcal_uq.core.records import to_plain
@@ -45,6 +46,9 @@ from starcal_uq.inference.target import (
     start_target,
 )
 from starcal_uq.inference.update import check_chain
+from starcal_uq.likelihood.compressed import optimum
+from starcal_uq.likelihood.fitted_effects import Effects
+from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
@@ -181,7 +185,8 @@ def sample(
     if source.inflation is not None:
         factors = dict(zip(cal.parameter_names, source.inflation.tolist(), strict=True))
         record = record.adding(inflation=factors)
-    run = _Run(cal, source, priors, settings, n_ensembles, seed, sigma, progress, record)
+    given = None if sigma == "sampled" else float(sigma)
+    run = _Run(cal, source, priors, settings, n_ensembles, seed, given, progress, record)
     if isinstance(likelihood, str):
         outcome, compression = _with_fallback(run, evaluation, checkpoint)
     else:
@@ -192,37 +197,33 @@ def sample(
     return _assemble(run, outcome, compression)
 
 
+@dataclass(eq=False)
 class _Run:
     """What stays the same when another likelihood takes over."""
 
-    def __init__(
-        self,
-        cal: Calibration,
-        source: Source,
-        priors: Priors,
-        settings: EnsembleSettings,
-        n_ensembles: int,
-        seed: int,
-        sigma: Literal["sampled"] | float,
-        progress: Progress | None,
-        provenance: Provenance,
-    ) -> None:
-        self.cal, self.source, self.priors, self.settings, self.progress = (
-            cal,
-            source,
-            priors,
-            settings,
-            progress,
-        )
-        self.n_ensembles, self.provenance = n_ensembles, provenance
-        self.given = None if sigma == "sampled" else float(sigma)
-        # The ensembles come last, so that their number changes neither the checks nor the ensembles
-        # before.
-        self.importance_seed, self.check_seed, *self.seeds = np.random.SeedSequence(seed).spawn(
-            2 + n_ensembles
-        )
-        (self.design_seed,) = self.check_seed.spawn(1)
-        self._mode: Target | None = None
+    cal: Calibration
+    source: Source
+    priors: Priors
+    settings: EnsembleSettings
+    n_ensembles: int
+    seed: int
+    given: float | None
+    progress: Progress | None
+    provenance: Provenance
+    mode: Target | None = None
+
+    @cached_property
+    def streams(self) -> list[np.random.SeedSequence]:
+        """Of the importance weights, of the checks, and of each ensemble.
+
+        The ensembles come last, so that their number changes neither the checks nor the ensembles
+        before.
+        """
+        return np.random.SeedSequence(self.seed).spawn(2 + self.n_ensembles)
+
+    @cached_property
+    def design_seed(self) -> np.random.SeedSequence:
+        return self.streams[1].spawn(1)[0]
 
     def start(self, log_likelihood: LogLikelihood) -> Target:
         source = self.source
@@ -241,10 +242,10 @@ class _Run:
         )
 
     def polynomial(self, exact: LogLikelihood, degree: int) -> LogLikelihood | None:
-        if self._mode is None:
-            self._mode, _ = laplace_approximation(self.start(exact))
+        if self.mode is None:
+            self.mode, _ = laplace_approximation(self.start(exact))
         try:
-            fitted = fit_polynomial(self._mode, degree, np.random.default_rng(self.design_seed))
+            fitted = fit_polynomial(self.mode, degree, np.random.default_rng(self.design_seed))
         except SamplingError:
             if self.source.fast is None:
                 raise
@@ -263,7 +264,7 @@ class _Run:
         chains = run_ensembles(
             target.log_density,
             target.dim,
-            self.seeds,
+            self.streams[2:],
             self.settings,
             progress=self.progress,
             checkpoint=checkpoint,
@@ -272,27 +273,21 @@ class _Run:
         return _Outcome(name, target, laplace, chains, checkpoint)
 
 
+@dataclass(eq=False)
 class _Outcome:
     """Chains of one likelihood."""
 
-    def __init__(
-        self,
-        name: str,
-        target: Target,
-        laplace: Laplace,
-        chains: Chains,
-        checkpoint: PathLike | None,
-    ) -> None:
-        self.name, self.target, self.laplace, self.chains, self.checkpoint = (
-            name,
-            target,
-            laplace,
-            chains,
-            checkpoint,
-        )
-        ordered = chain_order(chains.u)
-        natural = target.natural(ordered.reshape(-1, target.dim))
-        self.draws = natural.reshape(*ordered.shape[:2], natural.shape[1])
+    name: str
+    target: Target
+    laplace: Laplace
+    chains: Chains
+    checkpoint: PathLike | None
+
+    @cached_property
+    def draws(self) -> FloatArray:
+        ordered = chain_order(self.chains.u)
+        natural = self.target.natural(ordered.reshape(-1, self.target.dim))
+        return natural.reshape(*ordered.shape[:2], natural.shape[1])
 
 
 def _with_fallback(
@@ -354,7 +349,7 @@ def _attempt(checkpoint: PathLike | None, files: list[str]) -> str | None:
 def _compare(
     run: _Run, outcome: _Outcome, compressed: LogLikelihood, exact: LogLikelihood
 ) -> CompressionCheck:
-    rng = np.random.default_rng(run.check_seed)
+    rng = np.random.default_rng(run.streams[1])
     flat = outcome.draws.reshape(-1, outcome.draws.shape[-1])
     picks = flat[rng.choice(len(flat), min(_N_CHECKED, len(flat)), replace=False)]
     return check_compression(
@@ -365,9 +360,7 @@ def _compare(
 def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Posterior:
     cal, settings, target, source = run.cal, run.settings, outcome.target, run.source
     n = _N_IMPORTANCE.get(outcome.name, _N_IMPORTANCE_SLOW)
-    importance = importance_check(
-        target, n, PROPOSAL_DF, np.random.default_rng(run.importance_seed)
-    )
+    importance = importance_check(target, n, PROPOSAL_DF, np.random.default_rng(run.streams[0]))
     shown = (*parameters(cal.camera.distortion), sigma_parameter(cal.sigma_name == SIGMA_NAMES[1]))
     draws, chains, laplace, extra = outcome.draws, outcome.chains, outcome.laplace, None
     if target.extra is not None:
@@ -400,13 +393,43 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
         camera=cal.camera,
         provenance=run.provenance,
         dof_draws=None if extra is None else extra.reshape(-1),
-        star_error_px=0.0 if cal.star_errors is None else cal.star_errors.total_px,
+        star_error_px=_star_error_px(cal),
+        effects=_effects(cal, draws.reshape(-1, len(shown))[:, :-1]),
     )
     derived = derived_quantities(posterior)
-    checks = (*source.checks, *check_draws(posterior, source.notes, derived))
+    checks = (*source.checks, *check_draws(posterior, source.about, derived))
     if outcome.checkpoint is not None:
         Path(outcome.checkpoint).unlink(missing_ok=True)
     return replace(posterior, diagnostics=replace(diagnostics, checks=checks, derived=derived))
+
+
+def _star_error_px(cal: Calibration) -> float:
+    """Direction error of a star per axis, px; zero where the calibration holds none."""
+    if cal.star_errors is not None:
+        return cal.star_errors.total_px
+    return 0.0 if cal.effects is None else cal.effects.scale("star")
+
+
+def _effects(cal: Calibration, theta: FloatArray) -> Effects | None:
+    """The effects of a calibration beside draws (n, p) of the parameters, which their coefficients
+    follow as far as the data tie these together.
+    """
+    effects = cal.effects
+    if effects is None or not effects.names:
+        return None
+    # The draws hold the scales already.
+    effects = replace(effects, node_grams=np.zeros((0, 0, 0)), node_log_weights=np.zeros(0))
+    if not len(effects.coefficients):
+        return effects
+    best = optimum(cal.compressed).covariance
+    follow = scaled_inverse(best) @ effects.cross
+    covariance = np.cov(theta, rowvar=False)
+    return replace(
+        effects,
+        coefficients=effects.coefficients + (theta.mean(axis=0) - cal.theta) @ follow,
+        covariance=effects.covariance + follow.T @ (covariance - best) @ follow,
+        cross=covariance @ follow,
+    )
 
 
 def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, FloatArray]:
@@ -462,7 +485,8 @@ def _settings(
         raise SamplingError(f"sigma is {sigma!r}: use 'sampled' or a number above zero.")
     n_burn = _BURN[moves] if n_burn is None else n_burn
     dim = len(cal.theta) + 1
-    for good, text in (
+    require(
+        SamplingError,
         (
             n_ensembles >= 2,
             (
@@ -478,10 +502,7 @@ def _settings(
             n_steps >= 8 and n_steps % 2 == 0,
             f"n_steps is {n_steps}: give an even number of at least 8.",
         ),
-        (n_burn >= 0, f"n_burn is {n_burn}: give zero or more steps."),
-    ):
-        if not good:
-            raise SamplingError(text)
+    )
     check_memory(
         f"n_ensembles={n_ensembles}, n_walkers={n_walkers}, n_steps={n_steps}",
         8.0 * dim * n_ensembles * n_walkers * (n_steps + n_burn),

@@ -1,4 +1,4 @@
-"""The likelihood that a refinement maximises, composed of parts: noise, tails and star errors.
+"""The likelihood that a refinement maximises, composed of parts: noise, tails, star errors, effects.
 
 Every combination of parts makes sense. The noise of a star scales its residuals, whatever their
 distribution; tails give every star a weight on top of that scale; errors that stars bring along are
@@ -7,10 +7,12 @@ linear in the pixels and have a prior, whatever weighs the pixels.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.settings import NoiseKind
+from starcal_uq.core.settings import EffectName, NoiseKind
 from starcal_uq.likelihood.student import DEFAULT_DOF, DOF_RANGE
 
 
@@ -40,6 +42,39 @@ class StarDirections:
 
 
 @dataclass(frozen=True)
+class EffectTerms:
+    """Effects beyond the camera, whose scales are estimated.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The effects; those that the data ask for, of all, where it is empty.
+    """
+
+    names: tuple[str, ...] = ()
+
+    @classmethod
+    def parsed(cls, effects: str | Sequence[str] | None) -> EffectTerms | None:
+        """Effects as they are typed: ``none``, ``auto``, or names with commas or as a sequence.
+
+        CalibrationError for a name that is unknown.
+        """
+        names = effects.split(",") if isinstance(effects, str) else list(effects or ())
+        names = [name.strip() for name in names]
+        if names in ([], ["none"]):
+            return None
+        if names == ["auto"]:
+            return cls()
+        for name in names:
+            if name not in get_args(EffectName):
+                raise CalibrationError(
+                    f"effect {name!r} is unknown: use auto or none alone, or some of "
+                    f"{', '.join(get_args(EffectName))}."
+                )
+        return cls(tuple(dict.fromkeys(names)))
+
+
+@dataclass(frozen=True)
 class Likelihood:
     """What the refinement maximises, the attitudes marginalised.
 
@@ -50,13 +85,13 @@ class Likelihood:
         a function of radius, magnitude, frame and axis.
     tails : StudentTails or None
         Tails of the residuals; None for Gaussian ones.
-    terms : tuple of StarDirections
+    terms : tuple of StarDirections or EffectTerms
         Terms that are linear in the pixels and have a prior, marginalised.
     """
 
     noise: NoiseKind = "common"
     tails: StudentTails | None = None
-    terms: tuple[StarDirections, ...] = ()
+    terms: tuple[StarDirections | EffectTerms, ...] = ()
 
     @property
     def name(self) -> str:
@@ -67,3 +102,8 @@ class Likelihood:
     def star_errors(self) -> bool:
         """Whether stars bring along errors of their directions."""
         return any(isinstance(term, StarDirections) for term in self.terms)
+
+    @property
+    def effects(self) -> EffectTerms | None:
+        """Effects beyond the camera; None where there are none."""
+        return next((term for term in self.terms if isinstance(term, EffectTerms)), None)

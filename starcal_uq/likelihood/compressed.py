@@ -17,32 +17,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.camera.projection import bent_index, forward_kernel, forward_root
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
-from starcal_uq.likelihood.paths import loops_for
-from starcal_uq.likelihood.sums import (
-    ATTITUDE_STEPS,
-    ATTITUDE_TOLERANCE_RAD,
-    Attitudes,
-    NormalSums,
-    settled_sums,
-)
+from starcal_uq.likelihood import arrays
+from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood, Profile
+from starcal_uq.likelihood.paths import sums_for
+from starcal_uq.likelihood.sums import Attitudes, NormalSums, settled_sums
 from starcal_uq.likelihood.terms import Term, TermSums
-from starcal_uq.maths.linear import (
-    COLUMNS,
-    ROWS,
-    inverse_symmetric,
-    scaled_cholesky,
-    symmetric_inverse,
-)
+from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 
-# Stars whose columns stay in the second-level cache.
-_BLOCK_STARS = 2048
 _pairs = cache(np.triu_indices)
 
 
@@ -157,180 +142,28 @@ class GramSums:
         )
 
 
-class _Expansion:
-    """The residuals of frames expanded around one point, block by block.
-
-    Second derivatives Q over (theta, phi) are contracted with the directions (L z, phi(z)), in
-    which the attitudes phi(z) = K z follow the parameters; most entries of Q that belong to theta
-    alone vanish and are not formed.
-    """
-
-    def __init__(self, model_name: str, theta: FloatArray, whitening: FloatArray) -> None:
-        self.model_name, self.theta, self.whitening = model_name, theta, whitening
-        p = self.p = len(theta)
-        self.q = (p + 1) * (p + 2) // 2
-        self._kernel = forward_kernel(model_name, "bent")
-        rows, columns = bent_index(model_name)
-        own, mixed, turned = columns < p, (rows < p) & (columns >= p), rows >= p
-        self._own, self._mixed = np.flatnonzero(own), np.flatnonzero(mixed)
-        self._turned = {
-            (int(rows[n]) - p, int(columns[n]) - p): int(n) for n in np.flatnonzero(turned)
-        }
-        i, j = np.triu_indices(p)
-        # A diagonal entry of z z^T stands once in the expansion, halved; the others stand for both
-        # orders.
-        self._halved = np.where(i == j, 0.5, 1.0)
-        r, c = rows[own], columns[own]
-        both = whitening[r][:, i] * whitening[c][:, j] + np.where(r == c, 0.0, 1.0)[:, None] * (
-            whitening[c][:, i] * whitening[r][:, j]
-        )
-        self._to_square = (both * self._halved).T
-        # From the entries (theta_t, phi_c) to (z_a, phi_c), rows a, c.
-        self._to_mixed = np.zeros((p, 3, len(self._mixed)))
-        for n, entry in enumerate(self._mixed):
-            self._to_mixed[:, columns[entry] - p, n] = whitening[rows[entry]]
-
-    def block(self, part: StarFrames, rotations: FloatArray) -> _Block:
-        """Columns and sums of frames that fit into the cache."""
-        p, n = self.p, part.n_stars
-        xy, h, a = np.empty((2, n)), np.empty((p, 2, n)), np.empty((3, 2, n))
-        bent = np.empty((self._kernel.shapes[3][0], 2, n))
-        for _ in range(ATTITUDE_STEPS):
-            b = part.rotated(rotations)
-            outputs = (xy, h.reshape(-1, n), a.reshape(-1, n), bent.reshape(-1, n))
-            self._kernel.into(
-                (self.theta, b, forward_root(self.model_name, self.theta, b)), outputs
-            )
-            e = part.pixel - xy
-            for array in (e, h, a, bent):
-                part.whiten(array)
-            d = (self.whitening.T @ h.reshape(p, -1)).reshape(p, 2, n)
-            packed = np.stack(
-                [np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)]
-            )
-            inverse, determinant = inverse_symmetric(part.sum(packed))
-            slopes = np.stack([part.sum(np.sum(column * d, axis=1)) for column in a])
-            slope = part.sum(np.sum(a * e, axis=1))
-            shift = np.einsum("ijk,jk->ik", inverse, slope)
-            if not np.max(np.abs(shift)) >= ATTITUDE_TOLERANCE_RAD:
-                break
-            rotations = exp_rotation(shift.T) @ rotations
-        path = part.spread(-np.einsum("ijk,jak->iak", inverse, slopes))
-        columns = np.empty((self.q, 2, n))
-        columns[0] = e - np.sum(part.spread(shift)[:, None] * a, axis=0)
-        first, second = columns[1 : p + 1], columns[p + 1 :]
-        np.copyto(first, d)
-        for c in range(3):
-            first += path[c][:, None] * a[c]
-        np.negative(first, out=first)
-        bend = self._curves(bent, path, second)
-        pseudo = np.einsum("ijn,jxn->ixn", part.spread(inverse), a)
-        log_slope = 2.0 * (bend.reshape(p, -1) @ pseudo.ravel())
-        return _Block(columns, a, inverse, float(np.sum(np.log(determinant))), log_slope, rotations)
-
-    def _curves(self, bent: FloatArray, path: FloatArray, second: FloatArray) -> FloatArray:
-        """Second derivatives along z into `second`; the derivatives (p, 3, 2, n) of the attitude
-        columns come back.
-        """
-        p, n = self.p, bent.shape[2]
-        flat = bent.reshape(len(bent), -1)
-        bend = (self._to_mixed.reshape(3 * p, -1) @ flat[self._mixed]).reshape(p, 3, 2, n)
-        turned = np.zeros((p, 3, 2, n))
-        for (c, d), entry in self._turned.items():
-            turned[:, c] += path[d][:, None] * bent[entry]
-            if c != d:
-                turned[:, d] += path[c][:, None] * bent[entry]
-        half = bend + 0.5 * turned
-        np.matmul(self._to_square, flat[self._own], out=second.reshape(len(second), -1))
-        start = 0
-        for i in range(p):
-            rows = second[start : start + p - i]
-            for c in range(3):
-                rows[0] += half[i, c] * path[c, i]
-                rows[1:] += half[i, c] * path[c, i + 1 :, None]
-                rows[1:] += half[i + 1 :, c] * path[c, i]
-            start += p - i
-        np.negative(second, out=second)
-        bend += turned
-        return bend
-
-
-@dataclass(frozen=True)
-class _Block:
-    """One block of an expansion.
-
-    `columns` (q, 2, n) are derivatives of the residuals along the attitudes' first-order path:
-    value and first derivatives are free of what attitudes can reproduce, second derivatives are
-    not.
-    """
-
-    columns: FloatArray
-    attitude: FloatArray
-    inverse: FloatArray
-    log_determinant: float
-    log_determinant_slope: FloatArray
-    rotations: FloatArray
-
-    def gram(self, part: StarFrames, p: int) -> FloatArray:
-        """Products (q, q) of the columns with the attitudes projected out."""
-        flat = self.columns.reshape(len(self.columns), -1)
-        gram = flat @ flat.T
-        second = self.columns[p + 1 :]
-        slopes = np.stack([part.sum(np.sum(column * second, axis=1)) for column in self.attitude])
-        solved = np.einsum("ijk,jqk->iqk", self.inverse, slopes)
-        gram[p + 1 :, p + 1 :] -= np.tensordot(slopes, solved, axes=([0, 2], [0, 2]))
-        return np.asarray(gram)
-
-
 def gram_sums(
     frames: StarFrames,
     model_name: str,
     theta: FloatArray,
     whitening: FloatArray,
-    rotations: FloatArray,
-    known: tuple[NormalSums, Attitudes] | None = None,
+    known: tuple[NormalSums, Attitudes],
+    look: Callable[[slice, FloatArray], None] | None = None,
 ) -> GramSums:
-    """What a part of the frames adds to the compressed likelihood around theta (p,), in one pass.
+    """What a part of the frames adds to the compressed likelihood around theta (p,).
 
     `theta` (p,): point of expansion, px units; the same for all parts. `whitening` (p, p): L in
-    ``theta = theta_hat + L z``, lower triangular; the same for all parts. `rotations` (K, 3, 3):
-    attitudes to start from.
-    `known`: sums at theta with settled attitudes, where there are any; the compiled path need not
-    make them again.
+    ``theta = theta_hat + L z``, lower triangular; the same for all parts. `known`: sums at theta
+    with settled attitudes, as `starcal_uq.likelihood.sums.settled_sums` gives them. `look` is shown
+    what `starcal_uq.likelihood.arrays.gram` shows.
     """
-    theta = np.asarray(theta, dtype=np.float64)
-    loops = loops_for(frames)
-    if loops is not None:
-        sums, at = settled_sums(frames, model_name, theta, rotations) if known is None else known
-        # A nanoradian that is left would move the estimate by some 1e-8 sigma.
-        moved = (np.zeros_like(at.shift), at.response, at.inverse)
-        gram, slope = loops.gram_loop(frames, model_name, theta, whitening, at.at(theta), moved)
-        return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)
-    return _expanded(
-        frames, model_name, theta, whitening, rotations, lambda part, block, stars: None
-    )
-
-
-def _expanded(
-    frames: StarFrames,
-    model_name: str,
-    theta: FloatArray,
-    whitening: FloatArray,
-    rotations: FloatArray,
-    look: Callable[[StarFrames, _Block, slice], None],
-) -> GramSums:
-    """As `gram_sums`, with NumPy; `look` is shown every block, and where its stars stand."""
-    expansion, p = _Expansion(model_name, theta, whitening), len(theta)
-    gram, slope, log_determinant = np.zeros((expansion.q, expansion.q)), np.zeros(p), 0.0
+    theta, (sums, at) = np.asarray(theta, dtype=np.float64), known
+    # A nanoradian that is left would move the estimate by some 1e-8 sigma.
+    moved = (np.zeros_like(at.shift), at.response, at.inverse)
+    given = (frames, model_name, theta, whitening, at.at(theta), moved)
     with np.errstate(all="ignore"):
-        for first, last in frames.parts(_BLOCK_STARS):
-            part = frames.part(first, last)
-            block = expansion.block(part, rotations[first:last])
-            gram += block.gram(part, p)
-            slope += block.log_determinant_slope
-            log_determinant += block.log_determinant
-            look(part, block, slice(int(frames.starts[first]), int(frames.starts[last])))
-    return GramSums(gram, log_determinant, slope, frames.n_stars, frames.n_frames)
+        gram, slope = sums_for(frames).gram(*given) if look is None else arrays.gram(*given, look)
+    return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)
 
 
 def compress(
@@ -352,31 +185,39 @@ def compress(
     """
     whitening, theta = scaled_cholesky(covariance), np.asarray(theta_hat, dtype=np.float64)
     frames, model_name = likelihood.frames, likelihood.model_name
-    known = likelihood.last_sums
-    if known is not None and not (
-        np.array_equal(known[1].theta, theta) and known[0].turn < TURN_RAD
-    ):
-        known = None
     if rotations is None:
-        # Of use to the NumPy path alone, where sums are known.
-        compiled = likelihood.kernels == "numba"
-        rotations = known[1].rotations if compiled and known is not None else likelihood.rotations
-    if rotations is None:
-        rotations = likelihood.start_rotations(theta)
-    if term is not None:
-        of_term = TermSums(term)
+        known = likelihood.sums(theta, tolerance=TURN_RAD)
+    else:
+        known = settled_sums(frames, model_name, theta, rotations)
+    if term is None:
+        return gram_sums(frames, model_name, theta, whitening, known).likelihood(theta, whitening)
+    of_term = TermSums(term)
+    sums = expanded(likelihood, theta, whitening, known, of_term.add)
+    taken = of_term.eliminated(term.ratio(sigma)).correction()
+    return dataclasses.replace(sums, gram=sums.gram - taken).likelihood(theta, whitening)
 
-        def add(part: StarFrames, block: _Block, rows: slice) -> None:
-            own = MarginalLikelihood(part, model_name)
-            state, _ = own.profile(theta, block.rotations)
-            of_term.add(own, state, own.project_out(state, block.columns), rows)
 
-        sums = _expanded(frames, model_name, theta, whitening, rotations, add)
-        taken = of_term.eliminated(term.ratio(sigma)).correction()
-        return dataclasses.replace(sums, gram=sums.gram - taken).likelihood(theta, whitening)
-    return gram_sums(frames, model_name, theta, whitening, rotations, known).likelihood(
-        theta, whitening
-    )
+def expanded(
+    likelihood: MarginalLikelihood,
+    theta: FloatArray,
+    whitening: FloatArray,
+    known: tuple[NormalSums, Attitudes],
+    add: Callable[[MarginalLikelihood, Profile, FloatArray, slice], object],
+) -> GramSums:
+    """As `gram_sums`, with what else is summed over the columns of the expansion: `add` takes some
+    frames, the model there, the columns (q, 2, n) without their attitudes, and the rows of the
+    stars.
+    """
+    frames, model_name = likelihood.frames, likelihood.model_name
+    best = known[1].at(theta)
+
+    def look(which: slice, columns: FloatArray) -> None:
+        own = MarginalLikelihood(frames.part(which.start, which.stop), model_name)
+        state, _ = own.profile(theta, best[which])
+        rows = slice(int(frames.starts[which.start]), int(frames.starts[which.stop]))
+        add(own, state, own.project_out(state, columns), rows)
+
+    return gram_sums(frames, model_name, theta, whitening, known, look)
 
 
 _STEPS = 50

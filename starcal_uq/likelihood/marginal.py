@@ -20,16 +20,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.attitude.wahba import quest
-from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
+from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import FloatArray
+from starcal_uq.likelihood.arrays import BLOCK_STARS, attitudes
 from starcal_uq.likelihood.elimination import ByFrame
 from starcal_uq.likelihood.paths import path_of
 from starcal_uq.likelihood.solvers import Normal
 from starcal_uq.likelihood.sums import (
     ATTITUDE_STEPS,
     ATTITUDE_TOLERANCE_RAD,
-    BLOCK_STARS,
     Attitudes,
     NormalSums,
     settled_sums,
@@ -89,12 +88,7 @@ class MarginalLikelihood:
 
     def start_rotations(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) by QUEST at theta."""
-        b = unproject_theta(self.model_name, theta, self.frames.pixel.T)
-        weights = self._quest_weights()
-        found = quest(
-            b, self.frames.r.T, self.frames.starts, weights, covariance=False, on_degenerate="flag"
-        )
-        return found.rotations
+        return attitudes(self.frames, self.model_name, theta, self._quest_weights())
 
     def _quest_weights(self) -> FloatArray | None:
         return None if self.frames.weight is None else self.frames.weight**2

@@ -10,72 +10,20 @@ nothing cancels:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cached_property
-
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.camera.projection import backward_kernel, backward_root, unproject_theta
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.likelihood.paths import loops_for
+from starcal_uq.likelihood import arrays
+from starcal_uq.likelihood.paths import sums_for
 from starcal_uq.likelihood.solvers import Normal, is_singular
-from starcal_uq.maths.linear import COLUMNS, ROWS, unit_inverse
+from starcal_uq.maths.linear import unit_inverse
 from starcal_uq.observations.frames import StarFrames
 
-# Stars per block: small enough that its arrays stay in cache, large enough to hide the interpreter.
-_BLOCK_STARS = 4096
 # The objective does not depend on how the catalogue is turned; a turn that is right to within this
 # many pixels keeps E small enough for eleven digits of the cost.
 _TURN_AGAIN_PX = 30.0
-
-
-# Where the entries of a symmetric matrix stand among its six unique ones.
-_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-
-
-def _gram(frames: StarFrames, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Per-frame 3 x 3 matrices ``A^T B`` of two stacks of vectors (3, N): (3, 3, K)."""
-    return frames.sum(a[:, None, :] * b[None, :, :])
-
-
-def _apply(stars: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Every star's vectors (..., 3, N) times its frame's matrix (3, 3, N): the rows of ``A M``."""
-    x, y, z = (stars[..., i, None, :] for i in range(3))
-    product: FloatArray = x * matrix[0]
-    product += y * matrix[1]
-    product += z * matrix[2]
-    return product
-
-
-def _dot(stars: FloatArray, vector: FloatArray) -> FloatArray:
-    """Products of vectors (..., 3, N) with one (3, N)."""
-    product: FloatArray = stars[..., 0, :] * vector[0]
-    product += stars[..., 1, :] * vector[1]
-    product += stars[..., 2, :] * vector[2]
-    return product
-
-
-def _block_terms(
-    frames: StarFrames, catalogue: FloatArray, b: FloatArray
-) -> tuple[float, FloatArray]:
-    """Cost and D B (3, N) of one block; `catalogue` are the directions (3, N), turned nearly into
-    the camera frame.
-    """
-    e = b - catalogue
-    ee, rr, re = (
-        _gram(frames, e, e),
-        _gram(frames, catalogue, catalogue),
-        _gram(frames, catalogue, e),
-    )
-    er = re.transpose(1, 0, 2)
-    cost = float(np.sum(ee * rr + re * er + 2.0 * ee * re + 0.5 * ee * ee))
-    # D B = R' (E^T B) + E (R'^T B) + E (E^T B), with B = R' + E.
-    return cost, _apply(catalogue, frames.spread(er + ee)) + _apply(
-        e, frames.spread(rr + re + er + ee)
-    )
 
 
 class PairObjective:
@@ -90,12 +38,8 @@ class PairObjective:
         self.model_name = model_name
         self.n_parameters = 3 + len(get_model(model_name).coefficients)
         self._turned_at: FloatArray | None = None
-        self._turned, self._rotations = np.empty((3, 0)), np.empty((0, 3, 3))
+        self._rotations = np.empty((0, 3, 3))
         self._last: tuple[FloatArray, Normal, FloatArray] | None = None
-
-    @cached_property
-    def _blocks(self) -> list[tuple[int, int]]:
-        return self.frames.parts(_BLOCK_STARS)
 
     @property
     def n_pairs(self) -> int:
@@ -121,9 +65,7 @@ class PairObjective:
 
     def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
         """Measured unit vectors (3, N) and their derivatives (p, 3, N)."""
-        root = backward_root(self.model_name, theta, frames.pixel)
-        b, db = backward_kernel(self.model_name, True)(frames.n_stars, theta, frames.pixel, root)
-        return b, db
+        return arrays.directions(frames, self.model_name, theta)
 
     def _turn(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) that turn the catalogue nearly into the camera frame; new ones if
@@ -134,16 +76,9 @@ class PairObjective:
             and np.max(np.abs(theta[:3] - self._turned_at)) <= _TURN_AGAIN_PX
         ):
             return self._rotations
-        frames = self.frames
-        loops = loops_for(frames)
-        found = loops and loops.attitude_loop(frames, self.model_name, theta)
-        if found is None:
-            b = unproject_theta(self.model_name, theta, frames.pixel.T)
-            by_quest = quest(b, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
-            found = by_quest.rotations, bool(by_quest.ok.all())
-            self._turned = frames.rotated(by_quest.rotations)
+        self._rotations = sums_for(self.frames).attitudes(self.frames, self.model_name, theta)
         # Where the model is not finite there is no reference to keep.
-        self._rotations, self._turned_at = found[0], theta[:3].copy() if found[1] else None
+        self._turned_at = theta[:3].copy() if np.isfinite(self._rotations).all() else None
         return self._rotations
 
     def cost(self, theta: FloatArray) -> float:
@@ -172,46 +107,15 @@ class PairObjective:
             near = tolerance > 0.0 and float(step @ normal.matrix @ step) <= tolerance * normal.cost
             if near or np.array_equal(theta, at):
                 return self._last[1:]
-        self._last = (theta, *self._sum_over_blocks(theta))
+        self._last = (theta, *self._sums(theta))
         return self._last[1:]
 
-    def _sum_over_blocks(self, theta: FloatArray) -> tuple[Normal, FloatArray]:
-        p = self.n_parameters
-        cost, matrix, scores = 0.0, np.zeros((p, p)), []
+    def _sums(self, theta: FloatArray) -> tuple[Normal, FloatArray]:
         with np.errstate(all="ignore"):
-            rotations = self._turn(theta)
-            loops = loops_for(self.frames)
-            whole = loops and loops.pair_loop(self.frames, self.model_name, theta, rotations)
-            for part in self._parts(theta) if whole is None else [whole]:
-                cost += part[0]
-                matrix += part[1]
-                scores.append(part[2])
-            frame_scores = np.concatenate(scores, axis=1)
-        return Normal(cost, np.sum(frame_scores, axis=1), 0.5 * (matrix + matrix.T)), frame_scores
-
-    def _parts(self, theta: FloatArray) -> Iterator[tuple[float, FloatArray, FloatArray]]:
-        starts = self.frames.starts
-        for first, last in self._blocks:
-            turned = self._turned[:, int(starts[first]) : int(starts[last])]
-            yield self._block_sums(self.frames.part(first, last), theta, turned)
-
-    def _block_sums(
-        self, frames: StarFrames, theta: FloatArray, turned: FloatArray
-    ) -> tuple[float, FloatArray, FloatArray]:
-        """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of one block."""
-        p = self.n_parameters
-        b, db = self.directions(theta, frames)
-        cost, d_b = _block_terms(frames, turned, b)
-        scores = frames.sum(_dot(db, d_b))
-        bb = frames.sum(np.stack([b[i] * b[j] for i, j in zip(ROWS, COLUMNS, strict=True)]))
-        weighted = _apply(db, frames.spread(bb)[_SYMMETRIC])
-        matrix = weighted.reshape(p, -1) @ db.reshape(p, -1).T
-        cross = np.empty((3, p, 3, frames.n_frames))
-        for i in range(3):
-            cross[i] = frames.sum((b[i] * db).reshape(3 * p, -1)).reshape(p, 3, -1)
-        cross = cross.transpose(1, 0, 2, 3)
-        matrix += cross.reshape(p, -1) @ cross.transpose(0, 2, 1, 3).reshape(p, -1).T
-        return cost, matrix, scores
+            cost, matrix, scores = sums_for(self.frames).pairs(
+                self.frames, self.model_name, theta, self._turn(theta)
+            )
+        return Normal(cost, np.sum(scores, axis=1), 0.5 * (matrix + matrix.T)), scores
 
     def godambe(self, theta: FloatArray, tolerance: float = 0.0) -> FloatArray:
         """Sandwich covariance ``H^-1 V H^-1`` of the estimator that minimises the objective, (p,

@@ -14,10 +14,12 @@ import importlib
 import importlib.util
 import os
 from collections.abc import Iterator
-from typing import Any
+from typing import Protocol
 
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.extras import extra
+from starcal_uq.core.types import FloatArray
+from starcal_uq.likelihood import arrays
 from starcal_uq.observations.frames import StarFrames
 
 SWITCH = "STARCAL_UQ_KERNELS"
@@ -75,11 +77,59 @@ def path_of(frames: StarFrames) -> str:
     return "numpy" if frames.axes is not None else chosen(frames.n_stars)
 
 
-def loops_for(frames: StarFrames) -> Any:
-    """The module `starcal_uq.likelihood.loops` where it makes the sums over these frames, or None."""
-    return load() if path_of(frames) == "numba" else None
+class Sums(Protocol):
+    """Sums over the stars of some frames: what `starcal_uq.likelihood.arrays` and
+    `starcal_uq.likelihood.loops` both are.
+    """
+
+    def normals(
+        self,
+        frames: StarFrames,
+        model_name: str,
+        theta: FloatArray,
+        rotations: FloatArray,
+        residuals: FloatArray | None,
+        /,
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Gram matrix (p + 1, p + 1) of e and H with the attitudes eliminated, and what
+        `starcal_uq.likelihood.sums.Attitudes` holds of every frame: shift, response, inverse and
+        log determinant. Residuals are filled if given.
+        """
+
+    def gram(
+        self,
+        frames: StarFrames,
+        model_name: str,
+        theta: FloatArray,
+        whitening: FloatArray,
+        rotations: FloatArray,
+        moved: tuple[FloatArray, FloatArray, FloatArray],
+        /,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Gram matrix (q, q) of `starcal_uq.likelihood.compressed.GramSums`, and the slope (p,) of
+        the log determinant.
+
+        `moved` are shift, response and inverse of the frames at `rotations`.
+        """
+
+    def pairs(
+        self, frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, /
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of frames over interstar angles.
+
+        `rotations` (K, 3, 3) turn the catalogue nearly into the camera frame.
+        """
+
+    def attitudes(self, frames: StarFrames, model_name: str, theta: FloatArray, /) -> FloatArray:
+        """Attitudes (K, 3, 3) by QUEST at theta, without weights; NaN where stars determine
+        none.
+        """
 
 
-def load() -> Any:
-    """The module `starcal_uq.likelihood.loops`, which imports Numba."""
-    return importlib.import_module("starcal_uq.likelihood.loops")
+def sums_for(frames: StarFrames) -> Sums:
+    """What makes the sums over these frames."""
+    if path_of(frames) == "numpy":
+        return arrays
+    # Numba is imported where it is needed.
+    loops: Sums = importlib.import_module("starcal_uq.likelihood.loops")
+    return loops

@@ -26,24 +26,22 @@ one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood import paths
+from starcal_uq.likelihood.arrays import blocks, unpacked
+from starcal_uq.likelihood.paths import sums_for
 from starcal_uq.likelihood.solvers import Normal
 from starcal_uq.maths.linear import inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
 
-# Stars whose arrays stay in the second-level cache, and are enough to hide the interpreter.
-BLOCK_STARS = 3072
 T = TypeVar("T")
 ATTITUDE_STEPS = 12
 ATTITUDE_TOLERANCE_RAD = 1e-9
@@ -99,67 +97,11 @@ class Attitudes:
     response: FloatArray  # (3, p, K): derivative of the best ones with respect to theta
     inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
     log_determinant: FloatArray  # (K,): log |A^T A|
-    compiled: bool = False  # Whether loops made them, or NumPy
 
     def at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta (p,), to first order."""
         step = self.shift + np.einsum("ipk,p->ik", self.response, theta - self.theta)
-        if self.compiled:
-            turned: FloatArray = paths.load().turned_loop(step, self.rotations)
-            return turned
         return np.asarray(exp_rotation(step.T) @ self.rotations)
-
-
-class _Buffers:
-    """Arrays of one block, used again for the next one."""
-
-    def __init__(self, p: int, n: int) -> None:
-        self._columns = np.empty((4 + p) * 2 * n)
-        self._products = np.empty((4 + p) * (5 + p) // 2 * n)
-        self._one, self._two = np.empty((4 + p) * n), np.empty((4 + p) * n)
-        self.p = p
-
-    def columns(self, n: int) -> FloatArray:
-        """A, e and H: (3 + 1 + p, 2, n)."""
-        return self._columns[: (4 + self.p) * 2 * n].reshape(4 + self.p, 2, n)
-
-    def products(self, columns: FloatArray, depth: int) -> FloatArray:
-        """Products of the first rows (those of A) with themselves and the ones that follow, over
-        both axes: (.., n).
-        """
-        rows, _, n = columns.shape
-        total = depth * rows - depth * (depth - 1) // 2
-        out = self._products[: total * n].reshape(total, n)
-        first = 0
-        for i in range(depth):
-            count = rows - i
-            one, two = (buffer[: count * n].reshape(count, n) for buffer in (self._one, self._two))
-            np.multiply(columns[i:, 0], columns[i, 0], out=one)
-            np.multiply(columns[i:, 1], columns[i, 1], out=two)
-            np.add(one, two, out=out[first : first + count])
-            first += count
-        return out
-
-
-def _unpacked(sums: FloatArray, rows: int) -> tuple[FloatArray, FloatArray]:
-    """From the sums of `_Buffers.products`: packed A^T A (6, K), and A^T [e, H] (3, p + 1, K)."""
-    starts = (0, rows, 2 * rows - 1)
-    packed = np.concatenate([sums[first : first + 3 - i] for i, first in enumerate(starts)])
-    rest = np.stack([sums[first + 3 - i : first + rows - i] for i, first in enumerate(starts)])
-    return packed, rest
-
-
-def _common_turn(columns: FloatArray) -> FloatArray:
-    """C (3, p): the turn of all frames of a block together that follows theta best."""
-    flat = columns.reshape(len(columns), -1)
-    a, h = flat[:3], flat[4:]
-    none = np.zeros((3, len(h)))
-    try:
-        with np.errstate(all="ignore"):
-            turn = np.linalg.solve(a @ a.T, a @ h.T)
-    except np.linalg.LinAlgError:
-        return none
-    return np.asarray(turn) if np.isfinite(turn).all() else none
 
 
 def frame_sums(
@@ -176,10 +118,8 @@ def frame_sums(
     over parts, not finite where the model is not, and what stays with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    loops = paths.loops_for(frames)
-    path = _frame_blocks if loops is None else loops.frame_loop
     with np.errstate(all="ignore"):
-        gram, shift, response, inverse, volume = path(
+        gram, shift, response, inverse, volume = sums_for(frames).normals(
             frames, model_name, theta, rotations, residuals
         )
         sums = NormalSums(
@@ -191,77 +131,7 @@ def frame_sums(
             n_stars=frames.n_stars,
             n_frames=frames.n_frames,
         )
-    return sums, Attitudes(theta, rotations, shift, response, inverse, volume, loops is not None)
-
-
-def _frame_blocks(
-    frames: StarFrames,
-    model_name: str,
-    theta: FloatArray,
-    rotations: FloatArray,
-    residuals: FloatArray | None,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """As `starcal_uq.likelihood.loops.frame_loop`, with NumPy."""
-    p, k = len(theta), frames.n_frames
-    gram, turn = np.zeros((p + 1, p + 1)), np.zeros((3, p))
-    packed, mixed = np.empty((6, k)), np.empty((3, p + 1, k))
-    for block in _columns(frames, model_name, theta, rotations, residuals):
-        flat, turn = block.columns.reshape(p + 4, -1), block.turn
-        gram += flat[3:] @ flat[3:].T
-        packed[:, block.place], mixed[:, :, block.place] = _unpacked(block.products(3), p + 4)
-    inverse, determinant = inverse_symmetric(packed)
-    solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
-    gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
-    return gram, solved[:, 0], -solved[:, 1:] - turn[:, :, None], inverse, np.log(determinant)
-
-
-class _Block(NamedTuple):
-    """A (3, 2, n), e (2, n) and H' (p, 2, n) of some frames, in a buffer that the next block uses
-    again.
-    """
-
-    place: slice
-    part: StarFrames
-    columns: FloatArray
-    turn: FloatArray
-    buffers: _Buffers
-
-    def products(self, depth: int) -> FloatArray:
-        """Sums over the stars of each frame of `_Buffers.products`."""
-        return self.part.sum(self.buffers.products(self.columns, depth))
-
-
-def _columns(
-    frames: StarFrames,
-    model_name: str,
-    theta: FloatArray,
-    rotations: FloatArray,
-    residuals: FloatArray | None = None,
-) -> Iterator[_Block]:
-    """All frames in blocks, whitened; the common turn C is that of the first."""
-    p, starts = len(theta), frames.starts
-    blocks = frames.parts(BLOCK_STARS)
-    largest = max((int(starts[last] - starts[first]) for first, last in blocks), default=0)
-    buffers, kernel, turn = (
-        _Buffers(p, largest),
-        forward_kernel(model_name, "first"),
-        np.zeros((3, p)),
-    )
-    for first, last in blocks:
-        part = frames.part(first, last)
-        columns = buffers.columns(part.n_stars)
-        b = part.rotated(rotations[first:last])
-        flat = columns.reshape(2 * (p + 4), -1)
-        kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
-        np.subtract(part.pixel, columns[3], out=columns[3])
-        part.whiten(columns)
-        if residuals is not None:
-            residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
-        if first == 0:
-            turn = _common_turn(columns)
-        flat = columns.reshape(p + 4, -1)
-        flat[4:] -= turn.T @ flat[:3]
-        yield _Block(slice(first, last), part, columns, turn, buffers)
+    return sums, Attitudes(theta, rotations, shift, response, inverse, volume)
 
 
 def frame_normals(
@@ -288,9 +158,9 @@ def _frame_normals(
     rows = p + 4
     sums = np.empty((rows * (rows + 1) // 2, k))
     with np.errstate(all="ignore"):
-        for block in _columns(frames, model_name, theta, rotations):
+        for block in blocks(frames, model_name, theta, rotations):
             sums[:, block.place], turn = block.products(rows), block.turn
-        packed, mixed = _unpacked(sums[: 3 * (rows - 1)], rows)
+        packed, mixed = unpacked(sums[: 3 * (rows - 1)], rows)
         inverse, determinant = inverse_symmetric(packed)
         solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
         gram = np.empty((k, p + 1, p + 1))

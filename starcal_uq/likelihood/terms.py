@@ -71,6 +71,8 @@ class Term:
 
 def add_by_group(total: FloatArray, values: FloatArray, groups: IntArray) -> None:
     """Add values (..., n) of images to the sums (G, ...) of their groups."""
+    if not values.size:
+        return
     if len(total) <= 4 * len(groups):
         present, member = np.arange(len(total)), groups
     else:
@@ -97,16 +99,28 @@ class TermSums:
         return np.zeros((rows, 0)) if self._cross is None else self._cross.reshape(rows, -1)
 
     def add(
-        self, part: MarginalLikelihood, state: Profile, projected: FloatArray, rows: slice
+        self,
+        part: MarginalLikelihood,
+        state: Profile,
+        projected: FloatArray,
+        rows: slice,
+        of_frames: FloatArray | None = None,
     ) -> None:
-        """Add frames, with columns (q, 2, n) whose attitudes are projected out."""
+        """Add frames, with columns (q, 2, n) whose attitudes are projected out.
+
+        `of_frames` (c, 2, n): such columns that every frame has coefficients of, beside its
+        attitude.
+        """
         groups, z = self.term.groups[rows], self.term.columns(part, state, rows)
         if self._cross is None:
             self._cross = np.zeros((self.n_groups, self.size, len(projected)))
         add_by_group(self.own, np.einsum("ixn,jxn->ijn", z, z), groups)
         add_by_group(self._cross, np.einsum("ixn,qxn->iqn", z, projected), groups)
         # P in the coordinates of the groups is the square of this.
-        block = np.einsum("ixn,bxn->nib", z, part.attitudes(state).orthonormal, optimize=True)
+        own = part.attitudes(state).orthonormal
+        if of_frames is not None:
+            own = np.concatenate([own, of_frames])
+        block = np.einsum("ixn,bxn->nib", z, own, optimize=True)
         frame = self._frames + np.repeat(np.arange(part.frames.n_frames), part.frames.sizes)
         self._blocks.append((block, groups, frame))
         self._frames += part.frames.n_frames
@@ -134,20 +148,31 @@ class TermSums:
     @cached_property
     def coupling(self) -> Any:
         """``Z^T A (A^T A)^(-1/2)`` (G c, 3 K), sparse."""
+        return self._by_frame(lambda block, frames: block[:, :, :3])
+
+    def coupling_of(self, turn: FloatArray) -> Any:
+        """Products (G c, d K) with the columns of frames turned by (K, c, d), sparse."""
+        return self._by_frame(lambda block, frames: block[:, :, 3:] @ turn[frames])
+
+    def _by_frame(self, columns: Callable[[FloatArray, IntArray], FloatArray]) -> Any:
         from scipy.sparse import csr_array
 
         block, groups, frames = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
+        block = columns(block, frames)
+        width = block.shape[2]
         rows = self.size * groups[:, None, None] + np.arange(self.size)[:, None]
-        columns = 3 * frames[:, None, None] + np.arange(3)
-        place = np.broadcast_arrays(rows, columns)
-        shape = (self.n_groups * self.size, 3 * self._frames)
+        place = np.broadcast_arrays(rows, width * frames[:, None, None] + np.arange(width))
+        shape = (self.n_groups * self.size, width * self._frames)
         return csr_array((block.ravel(), tuple(index.ravel() for index in place)), shape=shape)
 
     @cached_property
     def matrix(self) -> Any:
         """``Z^T (I-P) Z`` (G c, G c), sparse."""
-        b = self.coupling
-        return (_block_diagonal(self.own) - b @ b.T).tocsr()
+        return self.matrix_without(self.coupling)
+
+    def matrix_without(self, coupling: Any) -> Any:
+        """The same less the square of a coupling, sparse."""
+        return (_block_diagonal(self.own) - coupling @ coupling.T).tocsr()
 
     def eliminated(self, ratio: FloatArray) -> Eliminated:
         """Eliminate coefficients of variances `ratio` (G c,), in units of sigma^2."""
@@ -190,19 +215,26 @@ def _factor(matrix: Any, term: Term) -> tuple[Callable[[FloatArray], FloatArray]
 
 class Eliminated:
     """``G = Lambda^-1 + Z^T (I-P) Z`` with a factor of its smaller side, or of the groups' or the
-    frames'.
+    frames'; `also` is a coupling beside the attitudes'.
     """
 
-    def __init__(self, sums: TermSums, ratio: FloatArray, by_group: bool | None = None) -> None:
-        from scipy.sparse import diags_array, eye_array
+    def __init__(
+        self,
+        sums: TermSums,
+        ratio: FloatArray,
+        by_group: bool | None = None,
+        also: Any = None,
+    ) -> None:
+        from scipy.sparse import diags_array, eye_array, hstack
 
         self._sums, self.ratio = sums, np.maximum(ratio, _NO_RATIO)
         precision = 1.0 / self.ratio
-        b = sums.coupling
+        b = sums.coupling if also is None else hstack([sums.coupling, also]).tocsr()
+        self._coupling = b
         self._by_group = b.shape[0] <= b.shape[1] if by_group is None else by_group
         log_own = 0.0
         if self._by_group:
-            left = sums.matrix + diags_array(precision)
+            left = sums.matrix_without(b) + diags_array(precision)
         else:
             own = sums.own + precision.reshape(-1, sums.size, 1) * np.eye(sums.size)
             self._inverse: FloatArray = np.asarray(np.linalg.inv(own), dtype=np.float64)
@@ -220,7 +252,7 @@ class Eliminated:
         """``G^-1 c`` (G c, q): best coefficients for ``c = Z^T (I-P) X``."""
         if self._by_group:
             return self._solve(cross)
-        b, first = self._sums.coupling, self._own_solve(cross)
+        b, first = self._coupling, self._own_solve(cross)
         return np.asarray(first + self._own_solve(b @ self._solve(b.T @ first)))
 
     def correction(self) -> FloatArray:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import unit_vectors
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.errors import ObservationError
@@ -65,8 +66,7 @@ def corr_content(columns: AnyMapping, meta: AnyDict, camera: Camera | None) -> b
     seen_deg, expected_px = (np.full((n, 2), np.nan) for _ in range(2))
     if camera is not None:
         b = unproject(camera, np.column_stack([columns["x_px"], columns["y_px"]]))
-        ra, dec = np.radians(columns["ra_deg"]), np.radians(columns["dec_deg"])
-        r = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+        r = unit_vectors(columns["ra_deg"], columns["dec_deg"])
         rotation = quest(b, r, np.array([0, n]), covariance=False).rotations[0]
         expected_px = project(camera, r @ rotation.T)
         seen = b @ rotation

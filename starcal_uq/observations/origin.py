@@ -100,6 +100,9 @@ class Origin(Facts):
                 f"observations: meta directions is {self.directions!r}; use apparent, catalogue or "
                 "undeclared."
             )
+        if not isinstance(self.frames, str):
+            # The number of frames, which simulated partitions of former versions hold.
+            object.__setattr__(self, "frames", None)
 
     @classmethod
     def identified(cls, catalogue: str, **facts: Any) -> Origin:

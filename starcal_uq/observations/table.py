@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starcal_uq.attitude.rotations import unit_vectors
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, StrArray
@@ -142,9 +143,12 @@ class Observations(FrameRows, Sourced, Shown):
     @cached_property
     def directions_icrs(self) -> FloatArray:
         """Unit vectors of the directions, shape (N, 3), ICRS axes."""
-        ra, dec = np.radians(self.ra_deg), np.radians(self.dec_deg)
-        level = np.cos(dec)
-        return locked(np.column_stack([level * np.cos(ra), level * np.sin(ra), np.sin(dec)]))
+        return locked(unit_vectors(self.ra_deg, self.dec_deg))
+
+    @property
+    def sigma_or_one(self) -> FloatArray:
+        """Noise that the stars state, shape (N,), px per axis; one where they state none."""
+        return np.ones(self.n_stars) if self.sigma_px is None else self.sigma_px
 
     @cached_property
     def timed(self) -> bool:

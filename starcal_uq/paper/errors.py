@@ -20,7 +20,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from starcal_uq.attitude.rotations import rotation_vector
-from starcal_uq.attitude.wahba import quest
+from starcal_uq.attitude.wahba import aligned
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.fields import detector_axes, grid_points
 from starcal_uq.camera.projection import project, unproject
@@ -131,20 +131,6 @@ def map_error(
         weight=weight,
         rotation_arcsec=rotation_vector(rotation) * ARCSEC,
     )
-
-
-def aligned(
-    estimated: FloatArray, true: FloatArray, weight: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Turn directions (N, 3) by the rotation that brings them closest to others, in weighted least
-    squares.
-
-    Returns the turned directions, and the rotation (3, 3) taken off.
-    """
-    rotation = quest(estimated, true, np.array([0, len(true)]), weight, covariance=False).rotations[
-        0
-    ]
-    return estimated @ rotation, rotation
 
 
 def undistorted(camera: Camera, xy_px: FloatArray, how: Undistortion = "model") -> FloatArray:

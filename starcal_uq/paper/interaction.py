@@ -458,7 +458,6 @@ def interaction_study(
         cameras=(truth, start),
         n_replicates=n_replicates,
         campaign=campaign,
-        workers=workers,
     )
     sky = deep_catalogue(truth, max([max_mag, *max_mags]), max_mag, fields_deg)
     base = Condition(truth, start, campaign)

@@ -24,7 +24,7 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.status import Status
 from starcal_uq.core.store import Kept
 from starcal_uq.core.types import FloatArray, IntArray, PathLike, Progress, floats
-from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
+from starcal_uq.estimation.stages import Search, distortion_stage, joint_stage, optics_stage
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
@@ -122,7 +122,6 @@ def run_readings(
 AS_PRINTED, OTHER_EQUATION, DIAGONAL = "as printed", "other equation", "diagonal"
 FEW_FRAMES = 100
 _PROCESS_NOISE_PX = 0.1
-_SOLVER = ("lm", 200)
 _MAX_STEPS = 20
 _TOLERANCE_PX = 1e-7
 # An estimate of a method, None where it failed.
@@ -221,10 +220,10 @@ def draw(plan: Plan, index: int) -> dict[Key, float]:
 def paper_methods(obs: Observations, start: Camera) -> Estimates:
     """The three methods of the paper's Table 2 on one data set."""
     frames = StarFrames.from_observations(obs)
-    optics = optics_stage(frames, start, *_SOLVER)
+    optics = optics_stage(frames, start, Search())
     linear = distortion_stage(frames, start, optics.theta)
     objective = PairObjective(frames, start.distortion)
-    joint = joint_stage(objective, start, linear.theta, *_SOLVER)
+    joint = joint_stage(objective, start, linear.theta, Search())
     return {
         LEAST_SQUARES: pinhole(start, optics.theta) if optics.status.ok else None,
         SAMAAN: _recursive(obs, start, "samaan"),

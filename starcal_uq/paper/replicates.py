@@ -19,7 +19,13 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
+from starcal_uq.core.errors import (
+    CalibrationError,
+    DistortionError,
+    SamplingError,
+    StarcalError,
+    require,
+)
 from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import Remedy
@@ -382,7 +388,6 @@ def replicate(
         cameras=(truth, start),
         n_replicates=n_replicates,
         campaign=campaign,
-        workers=workers,
     )
     sky = load_catalogue(max_mag=max_mag) if stars is None else stars
     n_slow = max(_LEAST, n_replicates // SHARE) if share_slow else n_replicates
@@ -437,13 +442,13 @@ def check_settings(
     cameras: tuple[Camera, Camera],
     n_replicates: int,
     campaign: Campaign,
-    workers: int | None,
 ) -> None:
     """Refuse settings of a study over seeds that cannot work; `others` are conditions and what to
     say without them.
     """
     models = [camera.distortion for camera in cameras]
-    for good, text in (
+    require(
+        SamplingError,
         *others,
         (
             models[0] == models[1],
@@ -454,13 +459,7 @@ def check_settings(
             ),
         ),
         (n_replicates >= 2, f"n_replicates is {n_replicates}: a spread needs at least 2."),
-        (
-            workers is None or workers >= 0,
-            f"workers is {workers}: give at least 1, or 0 for this process.",
-        ),
-    ):
-        if not good:
-            raise SamplingError(text)
+    )
     campaign.check(SamplingError)
 
 

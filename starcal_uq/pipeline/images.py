@@ -41,7 +41,7 @@ FAINTER_NEIGHBOURS, FAINTEST = 1.5, 10.0
 
 def are_images(paths: Sequence[Path]) -> bool:
     """Whether paths name images or folders of them, rather than one table of observations."""
-    from starcal_uq.images.image import IMAGE_ENDINGS
+    from starcal_uq.images.read import IMAGE_ENDINGS
 
     def is_image(path: Path) -> bool:
         name = path.name.lower()
@@ -360,7 +360,7 @@ def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
 
     Times from the names of files give way. An offset such as "+02:00" is taken out.
     """
-    from starcal_uq.images.image import time_in_name_message
+    from starcal_uq.images.read import time_in_name_message
 
     if time_utc is None:
         return centroids

@@ -18,7 +18,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import run_tasks
 from starcal_uq.core.types import BoolArray, FloatArray, Progress
 from starcal_uq.maths.linear import inverses
-from starcal_uq.planning.forecast import N_FRAMES, Forecast, Forecaster, spreads
+from starcal_uq.planning.forecast import N_FRAMES, Forecast, Forecaster, Outlook, spreads
 from starcal_uq.planning.information import random_frames
 from starcal_uq.simulation.frames import Campaign
 
@@ -203,7 +203,7 @@ def check_forecast(
     mission = random_frames(
         stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed
     )
-    forecaster = Forecaster(mission.information, mission.mean_stars, mission, seed=seed)
+    forecaster = Forecaster(mission, Outlook(seed=seed))
     campaigns = [Campaign(n, min_stars, sigma_px) for n in n_frames]
     task = partial(_campaign, _Campaigns(camera, stars, campaigns, n_campaigns, seed))
     outcomes, interrupted = run_tasks(

@@ -23,7 +23,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import random_rotations, rotation_to_quaternion
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.errors import PlanningError, require
 from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.settings import Criterion, bounded
 from starcal_uq.core.types import FloatArray, IntArray, floats
@@ -97,7 +97,7 @@ def choose_frames(
     CatalogueError
         When the field is too narrow for the catalogue to show `min_stars`.
     """
-    _check(n_frames, min_stars, criterion, scope)
+    _check(min_stars, criterion, scope)
     mission = random_frames(
         stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed
     )
@@ -268,9 +268,9 @@ class _Design:
         )
 
 
-def _check(n_frames: int, min_stars: int, criterion: str, scope: str) -> None:
-    for good, text in (
-        (n_frames >= 1, f"n_frames is {n_frames}: give at least 1."),
+def _check(min_stars: int, criterion: str, scope: str) -> None:
+    require(
+        PlanningError,
         (min_stars >= 3, f"min_stars is {min_stars}: an attitude needs at least 3."),
         (
             criterion in CRITERIA,
@@ -280,9 +280,7 @@ def _check(n_frames: int, min_stars: int, criterion: str, scope: str) -> None:
             scope in CHOICE_SCOPES,
             f"the scope {scope!r} cannot be optimised: use one of {', '.join(CHOICE_SCOPES)}.",
         ),
-    ):
-        if not good:
-            raise PlanningError(text)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,7 @@ from starcal_uq.maths.linear import inverses
 if TYPE_CHECKING:
     import pandas as pd
 
+    from starcal_uq.camera.camera import Camera
     from starcal_uq.planning.information import FrameSet
 
 # Parts of the attitude error that a target can be set for: what is in the error of one attitude.
@@ -131,16 +132,20 @@ def _quantity(name: str, rows: FloatArray) -> Quantity:
     return Quantity(name, rows.T @ rows)
 
 
+def edges(camera: Camera) -> FloatArray:
+    """Where the detector begins and ends along x and along y, (2, 2) px."""
+    return np.array([[-0.5, camera.width_px - 0.5], [-0.5, camera.height_px - 0.5]])
+
+
 def _corner_displacement(mission: FrameSet) -> FloatArray:
     """Displacement (2, p) px by the distortion at the corner that is farthest from the principal
     point.
     """
     camera = mission.camera
     model = get_model(camera.distortion)
-    corners = np.array([-0.5, camera.width_px - 0.5]), np.array([-0.5, camera.height_px - 0.5])
     u, v = (
         side[np.argmax(np.abs(side - point))] - point
-        for side, point in zip(corners, camera.theta[:2], strict=True)
+        for side, point in zip(edges(camera), camera.theta[:2], strict=True)
     )
     columns = np.zeros((2, len(camera.theta)))
     for j, one in enumerate(np.eye(len(model.coefficients)).tolist()):
@@ -182,36 +187,43 @@ def spreads(forms: FloatArray, covariances: FloatArray) -> FloatArray:
     return np.where(known, np.sqrt(np.maximum(variances, 0.0)), np.inf)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Outlook:
+    """What a forecast is of, beyond its frames.
+
+    `confidence`, `scope`: probability of the two-axis radius, and one of `SCOPES`. `start` (p, p),
+    `start_dof`: information that is there already, and the degrees of freedom of those data.
+    `n_campaigns`, `seed`: campaigns to draw.
+    """
+
+    confidence: float = 0.997
+    scope: str = "common"
+    start: FloatArray | None = None
+    start_dof: float = 0.0
+    n_campaigns: int = N_CAMPAIGNS
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_known("the scope", self.scope, SCOPES, PlanningError)
+        if not 0.0 < self.confidence < 1.0:
+            raise PlanningError(
+                f"the confidence {self.confidence!r} is no probability: give one such as 0.997."
+            )
+
+
 class Forecaster:
     """Forecasts for one set of frames, one mission and one target.
 
-    `information` (M, p, p): information of each frame that a campaign may take. `n_stars`: stars
-    per frame on average.
-    `confidence`, `scope`: probability of the two-axis radius, and one of `SCOPES`. `start` (p, p),
-    `start_dof`: information that is there already, and the degrees of freedom of those data.
+    `information` (M, p, p): information of each frame that a campaign may take, if it is not that
+    of the mission.
     """
 
     def __init__(
-        self,
-        information: FloatArray,
-        n_stars: float,
-        mission: FrameSet,
-        *,
-        confidence: float = 0.997,
-        scope: str = "common",
-        start: FloatArray | None = None,
-        start_dof: float = 0.0,
-        n_campaigns: int = N_CAMPAIGNS,
-        seed: int = 0,
+        self, mission: FrameSet, outlook: Outlook, information: FloatArray | None = None
     ) -> None:
-        check_known("the scope", scope, SCOPES, PlanningError)
-        if not 0.0 < confidence < 1.0:
-            raise PlanningError(
-                f"the confidence {confidence!r} is no probability: give one such as 0.997."
-            )
-        self.information, self.n_stars, self.mission = information, n_stars, mission
-        self.confidence, self.scope, self.start = confidence, scope, start
-        self.start_dof, self.n_campaigns, self.seed = start_dof, n_campaigns, seed
+        self.mission, self.outlook = mission, outlook
+        self.information = mission.information if information is None else information
+        scope = outlook.scope
         self.quantities = quantities(mission)
         self._forms = np.stack([q.form for q in self.quantities])
         some = slice(None, None, max(1, mission.n_frames // _MISSION_FRAMES))
@@ -251,14 +263,20 @@ class Forecaster:
 
     def covariances(self, n_frames: int) -> FloatArray:
         """Covariances (C, p, p) of the parameters after drawn campaigns of n frames."""
-        return campaigns(self.information, n_frames, self.n_campaigns, self.seed, self.start)
+        return campaigns(
+            self.information,
+            n_frames,
+            self.outlook.n_campaigns,
+            self.outlook.seed,
+            self.outlook.start,
+        )
 
     def dof(self, n_frames: int) -> float:
         """Independent numbers beyond the parameters, with those of the data that are there
         already.
         """
-        own = n_frames * (2.0 * self.n_stars - 3.0) - len(self._size)
-        return float(max(1.0, own + self.start_dof))
+        own = n_frames * (2.0 * self.mission.mean_stars - 3.0) - len(self._size)
+        return float(max(1.0, own + self.outlook.start_dof))
 
     def noise_sigma(self, n_frames: int) -> float:
         """Relative standard error of the estimated noise."""
@@ -281,8 +299,10 @@ class Forecaster:
         size = float(np.mean(np.trace(shape, axis1=1, axis2=2)))
         ratios = np.where(known, sizes, size) / size
         grid = np.linspace(np.sqrt(ratios.min()) * 0.999, np.sqrt(ratios.max()) * 1.001, _SCALES)
-        at_grid = [mixture_radius(g**2 * shape + self._noise, self.confidence) for g in grid]
-        radii = student_factor(self.confidence, self.dof(n_frames)) * np.interp(
+        at_grid = [
+            mixture_radius(g**2 * shape + self._noise, self.outlook.confidence) for g in grid
+        ]
+        radii = student_factor(self.outlook.confidence, self.dof(n_frames)) * np.interp(
             np.sqrt(ratios), grid, at_grid
         )
         return np.where(known, radii, np.inf)
@@ -291,7 +311,7 @@ class Forecaster:
         """Radius that no number of frames goes below: that of the centroid noise, where the scope
         has it.
         """
-        return mixture_radius(self._noise, self.confidence)
+        return mixture_radius(self._noise, self.outlook.confidence)
 
     def frames_needed(self, target_arcsec: float, share: float | None = None) -> int | None:
         """Fewest frames whose radius (arcsec) is within a target; None where no number up to ten

@@ -15,7 +15,8 @@ makes the pattern larger.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -23,8 +24,8 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import DistortionError, PlanningError
-from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.planning.forecast import SCOPES, Forecaster
+from starcal_uq.core.types import FloatArray
+from starcal_uq.planning.forecast import SCOPES, Forecaster, Outlook, edges
 from starcal_uq.planning.information import FrameSet, Noise, random_frames
 from starcal_uq.sky.catalogue import StarCatalogue
 
@@ -126,8 +127,7 @@ def _unfolded(camera: Camera, percent: float) -> float:
     """As much of a displacement of the corner as one coefficient can give without a fold on the
     detector, per cent.
     """
-    x, y = np.array([-0.5, camera.width_px - 0.5]), np.array([-0.5, camera.height_px - 0.5])
-    corners = np.array([(a, b) for a in x for b in y])
+    corners = np.array(list(product(*edges(camera))))
     for share in np.linspace(1.0, 0.02, 50):
         try:
             unproject(with_distortion(camera, percent * share / _NEAR_FOLD), corners)
@@ -168,37 +168,39 @@ def distortion_range(
     stars: StarCatalogue,
     noise: Noise,
     bounds: tuple[float, float],
+    outlook: Outlook,
     *,
     n_frames: Sequence[int],
     min_stars: int,
     target_arcsec: float | None,
-    scope: str,
-    options: AnyDict,
-    seed: int,
 ) -> DistortionRange:
     """Forecast over a range of distortions, `bounds` on the displacement of the corner, per cent.
 
-    `base` are frames of the plan, of a camera whose distortion lies in the range; `options` are
-    those of `Forecaster`.
+    `base` are frames of the plan, of a camera whose distortion lies in the range.
     """
     camera = base.camera
     percent = nodes(camera, bounds)
     scopes = () if target_arcsec is None else tuple(SCOPES)
-    settings = options | {"n_campaigns": _CAMPAIGNS}
+    outlook = replace(outlook, n_campaigns=_CAMPAIGNS)
     frames, radius, sigmas = [], [], []
     for value in percent.tolist():
         other = with_distortion(camera, value)
         seen = base
         if other.coefficients != camera.coefficients:
             seen = random_frames(
-                stars, other, noise, n_frames=_GEOMETRIES, min_stars=min_stars, seed=seed
+                stars,
+                other,
+                noise,
+                n_frames=_GEOMETRIES,
+                min_stars=min_stars,
+                seed=outlook.seed,
             )
         needed = (
-            _forecaster(seen, name, settings).frames_needed(target_arcsec or np.nan)
+            Forecaster(seen, replace(outlook, scope=name)).frames_needed(target_arcsec or np.nan)
             for name in scopes
         )
         frames.append([np.inf if n is None else float(n) for n in needed])
-        forecaster = _forecaster(seen, scope, settings)
+        forecaster = Forecaster(seen, outlook)
         radius.append(forecaster.forecast(n_frames).radius)
         sigmas.append(forecaster.forecast((AFTER_FRAMES,)))
     point = np.array([[found.of(name)[0] for name in ("x0_px", "y0_px")] for found in sigmas])
@@ -212,7 +214,3 @@ def distortion_range(
         focal_px=np.array([found.of("f_px")[0] for found in sigmas]),
         f_theta_percent=f_theta_percent(camera),
     )
-
-
-def _forecaster(seen: FrameSet, scope: str, options: AnyDict) -> Forecaster:
-    return Forecaster(seen.information, seen.mean_stars, seen, scope=scope, **options)

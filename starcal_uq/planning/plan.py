@@ -18,7 +18,7 @@ from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.errors import PlanningError, require
 from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
@@ -30,6 +30,7 @@ from starcal_uq.planning.forecast import (
     SCOPES,
     Forecast,
     Forecaster,
+    Outlook,
     nea_arcsec,
 )
 from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
@@ -160,14 +161,15 @@ def plan(
     )
     # A posterior does not say how many data it rests on; its noise is then as uncertain as the new
     # frames make it.
-    options = {
-        "confidence": confidence,
-        "start": start,
-        "start_dof": float(getattr(after, "dof", 0.0)),
-        "n_campaigns": n_campaigns,
-        "seed": seed,
-    }
-    forecast = _forecaster(frames, scope, options).forecast(n_frames)
+    outlook = Outlook(
+        confidence=confidence,
+        scope=scope,
+        start=start,
+        start_dof=float(getattr(after, "dof", 0.0)),
+        n_campaigns=n_campaigns,
+        seed=seed,
+    )
+    forecast = Forecaster(frames, outlook).forecast(n_frames)
     noise = float(np.sqrt(np.mean(noise_of(sigma_px, frames.mag, frames.frames.pixel) ** 2)))
     settings = {
         "n_geometries": n_geometries,
@@ -184,12 +186,10 @@ def plan(
             seen,
             sigma_px,
             bounds,
+            outlook,
             n_frames=n_frames,
             min_stars=min_stars,
             target_arcsec=target_arcsec,
-            scope=scope,
-            options=options,
-            seed=seed,
         )
     table = None
     if sweeps:
@@ -198,8 +198,7 @@ def plan(
             base,
             frames,
             noise,
-            scope,
-            options | {"n_campaigns": _SWEEP_CAMPAIGNS},
+            replace(outlook, n_campaigns=_SWEEP_CAMPAIGNS),
             target_arcsec,
             progress,
         )
@@ -215,7 +214,7 @@ def plan(
         confidence=confidence,
         scope=scope,
         target_arcsec=target_arcsec,
-        needs=() if target_arcsec is None else _needs(frames, target_arcsec, options),
+        needs=() if target_arcsec is None else _needs(frames, target_arcsec, outlook),
         sweeps=table,
         distortion=spread,
         seed=seed,
@@ -238,14 +237,10 @@ class _Base(NamedTuple):
     seed: int
 
 
-def _forecaster(frames: FrameSet, scope: str, options: AnyDict) -> Forecaster:
-    return Forecaster(frames.information, frames.mean_stars, frames, scope=scope, **options)
-
-
-def _needs(frames: FrameSet, target_arcsec: float, options: AnyDict) -> tuple[Need, ...]:
+def _needs(frames: FrameSet, target_arcsec: float, outlook: Outlook) -> tuple[Need, ...]:
     needs = []
     for scope in SCOPES:
-        forecaster = _forecaster(frames, scope, options)
+        forecaster = Forecaster(frames, replace(outlook, scope=scope))
         needs.append(
             Need(
                 scope,
@@ -261,8 +256,7 @@ def _sweep(
     base: _Base,
     frames: FrameSet,
     noise_px: float,
-    scope: str,
-    options: AnyDict,
+    outlook: Outlook,
     target_arcsec: float | None,
     progress: Progress | None,
 ) -> pd.DataFrame:
@@ -271,7 +265,7 @@ def _sweep(
     rows: list[AnyDict] = []
     n_points = len(_MAG_STEPS) + len(_NOISE_FACTORS) + len(_FIELD_PARTS)
     for name, value, information, mission, sky in _points(base, frames, noise_px):
-        forecaster = Forecaster(information, mission.mean_stars, mission, scope=scope, **options)
+        forecaster = Forecaster(mission, outlook, information)
         row = {"sweep": name, "value": value, "sky_fraction": sky, "mean_stars": mission.mean_stars}
         row |= forecaster.forecast((SWEEP_FRAMES,)).to_dataframe().iloc[0].to_dict()
         row |= dict(zip((f"nea_{axis}_arcsec" for axis in AXES), nea_arcsec(mission), strict=True))
@@ -353,7 +347,8 @@ def _check(
     n_geometries: int,
     n_campaigns: int,
 ) -> None:
-    for good, text in (
+    require(
+        PlanningError,
         (len(n_frames) > 0, "n_frames is empty: give some numbers of frames."),
         (min_stars >= 3, f"min_stars is {min_stars}: an attitude needs at least 3."),
         (
@@ -362,9 +357,7 @@ def _check(
         ),
         (n_geometries >= 50, f"n_geometries is {n_geometries}: give at least 50."),
         (n_campaigns >= 20, f"n_campaigns is {n_campaigns}: give at least 20."),
-    ):
-        if not good:
-            raise PlanningError(text)
+    )
 
 
 @dataclass(frozen=True)

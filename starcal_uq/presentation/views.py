@@ -18,7 +18,6 @@ from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.result import Validation
-from starcal_uq.diagnostics.verdict.estimate import models_sentence, star_sentence
 from starcal_uq.diagnostics.verdict.judge import Verdict
 from starcal_uq.estimation.merging import Consistency
 from starcal_uq.estimation.result import Calibration
@@ -29,6 +28,7 @@ from starcal_uq.inference.power_scaling import PriorSensitivity
 from starcal_uq.inference.prior_draws import PriorPredictive
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.update import ShiftTest
+from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.observations.table import Observations
 from starcal_uq.pipeline.examples import ExampleData
 from starcal_uq.pipeline.inspection import Frames, InspectedFrame
@@ -82,11 +82,14 @@ from starcal_uq.presentation.pages.budgeting import section_html
 from starcal_uq.presentation.pages.gallery import frames_html
 from starcal_uq.presentation.report.results import Results
 from starcal_uq.presentation.report.words import run_html, run_text
+from starcal_uq.presentation.sentences.budgeting import outcome_text
+from starcal_uq.presentation.sentences.estimate import models_sentence, star_sentence
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import (
     budgeting,
     comparison,
     diagnostics,
+    effects,
     estimation,
     images,
     inference,
@@ -95,6 +98,7 @@ from starcal_uq.presentation.words import (
     propagation,
     studies,
     study_advice,
+    study_tables,
 )
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError
 from starcal_uq.propagation.coupling import Coupling
@@ -108,14 +112,15 @@ from starcal_uq.studies.result import Study
 def _view(
     title: str,
     text: Callable[[Any], str],
-    table: Callable[[Any], TextTable | None],
+    table: Callable[[Any], TextTable | list[TextTable | None] | None],
     notes: Callable[[Any], Iterable[str]] = lambda result: (),
     **figures: Callable[..., Any],
 ) -> View:
     """A result with its sentences, its table, what is worth noting, and its figures."""
 
     def html(result: Any) -> str:
-        tables = filter(None, [table(result)])
+        found = table(result)
+        tables = filter(None, found if isinstance(found, list) else [found])
         return card(title, text(result), *tables) + listed(notes(result))
 
     return View(text, html, figures)
@@ -153,10 +158,11 @@ VIEWS: Mapping[type, View] = {
     Calibration: _view(
         "Calibration",
         estimation.calibration_text,
-        estimation.calibration_table,
+        estimation.calibration_tables,
         convergence=plot_convergence,
         residuals=plot_residuals,
     ),
+    Effects: _view("Effects beyond the camera", effects.effects_text, effects.effects_table),
     Screening: _view("Screening", estimation.screening_text, estimation.screening_table),
     Consistency: _view(
         "Consistency", estimation.consistency_text, estimation.consistency_table, _messages
@@ -221,7 +227,7 @@ VIEWS: Mapping[type, View] = {
     ForecastCheck: _view(
         "Forecast against simulation", planning.check_text, _rows, check=plot_forecast_check
     ),
-    Outcome: View(budgeting.outcome_text),
+    Outcome: View(outcome_text),
     Budget: View(budgeting.headline, section_html, {"contributors": plot_budget}),
     Agreement: _view(
         "Sampled over first order", propagation.agreement_text, propagation.agreement_table
@@ -266,7 +272,7 @@ VIEWS: Mapping[type, View] = {
     Study: _view(
         "Study",
         studies.study_text,
-        studies.study_table,
+        study_tables.study_table,
         study_advice.study_notes,
         correlation=plot_study_correlation,
         map=plot_study_map,

@@ -20,9 +20,12 @@ import numpy as np
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
-from starcal_uq.core.formatting import count, join_words, plural, significant
+from starcal_uq.core.findings import Finding
+from starcal_uq.core.formatting import count, plural
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy
+from starcal_uq.core.settings import OnboardModel
+from starcal_uq.core.status import Note
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, PathLike, floats
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
@@ -141,6 +144,46 @@ class MisfitFound:
 
 
 @dataclass(frozen=True, eq=False)
+class EffectError:
+    """What one effect does to attitudes by itself.
+
+    Attributes
+    ----------
+    name : str
+        The effect.
+    common_arcsec, rest_arcsec : (3,) array
+        Root mean squares of its common rotation and, over frames, of its rest, arcsec.
+    """
+
+    name: str
+    common_arcsec: FloatArray
+    rest_arcsec: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class OnboardError:
+    """The calibration's part of the attitude error with one onboard model, effects included.
+
+    Attributes
+    ----------
+    onboard : {"model", "effects"}
+        What the mission's software uses: parameters of the camera alone, or what can be uploaded of
+        the effects as well.
+    common_arcsec, rest_arcsec, total_arcsec : (3,) array
+        Root mean squares of common rotation, rest, and both together, arcsec.
+    effects : tuple of EffectError
+        What every effect does by itself. They are correlated with the parameters, so that squares
+        need not add up.
+    """
+
+    onboard: OnboardModel
+    common_arcsec: FloatArray
+    rest_arcsec: FloatArray
+    total_arcsec: FloatArray
+    effects: tuple[EffectError, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class AttitudeError(Shown):
     """Attitude error of single frames by contributor, arcsec.
 
@@ -199,6 +242,14 @@ class AttitudeError(Shown):
         What the tests of the model add; None as long as it was not tested.
     seen : Observations or None
         The frames themselves; None when read from a file.
+    onboard : {"model", "effects"}
+        What the mission's software uses, where the calibration holds effects.
+    variants : tuple of OnboardError
+        The calibration's part with every onboard model; empty without effects. That of `onboard`
+        stands in the other fields as well.
+    effects_per_frame_arcsec : (K, 3) array or None
+        Root mean square of what effects of every frame by itself do to each frame; None without
+        such, and when read from a file.
 
     Notes
     -----
@@ -234,6 +285,14 @@ class AttitudeError(Shown):
     )
     aligned: Observations | None = None
     n_sampled_frames: int = 0
+    onboard: OnboardModel = "model"
+    variants: tuple[OnboardError, ...] = ()
+    effects_per_frame_arcsec: FloatArray | None = None
+
+    @property
+    def effects(self) -> tuple[EffectError, ...]:
+        """What effects of the calibration do to attitudes, with the onboard model."""
+        return next((own.effects for own in self.variants if own.onboard == self.onboard), ())
 
     @property
     def told_frames(self) -> str:
@@ -440,6 +499,9 @@ class AttitudeError(Shown):
                 prefix + name: filled[..., i].ravel() for i, name in enumerate(_COVARIANCES)
             }
         table = table.assign(alignment=self.alignment, **columns)
+        if self.variants:
+            aboard = json.dumps(to_plain(_Aboard(self.onboard, self.variants)))
+            table = table.assign(onboard=[aboard] + [""] * (len(table) - 1))
         # Once is enough: it is the same for all rows.
         write_csv(table.assign(misfit=[misfit] + [""] * (len(table) - 1)), path)
 
@@ -484,6 +546,8 @@ class AttitudeError(Shown):
             others["interaction_arcsec"] = sigma[4, :3]
             if first.get("misfit"):
                 others["misfit"] = from_plain(MisfitFound, json.loads(first["misfit"]))
+            if first.get("onboard"):
+                others |= vars(from_plain(_Aboard, json.loads(first["onboard"])))
             if first.get("alignment"):
                 constant = [float(rows[known[0], axis]["rest_constant_arcsec"]) for axis in AXES]
                 aligned = [numbers(f"alignment_{name}", AXES)[0] for name in _COVARIANCES]
@@ -501,40 +565,23 @@ class AttitudeError(Shown):
         return cls(*single, **others)
 
 
-def two_figures(with_misfit_found: float, if_model_holds: float) -> str:
-    """One error by its two names, arcsec, for a sentence; once, where both print alike."""
-    found, held = significant(float(with_misfit_found)), significant(float(if_model_holds))
-    if np.isnan(with_misfit_found):
-        return f"{held} arcsec {IF_MODEL_HOLDS} ({WITH_MISFIT_FOUND}: {NOT_ASSESSED})"
-    return (
-        f"{held} arcsec"
-        if found == held
-        else f"{found} arcsec {WITH_MISFIT_FOUND} ({held} {IF_MODEL_HOLDS})"
-    )
+@dataclass(frozen=True, eq=False)
+class _Aboard:
+    """What a file holds of onboard models."""
+
+    onboard: OnboardModel
+    variants: tuple[OnboardError, ...]
 
 
-def choice_words(error: AttitudeError) -> str:
-    """What other models that the data do not reject would do to attitudes, in a sentence; empty
-    where it is little.
+def choice(error: AttitudeError) -> tuple[Finding, ...]:
+    """What other models that the data do not reject would do to attitudes; nothing where it is
+    little.
     """
     if error.misfit is None or not error.misfit.choice_models:
-        return ""
-    names = join_words([repr(name) for name in error.misfit.choice_models])
-    verb = "predicts" if len(error.misfit.choice_models) == 1 else "predict"
-    moved = []
-    for what, row in zip(
-        ("the common rotation", "the rest"), error.choice_of_model_arcsec[1:3], strict=True
-    ):
-        sizes = ((row[3], "across the boresight"), (row[2], "in roll"))
-        stated = [
-            f"{significant(float(size))} arcsec {where}" for size, where in sizes if size > 0.0
-        ]
-        moved += [f"{what} by up to {join_words(stated)}"] if stated else []
-    return (
-        f"{CHOICE_OF_MODEL[0].upper()}{CHOICE_OF_MODEL[1:]}, in none of these errors: {names} "
-        f"{verb} about as well as "
-        f"the fitted model, and would move {', '.join(moved)}."
-    )
+        return ()
+    common, rest = (tuple(map(float, row[[3, 2]])) for row in error.choice_of_model_arcsec[1:3])
+    facts = {"models": error.misfit.choice_models, "common_arcsec": common, "rest_arcsec": rest}
+    return (Finding(Note.CHOICE_OF_MODEL, facts),)
 
 
 def _gaussian_tails(sigmas: FloatArray, confidence: float, one_axis: float) -> FloatArray:

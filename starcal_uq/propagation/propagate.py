@@ -27,25 +27,30 @@ order is that of every frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import left_error
-from starcal_uq.attitude.wahba import quest
-from starcal_uq.camera.projection import unproject_jacobian, unproject_theta
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.errors import DistortionError, ObservationError, SamplingError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.settings import OnboardModel, bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.weights import weighed
 from starcal_uq.observations.splits import frame_sample
 from starcal_uq.propagation.alignment import alignment_frames as _alignment_frames
 from starcal_uq.propagation.alignment import alignment_weights
-from starcal_uq.propagation.attitude_error import OBSERVED, AttitudeError
+from starcal_uq.propagation.attitude_error import (
+    OBSERVED,
+    AttitudeError,
+    EffectError,
+    OnboardError,
+)
+from starcal_uq.propagation.geometry import FrameGeometry
+from starcal_uq.propagation.onboard import Aboard, Turns
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -53,17 +58,14 @@ if TYPE_CHECKING:
 
 
 _LEVELS = (0.95, 0.997)
-_STARS_AT_ONCE = 1_000_000
 _SAMPLES = 400_000
+_COLUMNS = 10
 # Draws that are given noise as well: the interaction is averaged over frames, and its size is what
 # counts.
 _NOISY_DRAWS = 40
 # Frames that go through QUEST, of more: so many, or fewer that hold so many stars, but not fewer
 # than the last.
 _SAMPLED_FRAMES, _SAMPLED_STARS, _FEWEST_FRAMES = 300, 20_000, 30
-# Half a pixel: the map is so smooth that the central difference errs by (h / f)^2, while rounding
-# stays below 1e-12.
-_STEP_PX = 0.5
 
 
 @bounded
@@ -76,6 +78,8 @@ def propagate(
     seed: int = 0,
     alignment: Observations | str | None = None,
     alignment_frames: int | None = None,
+    onboard: OnboardModel = "model",
+    calibrated: Observations | None = None,
 ) -> AttitudeError:
     """Attitude error of single frames: centroid noise, calibration as common rotation and rest, and
     their interaction.
@@ -98,6 +102,14 @@ def propagate(
         with as many stars a frame as `obs`, ``observed`` for `obs` itself, or a table.
     alignment_frames : int, optional
         Number of frames of the random sky; 100 by default.
+    onboard : {"model", "effects"}
+        What the mission's software uses, where the calibration holds effects. ``model``: the
+        parameters of the camera alone, so that effects act on attitudes. ``effects``: what can be
+        uploaded (field, axes, temperature, time, phase, magnitude) as well, and only its
+        uncertainty is left. Frames and nights of the mission draw their own either way.
+    calibrated : Observations, optional
+        The table of the calibration, for frames of a mission, where effects change with what a
+        table states; `obs` by default. What the mission does not state is drawn from it.
 
     Raises
     ------
@@ -107,7 +119,7 @@ def propagate(
         When a draw folds the distortion within the observed pixels.
     ObservationError
         When the posterior scales stated noises that the observations lack, or the alignment is none
-        of these.
+        of these, or effects are those of another table than `calibrated`.
     DegenerateFrameError
         When a frame does not determine an attitude.
     """
@@ -119,29 +131,27 @@ def propagate(
     aligning, told = _alignment_frames(post, obs, alignment, alignment_frames, seed)
     aligned = frames if aligning is obs else FrameGeometry.of(post, aligning)
     weights, alignment_covariance = alignment_weights(aligned.noise_covariance)
-    together = np.einsum("nij,njp->ip", weights, aligned.response)
-    apart = frames.response - together
+    aboard = Aboard(post, obs if calibrated is None else calibrated)
+    turns = aboard.turns(frames, obs)
+    split = _Split.of(
+        turns, None if aligned is frames else aboard.turns(aligned, aligning), weights
+    )
+    together, moments = split.together, aboard.moments(onboard)
     sampled = _sampled(post, frames, aligned, draws, seed)
-    shift = draws - post.mean
     # First order is that of all frames; what is beyond it, that of the sample.
-    common = sampled.common + shift @ (together - sampled.together).T
+    shift, p = aboard.draws(draws, onboard, seed), len(post.mean)
+    common = sampled.common + shift[:, :p] @ (together[:, :p] - sampled.together).T
+    common = common + shift[:, p:] @ together[:, p:].T
     nea = frames.noise_covariance
-    common_variance = np.maximum(spread(together, post.covariance) + sampled.beyond_common, 0.0)
-    constant_variance = np.maximum(
-        spread(apart.mean(axis=0), post.covariance) + sampled.beyond_constant, 0.0
-    )
-    rest_variance = np.maximum(
-        spread(apart, post.covariance) + sampled.over(obs.n_frames, sampled.beyond_rest), 0.0
-    )
-    whole = spread(frames.response, post.covariance) + sampled.over(
-        obs.n_frames, sampled.beyond_whole
-    )
-    whole_variance = np.maximum(whole, 0.0).mean(axis=0)
+    first = split.variances(moments)
+    whole = first.with_sampled(sampled)
+    sigmas = whole.sigmas
     interaction = sampled.interaction
     half_widths = [_noise_half_widths(nea, seed)]
-    sigmas = (np.sqrt(common_variance), _rms(rest_variance))
     half_widths += [
-        *_calibration_half_widths(post, together, apart, sigmas, seed),
+        *_calibration_half_widths(
+            aboard.draws(post.theta_draws, onboard, seed), split, sigmas, seed
+        ),
         _half_widths(interaction),
     ]
     p95, p997 = np.swapaxes(half_widths, 0, 1) * ARCSEC
@@ -149,11 +159,9 @@ def propagate(
     met = interaction.reshape(-1, 3)
     covariances = [
         _with_sigmas(nea.mean(axis=0), noise_sigma),
-        _with_sigmas(together @ post.covariance @ together.T, sigmas[0]),
-        _with_sigmas((apart @ post.covariance @ np.swapaxes(apart, 1, 2)).mean(axis=0), sigmas[1]),
-        _with_sigmas(
-            (frames.response @ post.covariance @ np.swapaxes(frames.response, 1, 2)).mean(axis=0),
-            np.sqrt(whole_variance),
+        *(
+            _with_sigmas(own, sigma)
+            for own, sigma in zip(split.covariances(moments), sigmas, strict=True)
         ),
         met.T @ met / len(met),
     ]
@@ -164,25 +172,159 @@ def propagate(
         p95_arcsec=p95,
         p997_arcsec=p997,
         analytic_nea_arcsec=_rms(_diagonal(nea)) * ARCSEC,
-        analytic_common_arcsec=np.sqrt(spread(together, post.covariance)) * ARCSEC,
-        analytic_rest_arcsec=_rms(spread(apart, post.covariance)) * ARCSEC,
+        analytic_common_arcsec=first.sigmas[0] * ARCSEC,
+        analytic_rest_arcsec=first.sigmas[1] * ARCSEC,
         n_draws=count,
         n_frames=obs.n_frames,
         n_sampled_frames=len(sampled.places),
         common_draws_arcsec=common * ARCSEC,
-        rest_rms_per_frame_arcsec=np.sqrt(rest_variance) * ARCSEC,
+        rest_rms_per_frame_arcsec=np.sqrt(whole.rest) * ARCSEC,
         nea_per_frame_arcsec=np.sqrt(_diagonal(nea)) * ARCSEC,
         interaction_arcsec=_rms(interaction.reshape(-1, 3) ** 2) * ARCSEC,
         frames=str(obs.origin.frames or OBSERVED),
         seen=obs,
-        total_arcsec=np.sqrt(whole_variance) * ARCSEC,
-        analytic_total_arcsec=_rms(spread(frames.response, post.covariance)) * ARCSEC,
-        rest_constant_arcsec=np.sqrt(constant_variance) * ARCSEC,
+        total_arcsec=sigmas[2] * ARCSEC,
+        analytic_total_arcsec=first.sigmas[2] * ARCSEC,
+        rest_constant_arcsec=np.sqrt(whole.constant) * ARCSEC,
         covariance_arcsec2=np.stack(covariances) * ARCSEC**2,
         alignment=told,
         alignment_covariance_arcsec2=alignment_covariance * ARCSEC**2,
         aligned=aligning,
+        onboard=onboard,
+        variants=_variants(aboard, split, sampled),
+        effects_per_frame_arcsec=(
+            np.sqrt(_diagonal(_total(turns.own))) * ARCSEC if turns.own else None
+        ),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    """Turns of K frames as common rotation and rest.
+
+    `response` (K, 3, q) are the turns, of which `together` (3, q) are common. `own` (K, 3, 3),
+    `own_together` (3, 3) and `own_apart` (K, 3, 3), each by effect, are covariances of what frames
+    draw for themselves.
+    """
+
+    response: FloatArray
+    together: FloatArray
+    own: Mapping[str, FloatArray]
+    own_together: Mapping[str, FloatArray]
+    own_apart: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, turns: Turns, aligned: Turns | None, weights: FloatArray) -> _Split:
+        """Turns of frames, and those of the alignment (None: of the same ones), which weighs its
+        frames by (n, 3, 3).
+        """
+        there = turns if aligned is None else aligned
+        transposed = np.swapaxes(weights, 1, 2)
+        own_together = {
+            name: (weights @ own @ transposed).sum(axis=0) for name, own in there.own.items()
+        }
+        own_apart = {}
+        for name, own in turns.own.items():
+            # A frame of the alignment itself is part of the mean.
+            shared = weights @ own if aligned is None else np.zeros_like(own)
+            mean = own_together.get(name, np.zeros((3, 3)))
+            own_apart[name] = own + mean - shared - np.swapaxes(shared, 1, 2)
+        return cls(
+            turns.response,
+            np.einsum("nij,njp->ip", weights, there.response),
+            turns.own,
+            own_together,
+            own_apart,
+        )
+
+    @cached_property
+    def apart(self) -> FloatArray:
+        """Turns (K, 3, q) less those in common."""
+        return self.response - self.together
+
+    def variances(self, moments: FloatArray) -> _Variances:
+        """Variances to first order, for these second moments (q, q)."""
+        common = _diagonal(_total(self.own_together))
+        constant = spread(self.apart.mean(axis=0), moments) + common
+        return _Variances(
+            spread(self.together, moments) + common,
+            constant,
+            spread(self.apart, moments) + _diagonal(_total(self.own_apart)),
+            spread(self.response, moments) + _diagonal(_total(self.own)),
+        )
+
+    def covariances(self, moments: FloatArray) -> list[FloatArray]:
+        """Covariances (3, 3) of common rotation, and mean over frames of rest and whole."""
+        return [
+            self.together @ moments @ self.together.T + _total(self.own_together),
+            (self.apart @ moments @ np.swapaxes(self.apart, 1, 2) + _total(self.own_apart)).mean(
+                axis=0
+            ),
+            (self.response @ moments @ np.swapaxes(self.response, 1, 2) + _total(self.own)).mean(
+                axis=0
+            ),
+        ]
+
+
+def _total(own: Mapping[str, FloatArray]) -> FloatArray:
+    """Sum over effects of covariances (..., 3, 3); zero where there is none."""
+    return np.asarray(sum(own.values(), np.zeros((3, 3))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Variances:
+    """Variances, rad^2, of common rotation and of the mean of the rest (3,), and of rest and whole
+    of every frame (K, 3).
+    """
+
+    common: FloatArray
+    constant: FloatArray
+    rest: FloatArray
+    whole: FloatArray
+
+    def with_sampled(self, sampled: _Sampled) -> _Variances:
+        """What draws through QUEST show beyond first order added."""
+        n = len(self.rest)
+        return _Variances(
+            np.maximum(self.common + sampled.beyond_common, 0.0),
+            np.maximum(self.constant + sampled.beyond_constant, 0.0),
+            np.maximum(self.rest + sampled.over(n, sampled.beyond_rest), 0.0),
+            np.maximum(self.whole + sampled.over(n, sampled.beyond_whole), 0.0),
+        )
+
+    @property
+    def sigmas(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Root mean squares (3,) of common rotation, rest and whole."""
+        return np.sqrt(self.common), _rms(self.rest), _rms(self.whole)
+
+
+def _variants(aboard: Aboard, split: _Split, sampled: _Sampled) -> tuple[OnboardError, ...]:
+    """The calibration's part with every onboard model; none without effects."""
+    if not (aboard.places or split.own):
+        return ()
+    made = []
+    for onboard in get_args(OnboardModel):
+        moments = aboard.moments(onboard)
+        common, rest, both = split.variances(moments).with_sampled(sampled).sigmas
+        effects = [
+            EffectError(
+                name,
+                np.sqrt(spread(split.together[:, at], moments[at, at])) * ARCSEC,
+                _rms(spread(split.apart[:, :, at], moments[at, at])) * ARCSEC,
+            )
+            for name, at in aboard.places.items()
+        ]
+        effects += [
+            EffectError(
+                name,
+                np.sqrt(_diagonal(split.own_together.get(name, np.zeros((3, 3))))) * ARCSEC,
+                _rms(_diagonal(own)) * ARCSEC,
+            )
+            for name, own in split.own_apart.items()
+        ]
+        arcsec = common * ARCSEC, rest * ARCSEC, both * ARCSEC
+        made.append(OnboardError(onboard, *arcsec, tuple(effects)))
+    return tuple(made)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,98 +438,6 @@ class _Moments:
         return found
 
 
-@dataclass(frozen=True, eq=False)
-class FrameGeometry:
-    """Frames as QUEST sees them at the posterior mean, with its first-order responses.
-
-    Displacements db of the directions turn the attitude by phi = [sum w (I - b b^T)]^-1 sum w b x
-    db; weights (N,) are None where all stars count alike. `noise_px` (N,) is the centroid noise per
-    axis; `response` (K, 3, p) is d phi / d theta, rad per px unit, `noise_response` (2, N, 3) the
-    turns of a star's frame by one standard deviation of its x and of its y, or of two independent
-    parts where a noise model has its axes correlate, rad, and `noise_covariance` (K, 3, 3) the
-    covariance of phi from centroid noise, rad^2.
-    """
-
-    post: Posterior
-    obs: Observations
-    weights: FloatArray | None
-    noise_px: FloatArray
-    response: FloatArray
-    noise_response: FloatArray
-    noise_covariance: FloatArray
-
-    @classmethod
-    def of(cls, post: Posterior, obs: Observations) -> FrameGeometry:
-        """Linearise QUEST on these frames."""
-        obs = weighed(obs, post)
-        noise_px, weights = _noise(post, obs)
-        model, xy, starts = post.camera.distortion, obs.xy, obs.frame_starts
-        b, per_theta = unproject_jacobian(model, post.mean, xy)
-        steps = _STEP_PX * np.eye(2)
-        per_pixel = [
-            (
-                unproject_theta(model, post.mean, xy + step)
-                - unproject_theta(model, post.mean, xy - step)
-            )
-            / (2.0 * _STEP_PX)
-            for step in steps
-        ]
-        w = np.ones(obs.n_stars) if weights is None else weights
-        inverse = np.linalg.inv(
-            _frame_sums(w[:, None, None] * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts)
-        )
-        by_theta = _frame_sums(
-            w[:, None, None] * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts
-        )
-        root = np.eye(2) if obs.noise_axes is None else np.linalg.cholesky(obs.noise_axes)
-        torque = np.stack([(w * noise_px)[:, None] * np.cross(b, column) for column in per_pixel])
-        torque = np.einsum("anj,ab->bnj", torque, root)
-        turns = np.einsum("nij,anj->ani", np.repeat(inverse, np.diff(starts), axis=0), torque)
-        return cls(
-            post=post,
-            obs=obs,
-            weights=weights,
-            noise_px=noise_px,
-            response=inverse @ np.swapaxes(by_theta, 1, 2),
-            noise_response=turns,
-            noise_covariance=_frame_sums(np.einsum("ani,anj->nij", turns, turns), starts),
-        )
-
-    def attitudes(self, thetas: FloatArray, xy: FloatArray) -> FloatArray:
-        """Quaternions (d, K, 4) by QUEST for parameters (d, p) and pixels (N, 2), or (d, N, 2)."""
-        model = self.post.camera.distortion
-        pixels = np.broadcast_to(xy, (len(thetas), *xy.shape[-2:]))
-        b = np.stack(
-            [unproject_theta(model, theta, own) for theta, own in zip(thetas, pixels, strict=True)]
-        )
-        folded = ~np.isfinite(b).all(axis=(1, 2))
-        if folded.any():
-            raise DistortionError(
-                f"at {int(folded.sum())} of {len(b)} posterior draws the distortion {model!r} "
-                "folds over within the "
-                "observed field: use more frames, a tighter prior or a model with fewer "
-                "coefficients."
-            )
-        obs = self.obs
-        return quest(
-            b, obs.directions_icrs, obs.frame_starts, self.weights, covariance=False
-        ).quaternions
-
-    def rotations(self, draws: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
-        """Left rotations (d, K, 3) rad of the attitudes at some draws from those at the posterior
-        mean.
-        """
-        xy = self.obs.xy
-        reference = self.attitudes(self.post.mean[None], xy)
-        for part in self.batches(len(draws)):
-            yield part, left_error(self.attitudes(draws[part], xy), reference)
-
-    def batches(self, count: int) -> Iterator[slice]:
-        """Ranges of draws whose stars fit into memory."""
-        step = max(1, _STARS_AT_ONCE // self.obs.n_stars)
-        return (slice(first, min(first + step, count)) for first in range(0, count, step))
-
-
 def _with_noise(
     frames: FrameGeometry, draws: FloatArray, quiet: FloatArray, seed: int
 ) -> tuple[FloatArray, FloatArray]:
@@ -417,29 +467,6 @@ def _with_noise(
     return excess / (len(draws) * frames.obs.n_frames), np.concatenate(interactions)
 
 
-def _noise(post: Posterior, obs: Observations) -> tuple[FloatArray, FloatArray | None]:
-    """Noise of every star (N,) in px at the posterior mean, its own direction error included, and
-    QUEST's weights.
-    """
-    sigma = float(np.mean(post.sigma_draws))
-    if post.sigma_name != "sigma_scale":
-        return np.full(obs.n_stars, np.hypot(sigma, post.star_error_px)), None
-    if obs.sigma_px is None:
-        raise ObservationError(
-            "the posterior scales the stated noise of the stars, but these observations have no "
-            "sigma_px: "
-            "pass the observations that it was sampled from, or mission_frames(..., "
-            "noise_like=observations).",
-            column="sigma_px",
-        )
-    return np.hypot(sigma * obs.sigma_px, post.star_error_px), obs.sigma_px**-2.0
-
-
-def _frame_sums(values: Any, starts: IntArray) -> FloatArray:
-    sums: FloatArray = np.add.reduceat(values, starts[:-1], axis=0)
-    return sums
-
-
 def _noise_half_widths(covariance: FloatArray, seed: int) -> FloatArray:
     """Half-widths of Gaussian errors with the covariance (K, 3, 3) of a frame taken at random."""
     shape = (max(1, _SAMPLES // len(covariance)), len(covariance), 3, 1)
@@ -449,20 +476,25 @@ def _noise_half_widths(covariance: FloatArray, seed: int) -> FloatArray:
 
 
 def _calibration_half_widths(
-    post: Posterior,
-    together: FloatArray,
-    apart: FloatArray,
-    sigmas: tuple[FloatArray, FloatArray],
-    seed: int,
+    shift: FloatArray, split: _Split, sigmas: Sequence[FloatArray], seed: int
 ) -> list[FloatArray]:
-    """Half-widths of common rotation, rest and total: first-order errors of draws and frames,
+    """Half-widths of common rotation, rest and total: first-order errors of draws (n, q) and frames,
     scaled to `sigmas`.
     """
-    shift = post.theta_draws - post.mean
-    common = _scaled(shift @ together.T, sigmas[0])
+    apart = split.apart
+    common = _scaled(shift @ split.together.T, sigmas[0])
     rng = np.random.default_rng(seed)
     draw, frame = rng.integers(len(shift), size=_SAMPLES), rng.integers(len(apart), size=_SAMPLES)
-    rest = _scaled(np.einsum("np,nip->ni", shift[draw], apart[frame]), sigmas[1])
+    # Few columns at once: there may be a hundred of effects.
+    parts = np.array_split(np.arange(_SAMPLES), -(-shift.shape[1] // _COLUMNS))
+    errors = np.concatenate(
+        [np.einsum("np,nip->ni", shift[draw[part]], apart[frame[part]]) for part in parts]
+    )
+    if split.own_apart:
+        values, vectors = np.linalg.eigh(_total(split.own_apart))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+        errors = errors + np.einsum("nij,nj->ni", root[frame], rng.standard_normal(errors.shape))
+    rest = _scaled(errors, sigmas[1])
     return [_half_widths(errors) for errors in (common, rest, rest + common[draw])]
 
 

@@ -28,7 +28,7 @@ from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.propagation.attitude_error import OBSERVED
-from starcal_uq.propagation.propagate import FrameGeometry
+from starcal_uq.propagation.geometry import FrameGeometry
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -96,12 +96,6 @@ def render_frames(
     SensorError
         For arguments that do not fit together.
     """
-    if n_frames < 1 or min_stars < 0 or seed < 0 or not sigma_px >= 0.0:
-        raise SensorError(
-            f"rendering: n_frames={n_frames}, min_stars={min_stars}, seed={seed}, "
-            f"sigma_px={sigma_px} do not fit; "
-            "give at least one frame and no negative number."
-        )
     rotations, _ = choose_attitudes(
         Sky(stars, camera, EDGE_SIGMAS * sigma_px),
         np.random.default_rng(seed),

@@ -12,7 +12,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
-from starcal_uq.core.errors import CatalogueError, SettingError, StarcalError
+from starcal_uq.core.errors import CatalogueError, SettingError, StarcalError, require
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.origin import SIMULATED, Origin
@@ -55,16 +55,14 @@ class Campaign:
 
     def check(self, error: type[StarcalError]) -> None:
         """Raise `error` for a number that cannot work."""
-        for good, text in (
-            (self.n_frames >= 1, f"n_frames is {self.n_frames}: give at least 1."),
+        require(
+            error,
             (self.min_stars >= 3, f"min_stars is {self.min_stars}: an attitude needs at least 3."),
             (
                 0.0 < self.sigma_px < np.inf,
                 f"sigma_px is {self.sigma_px:g}: give a noise above zero.",
             ),
-        ):
-            if not good:
-                raise error(text)
+        )
 
     def simulate(
         self, stars: StarCatalogue, camera: Camera, seed: int | np.integer

@@ -156,7 +156,7 @@ class _Maker:
         return {
             **self.meta,
             "first_frame": first,
-            "frames": min(self.partition_frames, self.n_frames - first),
+            "n_frames": min(self.partition_frames, self.n_frames - first),
         }
 
     def is_made(self, folder: Path, number: int) -> bool:
@@ -173,7 +173,7 @@ class _Maker:
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         sky = Sky(stars, self.camera, EDGE_SIGMAS * self.sigma_px)
         frame, star, xy = observed(
-            sky, rng, self.sigma_px, n_frames=meta["frames"], min_stars=self.min_stars
+            sky, rng, self.sigma_px, n_frames=meta["n_frames"], min_stars=self.min_stars
         )
         columns: AnyDict = {
             "frame": frame + meta["first_frame"],

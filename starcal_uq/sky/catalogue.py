@@ -30,6 +30,17 @@ from starcal_uq.sky.positions import propagate_proper_motion, ra_dec_deg, unit_v
 if TYPE_CHECKING:
     import pandas as pd
 
+# Of each star.
+COLUMNS = (
+    "star_id",
+    "ra_deg",
+    "dec_deg",
+    "mag",
+    "pm_ra_mas_yr",
+    "pm_dec_mas_yr",
+    "has_proper_motion",
+)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StarCatalogue(Shown):
@@ -93,16 +104,7 @@ class StarCatalogue(Shown):
 
     def select(self, mask: BoolArray | IntArray) -> StarCatalogue:
         """The stars that a mask of shape (n,), or an array of indices, picks, in that order."""
-        columns = (
-            "star_id",
-            "ra_deg",
-            "dec_deg",
-            "mag",
-            "pm_ra_mas_yr",
-            "pm_dec_mas_yr",
-            "has_proper_motion",
-        )
-        changes: dict[str, Any] = {name: getattr(self, name)[mask] for name in columns}
+        changes: dict[str, Any] = {name: getattr(self, name)[mask] for name in COLUMNS}
         return replace(self, **changes)
 
     def at_epoch(self, epoch: float) -> StarCatalogue:
@@ -151,16 +153,7 @@ class StarCatalogue(Shown):
         """A pandas table with one row for each star and the columns of this class."""
         import pandas as pd
 
-        names = (
-            "star_id",
-            "ra_deg",
-            "dec_deg",
-            "mag",
-            "pm_ra_mas_yr",
-            "pm_dec_mas_yr",
-            "has_proper_motion",
-        )
-        return pd.DataFrame({name: getattr(self, name) for name in names})
+        return pd.DataFrame({name: getattr(self, name) for name in COLUMNS})
 
 
 def load_catalogue(

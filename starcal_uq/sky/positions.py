@@ -4,16 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import unit_vectors as unit_vectors
 from starcal_uq.core.types import FloatArray, floats
-
-
-def unit_vectors(ra_deg: FloatArray, dec_deg: FloatArray) -> FloatArray:
-    """Unit vectors (n, 3) of directions, deg: x towards (0, 0), y towards (90, 0), z towards
-    declination 90.
-    """
-    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
-    cos_dec = np.cos(dec)
-    return np.stack([cos_dec * np.cos(ra), cos_dec * np.sin(ra), np.sin(dec)], axis=-1)
 
 
 def ra_dec_deg(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import unit_vectors
 from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.sky.site import Site
@@ -46,13 +47,7 @@ def site_among_stars(
         -1, 3, 3
     )
     latitude, longitude = np.radians(site.latitude_deg), np.radians(site.longitude_deg)
-    up = np.array(
-        [
-            np.cos(latitude) * np.cos(longitude),
-            np.cos(latitude) * np.sin(longitude),
-            np.sin(latitude),
-        ]
-    )
+    up = unit_vectors(site.longitude_deg, site.latitude_deg)
     place_km = floats(erfa.gd2gc(_WGS84, longitude, latitude, site.height_m)) / 1000.0
     velocity = _EARTH_RATE_RAD_S * np.array([-place_km[1], place_km[0], 0.0])
     # Rows times the rotation are columns times its transpose: from the axes of the Earth to those

@@ -40,20 +40,17 @@ class Axis:
 
     def check(self, value: Any, where: str) -> Any:
         """The value in its own type; `StudyError` with `where` in front if it does not fit."""
-        if self.kind == "name":
-            if not isinstance(value, str) or (self.choices and value not in self.choices):
-                raise StudyError(f"{where}: {self.name} is {shown(value)}; {self.wanted}.")
-            return value
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        # Whole numbers may come as floats.
-        value = (
-            int(value)
-            if self.kind == "whole" and number and math.isfinite(value) and value % 1 == 0
-            else value
-        )
-        if not number or self.limit is None or not self.limit.holds(value):
+        if self.limit is None:
+            good = isinstance(value, str) and (not self.choices or value in self.choices)
+        else:
+            # Whole numbers may come as floats.
+            if self.limit.whole and number and math.isfinite(value) and value % 1 == 0:
+                value = int(value)
+            good = number and self.limit.holds(value)
+        if not good:
             raise StudyError(f"{where}: {self.name} is {shown(value)}; {self.wanted}.")
-        return value if self.kind == "whole" else float(value)
+        return float(value) if self.kind == "number" else value
 
     @property
     def kind(self) -> str:

@@ -274,9 +274,7 @@ class StudyDefinition:
                 "values, or a Latin hypercube."
             )
         try:
-            camera_of(
-                self.camera, {k: v for k, v in self.observation.items() if k not in self.sweep}
-            )
+            camera_of(self.camera, self._fixed)
         except StudyError as error:
             raise StudyError(f"{where}, section [camera]: {error}") from None
 
@@ -357,9 +355,14 @@ class StudyDefinition:
             dict(zip(columns, point, strict=True)) for point in zip(*columns.values(), strict=True)
         ]
 
+    @property
+    def _fixed(self) -> AnyDict:
+        """Settings that the sweep does not change."""
+        return {k: v for k, v in self.observation.items() if k not in self.sweep}
+
     def cells(self) -> list[Cell]:
         """Every cell: the grid, the hypercube within it, and the repetitions within that."""
-        fixed = base_settings({k: v for k, v in self.observation.items() if k not in self.sweep})
+        fixed = base_settings(self._fixed)
         made = []
         for values in product(*self.sweep.values()):
             grid = fixed | dict(zip(self.sweep, values, strict=True))

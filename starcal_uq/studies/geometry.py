@@ -20,7 +20,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.formatting import count
-from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.terms import add_by_group
@@ -149,8 +149,14 @@ class _Views(Window):
         b = np.matmul(rotations[frame], self.depth.directions[star][:, :, None])[:, :, 0]
         xy, inside = self.seen(b)
         sizes = np.bincount(frame[inside], minlength=len(rotations))
-        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        return Geometry(self.camera, self.depth, rotations, starts, star[inside], xy[inside])
+        return Geometry(
+            self.camera, self.depth, rotations, _starts(sizes), star[inside], xy[inside]
+        )
+
+
+def _starts(sizes: IntArray) -> IntArray:
+    """Bounds (M + 1,) of the stars of frames of these sizes."""
+    return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,23 +180,29 @@ class Geometry:
         """Number M of frames."""
         return len(self.rotations)
 
+    def _with(
+        self, rotations: FloatArray, starts: IntArray, kept: BoolArray | IntArray | slice
+    ) -> Geometry:
+        """Other frames, of the stars that are kept."""
+        return replace(
+            self,
+            rotations=rotations,
+            starts=starts,
+            star=self.star[kept],
+            pixel=self.pixel[kept],
+        )
+
     def with_stars(self, n: int) -> Geometry:
         """The frames with at least n stars."""
         sizes = np.diff(self.starts)
         good = sizes >= n
         kept = np.repeat(good, sizes)
-        starts = np.concatenate([[0], np.cumsum(sizes[good])]).astype(np.int64)
-        return Geometry(
-            self.camera, self.depth, self.rotations[good], starts, self.star[kept], self.pixel[kept]
-        )
+        return self._with(self.rotations[good], _starts(sizes[good]), kept)
 
     def first(self, n: int) -> Geometry:
         """The first n frames."""
         stars = slice(0, int(self.starts[min(n, self.n_frames)]))
-        starts = self.starts[: n + 1]
-        return Geometry(
-            self.camera, self.depth, self.rotations[:n], starts, self.star[stars], self.pixel[stars]
-        )
+        return self._with(self.rotations[:n], self.starts[: n + 1], stars)
 
     @classmethod
     def joined(cls, parts: Sequence[Geometry]) -> Geometry:
@@ -200,7 +212,7 @@ class Geometry:
             parts[0].camera,
             parts[0].depth,
             np.concatenate([part.rotations for part in parts]),
-            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+            _starts(sizes),
             np.concatenate([part.star for part in parts]),
             np.concatenate([part.pixel for part in parts]),
         )
@@ -219,10 +231,7 @@ class Geometry:
         rank = np.arange(len(order)) - self.starts[:-1][frame]
         kept = np.sort(order[rank < n])
         sizes = np.minimum(np.diff(self.starts), n)
-        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        return Geometry(
-            self.camera, self.depth, self.rotations, starts, self.star[kept], self.pixel[kept]
-        )
+        return self._with(self.rotations, _starts(sizes), kept)
 
     def frames(self, sigma_px: FloatArray) -> StarFrames:
         """Stars with this noise (N,), px per axis."""

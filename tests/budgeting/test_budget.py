@@ -41,9 +41,10 @@ from starcal_uq.budgeting.rows import (
     Contributor,
 )
 from starcal_uq.budgeting.shapes import one_axis_factor
-from starcal_uq.budgeting.totals import Total
+from starcal_uq.budgeting.totals import Difference, Total
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
+from starcal_uq.core.findings import Finding
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.diagnostics.inflation import with_misfit
@@ -406,24 +407,30 @@ def test_frames_that_disagree_multiply_both_calibration_rows() -> None:
 
 
 def test_reasons_that_differ_in_numbers_alone_are_told_once() -> None:
-    texts = [
-        f"The rule is {size} % below: the sigma of {name} reaches 3.35."
+    found = [
+        Finding(
+            Difference.DIFFER,
+            {
+                "size": size,
+                "side": "below",
+                "reasons": (Finding(Difference.CHANGING_SIGMA, {"row": name, "tail_sigma": 3.35}),),
+            },
+        )
         for size, name in zip(
-            (11, 9.5, 14, 12, 11),
-            ("'row 1'", "'row 1'", "'row 1'", "'row 2'", '"user\'s 1"'),
+            (0.11, 0.095, 0.14, 0.12, 0.11),
+            ("row 1", "row 1", "row 1", "row 2", "user's 1"),
             strict=True,
         )
     ]
     whole = made()
     totals = [total for total in whole.totals if total.interpretation == "mixed"][:5]
     few = [
-        dataclasses.replace(total, explanation=text)
-        for total, text in zip(totals, texts, strict=True)
+        dataclasses.replace(total, difference=one) for total, one in zip(totals, found, strict=True)
     ]
     told = explanations(dataclasses.replace(whole, totals=tuple(few)))
     assert [line.partition(": ")[2] for line in told] == [
-        "The rule is 9.5 to 14 % below: the sigma of 'row 1' reaches 3.35.",
-        *texts[3:],
+        found[0].sentence.replace("11\xa0%", "9.5 to 14\xa0%"),
+        *(one.sentence for one in found[3:]),
     ]
     assert told[0].startswith(
         "X (pitch), before alignment; Y (yaw), before alignment; Z (roll), before alignment: "
@@ -1199,7 +1206,8 @@ def test_json_is_all_that_the_tables_hold(stated: Path) -> None:
         ]
 
     assert plain["contributors"] == lines(found.rows, "assessed", "combination")
-    totals = lines(found.totals, "at_least")
+    totals = lines(found.totals, "explanation", "at_least")
+    assert all(line.pop("difference") for line in totals)
     assert plain["totals"] == [
         {**line, "not_assessed": "; ".join(line["not_assessed"])} for line in totals
     ]
@@ -1260,6 +1268,8 @@ def test_names_of_axes_and_limits_of_this_confidence(tmp_path: Path) -> None:
         for kind in (Contributor, Requirement, Total)
         for field in dataclasses.fields(kind)
     ]
+    # Facts for programs beside the words for readers.
+    names.insert(names.index("difference"), "explanation")
     columns = ["record", *dict.fromkeys(names), "combination", "margin_arcsec", "verdict", "value"]
     assert text[0] == ",".join(columns)
     kinds = [line.split(",")[0] for line in text[1:]]

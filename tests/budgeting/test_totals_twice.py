@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy import optimize, special, stats
+from scipy import linalg, optimize, special, stats
 
 from starcal_uq.budgeting.rows import GAUSSIAN_997, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import RAYLEIGH_MEAN, half_width, mixture_spread, two_axis_radius
@@ -192,7 +192,7 @@ def sampled_rows(rows: list[Contributor]) -> list[np.ndarray | None]:
     scales: dict[str, np.ndarray] = {}
     found: list[np.ndarray | None] = []
     first = {entry.name: place for place, entry in reversed([*enumerate(rows)])}
-    values, vectors = np.linalg.eigh(np.array(CORRELATION))
+    root = linalg.sqrtm(np.array(CORRELATION)).real
     for index, entry in enumerate(rows):
         if not entry.assessed or not entry.sigma_arcsec > 0.0:
             found.append(None)
@@ -203,7 +203,7 @@ def sampled_rows(rows: list[Contributor]) -> list[np.ndarray | None]:
         )
         if entry.axis_correlation:
             plain = stream.standard_normal((SAMPLES, 3))
-            uniform = stats.norm.cdf(plain @ (vectors * np.sqrt(values))[AXES.index(entry.axis)])
+            uniform = stats.norm.cdf(plain @ root[AXES.index(entry.axis)])
         else:
             uniform = stream.random(SAMPLES)
         uniform = shared.setdefault(group, uniform) if group else uniform
@@ -373,7 +373,7 @@ def test_all_totals_are_those_of_a_second_make() -> None:
     errors = sampled_rows(rows)
     wanted = [second(rows, errors, *each) for each in itertools.product(SCOPES, TOTAL_AXES, KINDS)]
     for one, expected in zip(found, wanted, strict=True):
-        values = {name: value for name, value in vars(one).items() if name != "explanation"}
+        values = {name: value for name, value in vars(one).items() if name != "difference"}
         assert values.keys() == expected.keys()
         for name, value in values.items():
             close = (
@@ -553,7 +553,7 @@ def test_a_difference_is_explained_by_what_is_large_enough(
     )
     told = dataclasses.replace(told, **numbers)
     random = [entry for entry in rows if entry.interpretation == "ensemble"]
-    assert explain(told, rows, random, rows[0]) == sentence.replace(
+    assert explain(told, rows, random, rows[0]).sentence == sentence.replace(
         " %", "\N{NO-BREAK SPACE}%"
     ).replace("99.7\N{NO-BREAK SPACE}%", "99.7 %")
 

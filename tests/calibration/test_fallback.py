@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.calibration.fallback import fallback_words
 from starcal_uq.core.errors import CalibrationError, SamplingError
 from starcal_uq.core.remedy import PLAN
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.verdict import estimate
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import symmetric_inverse
+from starcal_uq.presentation.words.estimation import fallback_words
 from tests.helpers.outside import Campaign, campaign
 
 

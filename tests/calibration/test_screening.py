@@ -16,7 +16,7 @@ import starcal_uq as sc
 from starcal_uq.calibration.screening.result import COLUMNS, REASONS
 from starcal_uq.calibration.screening.screening import screen
 from starcal_uq.calibration.screening.tails import allowed_near, fit_tails
-from starcal_uq.estimation.consensus import focal_ratio, pre_screen
+from starcal_uq.estimation.consensus import focal_lengths, ideal_frames, pre_screen
 from starcal_uq.estimation.outliers import (
     star_residuals,
     star_threshold,
@@ -154,7 +154,8 @@ def test_pre_screen_with_an_uncalibrated_camera(focal: float) -> None:
     for kind in ("random", "neighbour"):
         dirty = contaminate(obs, deep_catalogue(), TRUTH, 0.1, kind, seed=1)
         frames = StarFrames.from_observations(dirty.observations)
-        assert focal_ratio(nominal, frames) * focal == pytest.approx(1.0, abs=2e-3)
+        found = focal_lengths(ideal_frames(nominal, frames), nominal.focal_px)
+        assert found / nominal.focal_px * focal == pytest.approx(1.0, abs=2e-3)
         agree, _ = pre_screen(nominal, frames)
         assert not np.any(~agree & ~dirty.wrong)
         missed = dirty.wrong & agree

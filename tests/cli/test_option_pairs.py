@@ -29,6 +29,7 @@ VALUES = {
     "--robust": (None,),
     "--star-errors": (None,),
     "--noise": ("model",),
+    "--effects": ("auto", "none", "field,frame", "star"),
     "--start": ("x0_px=500",),
     "--max-iterations": ("500",),
     "--accept-inflation": (None,),
@@ -58,6 +59,7 @@ VALUES = {
     "--dof": ("free", "5"),
     "--alignment": ("observed", "rich.csv"),
     "--alignment-frames": ("20",),
+    "--onboard": ("effects",),
     "--budget": ("budget.toml",),
     "--json": (None,),
 }
@@ -205,6 +207,14 @@ def test_some_pairs_of_options_work_or_are_refused_in_words(asked):
     assert asked("plain.csv", [("--robust", None), ("--model", "k1")])
     assert asked("plain.csv", [("--robust", None), ("--noise", "model")])
     assert asked("plain.csv", [("--robust", None), ("--star-errors", None)])
+    assert asked("plain.csv", [("--effects", "auto"), ("--noise", "model")])
+    assert asked("plain.csv", [("--effects", "field"), ("--robust", None)])
+    assert asked("plain.csv", [("--effects", "auto"), ("--screen", None)])
+    assert asked("parts", [("--effects", "none")])
+    assert asked("plain.csv", [("--effects", "none"), ("--star-errors", None)])
+    assert not asked("parts", [("--effects", "auto")])
+    assert not asked("plain.csv", [("--effects", "frame"), ("--star-errors", None)])
+    assert not asked("plain.csv", [("--effects", "auto"), ("--method", "samaan")])
     assert not asked("plain.csv", [("--robust", None), ("--method", "three_stage")])
     assert not asked("plain.csv", [("--star-errors", None), ("--method", "samaan")])
     assert not asked("parts", [("--star-errors", None)])

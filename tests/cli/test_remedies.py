@@ -135,7 +135,7 @@ EXAMPLES = {
         checks._evaluation(changed(s.post, compressed_max_difference=value))
         for value in (9.0, float("nan"))
     ],
-    "inference.checks._likelihood": lambda s: [checks._likelihood(short_of("pairs_naive", s), ())],
+    "inference.checks._likelihood": lambda s: [checks._likelihood(short_of("pairs_naive", s), {})],
     "inference.named.find_source": lambda s: list(
         sc.sample(
             s.obs,
@@ -411,7 +411,7 @@ def test_every_check_has_an_example():
     # Requirements of a budget have advice alone: tests/cli/test_cli_mission.py.
     shared = {
         *(f"inference.checks.{name}" for name in shared),
-        "presentation.words.budgeting._requirement_check",
+        "budgeting.result._requirement_check",
     }
     assert giving - shared == set(EXAMPLES)
 
@@ -432,6 +432,7 @@ def remedies(small):
             # Something to try: a command, a call, or an order of what to do with instrument or
             # data.
             assert re.fullmatch(r"\S.*\.", check.sentence), check.sentence
+            assert check.value and check.bound and check.told is None, name
             assert check.remedies or check.advice, f"{name} gives nothing to try: {check}"
             assert not check.advice or re.fullmatch(r"[A-Z].*\.", check.advice), check.advice
             typed = any(remedy.command for remedy in check.remedies)

@@ -22,7 +22,7 @@ from starcal_uq.diagnostics.models import compare_models
 from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.attitude_error import AttitudeError
-from starcal_uq.propagation.propagate import FrameGeometry
+from starcal_uq.propagation.geometry import FrameGeometry
 from tests.helpers.outside import Campaign, attitude_errors, campaign
 from tests.helpers.posteriors import normal_posterior
 
@@ -131,7 +131,7 @@ def test_the_choice_is_stated_wherever_the_error_is() -> None:
     assert found.choice_models == ("brown_tangential",) and not found.reasons
     sentence = "'brown_tangential' predicts about as well as the fitted model"
     assert sentence in run.error.text and sentence in " ".join(
-        limits(run.obs, run.cal, attitude=run.error)
+        one.sentence for one in limits(run.obs, run.cal, attitude=run.error)
     )
     table = run.error.to_dataframe().set_index(["contributor", "axis"])["choice_of_model_arcsec"]
     np.testing.assert_array_equal(

@@ -16,9 +16,9 @@ from benchmarks import regimes
 from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, _Columns, misfit_tests
-from starcal_uq.diagnostics.shapes import View, shapes
 from starcal_uq.diagnostics.verdict.estimate import misfit
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.shapes import View, shapes
 from starcal_uq.maths.intervals import holm
 from starcal_uq.observations.frames import StarFrames
 from tests.helpers.outside import campaign

@@ -117,17 +117,48 @@ def test_every_reader_shows_the_same_checks(short, disputed, monkeypatch, tmp_pa
     )
 
 
+def test_posteriors_of_earlier_versions_keep_the_words_of_their_checks(
+    disputed, tmp_path, monkeypatch
+):
+    path = tmp_path / "posterior.nc"
+
+    def without_facts(record, dumps=json.dumps):
+        for kept in record.get("diagnostics", {"checks": ()})["checks"]:
+            # For readers beside the facts, and all that there was before.
+            assert kept["sentence"] and kept["value"] and kept["bound"] and kept["name"]
+            kept["sentence"] = f"Long ago: {kept['sentence']}"
+            for name in ("values", "bounds", "orders", "told"):
+                del kept[name]
+        return dumps(record)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(json, "dumps", without_facts)
+        disputed.save(path)
+    old = sc.Posterior.load(path)
+    old.save(path, force=True)
+    for before, read, again in zip(
+        *(one.diagnostics.checks for one in (disputed, old, sc.Posterior.load(path))),
+        strict=True,
+    ):
+        assert read.sentence == f"Long ago: {before.sentence}"
+        assert (read.value, read.bound, read.advice) == (before.value, before.bound, before.advice)
+        assert again == read and str(again) == str(read)
+
+
 def test_checks_are_data():
     check = Check(
         Code.R_HAT,
+        {"rhat": 1.2, "disagreeing": ("f",), "n_ensembles": 4},
         Level.FAIL,
-        "1.2",
-        "< 1.01",
-        "Ensembles disagree.",
+        {"rhat_below": 1.01},
         (Remedy("sample", (RUN,), form="call"),),
     )
-    assert from_plain(Check, json.loads(json.dumps(to_plain(check)))) == check
-    assert str(check).startswith("fail: R-hat, 1.2 (asked for: < 1.01). ")
+    plain = json.loads(json.dumps(to_plain(check)))
+    assert plain["values"] == {"rhat": 1.2, "disagreeing": ["f"], "n_ensembles": 4}
+    assert to_plain(from_plain(Check, plain)) == plain
+    assert str(check).startswith(
+        "fail: R-hat, 1.2000 (asked for: < 1.01). The ensembles disagree in f: raise n_steps "
+    )
     assert str(check).endswith("Remedy: sc.sample(obs, cal)")
     assert [level.exit_status for level in Level] == [0, 0, 1]
     assert worst(()) is Level.PASS
@@ -147,7 +178,12 @@ def test_numbers_are_judged_with_their_monte_carlo_error(short):
 
 
 def test_what_a_run_was_made_with_is_no_remedy():
-    asked = Check(Code.EVENNESS_OF_THE_NOISE, Level.WARN, "9", "0", "Uneven.", NOISE + ROBUST)
+    asked = Check(
+        Code.EVENNESS_OF_THE_NOISE,
+        {"tests": ("uneven",), "p_value": 0.0},
+        Level.WARN,
+        remedies=NOISE + ROBUST,
+    )
     words = ("run", "obs.csv", "camera.toml", "--noise")
     plain = ("--method", "least_squares")
     found = Place("r", (*words, "model", *plain)).exact(asked)
@@ -176,7 +212,7 @@ def test_remedies_name_the_files_of_the_run():
     """By the command that made the run where there was one, else by what the run holds; calls in
     Python stay.
     """
-    check = Check(Code.OUTLIERS, Level.WARN, "9", "0", "Wrong stars.", SCREEN)
+    check = Check(Code.OUTLIERS, level=Level.WARN, remedies=SCREEN)
     made = Place(
         "/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--noise", "model")
     ).exact(check)

@@ -23,15 +23,22 @@ from starcal_uq.diagnostics.residuals import (
     residual_scale,
 )
 from starcal_uq.diagnostics.verdict import estimate
+from starcal_uq.diagnostics.verdict import limits as limiting
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.judge import judge
-from starcal_uq.diagnostics.verdict.limits import limits
-from starcal_uq.diagnostics.verdict.observed import OUTLIER_P, PATTERN_P, aberration_size
+from starcal_uq.diagnostics.verdict.observed import OUTLIER_P, PATTERN_P
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.tables import mean_to_mcse
+from starcal_uq.presentation.sentences.observed import aberration_words
+from starcal_uq.presentation.words.diagnostics import sensitivity
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import camera, observations, with_sigmas
+
+
+def limits(*results, **more):
+    """What limits a run, in sentences."""
+    return [one.sentence for one in limiting.limits(*results, **more)]
 
 
 @pytest.fixture(scope="module")
@@ -86,10 +93,7 @@ def test_a_good_run_passes_every_check(run):
 def test_a_requirement_of_the_budget_is_part_of_the_verdict(run, level, words):
     required = Check(
         Code.REQUIREMENT,
-        level,
-        "2 arcsec",
-        "at most 1 arcsec",
-        "It is so.",
+        level=level,
         title="Requirement 'R-1'",
     )
     verdict = judge(run.obs, run.cal, run.post, run.truth, requirements=[required])
@@ -519,9 +523,7 @@ def test_the_smallest_effect_that_few_data_show_is_said(run, found):
     few = dataclasses.replace(
         found.jackknife, effective_frames=found.jackknife.effective_frames / 20.0
     )
-    words, fewer = (
-        estimate.sensitivity(d) for d in (found, dataclasses.replace(found, jackknife=few))
-    )
+    words, fewer = (sensitivity(d) for d in (found, dataclasses.replace(found, jackknife=few)))
     assert (
         "120 frames" in words
         and "smooth pattern over radius" in words
@@ -534,7 +536,7 @@ def test_the_smallest_effect_that_few_data_show_is_said(run, found):
 def test_annual_aberration_is_that_of_the_field(run):
     """The sentence that named 10 degrees and 3.6 arcsec for every camera is the control."""
     narrow = run.truth.replace(focal_mm=5.0 * run.truth.focal_mm)
-    assert "5.0 arcsec" in aberration_size(run.truth) and "1.0 arcsec" in aberration_size(narrow)
+    assert "5.0 arcsec" in aberration_words(run.truth) and "1.0 arcsec" in aberration_words(narrow)
 
 
 def test_a_stated_noise_that_is_not_in_pixels_is_recognised():

@@ -177,16 +177,15 @@ def test_shuffled_identifications_are_not_called_a_calibration():
 
 def test_ipopt_keeps_the_principal_point_on_the_detector():
     """A handful of stars lets the optics run away; IPOPT's constraints hold."""
-    from starcal_uq.estimation.stages import constraints_for, joint_stage
+    from starcal_uq.estimation.stages import Search, constraints_for, joint_stage
     from starcal_uq.likelihood.pairs import PairObjective
     from starcal_uq.observations.frames import StarFrames
 
     obs = observations(n_frames=60, sigma_px=3.0)
     few = obs.select_frames(obs.frame_ids[:3])
     cam = nominal(camera())
-    stage = joint_stage(
-        PairObjective(StarFrames.from_observations(few), "brown"), cam, cam.theta, "ipopt", 300
-    )
+    pairs = PairObjective(StarFrames.from_observations(few), "brown")
+    stage = joint_stage(pairs, cam, cam.theta, Search("ipopt", 300))
     limits = constraints_for(cam, 5)
     assert (stage.theta >= limits.lower - 1e-6).all()
     assert (stage.theta <= limits.upper + 1e-6).all()

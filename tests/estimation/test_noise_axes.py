@@ -12,13 +12,13 @@ from starcal_uq.core.records import from_plain
 from starcal_uq.core.status import Level
 from starcal_uq.diagnostics import misfit
 from starcal_uq.diagnostics.misfit import misfit_tests
-from starcal_uq.diagnostics.shapes import View, shapes
 from starcal_uq.diagnostics.verdict.estimate import even_noise
 from starcal_uq.estimation.merging import merge
 from starcal_uq.estimation.noise_model import axis_noise
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
+from starcal_uq.likelihood.shapes import View, shapes
 from starcal_uq.planning.information import random_frames
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers.outside import Campaign, attitude_errors, campaign

@@ -13,7 +13,7 @@ from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.misfit import misfit_tests
 from starcal_uq.diagnostics.verdict.estimate import even_noise
 from starcal_uq.estimation.noise_model import fit_noise
-from starcal_uq.estimation.stages import refinement_stage
+from starcal_uq.estimation.stages import REFINEMENT_TOLERANCE, Search, refinement_stage
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import noise_model_of
@@ -161,7 +161,9 @@ def quick(sigma, seed):
     camera = camera.with_theta(c.theta)
     plain = MarginalLikelihood(obs, "brown")
     plain.use_rotations(plain.start_rotations(c.theta))
-    theta = refinement_stage(plain, c.theta, 50).theta
+    theta = refinement_stage(
+        plain, c.theta, Search(max_iterations=50, tolerance=REFINEMENT_TOLERANCE)
+    ).theta
     model, fitted = fit_noise(obs, camera.with_theta(theta))
     weighted = MarginalLikelihood(obs.weighted(model.sigma_px(obs)), "brown")
     z = []

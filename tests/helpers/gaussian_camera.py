@@ -63,6 +63,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "attitude_noise": np.eye(3) * 1e-12,
         "provenance": Provenance(data_sha256="0" * 64),
         "star_errors": None,
+        "effects": None,
         "noise_model": None,
         "inflation": None,
         "width_factors": np.ones(5),
@@ -70,6 +71,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "undetermined": (),
     }
     values |= changes
+    values["log_likelihood"] = getattr(values["compressed"], "log_likelihood", None)
     return SimpleNamespace(**values, remedy=values["status"].value)
 
 
@@ -98,5 +100,6 @@ def gaussian_posterior(
         attitude_noise=cal.attitude_noise,
         provenance=Provenance(),
         star_error_px=0.0,
+        effects=None,
         thin=lambda count, seed: draws[np.random.default_rng(seed).permutation(n)[:count]],
     )

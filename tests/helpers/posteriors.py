@@ -20,5 +20,6 @@ def normal_posterior(cal: sc.Calibration) -> Any:
         sigma_name=cal.sigma_name,
         provenance=cal.provenance,
         star_error_px=0.0,
+        effects=None,
         inflation=None,
     )

@@ -20,7 +20,8 @@ from starcal_uq.images import fits as star_fits
 from starcal_uq.images.background import prepare_image
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.extract import extract_centroids
-from starcal_uq.images.image import Image, read_image
+from starcal_uq.images.image import Image
+from starcal_uq.images.read import read_image
 from tests.helpers.speed import sort_a_million, times_as_long
 
 sep, fits = (
@@ -268,9 +269,7 @@ def test_windows_settle_where_sextractors_do():
     xy, image, found = trial(100, 2.0)
     frame, _, _ = prepare_image(Image(image, "window"), 1.0, None, None)
     start, width = found.xy[:, 0] + 0.2, np.full(len(found), 2.0)
-    stamps = star_fits.cut_stamps(
-        frame.counts, None, start, found.xy[:, 1] - 0.2, 9, frame.noise, 1.0
-    )
+    stamps = star_fits.cut_stamps(frame, start, found.xy[:, 1] - 0.2, 9)
     x, y, good = star_fits.window_positions(
         stamps, image.shape, start, found.xy[:, 1] - 0.2, np.hypot(width, 0.3), width, 2e-4
     )

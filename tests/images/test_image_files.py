@@ -26,7 +26,8 @@ from starcal_uq.core import files
 from starcal_uq.core.errors import ImageError, MissingExtraError
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS
 from starcal_uq.images.extract import _Measure, extract_centroids
-from starcal_uq.images.image import Image, read_image, read_images
+from starcal_uq.images.image import Image
+from starcal_uq.images.read import read_image, read_images
 
 
 def card(key, value, comment=""):

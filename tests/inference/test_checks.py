@@ -161,11 +161,16 @@ def test_points_around_the_mode_are_three_standard_deviations_out() -> None:
 
 
 def test_a_likelihood_that_is_known_to_be_wrong(post: Posterior) -> None:
-    assert checks._likelihood(changed(post, likelihood="marginal"), ()) is None
-    pairs = checks._likelihood(changed(post, likelihood="pairs"), ("Godambe.",))
+    assert checks._likelihood(changed(post, likelihood="marginal"), {}) is None
+    pairs = checks._likelihood(changed(post, likelihood="pairs"), {"variability": "empirical"})
     assert pairs.level is Level.PASS and pairs.remedy == ""
-    assert pairs.sentence == "The posterior is that of the likelihood 'pairs'. Godambe."
-    naive = checks._likelihood(changed(post, likelihood="pairs_naive"), ())
+    assert pairs.sentence == (
+        "The posterior is that of the likelihood 'pairs'. It is the composite one over pairs of "
+        "stars, with Godambe's curvature; its variability comes from the scatter between frames. "
+        "sigma is estimated from the pixel residuals at the best attitudes; pairs have no say in "
+        "it."
+    )
+    naive = checks._likelihood(changed(post, likelihood="pairs_naive"), {})
     assert (
         naive.level is Level.FAIL
         and "which they are not" in naive.sentence
@@ -189,7 +194,7 @@ def test_sampling_again_keeps_the_settings(post: Posterior) -> None:
 def test_remedies_that_were_written_as_text_are_read(post: Posterior) -> None:
     own = checks.resample(post, likelihood="gaussian")
     for remedies in (checks.resample(post, n_steps=900), own, with_model("k1") + PLAN, PLAN, ()):
-        bad = Check(Code.BOUNDS, Level.FAIL, "1", "0", "Bad.", remedies)
+        bad = Check(Code.BOUNDS, remedies=remedies)
         assert read_remedies(bad.remedy) == remedies
 
 

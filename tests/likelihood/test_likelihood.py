@@ -16,7 +16,6 @@ from starcal_uq.likelihood import compressed as module
 from starcal_uq.likelihood.compressed import (
     CompressedLikelihood,
     _derivatives,
-    _Expansion,
     combined,
     compress,
     gram_sums,
@@ -61,7 +60,7 @@ def test_attitudes_are_searched_from_where_it_was_said(monkeypatch):
     )
     for point in (theta, theta + np.array([1e-3, 0.0, 0.0, 0.0, 0.0])):
         compress(likelihood, point, symmetric_inverse(sums.normal.matrix))
-    assert known == [(sums, attitudes), None]
+    assert known[0] == (sums, attitudes) and known[1][0].cost != sums.cost
     likelihood.use_rotations(best)
     assert likelihood.last_sums is None and likelihood.rotations is best
     assert np.max(off(likelihood.rotations_at(theta))) < 1e-9
@@ -180,7 +179,9 @@ def test_slope_of_the_determinant_is_that_along_the_parameters(model):
     exact, theta = MarginalLikelihood(obs, model), camera(model).theta
     whitening = 3.0 * scaled_cholesky(symmetric_inverse(exact.evaluate(theta).matrix))
     rotations = exact.start_rotations(theta)
-    slope = gram_sums(exact.frames, model, theta, whitening, rotations).log_determinant_slope
+    slope = gram_sums(
+        exact.frames, model, theta, whitening, exact.sums(theta)
+    ).log_determinant_slope
     ahead, behind = (
         [
             np.sum(exact.profile(theta + sign * column, rotations)[0].log_determinant)
@@ -198,16 +199,18 @@ def test_gram_is_that_of_columns_without_what_attitudes_reproduce(model):
         camera(model).theta,
     )
     whitening = scaled_cholesky(symmetric_inverse(exact.evaluate(theta).matrix))
-    block = _Expansion(model, theta, whitening).block(exact.frames, exact.start_rotations(theta))
-    state, _ = exact.profile(theta, block.rotations)
-    columns = exact.project_out(state, block.columns).reshape(len(block.columns), -1)
-    scale = 1.0 / np.linalg.norm(columns, axis=1)
-    difference = (block.gram(exact.frames, len(theta)) - columns @ columns.T) * np.outer(
-        scale, scale
+    seen = []
+    known = exact.sums(theta)
+    found = gram_sums(
+        exact.frames, model, theta, whitening, known, lambda _, columns: seen.append(columns)
     )
-    assert np.max(np.abs(difference)) < 1e-6
+    (own,) = seen
+    state, _ = exact.profile(theta, known[1].at(theta))
+    columns = exact.project_out(state, own).reshape(len(own), -1)
+    scale = 1.0 / np.linalg.norm(columns, axis=1)
+    assert np.max(np.abs((found.gram - columns @ columns.T) * np.outer(scale, scale))) < 1e-6
     # Control: attitudes reproduce a large part of some second derivatives.
-    raw = np.linalg.norm(block.columns.reshape(len(columns), -1), axis=1)
+    raw = np.linalg.norm(own.reshape(len(columns), -1), axis=1)
     assert np.max(raw * scale) > 1.3
 
 

@@ -12,7 +12,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.camera.projection import forward_kernel
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.likelihood import paths, sums
+from starcal_uq.likelihood import arrays, paths
 from starcal_uq.likelihood.compressed import gram_sums
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
@@ -36,13 +36,19 @@ def test_parts_add_up_wherever_they_are_cut():
     frames, theta = likelihood.frames, camera().theta
     whole, attitudes = settled_sums(frames, "brown", theta, likelihood.start_rotations(theta))
     whitening = np.diag(1.0 / np.sqrt(np.diag(whole.matrix)))
-    gram = gram_sums(frames, "brown", theta, whitening, attitudes.rotations)
+    gram = gram_sums(frames, "brown", theta, whitening, (whole, attitudes))
     cuts = [(0, 1), (1, 27), (27, 60)]
     parts = [
         frame_sums(frames.part(a, b), "brown", theta, attitudes.rotations[a:b])[0] for a, b in cuts
     ]
     grams = [
-        gram_sums(frames.part(a, b), "brown", theta, whitening, attitudes.rotations[a:b])
+        gram_sums(
+            frames.part(a, b),
+            "brown",
+            theta,
+            whitening,
+            settled_sums(frames.part(a, b), "brown", theta, attitudes.rotations[a:b]),
+        )
         for a, b in cuts
     ]
     total = sum_of(parts)
@@ -68,7 +74,7 @@ def test_blocks_of_any_size_give_the_same_sums_and_residuals(monkeypatch):
     rotations = likelihood.start_rotations(theta)
     both = []
     for block in (3000, 40):
-        monkeypatch.setattr(sums, "BLOCK_STARS", block)
+        monkeypatch.setattr(arrays, "BLOCK_STARS", block)
         residuals = np.full((2, frames.n_stars), np.nan)
         both.append((*frame_sums(frames, "brown", theta, rotations, residuals), residuals))
     assert len(frames.parts(40)) > 2
@@ -212,7 +218,8 @@ def _compare_gram(likelihood, model, theta, rotations, matrix, monkeypatch):
     both = []
     for path in ("numba", "numpy"):
         monkeypatch.setenv(paths.SWITCH, path)
-        both.append(gram_sums(likelihood.frames, model, theta, whitening, rotations))
+        known = settled_sums(likelihood.frames, model, theta, rotations)
+        both.append(gram_sums(likelihood.frames, model, theta, whitening, known))
     fused, plain = both
     p = len(theta)
     difference = np.abs(_scaled(fused.gram - plain.gram, plain.gram))
@@ -261,8 +268,13 @@ def _residuals(likelihood, model, theta, rotations):
 def test_machine_code_is_kept_for_other_processes_and_not_needed(tmp_path, monkeypatch):
     script = (
         "import numpy as np\n"
-        "from starcal_uq.likelihood.loops import turned_loop\n"
-        "print(turned_loop(np.zeros((3, 1)), np.eye(3)[None]).trace(axis1=1, axis2=2)[0])\n"
+        "from starcal_uq.likelihood.loops import attitudes\n"
+        "from starcal_uq.observations.frames import StarFrames\n"
+        "r = np.array([[0.1, 0.0], [0.0, 0.1], [0.995, 0.995]])\n"
+        "r /= np.linalg.norm(r, axis=0)\n"
+        "frames = StarFrames(500.0 * r[:2] / r[2], r, None, np.array([0, 2]))\n"
+        "turn = attitudes(frames, 'none', np.array([0.0, 0.0, 500.0]))\n"
+        "print(round(turn[0].trace(), 9))\n"
     )
 
     def run(folder):
@@ -280,7 +292,8 @@ def test_machine_code_is_kept_for_other_processes_and_not_needed(tmp_path, monke
 
     run(tmp_path / "cache")
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nbc")}
-    assert len(kept) == 1
+    # A loop, and the kernel of the model.
+    assert len(kept) == 2
     run(tmp_path / "cache")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nbc")} == kept
     blocked = tmp_path / "file"

@@ -87,4 +87,7 @@ def test_a_fact_has_one_of_the_known_names_and_values():
     with pytest.raises(ObservationError, match="meta directions is 'nice'"):
         table(directions="nice")
     assert not table(source="simulated, then identified in part").origin.from_images
+    # Words are those of a mission; a number of frames says nothing of which frames they are.
+    assert table(frames="a mission").origin.frames == "a mission"
+    assert table(frames=20).origin.frames is None
     assert np.all([table(observer=one).origin.without_air for one in ("space", "rendered")])

@@ -395,7 +395,7 @@ class TestDownstream:
     @pytest.mark.parametrize(
         ("method", "stream", "given", "likelihood", "words"),
         [
-            ("samaan", True, False, "marginal", "parameters='all'"),
+            ("samaan", True, False, "marginal", "by griffith with all parameters"),
             ("samaan", False, True, "pairs", "method='three_stage'"),
             ("griffith", True, True, "student_t", "a stream does not keep"),
         ],

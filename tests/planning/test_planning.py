@@ -20,7 +20,14 @@ from starcal_uq.maths.linear import inverses
 from starcal_uq.planning import open_distortion
 from starcal_uq.planning.check import ForecastCheck, check_forecast
 from starcal_uq.planning.design import choose_frames
-from starcal_uq.planning.forecast import Forecaster, nea_arcsec, quantities, spreads, student_factor
+from starcal_uq.planning.forecast import (
+    Forecaster,
+    Outlook,
+    nea_arcsec,
+    quantities,
+    spreads,
+    student_factor,
+)
 from starcal_uq.planning.information import FrameSet, look_at, random_frames
 from starcal_uq.planning.open_distortion import with_distortion
 from starcal_uq.planning.plan import Plan, plan
@@ -259,7 +266,7 @@ def test_a_forecast_that_forgets_the_attitudes_fails():
     state, _ = likelihood.profile(cam.theta, found.rotations)
     h = likelihood.derivatives(cam.theta, state)
     wrong = np.moveaxis(found.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
-    forgetful = Forecaster(wrong, found.mean_stars, found, n_campaigns=50).forecast((10, 30))
+    forgetful = Forecaster(found, Outlook(n_campaigns=50), wrong).forecast((10, 30))
     check = replace(small_check(), forecast=forgetful)
     assert not check.ok
     assert (check.ratio[:, 0] > 20.0).all()
@@ -349,7 +356,7 @@ def even_sky(n: int) -> sc.StarCatalogue:
 
 
 def test_frames_needed_keep_the_target_and_fewer_do_not():
-    forecaster = Forecaster(some_frames().information, 17.7, some_frames(), n_campaigns=100)
+    forecaster = Forecaster(some_frames(), Outlook(n_campaigns=100))
     for target in (100.0, 20.0, 5.0):
         needed = forecaster.frames_needed(target)
         radius = [
@@ -365,9 +372,7 @@ def test_first_order_law_of_the_target():
 
     def needed(target_arcsec: float, sigma_px: float = 0.05) -> int | None:
         frames = random_frames(sky(), camera(), sigma_px, n_frames=500, min_stars=10, seed=0)
-        return Forecaster(
-            frames.information, frames.mean_stars, frames, n_campaigns=100
-        ).frames_needed(target_arcsec)
+        return Forecaster(frames, Outlook(n_campaigns=100)).frames_needed(target_arcsec)
 
     needs = [needed(10.0), needed(5.0)]
     assert needs[1] == pytest.approx(4 * needs[0], rel=0.02)

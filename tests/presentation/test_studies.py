@@ -18,10 +18,10 @@ from starcal_uq.presentation.pages.write import write_page
 from starcal_uq.presentation.words.studies import (
     study_answer,
     study_limits,
-    study_table,
     study_text,
 )
 from starcal_uq.presentation.words.study_advice import study_advice
+from starcal_uq.presentation.words.study_tables import study_table
 from starcal_uq.studies.result import Study
 from tests.helpers.studies import NAMES, made_study
 

@@ -42,6 +42,7 @@ class Draws:
         self.sigma_name = "sigma"
         self.provenance = Provenance()
         self.star_error_px = 0.0
+        self.effects = None
         self.camera = sc.Camera(
             width_px=1024, height_px=1024, pixel_um=12.0, focal_mm=69.6, x0_px=500.0, y0_px=530.0,
             distortion="brown", coefficients=(2.0e-10, -3.5e-15),

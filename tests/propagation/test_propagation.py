@@ -26,7 +26,7 @@ from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_start
 from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, AttitudeError, MisfitFound
-from starcal_uq.propagation.propagate import FrameGeometry
+from starcal_uq.propagation.geometry import FrameGeometry
 from starcal_uq.propagation.propagate import propagate as propagate_aligned
 from starcal_uq.simulation.mission import mission_frames, noise_by_magnitude
 from starcal_uq.sky.catalogue import load_catalogue
@@ -320,7 +320,7 @@ def test_batches_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> No
     obs, cal = scene()
     post = gaussian_posterior(cal)
     whole = propagate(post, obs, n_draws=10)
-    monkeypatch.setattr("starcal_uq.propagation.propagate._STARS_AT_ONCE", 3 * obs.n_stars)
+    monkeypatch.setattr("starcal_uq.propagation.geometry._STARS_AT_ONCE", 3 * obs.n_stars)
     parts = propagate(post, obs, n_draws=10)
     np.testing.assert_array_equal(whole.common_draws_arcsec, parts.common_draws_arcsec)
     np.testing.assert_allclose(whole.rest_arcsec, parts.rest_arcsec, rtol=1e-10)

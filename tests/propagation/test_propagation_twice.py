@@ -19,13 +19,13 @@ from scipy.stats import norm
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.observations.splits import frame_sample
 from starcal_uq.observations.table import Observations
+from starcal_uq.presentation.sentences.propagation import two_figures
 from starcal_uq.propagation import propagate as propagating
 from starcal_uq.propagation.alignment import random_sky
 from starcal_uq.propagation.attitude_error import (
     CONTRIBUTORS,
     AttitudeError,
     MisfitFound,
-    two_figures,
 )
 from starcal_uq.propagation.coupling import coupling
 from starcal_uq.propagation.distortion import distortion_curve
@@ -334,7 +334,17 @@ def test_a_random_sky_is_drawn_by_solid_angle() -> None:
 
 def test_what_is_taken_where_nothing_is_said() -> None:
     for function, defaults in (
-        (propagate, {"n_draws": 300, "seed": 0, "alignment": None, "alignment_frames": None}),
+        (
+            propagate,
+            {
+                "n_draws": 300,
+                "seed": 0,
+                "alignment": None,
+                "alignment_frames": None,
+                "onboard": "model",
+                "calibrated": None,
+            },
+        ),
         (error_spectrum, {"times_s": None, "n_draws": 100, "seed": 0}),
         (
             distortion_curve,

@@ -11,6 +11,7 @@ import starcal_uq as sc
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.core.errors import ObservationError, RunFolderError
 from starcal_uq.core.store import UNFINISHED
+from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.simulation.partitions import simulate_partitions
 from tests.helpers.crashes import snapshots
@@ -37,6 +38,33 @@ def test_files_depend_on_seed_and_number_alone(sky, tmp_path: Path) -> None:
     assert not np.array_equal(whole.x_px[:10], again.x_px[:10])
     clean = sc.simulate(stars, camera, n_frames=20, seed=4, sigma_px=0.0)
     assert np.std(again.x_px - clean.x_px) == pytest.approx(0.05, rel=0.15)
+
+
+def test_frames_of_partitions_are_those_observed(sky, tmp_path: Path) -> None:
+    """Not those of a mission, for which the noise of each frame would be left out."""
+    stars, camera = sky
+    (obs,) = simulate_partitions(stars, camera, tmp_path, n_frames=3, workers=0)
+    assert obs.origin.frames is None and obs.meta["n_frames"] == 3
+    model = NoiseModel(
+        terms=(),
+        coefficients=np.zeros(0),
+        errors=np.zeros(0),
+        level_px=0.1,
+        multiplies=False,
+        centre_px=np.zeros(2),
+        corner_px=1.0,
+        radius_range=np.zeros(2),
+        mag_range=np.zeros(2),
+        mag_reference=0.0,
+        frame_dof=4.0,
+        frame_ids=obs.frame_ids,
+        frame_factors=np.array([1.0, 4.0, 9.0]),
+        frame_mean=1.0,
+    )
+    own = model.sigma_px(obs)
+    assert own == pytest.approx(own[0] * (1.0 + obs.frame))
+    mission = model.sigma_px(obs.with_origin(frames="a mission"))
+    assert mission == pytest.approx(mission[0])
 
 
 def test_interrupted_simulation_goes_on(sky, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from starcal_uq.core.errors import (
     SensorError,
     SettingError,
 )
-from starcal_uq.images.image import read_image
+from starcal_uq.images.read import read_image
 from starcal_uq.paper.camera import paper_camera
 from starcal_uq.simulation.campaign import render_frames
 from starcal_uq.simulation.frames import simulate

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 import starcal_uq as sc
 from starcal_uq.core.errors import ObservationError, SiteError
 from starcal_uq.core.times import utc_text
-from starcal_uq.diagnostics.verdict.observed import corrected_words
-from starcal_uq.images.image import read_image, time_in_name
+from starcal_uq.diagnostics.verdict.observed import corrected
 from starcal_uq.images.optics import common_place, place_of
+from starcal_uq.images.read import read_image, time_in_name
 from starcal_uq.pipeline.displacement import as_measured, mirrored, undisplaced
 from starcal_uq.pipeline.images import observations_from_images, with_time
 from starcal_uq.pipeline.refine import identify_and_calibrate
@@ -567,7 +567,7 @@ def test_report_states_site_air_and_what_refraction_does(stars):
     assert "(pressure of the standard atmosphere)" in text
     assert "The weather may differ" not in text
     cal = replace(cal, covariance=0.04 * cal.covariance)
-    sharper = corrected_words(make_apparent(obs, site=replace(SITE, pressure_hpa=None)), cal)
+    sharper = corrected(make_apparent(obs, site=replace(SITE, pressure_hpa=None)), cal).sentence
     assert "more than the sigma of f: state pressure and temperature" in sharper
 
 

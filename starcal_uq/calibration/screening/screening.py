@@ -35,13 +35,14 @@ from starcal_uq.calibration.screening.result import (
 from starcal_uq.calibration.screening.tails import (
     Tails,
     allowed_near,
-    blame_words,
+    blamed,
     fit_tails,
     follows_place,
     mark_beyond,
 )
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.status import Status
+from starcal_uq.core.findings import Finding
+from starcal_uq.core.status import Note, Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.consensus import (
@@ -186,7 +187,8 @@ def screen(
     use, calibration, tested = (
         states[-1] if n_changed == 0 else min(states, key=lambda state: state[1].sigma)
     )
-    stable, tails, blame = n_changed == 0, None, ""
+    stable, tails = n_changed == 0, None
+    blame: AnyDict = {}
     found = star_residuals(frames, calibration.camera.distortion, calibration.theta, use)
     statistic, dof = found.studentised(rates.shrinkage)
     out = ~use & np.repeat(found.frame_count > 0, frames.sizes)
@@ -203,7 +205,7 @@ def screen(
             # all the more.
             last = options
             calibration = calibrate(obs.select(use), camera, throw=False, **last)
-        blame = blame_words(near, allowed, len(rounds), stable, calibration, follows)
+        blame = blamed(near, allowed, len(rounds), stable, calibration, follows)
     kept = obs.select(use)
     if throw and not calibration.status.ok:
         # For the error alone.
@@ -227,6 +229,8 @@ def screen(
         mark_beyond(table, residuals, tails, rates.star)
     n_rejected = int(np.count_nonzero(~use))
     taste, taste_p = residuals.taste(rates.shrinkage)
+    # Readers of the table find the words of it, checks the facts.
+    told = Finding(Note.MODEL_IS_WRONG, blame).sentence if blame else ""
     return Screening(
         kept=use,
         observations=kept.with_origin(
@@ -236,7 +240,7 @@ def screen(
                 "significance": significance,
                 "control": control,
             }
-            | ({"blame": blame} if blame else {})
+            | ({"blame": told, "blamed": blame} if blame else {})
         ),
         rejected=table,
         rounds=tuple(rounds),
@@ -255,7 +259,7 @@ def screen(
         focal_ratio=start.focal_px / camera.focal_px,
         n_pre_screened=found_before,
         stable=stable,
-        warnings=(blame,) if blame else warnings_about(obs, calibration.camera, use, table),
+        warnings=(told,) if blame else warnings_about(obs, calibration.camera, use, table),
         model_is_wrong=bool(blame),
     )
 

@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.calibration.screening.result import MARGINAL
-from starcal_uq.core.formatting import plural
-from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.likelihood.student import DOF_RANGE
 
 if TYPE_CHECKING:
@@ -163,25 +161,15 @@ def mark_beyond(
     table.loc[single, "threshold"] = _limit(tails.nu, tails.scale2, p_value) / residuals.variance()
 
 
-def blame_words(
+def blamed(
     near: int, allowed: int, n_rounds: int, stable: bool, cal: Calibration, follows: bool
-) -> str:
-    """That the model is to blame, by what that is known, what became of the stars, and what
-    helps.
-    """
-    found = [f"the rejections did not settle in {plural(n_rounds, 'round')}"] if not stable else []
-    if near > allowed:
-        found += [
-            f"{plural(near, 'star')} just beyond the limit were to be rejected, where noise and "
-            "wrong identifications "
-            f"leave {allowed} at most"
-        ]
-    robust = cal.provenance.likelihood == "student_t"
-    tails = ", with the heavy tails of a Student t" if robust else ""
-    remedy = "Fit noise that varies (--noise model), or another distortion"
-    if follows:
-        remedy = "Their residuals follow the place on the detector: fit another distortion"
-    return (
-        f"the model is wrong, not the stars: {' and '.join(found)}. They are kept{tails}. "
-        f"{remedy} (--model; `{Remedy('diagnose', (RUN,)).words}` compares them)."
-    )
+) -> AnyDict:
+    """Facts of a model that is to blame: by what that is known, and what became of the stars."""
+    return {
+        "near": int(near),
+        "allowed": int(allowed),
+        "n_rounds": n_rounds,
+        "stable": bool(stable),
+        "robust": cal.provenance.likelihood == "student_t",
+        "follows_place": bool(follows),
+    }

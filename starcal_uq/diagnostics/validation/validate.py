@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
+from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError, check_known
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import Truth, bounded
 from starcal_uq.core.store import Kept
@@ -54,6 +54,19 @@ _PRIOR_POINT_PX = 5.0
 _PRIOR_FOCAL = 1e-3
 _PRIOR_CORNER_PX = 1.0
 _PRIOR_LOG_SIGMA = 0.2
+# Fields of an outcome that become arrays of a validation.
+_ARRAYS = (
+    "replicate",
+    "truth",
+    "ranks",
+    "covered",
+    "error",
+    "sd",
+    "nees",
+    "nees_calibration",
+    "compression_error",
+    "dof",
+)
 
 
 @bounded
@@ -138,7 +151,7 @@ def validate(
     study = Replication(
         camera, nominal, priors, truth, campaign, seed, assumed_sigma_px, likelihood
     )
-    _check(study, n_replicates, workers)
+    _check(study)
     settings: AnyDict = {
         "truth": truth,
         **campaign.settings(stars),
@@ -185,17 +198,8 @@ def validate_study(
         camera=study.camera,
         nominal=study.nominal,
         priors=study.priors,
-        replicate=np.array([o.replicate for o in good]),
-        truth=np.array([o.truth for o in good]),
-        ranks=np.array([o.ranks for o in good]),
         n_ranked=study.n_ranked,
-        covered=np.array([o.covered for o in good]),
-        error=np.array([o.error for o in good]),
-        sd=np.array([o.sd for o in good]),
-        nees=np.array([o.nees for o in good]),
-        nees_calibration=np.array([o.nees_calibration for o in good]),
-        compression_error=np.array([o.compression_error for o in good]),
-        dof=np.array([o.dof for o in good]),
+        **{name: np.array([getattr(o, name) for o in good]) for name in _ARRAYS},
         failures=failures,
         n_requested=n_replicates,
         interrupted=interrupted,
@@ -227,28 +231,11 @@ def narrow_priors(camera: Camera, sigma_px: float) -> Priors:
     )
 
 
-def _check(study: Replication, n_replicates: int, workers: int | None) -> None:
+def _check(study: Replication) -> None:
     assumed = study.assumed_sigma_px
-    for good, text in (
-        (
-            study.truth in TRUTHS,
-            f"truth {study.truth!r} is unknown: use one of {', '.join(TRUTHS)}.",
-        ),
-        (
-            n_replicates >= 1,
-            f"n_replicates is {n_replicates}: give at least 1, and at least 100 for a verdict.",
-        ),
-        (
-            workers is None or workers >= 0,
-            f"workers is {workers}: give at least 1, or 0 for this process.",
-        ),
-        (
-            assumed is None or 0.0 < assumed < np.inf,
-            f"assumed_sigma_px is {assumed}: give a noise above zero.",
-        ),
-    ):
-        if not good:
-            raise SamplingError(text)
+    check_known("truth", study.truth, TRUTHS, SamplingError)
+    if assumed is not None and not 0.0 < assumed < np.inf:
+        raise SamplingError(f"assumed_sigma_px is {assumed}: give a noise above zero.")
     study.campaign.check(SamplingError)
     if isinstance(study.likelihood, str) and study.likelihood not in LIKELIHOODS:
         raise SamplingError(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.formatting import percent
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Check, Code, pass_or_fail, pass_or_warn
 
@@ -24,21 +23,12 @@ PROPAGATION_SLACK, PROPAGATION_ERRORS = 0.03, 4.0
 def same_data(post: Posterior, data_hash: str) -> Check:
     """Was the posterior sampled from the observations of this hash?"""
     good = post.provenance.data_sha256 == data_hash
-    sentence = (
-        "The posterior was sampled from the observations at hand."
-        if good
-        else "The posterior was sampled from other observations than those at hand: sample again."
-    )
-    value = f"SHA-256 {str(post.provenance.data_sha256)[:12]}…"
-    bound = f"{data_hash[:12]}…"
-    remedies = () if good else (Remedy("sample", (RUN,), {"force": True}),)
     return Check(
         Code.DATA_OF_THE_POSTERIOR,
+        {"sampled_sha256": str(post.provenance.data_sha256)},
         pass_or_fail(good),
-        value,
-        bound,
-        sentence,
-        remedies,
+        {"at_hand_sha256": data_hash},
+        () if good else (Remedy("sample", (RUN,), {"force": True}),),
     )
 
 
@@ -48,25 +38,13 @@ def propagation(error: AttitudeError) -> Check:
     # A standard deviation from n draws has a relative error of at most 1 / sqrt(2 n).
     bound = PROPAGATION_SLACK + PROPAGATION_ERRORS / float(np.sqrt(2.0 * error.n_draws))
     good = largest <= bound
-    sentence = (
-        "Draws through QUEST and first-order propagation give the same attitude error."
-        if good
-        else (
-            "Draws through QUEST and first-order propagation differ: prefer the draws, and raise "
-            "their number."
-        )
-    )
-    value = f"sigmas within {percent(largest)}"
     more = {"force": True, "n_draws": 4 * error.n_draws}
-    remedies = () if good else (Remedy("propagate", (RUN,), more, form="command"),)
-    level = pass_or_warn(good)
     return Check(
         Code.PROPAGATION_TO_ATTITUDE,
-        level,
-        value,
-        f"≤ {percent(bound)}",
-        sentence,
-        remedies,
+        {"difference": largest},
+        pass_or_warn(good),
+        {"difference_most": bound},
+        () if good else (Remedy("propagate", (RUN,), more, form="command"),),
     )
 
 

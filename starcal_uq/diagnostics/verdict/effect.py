@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Level
-from starcal_uq.diagnostics.shapes import IN_FIELD
+from starcal_uq.core.types import AnyDict
+from starcal_uq.likelihood.shapes import IN_FIELD
 
 if TYPE_CHECKING:
     from starcal_uq.core.types import FloatArray
@@ -43,16 +43,10 @@ class Effect:
         """A failure where it is off by more than is stated, else a warning."""
         return Level.FAIL if self.size > 1.0 else Level.WARN
 
-    def __str__(self) -> str:
-        size = significant(self.size)
-        if self.level is Level.FAIL:
-            return f"It moves {self.on} by {size} times the stated standard deviation."
-        if not self.size > 0.0:
-            return "As far as the data tell, it moves no parameter, direction or attitude."
-        return (
-            f"It moves nothing by as much as is stated: {self.on} by {size} of the standard "
-            "deviation, others by less."
-        )
+    @property
+    def facts(self) -> AnyDict:
+        """The effect among the values of a check."""
+        return {"effect_on": self.on, "effect_sigma": self.size}
 
 
 def largest(effects: Sequence[Effect]) -> Effect:

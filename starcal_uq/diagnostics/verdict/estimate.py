@@ -6,21 +6,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.calibration.fallback import fallback_words
+from starcal_uq.calibration.fallback import fallback_facts
 from starcal_uq.camera.distortion import get_model, next_simpler
-from starcal_uq.core.formatting import count, fixed, join_words, p_words, plural, significant
 from starcal_uq.core.remedy import CAMERA, PLAN, Remedies, Remedy, calibrated, with_model
 from starcal_uq.core.status import (
+    Advice,
     Check,
     Code,
     Level,
+    Order,
     Status,
     pass_or_fail,
     pass_or_warn,
 )
-from starcal_uq.core.types import BoolArray
+from starcal_uq.core.types import AnyDict, BoolArray
+from starcal_uq.diagnostics.beside import has_effects
 from starcal_uq.diagnostics.misfit import ALPHA
-from starcal_uq.diagnostics.shapes import IN_FIELD
+from starcal_uq.diagnostics.predictive import EXTREME_P
 from starcal_uq.diagnostics.verdict.effect import (
     Effect,
     largest,
@@ -35,9 +37,9 @@ from starcal_uq.diagnostics.verdict.observed import (
     SCREEN,
     lens_remedy,
 )
-from starcal_uq.estimation.undetermined import what_is_open
 from starcal_uq.inference.checks import resample
 from starcal_uq.inference.named import LIKELIHOODS
+from starcal_uq.likelihood.shapes import IN_FIELD
 from starcal_uq.maths.intervals import student_quantile
 
 if TYPE_CHECKING:
@@ -71,81 +73,60 @@ _INFLATE = calibrated(accept_inflation=True)
 
 def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
     """Did the optimiser reach an optimum in every stage?"""
-    steps = sum(len(stage.trajectory) - 1 for stage in cal.stages)
-    words = cal.status.name.lower().replace("_", " ")
-    if cal.status.ok:
-        sentence = (
-            f"All {plural(len(cal.stages), 'stage')} ended at an optimum, after "
-            f"{plural(steps, 'iteration')}."
-        )
-    else:
-        sentence = "The estimate is not an optimum."
     simpler = next_simpler(cal.camera.distortion)
     known = {
         Status.SINGULAR: with_model(simpler) + PLAN if simpler else PLAN,
         **_REMEDIES,
     }
-    level = pass_or_fail(cal.status.ok)
-    remedies = () if cal.solver == "filter" else known.get(cal.status, ())
-    advice = "" if cal.status.ok else f"{cal.remedy[0].upper()}{cal.remedy[1:]}."
-    if post is not None and cal.undetermined:
-        # Sampling refuses priors that do not determine what the data leave open.
-        level, said = Level.WARN, what_is_open(cal.undetermined)
-        sentence = f"{said[0].upper()}{said[1:]}: there the posterior is that of the priors."
-    return Check(Code.ESTIMATION, level, words, "converged", sentence, remedies, advice)
+    status = {"status": cal.status, "undetermined": cal.undetermined, "solver": cal.solver}
+    # Sampling refuses priors that do not determine what the data leave open.
+    by_priors = post is not None and bool(cal.undetermined)
+    return Check(
+        Code.ESTIMATION,
+        {
+            "status": cal.status,
+            "n_stages": len(cal.stages),
+            "n_iterations": sum(len(stage.trajectory) - 1 for stage in cal.stages),
+            "by_priors": cal.undetermined if by_priors else (),
+        },
+        Level.WARN if by_priors else pass_or_fail(cal.status.ok),
+        remedies=() if cal.solver == "filter" else known.get(cal.status, ()),
+        orders=() if cal.status.ok else (Order(Advice.MEND_THE_ESTIMATE, status),),
+    )
 
 
 def determined(cal: Calibration) -> Check | None:
     """Do the data determine the model of the camera, without a simpler one and without the coma of
     noise?
     """
-    record, sentence = cal.provenance.fallback, fallback_words(cal)
-    if record:
-        value, bound = str(record["used"]), str(record["model"])
-    elif sentence:
-        value, bound = "principal point from coma alone", "without"
-    else:
-        return None
+    found = fallback_facts(cal)
     # To ask for what was fitted would determine nothing.
-    return Check(
-        Code.MODEL_THAT_THE_DATA_DETERMINE,
-        Level.WARN,
-        value,
-        bound,
-        sentence,
-        PLAN,
+    return (
+        Check(Code.MODEL_THAT_THE_DATA_DETERMINE, found, Level.WARN, remedies=PLAN)
+        if found
+        else None
     )
 
 
 def estimators_agree(cal: Calibration) -> Check | None:
     """Do the interstar angles alone (the paper's estimator) lead to the same camera?"""
     difference = np.abs(cal.pair_theta - cal.theta)
-    if not np.any(difference > 0.0):
+    # Angles alone know of no effects, which move them by more than their noise.
+    if has_effects(cal) or not np.any(difference > 0.0):
         return None
     # The pair estimator is the less efficient one, so its own covariance bounds that of the
     # difference.
     z = difference / np.sqrt(np.diag(cal.pair_covariance))
-    name, largest = cal.parameter_names[int(np.argmax(z))], float(np.max(z))
-    limit = _largest_z(ESTIMATORS_P, cal)
-    good = largest < limit
-    sentence = (
-        "Interstar angles alone, which do not involve the attitude, give the same camera."
-        if good
-        else (
-            f"Interstar angles alone give another {name}: the data do not fit the model, or a "
-            "wrong optimum was found."
-        )
-    )
-    level = pass_or_fail(good)
-    value = f"{fixed(largest, 1)} sigma ({name})"
-    remedies = () if good else SCREEN
+    good = float(np.max(z)) < (limit := _largest_z(ESTIMATORS_P, cal))
     return Check(
         Code.TWO_ESTIMATORS,
-        level,
-        value,
-        f"< {fixed(limit, 1)} sigma",
-        sentence,
-        remedies,
+        {
+            "difference_sigma": float(np.max(z)),
+            "parameter": cal.parameter_names[int(np.argmax(z))],
+        },
+        pass_or_fail(good),
+        {"below_sigma": limit},
+        () if good else SCREEN,
     )
 
 
@@ -159,18 +140,15 @@ def _largest_z(size: float, cal: Calibration) -> float:
 def against_truth(cal: Calibration, truth: Camera, post: Posterior | None = None) -> Check:
     """Errors in units of sigma, where the truth is known."""
     z = truth_z(cal, truth, post)
-    name, largest = cal.parameter_names[int(np.argmax(np.abs(z)))], float(np.max(np.abs(z)))
-    limit = _largest_z(TRUTH_P, cal)
+    largest, limit = float(np.max(np.abs(z))), _largest_z(TRUTH_P, cal)
     good = largest < limit
-    sentence = (
-        "The truth of the simulation lies where the uncertainties say."
-        if good
-        else f"{name} is further from the truth than its sigma allows: the uncertainties are wrong."
+    return Check(
+        Code.KNOWN_TRUTH,
+        {"error_sigma": largest, "parameter": cal.parameter_names[int(np.argmax(np.abs(z)))]},
+        pass_or_fail(good),
+        {"below_sigma": limit},
+        () if good else (Remedy("validate", (CAMERA,), form="command"),),
     )
-    value = f"largest |z| {fixed(largest, 1)} ({name})"
-    level, bound = pass_or_fail(good), f"< {fixed(limit, 1)}"
-    remedies = () if good else (Remedy("validate", (CAMERA,), form="command"),)
-    return Check(Code.KNOWN_TRUTH, level, value, bound, sentence, remedies)
 
 
 def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> FloatArray:
@@ -185,13 +163,12 @@ def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> F
 # Frames that scatter by less than this beyond the formal errors are of no consequence, however
 # sure.
 JACKKNIFE_RATIO = 1.1
-_OF_FRAMES = "Calibrate stretches of frames apart (--only-frames), and compare the runs."
-_OF_PHASE = "Accept it as noise, or point between frames by parts of a pixel more or less."
+_OF_FRAMES = Advice.FRAMES_APART
 _NOT_OF_THE_LENS = {
-    "pixel phase in x": _OF_PHASE,
-    "pixel phase in y": _OF_PHASE,
-    "magnitude": "Leave out the brightest or the faintest stars, and compare the runs.",
-    "direction": "Check the times, and what the directions were declared to be.",
+    "pixel phase in x": Advice.ACCEPT_THE_PHASE,
+    "pixel phase in y": Advice.ACCEPT_THE_PHASE,
+    "magnitude": Advice.LEAVE_OUT_MAGNITUDES,
+    "direction": Advice.CHECK_THE_DIRECTIONS,
 }
 
 
@@ -222,15 +199,8 @@ def model_checks(
 def one_camera(found: MixedCameras) -> Check:
     """Do the frames' own focal lengths ask for several cameras?"""
     remedies = calibrated("command", frames=found.frames)
-    sentence = f"{found.words[0].upper()}{found.words[1:]}."
-    return Check(
-        Code.ONE_CAMERA,
-        Level.FAIL,
-        f"{found.n} cameras",
-        "1",
-        sentence,
-        remedies,
-    )
+    facts = {"n_cameras": found.n, "clause": found.words}
+    return Check(Code.ONE_CAMERA, facts, Level.FAIL, remedies=remedies)
 
 
 # Standard errors by which a change of a parameter differs from none, and growth of its error that
@@ -247,116 +217,58 @@ def misfit(
     """Is there structure in the residuals, and does it do more than is stated? `better` as for
     `lens_remedy`.
     """
-    name, bound = Code.UNEXPLAINED_STRUCTURE, f"p ≥ {MISFIT_P:g}"
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
-    value = (
-        f"{p_words(min(patterns, default=1.0))}, corrected for {plural(len(found.tests), 'test')}"
-    )
+    facts: AnyDict = {"p_value": min(patterns, default=1.0), "n_tests": len(found.tests)}
+    code, bounds = Code.UNEXPLAINED_STRUCTURE, {"p_least": MISFIT_P}
     rejected = [test for test in found.found(MISFIT_P) if not test.is_of_noise]
     if not rejected:
-        sentence = (
-            "The residuals show no structure beyond noise, in any of the ways that were looked for."
-        )
-        return Check(name, Level.PASS, value, bound, sentence)
-    words = []
-    for test in rejected[:3]:
-        size = "" if np.isnan(test.size_px) else f", {significant(test.size_px)} px"
-        words.append(f"{test.name} ({p_words(test.p_holm)}{size})")
-    more = "" if len(rejected) <= 3 else f" and {plural(len(rejected) - 3, 'other test')}"
+        return Check(code, facts, bounds=bounds)
     booked = on_attitudes(attitude) if found.pattern is not None and found.pattern.families else []
     effect = largest([*of_pattern(found.pattern, rejected, cal), *booked])
-    sentence = (
-        f"The residuals hold more than noise: {join_words(words)}{more}. "
-        f"{effect}{_hardly_told(rejected[0])}"
-    )
+    facts["tests"] = tuple((test.name, test.p_holm, test.size_px) for test in rejected)
+    facts |= effect.facts | _hardly_told(rejected[0])
     level = effect.level if min(patterns) < MISFIT_FAIL_P else Level.WARN
     # A lens can follow what keeps its place in the field, and no option here what does not.
     remedies: Remedies = ()
-    advice = _NOT_OF_THE_LENS.get(rejected[0].against, _OF_FRAMES)
+    orders: tuple[Order, ...] = (Order(_NOT_OF_THE_LENS.get(rejected[0].against, _OF_FRAMES)),)
     if any(t.against in IN_FIELD for t in rejected):
-        remedies, advice = lens_remedy(cal.camera.distortion, better)
-    return Check(name, level, value, bound, sentence, remedies, advice)
+        remedies, orders = lens_remedy(cal.camera.distortion, better)
+    return Check(code, facts, level, bounds, remedies, orders)
 
 
-def _hardly_told(test: MisfitTest) -> str:
-    """Statement that shapes can hardly be separated from the parameter that they move; else
+def _hardly_told(test: MisfitTest) -> AnyDict:
+    """Facts of shapes that can hardly be separated from the parameter that they move; else
     nothing.
     """
     if not test.moved_std > _HARDLY_TOLD or test.moved_sigma > _HARDLY_TOLD * test.moved_std:
-        return ""
-    return (
-        f" These data hardly tell {test.name} from {test.moved_name}: with both fitted, the "
-        f"error of {test.moved_name} "
-        f"would be {significant(float(np.hypot(1.0, test.moved_std)))} times as large."
-    )
+        return {}
+    return {"moved": test.moved_name, "error_times": float(np.hypot(1.0, test.moved_std))}
 
 
 def even_noise(found: Misfit, inflated: bool = False) -> Check:
     """Is the noise what the weights of the stars say?"""
-    tests = [test for test in found.tests if test.is_of_noise]
+    p_values = [test.p_holm for test in found.tests if test.is_of_noise]
     rejected = [test for test in found.found(MISFIT_P) if test.is_of_noise]
-    name, bound = Code.EVENNESS_OF_THE_NOISE, f"p ≥ {MISFIT_P:g}"
-    value = p_words(min((test.p_holm for test in tests), default=1.0))
-    if not rejected:
-        sentence = (
-            "The noise does not change with radius, magnitude, time, frame or axis beyond what "
-            "the weights know of it."
-        )
-        return Check(name, Level.PASS, value, bound, sentence)
-    changes = f"The residuals hold {join_words([test.name for test in rejected])}"
-    if found.uneven is None and inflated:
-        sentence = (
-            f"{changes}, which the weights of the stars do not know; the accepted inflation "
-            "holds it."
-        )
-        return Check(name, Level.PASS, value, bound, sentence)
-    if found.uneven is None:
-        sentence = (
-            f"{changes}, which the weights of the stars do not know: the stated sigmas may be "
-            "wrong."
-        )
-        return Check(name, Level.WARN, value, bound, sentence, _INFLATE)
+    facts: AnyDict = {
+        "p_value": min(p_values, default=1.0),
+        "tests": tuple(test.name for test in rejected),
+    }
+    level = Level.PASS
+    remedies: Remedies = ()
     uneven = found.uneven
-    if not uneven.model.varies:
-        sentence = f"{changes}, too little of it to change a stated sigma."
-        return Check(name, Level.PASS, value, bound, sentence)
-    of_attitude = (
-        "" if uneven.model.axes is None else " and the attitude noise of each axis is another"
-    )
-    worst = int(np.argmax(np.abs(np.log(uneven.ratios))))
-    sentence = (
-        f"{changes}: {uneven.model}. The stated sigmas do not know it: that of "
-        f"{uneven.parameter_names[worst]} should "
-        f"be {significant(float(uneven.ratios[worst]))} times as large{of_attitude}; with fitted "
-        "weights the estimate "
-        "itself would be more precise."
-    )
-    return Check(name, Level.WARN, value, bound, sentence, NOISE)
-
-
-def sensitivity(diagnosis: Diagnosis) -> str:
-    """The smallest effects that the checks find nine times in ten, with as many data as there
-    were.
-    """
-    found, frames = diagnosis.misfit, diagnosis.jackknife
-    smooth = [test for test in found.tests if test.against == "radius" and test.detectable_px > 0.0]
-    seen = []
-    if smooth:
-        test = smooth[-1]
-        seen.append(
-            f"a {test.name} of {significant(test.detectable_px)} px (rms per axis, beyond what "
-            "the fit absorbs)"
-        )
-    if frames is not None:
-        ratio = float(frames.detectable(JACKKNIFE_P / len(frames.ratio)).min())
-        seen.append(f"frames that make sigma {significant(ratio)} times as large as stated")
-    if not seen:
-        return ""
-    data = f"{plural(found.n_frames, 'frame')} and {plural(found.n_stars, 'star')}"
-    return (
-        f"What {data} let these checks see nine times in ten: {join_words(seen)}; less may be "
-        "there."
-    )
+    if rejected and uneven is not None:
+        facts |= {"noise": uneven.model}
+        if uneven.model.varies:
+            worst = int(np.argmax(np.abs(np.log(uneven.ratios))))
+            facts |= {
+                "parameter": uneven.parameter_names[worst],
+                "ratio": float(uneven.ratios[worst]),
+            }
+            level, remedies = Level.WARN, NOISE
+    elif rejected and not inflated:
+        level, remedies = Level.WARN, _INFLATE
+    bounds = {"p_least": MISFIT_P}
+    return Check(Code.EVENNESS_OF_THE_NOISE, facts, level, bounds, remedies)
 
 
 def disagreeing(found: Jackknife) -> BoolArray:
@@ -369,33 +281,29 @@ def disagreeing(found: Jackknife) -> BoolArray:
 def jackknife(found: Jackknife, inflated: bool = False, post: Posterior | None = None) -> Check:
     """Do frames scatter as their formal errors say?"""
     worst, bad = int(np.argmax(found.ratio)), disagreeing(found)
-    low, high = float(found.ratio.min()), float(found.ratio.max())
-    value = f"ratios {fixed(low, 2)} to {fixed(high, 2)} ({found.parameter_names[worst]})"
     chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(bad))[1]
-    bound = f"≤ {fixed(max(float(chance[worst]), JACKKNIFE_RATIO), 2)}"
     remedies: Remedies = ()
     formal = inflated and post is not None and post.inflation is None
-    if np.any(bad):
-        names = [name for name, flag in zip(found.parameter_names, bad, strict=True) if flag]
-        accepted = (
-            "The inflation is accepted: it has multiplied"
-            if inflated
-            else "Accepting the inflation multiplies"
-        )
-        draws = ", but not that of the draws" if formal else ""
-        sentence = (
-            f"Frames disagree more than their formal errors allow, in {join_words(names)}: "
-            "something makes stars of "
-            f"a frame err together. {accepted} sigma by up to {fixed(high, 2)}{draws}."
-        )
-        if not inflated:
-            remedies = _INFLATE
-        elif formal and post is not None:
-            remedies = _resample(post)
-    else:
-        sentence = "Frames scatter as the formal errors say."
-    level = pass_or_warn(not remedies)
-    return Check(Code.JACKKNIFE_OVER_FRAMES, level, value, bound, sentence, remedies)
+    if np.any(bad) and not inflated:
+        remedies = _INFLATE
+    elif np.any(bad) and formal and post is not None:
+        remedies = _resample(post)
+    return Check(
+        Code.JACKKNIFE_OVER_FRAMES,
+        {
+            "least": float(found.ratio.min()),
+            "most": float(found.ratio.max()),
+            "parameter": found.parameter_names[worst],
+            "disagreeing": tuple(
+                name for name, flag in zip(found.parameter_names, bad, strict=True) if flag
+            ),
+            "inflated": inflated,
+            "draws_left_out": formal,
+        },
+        pass_or_warn(not remedies),
+        {"ratio_most": max(float(chance[worst]), JACKKNIFE_RATIO)},
+        remedies,
+    )
 
 
 def _resample(post: Posterior) -> Remedies:
@@ -414,135 +322,83 @@ STAR_REMEDY = calibrated(star_errors=True)
 
 def stars(found: StarTest) -> Check:
     """Do stars bring errors of their own along?"""
-    name, bound = Code.ERRORS_OF_THE_STARS, f"p ≥ {STAR_P:g}"
+    code, facts = Code.ERRORS_OF_THE_STARS, star_facts(found)
     if found.included_px > PLAUSIBLE_NOISE_PX[1]:
         # What is wrong with the directions or the lens looks like this where all frames show one
         # field.
-        value = f"{significant(found.included_px)} ± {significant(found.included_px_std)} px"
-        bound = f"≤ {PLAUSIBLE_NOISE_PX[1]:g} px"
-        sentence = (
-            f"{star_sentence(found)} No catalogue errs by that: something else is wrong, and is "
-            "hidden by it."
-        )
-        advice = "Leave --star-errors out (star_errors=False), and see which checks then fail."
-        return Check(name, Level.FAIL, value, bound, sentence, advice=advice)
-    if not found.applicable:
-        value = "too few stars recur"
-        return Check(name, Level.PASS, value, bound, star_sentence(found))
-    widest = int(np.argmax(found.widening))
-    ratio = float(found.widening[widest])
-    value = (
-        f"p = {significant(found.p_value)}, sigma × {fixed(ratio, 2)} "
-        f"({found.parameter_names[widest]})"
-    )
-    if found.p_value >= STAR_P:
-        return Check(name, Level.PASS, value, bound, star_sentence(found))
-    if found.included_px > 0.0:
-        value, bound = (
-            f"{significant(found.included_px)} ± {significant(found.included_px_std)} px",
-            "in the intervals",
-        )
-        return Check(name, Level.PASS, value, bound, star_sentence(found))
-    added = Effect(found.parameter_names[widest], float(np.sqrt(max(ratio**2 - 1.0, 0.0))))
+        bounds = {"error_most_px": PLAUSIBLE_NOISE_PX[1]}
+        return Check(code, facts, Level.FAIL, bounds, (), (Order(Advice.WITHOUT_STAR_ERRORS),))
+    bounds = {"p_least": STAR_P}
+    if not found.applicable or found.p_value >= STAR_P or found.included_px > 0.0:
+        return Check(code, facts, bounds=bounds)
+    widening = float(np.max(found.widening))
+    added = Effect(facts["parameter"], float(np.sqrt(max(widening**2 - 1.0, 0.0))))
     level = added.level if found.p_value < STAR_FAIL_P else Level.WARN
-    return Check(name, level, value, bound, star_sentence(found), STAR_REMEDY)
+    return Check(code, facts, level, bounds, STAR_REMEDY)
 
 
-def star_sentence(found: StarTest) -> str:
+def star_facts(found: StarTest) -> AnyDict:
     """Size of the stars' own errors, and what they do to sigma."""
-
-    def sized(px: float) -> str:
-        return f"{significant(px)} px ({significant(px * found.arcsec_per_px)} arcsec)"
-
+    facts: AnyDict = {
+        "included_px": found.included_px,
+        "included_std_px": found.included_px_std,
+    }
     if not found.applicable:
-        return (
-            "Too few stars are seen in several frames to test whether a star errs alike in all "
-            "of them; where none is, "
-            "such errors act as noise."
-        )
-    if found.p_value >= STAR_P:
-        return (
-            "Residuals of one star in different frames are as independent as noise; a direction "
-            "error of "
-            f"{sized(found.visible_px)} would have been seen nine times in ten."
-        )
-    if found.included_px > 0.0:
-        return (
-            f"Each star brings a direction error of {sized(found.included_px)} ± "
-            f"{significant(found.included_px_std)} "
-            "px per axis along into every frame; estimate and intervals hold that."
-        )
+        return facts
     widest = int(np.argmax(found.widening))
-    error = significant(found.tau_px_std)
-    return (
-        f"Each star brings a direction error of {sized(found.tau_px)} ± {error} px per axis "
-        "along into every frame: "
-        "more frames of the same stars do not average it out, and sigma of "
-        f"{found.parameter_names[widest]} is "
-        f"{fixed(float(found.widening[widest]), 2)} times what is stated."
-    )
+    return facts | {
+        "p_value": found.p_value,
+        "seen": found.p_value < STAR_P,
+        "error_px": found.tau_px,
+        "error_std_px": found.tau_px_std,
+        "visible_px": found.visible_px,
+        "arcsec_per_px": found.arcsec_per_px,
+        "parameter": found.parameter_names[widest],
+        "widening": float(found.widening[widest]),
+    }
 
 
 def comparison(models: ModelComparison, attitude: AttitudeError | None = None) -> Check:
     """Does another distortion model predict left-out frames better, and would it move more than is
     stated?
     """
-    mine = models.of(models.fitted)
-    if mine is None or mine.difference == 0.0:
-        value = f"{models.fitted!r} predicts best"
-    else:
-        value = (
-            f"{fixed(mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat from "
-            f"{models.scores[0].model!r}"
-        )
-    level, sentence = Level.PASS, models_sentence(models)
+    mine, facts = models.of(models.fitted), model_facts(models)
+    level = Level.PASS
     remedies: Remedies = ()
     if mine is not None and mine.rejected:
         # A gain of one nat is what a displacement gives whose square is two units of the noise.
         bent = on_directions(-2.0 * mine.difference, mine.n_parameters)
         effect = largest([bent, *on_attitudes(attitude)])
         level, remedies = effect.level, with_model(models.better)
-        sentence = f"{sentence} {effect}"
-    return Check(Code.DISTORTION_MODEL, level, value, "not rejected", sentence, remedies)
+        facts |= effect.facts
+    return Check(Code.DISTORTION_MODEL, facts, level, remedies=remedies)
 
 
-def models_sentence(models: ModelComparison) -> str:
+def model_facts(models: ModelComparison) -> AnyDict:
     """Whether another model predicts left-out frames better, and what attitudes would do under the
     others.
     """
     mine, simplest = models.of(models.fitted), models.simplest
+    facts: AnyDict = {"fitted": models.fitted, "best": models.scores[0].model}
+    if mine is not None:
+        facts |= {
+            "difference_nat": mine.difference,
+            "difference_se_nat": mine.difference_se,
+        }
     if mine is not None and mine.rejected:
-        best = models.scores[0]
-        first = (
-            f"The model {models.fitted!r} predicts left-out frames worse than {best.model!r} by "
-            f"{fixed(-mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat: use "
-            f"{models.better!r}."
-        )
+        facts |= {"better": models.better}
     elif mine is not None and simplest.n_parameters < mine.n_parameters:
-        fewer, all_of_them = (_coefficients(model) for model in (simplest.model, models.fitted))
-        extra = [name for name in all_of_them if name not in fewer]
-        verb = "is" if len(extra) == 1 else "are"
-        first = (
-            f"{join_words(extra)} {verb} not needed: {simplest.model!r} predicts left-out frames "
-            "no worse than "
-            f"{models.fitted!r}."
-        )
-    else:
-        first = (
-            f"No other model predicts left-out frames better than {models.fitted!r} beyond doubt."
-        )
+        fewer = _coefficients(simplest.model)
+        extra = tuple(name for name in _coefficients(models.fitted) if name not in fewer)
+        facts |= {"simplest": simplest.model, "not_needed": extra}
     others = [score for score in models.accepted if score.model != models.fitted]
-    if not others:
-        return first + " All other models are rejected."
-    common = max(float(np.hypot(*score.common_arcsec[:2])) for score in others)
-    rest = max(float(np.hypot(*score.rest_arcsec[:2])) for score in others)
-    return (
-        f"{first} Under the other models that the data do not reject "
-        f"({join_words([score.model for score in others])}), attitudes across the boresight "
-        "would move by up to "
-        f"{significant(common)} arcsec in common and {significant(rest)} arcsec (rms) frame by "
-        "frame."
-    )
+    if others:
+        facts |= {
+            "others": tuple(score.model for score in others),
+            "common_arcsec": max(float(np.hypot(*score.common_arcsec[:2])) for score in others),
+            "rest_arcsec": max(float(np.hypot(*score.rest_arcsec[:2])) for score in others),
+        }
+    return facts
 
 
 def _coefficients(model: str) -> list[str]:
@@ -551,56 +407,35 @@ def _coefficients(model: str) -> list[str]:
 
 def predictive(found: PredictiveCheck) -> Check:
     """Do replicated data look like the measured ones?"""
-    extreme = [s for s in found.statistics if s.extreme]
+    extreme = tuple(s.name for s in found.statistics if s.extreme)
     low = min(found.statistics, key=lambda s: min(s.p_value, 1.0 - s.p_value))
-    value = f"most extreme {p_words(low.p_value, 1.0 / found.n_draws)}"
-    if extreme:
-        sentence = (
-            "Data made by the model differ from the measured ones in: "
-            f"{join_words([s.name for s in extreme])}."
-        )
-    else:
-        sentence = (
-            "Data made by the model have the same spread, tails and patterns as the measured ones."
-        )
-    name = Code.POSTERIOR_PREDICTIVE_CHECK
-    level, remedies = pass_or_warn(not extreme), ROBUST if extreme else ()
-    return Check(name, level, value, "0.001 to 0.999", sentence, remedies)
+    return Check(
+        Code.POSTERIOR_PREDICTIVE_CHECK,
+        {"p_value": low.p_value, "n_draws": found.n_draws, "extreme": extreme},
+        pass_or_warn(not extreme),
+        dict(zip(("p_least", "p_most"), EXTREME_P, strict=True)),
+        ROBUST if extreme else (),
+    )
 
 
 def starts(found: MultiStart) -> Check:
     """Do other starts lead to the same optimum?"""
-    value = f"{found.same} of {found.n} starts"
-    if found.n_frames < found.of_frames:
-        value += f", {count(found.n_frames)} of {plural(found.of_frames, 'frame')}"
+    level = Level.PASS
     remedies: Remedies = ()
-    advice = ""
+    orders: tuple[Order, ...] = ()
     if found.better:
-        level, sentence = Level.FAIL, "A start elsewhere reached a better optimum."
-        advice = "Calibrate again from there, or from a camera file that is nearer to the lens."
+        level, orders = Level.FAIL, (Order(Advice.NEARER_START),)
         if found.start:
             names = (f"focal_{found.focal_unit}", "x0_px", "y0_px")
             remedies = calibrated(start=dict(zip(names, found.start, strict=True)))
     elif found.same < found.n:
-        stuck = found.n - found.same
-        level = Level.WARN
-        sentence = (
-            f"{plural(stuck, 'start')} did not reach this optimum, and no start reached a better "
-            "one."
-        )
-        remedies = SCREEN
-        advice = "Accept it if the focal length of the camera file is surely good to 5 %."
-    else:
-        level, sentence = (
-            Level.PASS,
-            "Starts scattered around the nominal camera all lead to this optimum.",
-        )
-    return Check(
-        Code.OTHER_STARTS,
-        level,
-        value,
-        "all at the same optimum",
-        sentence,
-        remedies,
-        advice,
-    )
+        level, remedies = Level.WARN, SCREEN
+        orders = (Order(Advice.ACCEPT_THE_FOCAL_LENGTH),)
+    facts = {
+        "n_starts": found.n,
+        "same": found.same,
+        "better": found.better,
+        "n_frames": found.n_frames,
+        "of_frames": found.of_frames,
+    }
+    return Check(Code.OTHER_STARTS, facts, level, remedies=remedies, orders=orders)

@@ -7,17 +7,23 @@ warning means that they may be used by someone who has read it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from starcal_uq.core.display import Shown
-from starcal_uq.core.formatting import join_words, plural
+from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import Remedies, Remedy
-from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.status import Check, Level, Note, Question, worst
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
-from starcal_uq.diagnostics.verdict.remedies import INPUT, MOST_COMMANDS, Place, by_cause, telling
+from starcal_uq.diagnostics.verdict.remedies import (
+    INPUT,
+    MOST_COMMANDS,
+    Place,
+    by_cause,
+    first_cause,
+)
 from starcal_uq.estimation.weights import weighed
 
 if TYPE_CHECKING:
@@ -29,8 +35,6 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
 
 VERSION = 1
-# Checks that the headline names; of more it says how many there are.
-_NAMED = 2
 
 
 @dataclass(frozen=True)
@@ -41,22 +45,37 @@ class Verdict(Shown):
     ----------
     checks : tuple of Check
         In reading order.
-    headline : str
-        The verdict in one sentence.
+    summary : Finding
+        What follows from them.
     to_try : tuple of Remedy
         What to try, in this order; at most three.
-    ended : str
-        That no model here explains the data, and which data would tell; empty where something is
-        left to try.
+    end : Finding, optional
+        That no model here explains the data; None where something is left to try.
     """
 
     DOCUMENTED: ClassVar = ("level",)
-    WRITTEN_AS: ClassVar = {"to_try": ("commands",)}
+    WRITTEN_AS: ClassVar = {
+        "summary": ("headline",),
+        "to_try": ("commands",),
+        "end": ("ended",),
+    }
 
     checks: tuple[Check, ...]
-    headline: str
+    summary: Finding
     to_try: Remedies = ()
-    ended: str = ""
+    end: Finding | None = None
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        return self.summary.sentence
+
+    @property
+    def ended(self) -> str:
+        """That no model here explains the data, and which data would tell; empty where something is
+        left to try.
+        """
+        return "" if self.end is None else self.end.sentence
 
     @property
     def level(self) -> Level:
@@ -149,11 +168,11 @@ def judge(
     found = tuple(
         check if place is None else place.exact(check) for check in checks if check is not None
     )
-    to_try, ended = _way_on(found, place)
-    return Verdict(found, _headline(found, post is not None, rests), to_try, ended)
+    to_try, end = _way_on(found, place)
+    return Verdict(found, _summary(found, post is not None, rests), to_try, end)
 
 
-def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[Remedies, str]:
+def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[Remedies, Finding | None]:
     """The remedies to try, those of the first cause first, or that there is none that helps."""
     doubts = [check for check in checks if check.question is not Question.REQUIRED]
     every: list[Remedy] = []
@@ -167,9 +186,9 @@ def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[Remedies, s
     if worst(doubts) is not Level.FAIL or (
         to_try and not (place is not None and place.exhausted(doubts))
     ):
-        return to_try, ""
-    steps = f" (tried: {'; '.join(one.text for one in tried)})" if tried else ""
-    return (), f"No model here explains this{steps}. What would tell: {telling(doubts)}."
+        return to_try, None
+    facts = {"tried": tuple(one.text for one in tried), "cause": first_cause(doubts)}
+    return (), Finding(Note.NO_MODEL_EXPLAINS, facts)
 
 
 def _largest(remedies: Sequence[Remedy]) -> Remedies:
@@ -195,42 +214,25 @@ def _whole_numbers(remedy: Remedy) -> list[int]:
     return [int(value) for value in values if value.isdigit()]
 
 
-def _named(checks: Sequence[Check], level: Level) -> str:
-    """The checks with this outcome, by name where they are few, else how many point to what."""
-    found = [check for check in checks if check.level is level]
-    if len(found) <= _NAMED:
-        return join_words([check.phrase for check in found])
-    return join_words(
-        [f"{plural(len(some), 'check')} of {cause}" for cause, some in by_cause(found).items()]
-    )
-
-
-def _headline(checks: tuple[Check, ...], sampled: bool, rests: str) -> str:
+def _summary(checks: tuple[Check, ...], sampled: bool, rests: Finding | None) -> Finding:
     """What becomes of the requirements, whether the numbers can be used, and what f then rests
     on.
     """
     required = [check for check in checks if check.question is Question.REQUIRED]
-    violated = [check.phrase for check in required if check.level is Level.FAIL]
-    still_open = [check.phrase for check in required if check.level is Level.WARN]
-    sentences = [f"Violated: {join_words(violated)}."] if violated else []
-    sentences += [_usable([check for check in checks if check not in required], sampled)]
-    if rests and not any(check.level is Level.FAIL for check in checks):
-        sentences += [rests]
-    sentences += [f"Open: {join_words(still_open)}."] if still_open else []
-    return " ".join(sentences)
+    others = [check for check in checks if check not in required]
+    level = worst(others)
+    doubts = [check for check in others if check.level is level and level is not Level.PASS]
+    facts = {
+        "violated": _phrases(check for check in required if check.level is Level.FAIL),
+        "unmet": _phrases(check for check in required if check.level is Level.WARN),
+        "level": level,
+        "doubts": _phrases(doubts),
+        "causes": tuple((cause, len(some)) for cause, some in by_cause(doubts).items()),
+        "sampled": sampled,
+        "rests": None if worst(checks) is Level.FAIL else rests,
+    }
+    return Finding(Note.HEADLINE, facts)
 
 
-def _usable(checks: Sequence[Check], sampled: bool) -> str:
-    failed, warned = ([c for c in checks if c.level is level] for level in (Level.FAIL, Level.WARN))
-    if failed:
-        return f"Do not use these numbers: {_named(checks, Level.FAIL)} failed."
-    if warned:
-        start = "Converged; usable once " + (
-            "this warning is" if len(warned) == 1 else "these warnings are"
-        )
-        return f"{start} resolved or accepted: {_named(checks, Level.WARN)}."
-    if not sampled:
-        return (
-            "The estimate converged and passed every check; the posterior has not been sampled yet."
-        )
-    return "Converged, and every check passed: the stated uncertainties can be used."
+def _phrases(checks: Iterable[Check]) -> tuple[str, ...]:
+    return tuple(check.phrase for check in checks)

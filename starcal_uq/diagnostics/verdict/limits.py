@@ -1,19 +1,18 @@
-"""What limits the result, in sentences: the largest term of the attitude error, the coupling, the
-systematics.
-"""
+"""What limits the result: the largest term of the attitude error, the coupling, the systematics."""
 
 from __future__ import annotations
 
+from enum import Enum, auto
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.findings import Finding
 from starcal_uq.diagnostics.residuals import bin_residuals
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.observed import PATTERN_P, air
-from starcal_uq.propagation.attitude_error import choice_words, two_figures
+from starcal_uq.propagation.attitude_error import choice
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -25,95 +24,81 @@ if TYPE_CHECKING:
 _STRONG = 0.7
 
 
+class Limit(Enum):
+    """What limits a result."""
+
+    PATTERN = auto()
+    DIRECTIONS = auto()
+    AIR = auto()
+    STRUCTURE = auto()
+    ATTITUDE = auto()
+    COUPLED = auto()
+    FRAMES = auto()
+
+
 def limits(
     obs: Observations,
     cal: Calibration,
     coupling: Coupling | None = None,
     attitude: AttitudeError | None = None,
     diagnosis: Diagnosis | None = None,
-) -> tuple[str, ...]:
-    """What limits the result, the most important first; one sentence each."""
+) -> tuple[Finding, ...]:
+    """What limits the result, the most important first."""
     found = [_systematic(obs, cal)]
     found += [_structure(cal, diagnosis)] if diagnosis is not None else []
-    found += [choice_words(attitude), _attitude(attitude)] if attitude is not None else []
+    found += [*choice(attitude), _attitude(attitude)] if attitude is not None else []
     found += [_coupled(coupling)] if coupling is not None else []
-    return tuple(sentence for sentence in found if sentence)
+    return tuple(one for one in found if one is not None)
 
 
-def _systematic(obs: Observations, cal: Calibration) -> str:
+def _systematic(obs: Observations, cal: Calibration) -> Finding | None:
     binned = bin_residuals(cal, obs)
     if binned.p_value < PATTERN_P:
         arcsec = binned.pattern_px / cal.camera.focal_px * ARCSEC
-        return (
-            f"The model: residuals keep a pattern of {significant(arcsec)} arcsec, which more "
-            "frames will not remove."
-        )
+        return Finding(Limit.PATTERN, {"pattern_arcsec": arcsec})
     if not obs.origin.apparent:
-        return (
-            "Knowledge of the directions: until they are known to be apparent, f is conditional "
-            "on that."
-        )
-    if air(obs) == "unknown":
-        return (
-            "Refraction: until the site is stated, or that the camera was in space, f is "
-            "conditional on it."
-        )
-    return ""
+        return Finding(Limit.DIRECTIONS)
+    return Finding(Limit.AIR) if air(obs) == "unknown" else None
 
 
-def _structure(cal: Calibration, diagnosis: Diagnosis) -> str:
+def _structure(cal: Calibration, diagnosis: Diagnosis) -> Finding | None:
     """The largest pattern among those that the tests found."""
     sized = [test for test in diagnosis.misfit.found(MISFIT_P) if test.size_px > 0.0]
     if not sized:
-        return ""
+        return None
     worst = max(sized, key=lambda test: test.size_px)
     arcsec = worst.size_px / cal.camera.focal_px * ARCSEC
-    return (
-        f"The model: the largest structure that it leaves in the residuals is {worst.name}, "
-        f"{significant(worst.size_px)} px ({significant(arcsec)} arcsec) per star."
-    )
+    facts = {"name": worst.name, "size_px": worst.size_px, "size_arcsec": arcsec}
+    return Finding(Limit.STRUCTURE, facts)
 
 
-def _attitude(error: AttitudeError) -> str:
+def _attitude(error: AttitudeError) -> Finding:
     """Compare the terms across the boresight, where missions state their requirement."""
-    names = (
-        "centroid noise of a single frame",
-        "the calibration's common rotation",
-        "the calibration's rest",
-    )
+    names = ("noise", "common", "rest")
     values = error.headline_arcsec[:3, 3]
     pairs = zip(
-        error.with_misfit_found_arcsec[:3, 3], error.if_model_holds_arcsec[:3, 3], strict=True
+        error.with_misfit_found_arcsec[:3, 3].tolist(),
+        error.if_model_holds_arcsec[:3, 3].tolist(),
+        strict=True,
     )
-    noise, common, rest = (two_figures(*pair) for pair in pairs)
-    largest = names[int(np.argmax(values))]
-    if values[1] == max(values):
-        return (
-            f"Attitude across the boresight: {largest}, one constant, exceeds centroid noise: "
-            f"{common} against "
-            f"{noise} per frame. Alignment calibration with these parameters, on "
-            f"{error.alignment}, absorbs it; what "
-            f"remains is {rest}."
-        )
-    return (
-        f"Attitude across the boresight: {largest} dominates. Noise: {noise}; common rotation: "
-        f"{common}; rest: {rest}."
-    )
+    largest = "common" if values[1] == max(values) else names[int(np.argmax(values))]
+    sizes = {f"{name}_arcsec": pair for name, pair in zip(names, pairs, strict=True)}
+    return Finding(Limit.ATTITUDE, {"largest": largest, "alignment": error.alignment, **sizes})
 
 
-def _coupled(coupling: Coupling) -> str:
+def _coupled(coupling: Coupling) -> Finding:
     pairs = coupling.pairs(_STRONG)
     if not pairs:
-        return (
-            "Coupling: no two parameters are strongly coupled; every sigma falls as one over the "
-            "root of the frames."
-        )
+        return Finding(Limit.FRAMES)
     first, second, value = pairs[0]
     ratio = coupling.sigma_marginal / coupling.sigma_conditional
     worst = int(np.argmax(ratio))
-    return (
-        f"Coupling: {first} trades against {second} (correlation {value:.2f}); with the other "
-        "parameters known, "
-        f"{coupling.parameter_names[worst]} would be {significant(float(ratio[worst]))} times "
-        "better determined."
-    ).replace("-", "−")
+    return Finding(
+        Limit.COUPLED,
+        {
+            "pair": (first, second),
+            "correlation": value,
+            "parameter": coupling.parameter_names[worst],
+            "times": float(ratio[worst]),
+        },
+    )

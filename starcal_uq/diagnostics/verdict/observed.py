@@ -8,9 +8,8 @@ import numpy as np
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.formatting import fixed, percent, plural, significant
+from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import (
-    MORE,
     PLAN,
     SITE,
     UTC,
@@ -21,12 +20,16 @@ from starcal_uq.core.remedy import (
     with_model,
 )
 from starcal_uq.core.status import (
+    MORE,
+    Advice,
     Check,
     Code,
     Level,
+    Note,
+    Order,
     pass_or_warn,
 )
-from starcal_uq.core.times import TIMES_IN_NAMES
+from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
 from starcal_uq.diagnostics.verdict.effect import on_directions
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA
@@ -56,11 +59,6 @@ _SMALL_SIGMA = 1.0
 # Remedies that several checks give.
 SCREEN = calibrated(screening=True)
 _RICHEST = "brown_tangential"
-_NO_MODEL = (
-    "Count the pattern as an error of the directions, as the attitude error with the misfit "
-    "found does: no distortion "
-    "model here follows it."
-)
 ROBUST = calibrated("command", likelihood="student_t")
 NOISE = calibrated(noise="model")
 
@@ -70,165 +68,106 @@ def directions(
     cal: Calibration,
     found: AirTest | None = None,
     times: TimeTest | None = None,
-    rests: str = "",
+    rests: Finding | None = None,
 ) -> Check:
     """Is annual aberration in the directions, and refraction where there is air? `rests` is what f
     rests on.
     """
-    declared = obs.origin.directions
-    name, bound = Code.CATALOGUE_DIRECTIONS, "apparent"
+    declared, code = obs.origin.directions, Code.CATALOGUE_DIRECTIONS
     seen = air(obs)
-    wrong = [] if times is None else [_time_words(obs, times)]
+    wrong = [] if times is None else [_of_times(obs, times)]
     if found is not None and found.is_air:
-        order = (
-            "Give the directions of a catalogue, or apparent ones that hold refraction."
-            if seen == "none"
-            else ""
-        )
-        wrong.append(
-            (
-                f"refraction, p = {significant(found.p_value)}",
-                air_words(obs, found),
-                _with_site(obs, found),
-                order,
-            )
-        )
+        orders = (Order(Advice.GIVE_THE_DIRECTIONS),) if seen == "none" else ()
+        wrong.append((_of_air(obs, found), _with_site(obs, found), orders))
     if wrong:
-        values, sentences, remedies, orders = zip(*wrong, strict=True)
-        first, advice = next(filter(None, remedies), ()), " ".join(filter(None, orders))
+        parts, remedies, orders_of_each = zip(*wrong, strict=True)
         small = times is not None and len(wrong) == 1 and times.moves_sigma < _SMALL_SIGMA
-        level = Level.WARN if small else Level.FAIL
         return Check(
-            name,
-            level,
-            "; ".join(values),
-            bound,
-            " ".join(sentences),
-            first,
-            advice,
+            code,
+            {"declared": declared, "parts": parts},
+            Level.WARN if small else Level.FAIL,
+            remedies=next(filter(None, remedies), ()),
+            orders=sum(orders_of_each, ()),
         )
     if declared == "apparent" and seen == "unknown":
-        words = (
-            "Aberration is in the directions, refraction is not.",
-            rests,
-            _unsure(cal, found),
-            REMEDY,
-        )
-        sentence = " ".join(filter(None, words))
-        return Check(
-            name,
-            Level.WARN,
-            "without refraction",
-            bound,
-            sentence,
-            _about_air(obs),
-        )
+        first = (Finding(Note.WITHOUT_REFRACTION), rests, *_unsure(cal, found))
+        parts = (*filter(None, first), Order(Advice.STATE_THE_SITE))
+        facts = {"declared": declared, "parts": parts}
+        return Check(code, facts, Level.WARN, remedies=_about_air(obs))
     if declared == "apparent":
-        sentence = "The directions are declared as apparent: aberration is in them."
-        if obs.origin.observer == "space":
-            sentence = "Aberration is in the directions; the camera was in space."
-        if seen == "corrected":
-            sentence = (
-                f"Aberration and refraction at the site ({Site.from_dict(obs.origin.site or {})}) are "
-                "in the directions."
-            )
-        sentence = f"{sentence} {rests}".rstrip()
-        return Check(name, Level.PASS, declared, bound, sentence)
-    sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
+        site = Site.from_dict(obs.origin.site or {}) if seen == "corrected" else None
+        held = {"in_space": obs.origin.observer == "space", "site": site}
+        parts = tuple(filter(None, (Finding(Note.APPARENT_DIRECTIONS, held), rests)))
+        return Check(code, {"declared": declared, "parts": parts})
+    stated = {"declared": obs.directions_declared, "timed": obs.time_utc is not None}
+    parts = (Finding(Note.DIRECTIONS_WITHOUT_ABERRATION, stated), _of_aberration(cal))
     time = _time_of(obs) if obs.origin.from_images else {}
     remedies = _again(obs, **(time or {"directions": "apparent"}))
     if seen == "unknown":
-        sentence = f"{sentence} {_unsure(cal, found)} {REMEDY}"
+        parts = (*parts, *_unsure(cal, found), Order(Advice.STATE_THE_SITE))
         remedies += _about_air(obs)
-    return Check(name, Level.WARN, declared, bound, sentence, remedies)
+    return Check(code, {"declared": declared, "parts": parts}, Level.WARN, remedies=remedies)
 
 
-def rests_on_aberration(obs: Observations, found: UnseenAberration | None) -> str:
+def rests_on_aberration(obs: Observations, found: UnseenAberration | None) -> Finding | None:
     """That f is conditional on aberration being in the directions once, where no residual can show
     that.
     """
     made = obs.origin.simulated or obs.origin.observer == "rendered"
     if found is None or made or not obs.origin.apparent:
-        return ""
-    size = f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)"
-    return (
-        "The focal length f rests on annual aberration being in the directions, once: left out "
-        "or applied twice, it "
-        f"would move f by {'' if found.dated else 'up to '}{size}, and the residuals of these "
-        "frames would not show it."
-    )
+        return None
+    facts = {"f_px": found.f_px, "f_sigma": found.f_sigma, "dated": found.dated}
+    return Finding(Note.RESTS_ON_ABERRATION, facts)
 
 
-def air_words(obs: Observations, found: AirTest) -> str:
+def _of_air(obs: Observations, found: AirTest) -> Finding:
     """That refraction is in the residuals, what it does to f, and where the camera would have
     stood.
     """
-    first = (
-        "The residuals hold refraction that the directions do not: f is too short by "
-        f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)."
+    known = bool(np.isfinite(found.latitude_deg))
+    return Finding(
+        Note.REFRACTION_IN_THE_RESIDUALS,
+        {
+            "p_value": found.p_value,
+            "f_px": found.f_px,
+            "f_sigma": found.f_sigma,
+            "place": Site(found.latitude_deg, found.longitude_deg) if known else None,
+            "place_std_deg": (found.latitude_std_deg, found.longitude_std_deg),
+            "from_images": obs.origin.from_images,
+            "air": air(obs),
+        },
     )
-    if not np.isfinite(found.latitude_deg):
-        times = f"--time, or {TIMES_IN_NAMES if obs.origin.from_images else 'column time_utc'}"
-        return f"{first} The frames have no times: state the site (--site) and the times ({times})."
-    place = Site(found.latitude_deg, found.longitude_deg)
-    errors = (significant(error) for error in (found.latitude_std_deg, found.longitude_std_deg))
-    ends = " and ".join(f"± {error}°" for error in errors)
-    seen = {
-        "corrected": "Check site, pressure and times",
-        "none": "They are declared to hold all there is: check that",
-    }
-    asked = seen.get(air(obs), "State the site (--site)")
-    return f"{first} {asked}; the residuals point to {place.words} ({ends})."
 
 
-def _unsure(cal: Calibration, found: AirTest | None) -> str:
+def _unsure(cal: Calibration, found: AirTest | None) -> tuple[Finding, ...]:
     """That f is conditional on refraction, and where the residuals leave open whether there is
     any.
     """
-    if found is None or not found.like_others:
-        return conditional_words(cal)
-    return (
-        f"{conditional_words(cal)} The residuals hold what refraction would leave if the zenith "
-        "kept its place in the "
-        "camera, and so would axes of different scale, skewed axes or a drift of f: these cannot "
-        "be told apart here."
-    )
+    like = found is not None and found.like_others
+    return (conditional(cal), *((Finding(Note.LIKE_REFRACTION),) if like else ()))
 
 
-def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, Remedies, str]:
-    """Value, sentence, remedies and advice of a time, or an epoch, that is not that of the stars."""
-    effect = f"it moves {found.moves} by {significant(found.moves_sigma)} sigma"
-    unit = {"epoch": "years", "date": "days", "hour": "hours"}.get(found.cause, "")
-    later = f"{significant(abs(found.later))} ± {significant(found.later_std)} {unit}"
-    later += " later" if found.later > 0.0 else " earlier"
+def _of_times(obs: Observations, found: TimeTest) -> tuple[Finding, Remedies, tuple[Order, ...]]:
+    """A time, or an epoch, that is not that of the stars: fact, remedies and orders."""
+    facts = {
+        "cause": found.cause,
+        "later": found.later,
+        "later_std": found.later_std,
+        "moves": found.moves,
+        "moves_sigma": found.moves_sigma,
+    }
+    if found.cause == "hour":
+        facts["east_deg"] = HOUR_DEG * found.later
+    wrong, remedies = Finding(Note.WRONG_TIMES, facts), ()
     if found.cause == "epoch":
-        sentence = (
-            f"By proper motion the stars are those of an epoch {later} than that of the "
-            f"directions: {effect}."
-        )
-        return (
-            f"epoch {later}",
-            sentence,
-            (),
-            "Correct the times, or give directions of the epoch of the images.",
-        )
+        return wrong, (), (Order(Advice.CORRECT_THE_EPOCH),)
     if found.cause == "no aberration":
-        sentence = f"The residuals hold annual aberration that the directions do not: {effect}."
         unknown = obs.origin.from_images and obs.time_utc is None
         kind = {} if unknown else {"directions": "catalogue"}
-        return "no aberration", sentence, _again(obs, **kind, **_time_of(obs)), ""
+        return wrong, _again(obs, **kind, **_time_of(obs)), ()
     if found.cause == "aberration twice":
-        sentence = f"The directions hold annual aberration twice: {effect}."
-        return "aberration twice", sentence, _again(obs, directions="apparent"), ""
-    what, other = "Annual aberration", ""
-    if found.cause == "hour":
-        east = HOUR_DEG * found.later
-        what, other = (
-            "Refraction",
-            f", or a site {significant(abs(east))}° further {'east' if east > 0.0 else 'west'}",
-        )
-    sentence = f"{what} in the residuals is that of times {later} than stated{other}: {effect}."
-    return f"times {later}", sentence, (), "Correct the times, which are UTC (column time_utc)."
+        return wrong, _again(obs, directions="apparent"), ()
+    return wrong, remedies, (Order(Advice.CORRECT_THE_TIMES),)
 
 
 def wrong_time(obs: Observations, cal: Calibration) -> str | None:
@@ -243,9 +182,11 @@ def wrong_time(obs: Observations, cal: Calibration) -> str | None:
         return None
     if found is None or not np.isfinite(found.moves_sigma):
         return None
-    _, sentence, remedies, advice = _time_words(obs, found)
+    wrong, remedies, orders = _of_times(obs, found)
+    sentence = wrong.sentence
     order = f"Use `{remedies[0].words}`." if remedies else ""
-    return sentence[0].lower() + " ".join(filter(None, (sentence[1:], advice, order)))
+    said = (sentence[1:], *(one.sentence for one in orders), order)
+    return sentence[0].lower() + " ".join(filter(None, said))
 
 
 def _time_of(obs: Observations) -> dict[str, str]:
@@ -272,56 +213,42 @@ def _about_air(obs: Observations) -> Remedies:
     return _with_site(obs) + _again(obs, in_space=True)
 
 
-def aberration_words(cal: Calibration) -> str:
+def _of_aberration(cal: Calibration) -> Finding:
     """What annual aberration can do to this camera if it is not in the directions."""
-    ratio = significant(ABERRATION_RAD * cal.camera.focal_px / float(cal.sigmas[2]))
-    return f"Annual aberration {aberration_size(cal.camera)}, {ratio} times its sigma."
+    ratio = ABERRATION_RAD * cal.camera.focal_px / float(cal.sigmas[2])
+    return Finding(Note.ABERRATION, aberration_size(cal.camera) | {"f_sigma": ratio})
 
 
-def aberration_size(camera: Camera) -> str:
-    """What annual aberration can do to a camera of this field, as the end of a sentence."""
+def aberration_size(camera: Camera) -> dict[str, float]:
+    """What annual aberration can do to a camera of this field: from corner to corner, and to f."""
     diagonal_rad = 2.0 * np.arctan(camera.half_diagonal_px / camera.focal_px)
-    angle = fixed(ABERRATION_RAD * diagonal_rad * ARCSEC, 1)
-    return (
-        f"changes angles by up to {angle} arcsec from corner to corner of this field and can "
-        "move f by up to "
-        f"{significant(ABERRATION_RAD * camera.focal_px)} px"
-    )
+    return {
+        "corners_arcsec": float(ABERRATION_RAD * diagonal_rad * ARCSEC),
+        "f_px": ABERRATION_RAD * camera.focal_px,
+    }
 
 
 def residual_pattern(obs: Observations, cal: Calibration, better: str | None = None) -> Check:
     """Do mean residuals over the field show more than noise? `better` as for `lens_remedy`."""
     binned = bin_residuals(cal, obs)
-    p_value, pattern = binned.p_value, binned.pattern_px
-    cells = len(binned.counts)
-    if p_value >= PATTERN_P:
-        level, sentence = (
-            Level.PASS,
-            f"Mean residuals in {plural(cells, 'cell')} of the field are what noise gives.",
-        )
-    else:
-        seen = 2.0 * float(binned.counts.sum()) * (pattern / _noise_px(obs, cal)) ** 2
-        effect = on_directions(seen, len(cal.theta))
-        level = effect.level
-        arcsec = pattern / cal.camera.focal_px * ARCSEC
-        sentence = (
-            f"The residuals show a pattern of {significant(pattern)} px per axis "
-            f"({significant(arcsec)} arcsec) that "
-            f"the model does not explain; it is not in any interval of this report. {effect}"
-        )
-    value = f"p = {significant(p_value)}" + (
-        f", pattern {significant(pattern)} px" if pattern > 0.0 else ""
-    )
-    remedies: Remedies = ()
-    advice = ""
-    if level is not Level.PASS:
-        remedies, advice = lens_remedy(cal.camera.distortion, better)
-    name, bound = Code.PATTERN_IN_THE_RESIDUALS, f"p ≥ {PATTERN_P:g}"
-    return Check(name, level, value, bound, sentence, remedies, advice)
+    pattern = binned.pattern_px
+    facts: AnyDict = {
+        "p_value": binned.p_value,
+        "pattern_px": pattern,
+        "pattern_arcsec": pattern / cal.camera.focal_px * ARCSEC,
+        "n_cells": len(binned.counts),
+    }
+    code, bounds = Code.PATTERN_IN_THE_RESIDUALS, {"p_least": PATTERN_P}
+    if binned.p_value >= PATTERN_P:
+        return Check(code, facts, bounds=bounds)
+    seen = 2.0 * float(binned.counts.sum()) * (pattern / _noise_px(obs, cal)) ** 2
+    effect = on_directions(seen, len(cal.theta))
+    remedies, orders = lens_remedy(cal.camera.distortion, better)
+    return Check(code, facts | effect.facts, effect.level, bounds, remedies, orders)
 
 
-def lens_remedy(fitted: str, better: str | None = None) -> tuple[Remedies, str]:
-    """Remedies and advice where the residuals hold a pattern of the field.
+def lens_remedy(fitted: str, better: str | None = None) -> tuple[Remedies, tuple[Order, ...]]:
+    """Remedies and orders where the residuals hold a pattern of the field.
 
     `better` is the model that a comparison prefers, empty if none; without a comparison, one with
     further terms.
@@ -329,7 +256,7 @@ def lens_remedy(fitted: str, better: str | None = None) -> tuple[Remedies, str]:
     has_all = {coefficient.name for coefficient in get_model(_RICHEST).coefficients}
     further = {coefficient.name for coefficient in get_model(fitted).coefficients} < has_all
     model = better if better is not None else _RICHEST if further else ""
-    return (with_model(model), "") if model else ((), _NO_MODEL)
+    return (with_model(model), ()) if model else ((), (Order(Advice.COUNT_THE_PATTERN),))
 
 
 def outliers(obs: Observations, cal: Calibration) -> Check:
@@ -351,19 +278,13 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     # Probability of at least `found` where `expected` are expected (Poisson).
     p_value = 1.0 if found == 0 else float(pdtrc(found - 1, expected))
     good = p_value >= OUTLIER_P
-    place = f"largest {fixed(largest, 1)} sigma, in frame {frame}"
-    sentence = (
-        f"As many as Gaussian noise gives ({place})."
-        if good
-        else (
-            f"More than Gaussian noise gives ({place}): look for wrong identifications and "
-            "disturbed centroids."
-        )
+    return Check(
+        Code.OUTLIERS,
+        {"n_beyond": found, "largest_sigma": largest, "frame": frame},
+        pass_or_warn(good),
+        {"beyond_sigma": OUTLIER_SIGMA, "expected": expected},
+        () if good else SCREEN,
     )
-    value = f"{plural(found, 'star')} beyond {OUTLIER_SIGMA:g} sigma"
-    bound = f"about {significant(expected)} expected"
-    remedies = () if good else SCREEN
-    return Check(Code.OUTLIERS, pass_or_warn(good), value, bound, sentence, remedies)
 
 
 def screening(obs: Observations) -> Check | None:
@@ -371,17 +292,16 @@ def screening(obs: Observations) -> Check | None:
     record = obs.origin.screening
     if not isinstance(record, dict) or "blame" not in record:
         return None
-    value = f"{plural(int(record['rejected']), 'star')} of {int(record['of'])} rejected"
-    sentence, remedies = str(record["blame"]), calibrated("command", noise="model")
-    sentence = sentence[0].upper() + sentence[1:]
-    return Check(
-        Code.SCREENING,
-        Level.WARN,
-        value,
-        "wrong stars alone",
-        sentence,
-        remedies,
-    )
+    facts = {
+        "rejected": int(record["rejected"]),
+        "of": int(record["of"]),
+        # A table of an earlier version has words alone.
+        "blame": Finding(Note.MODEL_IS_WRONG, record["blamed"])
+        if "blamed" in record
+        else str(record["blame"]),
+    }
+    remedies = calibrated("command", noise="model")
+    return Check(Code.SCREENING, facts, Level.WARN, remedies=remedies)
 
 
 def noise(obs: Observations, cal: Calibration) -> Check:
@@ -392,65 +312,48 @@ def noise(obs: Observations, cal: Calibration) -> Check:
     good = low <= cal.sigma <= high
     if fitted is not None and not fitted.multiplies:
         good = PLAUSIBLE_NOISE_PX[0] <= cal.sigma * fitted.level_px <= PLAUSIBLE_NOISE_PX[1]
-    unit, advice = "" if scaled else " px", ""
-    remedies: Remedies = ()
-    value = f"{significant(cal.sigma, 3)}{unit}"
-    if good:
-        sentence = (
-            "The stated noise of the stars is confirmed." if scaled else "Usual for star centroids."
-        )
+    code, unit = Code.CENTROID_NOISE_PER_AXIS, "_px"
+    if scaled:
+        code, unit = Code.FACTOR_ON_THE_STATED_NOISE, ""
         if fitted is not None:
-            sentence = f"The noise was fitted: {fitted}."
+            code = Code.FACTOR_ON_THE_FITTED_NOISE
+    facts: AnyDict = {f"noise{unit}": cal.sigma}
+    remedies: Remedies = ()
+    orders: tuple[Order, ...] = ()
+    if good:
+        facts |= {} if fitted is None else {"fitted": fitted}
     elif cal.sigma > high:
-        sentence = (
-            "Far more scatter than centroids have: identifications, camera file or distortion "
-            "model may be wrong."
-        )
         remedies = SCREEN
     elif scaled:
-        sentence = "Less scatter than is stated: the stated noise is too large."
         remedies = NOISE
     else:
-        sentence = "Less scatter than centroids have: the data are not measurements."
-        advice = (
-            "Give centroids as they were measured, not positions that were computed or smoothed."
-        )
+        orders = (Order(Advice.GIVE_MEASURED_CENTROIDS),)
     if not good and scaled and fitted is None and (unlike := _stated_unit(obs, cal)):
-        (sentence, advice), remedies = unlike, ()
-    name = Code.CENTROID_NOISE_PER_AXIS
-    if scaled:
-        name = Code.FACTOR_ON_THE_STATED_NOISE
-        if fitted is not None:
-            name = Code.FACTOR_ON_THE_FITTED_NOISE
-    bound = f"{low:g} to {high:g}{unit}"
-    return Check(name, pass_or_warn(good), value, bound, sentence, remedies, advice)
+        facts["unlike"], orders = unlike
+        remedies = ()
+    bounds = {f"least{unit}": low, f"most{unit}": high}
+    return Check(code, facts, pass_or_warn(good), bounds, remedies, orders)
 
 
-def _stated_unit(obs: Observations, cal: Calibration) -> tuple[str, str] | None:
+def _stated_unit(obs: Observations, cal: Calibration) -> tuple[Finding, tuple[Order, ...]] | None:
     """What the column of stated noise holds, where it is not px, and what to do; None if that
     cannot be told.
     """
-    stated, in_px = obs.sigma_px, "Give the noise in px, or leave the column out."
+    stated, in_px = obs.sigma_px, (Order(Advice.STATE_NOISE_IN_PX),)
     if stated is None:
         return None
     if floor := obs.origin.noise_floor_px:  # The column is not the user's.
-        less = (
-            f"Less scatter than the stars state: the {significant(floor)} px that were added to "
-            "each are too many."
-        )
-        return (less, "Accept it: the factor is in every interval.") if cal.sigma < 1.0 else None
+        less = Finding(Note.ADDED_NOISE_TOO_LARGE, {"added_px": floor})
+        return (less, (Order(Advice.ACCEPT_THE_FACTOR),)) if cal.sigma < 1.0 else None
     arcsec_per_px = ARCSEC / cal.camera.focal_px
     if obs.mag is not None and np.array_equal(stated, obs.mag):
-        return "Column sigma_px holds the magnitudes.", in_px
+        return Finding(Note.NOISE_IS_THE_MAGNITUDES), in_px
     if cal.sigma < _FAR_BELOW and np.ptp(stated) > _MAGNITUDES[0] and stated.max() < _MAGNITUDES[1]:
-        ends = f"{stated.min():.3g} to {stated.max():.3g}"
-        return f"Column sigma_px ({ends}) looks like magnitudes.", in_px
+        ends = {"least": float(stated.min()), "most": float(stated.max())}
+        return Finding(Note.NOISE_LIKE_MAGNITUDES, ends), in_px
     if 1.0 / _SAME_UNIT < cal.sigma * arcsec_per_px < _SAME_UNIT:
-        per = significant(arcsec_per_px, 3)
-        return (
-            f"Column sigma_px looks like arcseconds, of which a pixel has {per}.",
-            "Divide it by that.",
-        )
+        like = Finding(Note.NOISE_LIKE_ARCSECONDS, {"arcsec_per_px": arcsec_per_px})
+        return like, (Order(Advice.DIVIDE_THE_NOISE),)
     return None
 
 
@@ -468,27 +371,18 @@ def partitions(cal: Calibration) -> Check | None:
     worst = int(np.argmax(np.abs(z)))
     p_value = min(1.0, len(z) * float(erfc(abs(z[worst]) / np.sqrt(2.0))))
     good = p_value >= PATTERN_P
-    factor = float(np.sqrt(found.chi2[worst] / dof[worst])) / cal.sigma
-    place = (
-        f"file {worst + 1} of {len(z)}, by frame number, has {significant(factor, 3)} times the "
-        "common noise"
-    )
-    sentence = (
-        f"The files scatter as alike as noise of one size lets them ({place})."
-        if good
-        else f"The files scatter unequally ({place})."
-    )
-    value, bound, name = (
-        f"p = {significant(p_value)}",
-        f"p ≥ {PATTERN_P:g}",
+    return Check(
         Code.NOISE_OF_THE_FILES,
+        {
+            "p_value": p_value,
+            "file": worst + 1,
+            "n_files": len(z),
+            "times": float(np.sqrt(found.chi2[worst] / dof[worst])) / cal.sigma,
+        },
+        pass_or_warn(good),
+        {"p_least": PATTERN_P},
+        orders=() if good else (Order(Advice.LOOK_AT_THE_FILE),),
     )
-    advice = (
-        ""
-        if good
-        else "Look for what changed in that file, or calibrate each by itself and compare the runs."
-    )
-    return Check(name, pass_or_warn(good), value, bound, sentence, advice=advice)
 
 
 def terms(cal: Calibration) -> Check | None:
@@ -502,23 +396,12 @@ def terms(cal: Calibration) -> Check | None:
     best = int(np.argmin(single))
     name, p_value = richer[best].model, min(1.0, len(single) * single[best])
     good = p_value >= PATTERN_P
-    sentence = (
-        (
-            f"No richer distortion model fits all stars better than chance lets it ({name!r} comes "
-            "nearest)."
-        )
-        if good
-        else f"All stars together ask for the terms of the distortion model {name!r}."
-    )
-    value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
-    remedies = () if good else calibrated("command", model=name)
     return Check(
         Code.TERMS_OF_THE_DISTORTION,
+        {"p_value": p_value, "model": name},
         pass_or_warn(good),
-        value,
-        bound,
-        sentence,
-        remedies,
+        {"p_least": PATTERN_P},
+        () if good else calibrated("command", model=name),
     )
 
 
@@ -527,33 +410,14 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
     binned = bin_residuals(cal, obs)
     share = len(binned.counts) / max(len(binned.counts) + binned.n_empty, 1)
     n_frames = obs.n_frames if cal.partitions is None else cal.n_frames
-    value = f"{percent(share, 3)} of the field, {plural(n_frames, 'frame')}"
-    bound = f"≥ {percent(COVERED_SHARE)}, ≥ {MIN_FRAMES} frames"
-    remedies, advice = PLAN, MORE
-    if share < COVERED_SHARE:
-        level, sentence = (
-            Level.WARN,
-            "Parts of the field hold no stars: the distortion is extrapolated there.",
-        )
-    elif n_frames < MIN_FRAMES:
-        level, sentence = (
-            Level.WARN,
-            "Few frames: errors common to a whole frame cannot be told from the camera.",
-        )
-    else:
-        level, sentence = (
-            Level.PASS,
-            "Stars covered the field, so that no part of it is extrapolated.",
-        )
-        remedies, advice = (), ""
+    good = share >= COVERED_SHARE and n_frames >= MIN_FRAMES
     return Check(
         Code.COVERAGE_OF_THE_FIELD,
-        level,
-        value,
-        bound,
-        sentence,
-        remedies,
-        advice,
+        {"share": share, "n_frames": n_frames},
+        pass_or_warn(good),
+        {"share_least": COVERED_SHARE, "n_frames_least": MIN_FRAMES},
+        () if good else PLAN,
+        () if good else MORE,
     )
 
 
@@ -562,19 +426,6 @@ def _noise_px(obs: Observations, cal: Calibration) -> float:
     return cal.sigma * stated
 
 
-def _undeclared(obs: Observations) -> str:
-    if obs.directions_declared:
-        return "The directions come straight from a catalogue."
-    if obs.time_utc is None:
-        return (
-            "Neither time nor observer velocity was declared, so it is not known whether "
-            "aberration is in the "
-            "directions."
-        )
-    return "The table has times, but it was not declared whether aberration is in the directions."
-
-
-REMEDY = "State the site (--site) and the times, or that the camera was in space (--in-space)."
 Air: TypeAlias = Literal["corrected", "none", "unknown"]
 _HIGH_DEG, _MIDDLE_DEG = 90.0, 45.0
 # What pressure and temperature of a place may differ from the standard atmosphere: 1.5 % and 4 %.
@@ -593,44 +444,36 @@ def air(obs: Observations | PartitionedObservations) -> Air:
     return "none" if origin.without_air or origin.simulated or declared else "unknown"
 
 
-def conditional_words(cal: Calibration) -> str:
+def conditional(cal: Calibration) -> Finding:
     """That f is conditional on refraction, with the size of the effect on this camera in standard
     air at sea level.
     """
     constants = refraction_constants(Site(latitude_deg=45.0, longitude_deg=0.0))
     focal, sigma = cal.camera.focal_px, float(cal.sigmas[2])
-    sizes = [float(shrinking(altitude, constants)) * focal for altitude in (_HIGH_DEG, _MIDDLE_DEG)]
-    high, middle = (f"{significant(size)} px ({significant(size / sigma)} sigma)" for size in sizes)
-    return (
-        "The focal length f is conditional on refraction: if the stars were seen through air, f "
-        "is too short by "
-        f"{high} at the zenith and by {middle} at 45° of altitude."
+    high, middle = (
+        float(shrinking(altitude, constants)) * focal for altitude in (_HIGH_DEG, _MIDDLE_DEG)
+    )
+    return Finding(
+        Note.CONDITIONAL_ON_REFRACTION,
+        {"zenith_px": high, "middle_px": middle, "f_sigma_px": sigma},
     )
 
 
-def corrected_words(obs: Observations, cal: Calibration) -> str:
+def corrected(obs: Observations, cal: Calibration) -> Finding:
     """Which air was taken at which site, and what it does to f."""
     site, atmosphere = Site.from_dict(obs.origin.site or {}), obs.origin.atmosphere or {}
     size = float(atmosphere["shrinking"]) * cal.camera.focal_px
     sigma = float(cal.sigmas[2])
-    assumed = " and ".join(site.assumed)
-    source = f" ({assumed} of the standard atmosphere)" if assumed else ""
-    low, high = (fixed(float(atmosphere[f"altitude_{end}_deg"]), 0) for end in ("min", "max"))
-    per_cent = (
-        f"each per cent of the air’s density (10 hPa, 3 °C) counts {significant(0.01 * size)} px"
-    )
-    weather = ""
-    if site.assumed and _WEATHER * size > sigma:
-        weather = (
-            f" The weather may differ from the standard atmosphere by {_WEATHER * 100:.0f} %, "
-            "which is more than the "
-            "sigma of f: state pressure and temperature."
-        )
-    return (
-        f"Site: {site}. Refraction in air of {fixed(site.air_pressure_hpa, 0)} hPa and "
-        f"{fixed(site.air_temperature_c, 0)} °C{source} is in the directions, at altitudes of "
-        f"{low}° to {high}°. "
-        f"Without it f would come out {significant(size)} px ({significant(size / sigma)} sigma) "
-        "shorter; "
-        f"{per_cent}.{weather}"
+    return Finding(
+        Note.REFRACTION_CORRECTED,
+        {
+            "site": site,
+            "altitudes_deg": tuple(
+                float(atmosphere[f"altitude_{end}_deg"]) for end in ("min", "max")
+            ),
+            "f_px": size,
+            "f_sigma": size / sigma,
+            "weather": _WEATHER,
+            "weather_matters": bool(site.assumed and _WEATHER * size > sigma),
+        },
     )

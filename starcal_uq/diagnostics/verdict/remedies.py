@@ -11,6 +11,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from typing import Any
 
 from starcal_uq.core.conflicts import (
@@ -20,30 +21,17 @@ from starcal_uq.core.conflicts import (
     sampled_by_default,
     words_of,
 )
-from starcal_uq.core.formatting import join_words
+from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, SITE, SOME_IMAGES, UTC, Near, Remedies, Remedy
-from starcal_uq.core.status import Check, Code, Level
+from starcal_uq.core.status import Advice, Check, Code, Level, Order
 from starcal_uq.core.types import AnyDict
 
 MOST_COMMANDS = 3
 # Runs after which a chain that did not get better ends.
 _PATIENCE = 2
-# What a cause of doubt is called, in the order in which to look for them, and which data tell it
-# from the others.
+# What a cause of doubt is called, in the order in which to look for them.
 INPUT, LENS, NOISE, NUMERICS = "the input", "the lens", "the noise", "the computation"
 _ORDER = (INPUT, LENS, NOISE, NUMERICS)
-_TELLING = {
-    INPUT: (
-        "times in UTC and the site, or the statement that the camera was in space, for every frame"
-    ),
-    LENS: (
-        "frames of the same stars at other places of the detector, shifted and turned by 90 degrees"
-    ),
-    NOISE: (
-        "repeated exposures of one field, whose scatter is noise alone, with times and temperatures"
-    ),
-    NUMERICS: "more frames, spread over the sky",
-}
 _CAUSES = {
     Code.CATALOGUE_DIRECTIONS: INPUT,
     Code.ONE_CAMERA: INPUT,
@@ -78,6 +66,16 @@ _ENDS = {
     "site": ("in_space", "observer_velocity"),
     "in_space": ("site",),
 }
+
+
+class Refusal(Enum):
+    """Why a calibration is of no use to a run."""
+
+    TIMES_UNKNOWN = auto()
+    SITE_UNKNOWN = auto()
+    MADE_WITH = auto()
+    TRIED = auto()
+    EXCLUDED = auto()
 
 
 @dataclass(frozen=True)
@@ -161,36 +159,34 @@ class Place:
         """
         reasons = {one: self.refused(one) for one in check.remedies}
         kept = tuple(self.of(one) for one, reason in reasons.items() if not reason)
-        advice = check.advice
-        if check.remedies and not kept and not advice:
-            said = join_words(list(dict.fromkeys(filter(None, reasons.values()))))
-            advice = f"Look for the cause in the instrument or the data: {said}."
-        return replace(check, remedies=kept, advice=advice)
+        orders = check.orders
+        if check.remedies and not kept and not check.advice:
+            why = tuple(reason for reason in reasons.values() if reason)
+            orders = (Order(Advice.LOOK_FOR_THE_CAUSE, {"reasons": why}),)
+        return replace(check, remedies=kept, orders=orders)
 
-    def refused(self, remedy: Remedy) -> str:
+    def refused(self, remedy: Remedy) -> Finding | None:
         """Why a calibration is of no use here: it was given, tried, or is against options of this
         run.
         """
         asked = _asked(remedy)
         if not asked:
-            return ""
-        words = shlex.join(words_of(asked))
+            return None
         if UTC in asked.values():
-            return "the times are not known"
+            return Finding(Refusal.TIMES_UNKNOWN)
         if asked.get("site") == SITE:
-            return "the site is not known"
+            return Finding(Refusal.SITE_UNKNOWN)
         _, given = self.made
         if all(given.get(name) == value for name, value in asked.items()):
-            return f"the run was made with {words} already"
+            return Finding(Refusal.MADE_WITH, {"asked": asked})
         options = changed(given, asked)
         if any(options == one.options for one in self.tried):
-            return f"{words} was tried already"
+            return Finding(Refusal.TRIED, {"asked": asked})
         settings = {"sampled": sampled_by_default(options)} | options
         if rule := conflict(settings | {"partitioned": self.partitioned}):
-            return (
-                f"the run was made with options that {words} excludes ({rule.name}, {rule.other})"
-            )
-        return ""
+            excluded = {"asked": asked, "name": rule.name, "other": rule.other}
+            return Finding(Refusal.EXCLUDED, excluded)
+        return None
 
     def of(self, remedy: Remedy) -> Remedy:
         """A remedy with the files of this run in place of OBS, CAMERA, SITE and RUN."""
@@ -241,7 +237,6 @@ def counted(checks: Sequence[Check]) -> tuple[int, int]:
     return levels.count(Level.FAIL), levels.count(Level.WARN)
 
 
-def telling(checks: Sequence[Check]) -> str:
-    """Which data would tell what is behind checks that did not pass."""
-    causes = by_cause(checks)
-    return _TELLING[next(iter(causes), NUMERICS)]
+def first_cause(checks: Sequence[Check]) -> str:
+    """What checks that did not pass point to first."""
+    return next(iter(by_cause(checks)), NUMERICS)

@@ -1,4 +1,4 @@
-"""What the loops share: kernels at a star, a chunk's directions, arguments."""
+"""What the loops share: a model's functions for a chunk of stars, directions, arguments."""
 
 from __future__ import annotations
 
@@ -9,180 +9,218 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numba import njit, types
-from numba.extending import overload
+from numba import cfunc, njit, types
+from numba.extending import intrinsic
 
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.camera.projection import backward_kernel, forward_kernel, newton_kernel
+from starcal_uq.camera.kernels import Kernel
+from starcal_uq.camera.projection import (
+    backward_kernel,
+    bent_index,
+    forward_kernel,
+    newton_kernel,
+)
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood.loops.unrolled import STRIDE, name_of, star_kernel
+from starcal_uq.likelihood.loops.expansion import expand, follow
+from starcal_uq.likelihood.loops.unrolled import STAR_FUNCTION, STRIDE, Code, Stars, call
 from starcal_uq.observations.frames import StarFrames
 
 F = TypeVar("F", bound=Callable[..., Any])
 CHUNK = 128
+# Rows of the buffer `work`: the direction, or the pixel; the root; the target.
+WORK = 8
 _NEWTON_STEPS = 60
 _NONE = np.empty(0)
-_SOURCES = sorted(Path(__file__).parent.glob("*.py"))
 
 # Sums in another order, fused products, shared reciprocals: nothing that changes what becomes of
 # NaN and infinity.
-_FAST = frozenset({"contract", "reassoc", "nsz", "arcp"})
-ORDERED = frozenset({"contract"})
+_FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-def compiled(entry: bool = False, fastmath: frozenset[str] = _FAST) -> Callable[[F], F]:
-    """Decorate a function that Numba compiles; an `entry` is called from Python, and kept."""
-    options = {"nogil": True, "error_model": "numpy", "fastmath": set(fastmath)}
+def _kept(make: Callable[[bool], Any]) -> Any:
+    try:
+        return make(True)
+    except RuntimeError:
+        # No folder can be written: compiled for this process alone.
+        return make(False)
+
+
+def compiled(entry: bool = False) -> Callable[[F], F]:
+    """Decorate a function that Numba compiles; an `entry` is called from Python, and kept.
+
+    It allocates nothing, so that Numba need not count references.
+    """
+    options = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "_nrt": False}
     # Not all versions of Numba declare all of its options.
     make: Any = njit
 
-    def kept(function: F) -> F:
-        wrapped: F
-        try:
-            wrapped = make(
-                cache=entry, no_cpython_wrapper=not entry, no_cfunc_wrapper=True, **options
-            )(function)
-        except RuntimeError:
-            # No folder can be written: compiled for this process alone.
-            wrapped = make(no_cfunc_wrapper=True, **options)(function)
+    def decorated(function: F) -> F:
+        def made(keep: bool) -> Any:
+            return make(cache=keep, no_cpython_wrapper=not entry, no_cfunc_wrapper=True, **options)(
+                function
+            )
+
+        wrapped: F = _kept(made) if entry else made(False)
         return wrapped
 
-    return kept
+    return decorated
 
 
-# Rows of `work`: the direction, or the pixel; the root, and the determinant there; the target.
-first_kernel = star_kernel(
-    lambda name: forward_kernel(name, "first"), [(0, 1, 2), (3, 4)], lambda p: (6, 8, 0)
-)
-bent_kernel = star_kernel(
-    lambda name: forward_kernel(name, "bent"),
-    [(0, 1, 2), (3, 4)],
-    lambda p: (0, 2, 2 + 2 * p, 8 + 2 * p),
-)
-newton = star_kernel(newton_kernel, [(6, 7), (3, 4)], lambda p: (3, 5))
-direction_kernel = star_kernel(
-    lambda name: backward_kernel(name, False), [(0, 1), (3, 4)], lambda p: (0,)
-)
-# Derivatives come as rows of (p, 3).
-derivatives_kernel = star_kernel(
-    lambda name: backward_kernel(name, True), [(0, 1), (3, 4)], lambda p: (0, 3)
-)
+# Functions of a chunk of stars that are no kernels of the model.
+_COLUMNS = {"expand": expand, "follow": follow}
 
 
-@compiled()
-def _solve_root(model: Any, theta: Any, work: FloatArray, m: int) -> None:
-    """Newton's method for the points that a model displaces to the targets, as
-    `solve_displacement` does it.
+def _kernel(what: str, model: str) -> Kernel:
+    if what in ("first", "bent"):
+        return forward_kernel(model, what)
+    return newton_kernel(model) if what == "root" else backward_kernel(model, what == "derivatives")
+
+
+def _star_code(typingctx: Any, key: Any, numbers: Any, one: Any, two: Any, m: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        what, model, _ = key.literal_value.split()
+        stars, p = Stars(Code(context, builder), args[1:]), 3 + len(get_model(model).coefficients)
+        if what in _COLUMNS:
+            _COLUMNS[what](stars, model, p)
+            return context.get_dummy_value()
+        kernel = _kernel(what, model)
+        reads = [(0, 1, 2), (3, 4)]
+        # e, H, A and second derivatives.
+        writes = (0, 2, 2 + 2 * p, 8 + 2 * p)[: len(kernel.shapes)]
+        if what in ("direction", "derivatives"):
+            # Derivatives come as rows of (p, 3).
+            reads, writes = [(0, 1), (3, 4)], (0, 3)[: len(kernel.shapes)]
+        elif what == "root":
+            reads, writes = [(6, 7), (3, 4)], (0, 2)
+        stars.kernel(kernel, p, reads, writes)
+        return context.get_dummy_value()
+
+    return types.void(key, numbers, one, two, m), codegen
+
+
+_written: Any = intrinsic(prefer_literal=True)(_star_code)
+
+
+@cache
+def _digest(text: str = "") -> str:
+    """Numba looks at the file of a function that it kept; it depends on others, and on the model."""
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        text += path.read_text("utf-8")
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def star_function(what: str, model: str) -> int:
+    """Address of a compiled function of a model, for a chunk of stars: ``first``, ``bent``,
+    ``direction`` and ``derivatives`` are its kernels, ``root`` solves for points, ``follow`` and
+    ``expand`` make columns.
+
+    Only these know the model; all loops around them are compiled once.
     """
-    flat = True
-    for q in range(3, len(theta)):
-        flat = flat and theta[q] == 0.0
-    for i in range(m):
-        work[3 * STRIDE + i] = work[6 * STRIDE + i]
-        work[4 * STRIDE + i] = work[7 * STRIDE + i]
-    if flat:
-        return
-    for step in range(_NEWTON_STEPS):
-        moving = 0.0
-        for i in range(m):
-            u, v = work[3 * STRIDE + i], work[4 * STRIDE + i]
-            newton(model, theta, work, work, i)
-            du, dv = work[3 * STRIDE + i] - u, work[4 * STRIDE + i] - v
-            far = max(abs(du), abs(dv)) >= 1e-5
-            # Past a fold the determinant changes sign: that branch is not an image of the field.
-            lost = not work[5 * STRIDE + i] > 0.0 or (far and step == _NEWTON_STEPS - 1)
-            moving += 1.0 if far and not lost else 0.0
-            if lost:
-                work[3 * STRIDE + i] = np.nan
-                work[4 * STRIDE + i] = np.nan
-        if moving == 0.0:
+    return int(_made(what, model).address)
+
+
+@cache
+def _made(what: str, model: str) -> Any:
+    text = str(bent_index(model) if what in _COLUMNS else _kernel(what, model).function)
+    key, p = f"{what} {model} {_digest(text)}", 3 + len(get_model(model).coefficients)
+
+    # The key is part of what Numba knows a kept function by.
+    def visit(numbers: Any, one: Any, two: Any, m: Any) -> None:
+        _written(key, numbers, one, two, m)
+
+    def root(theta: Any, work: Any, buf: Any, m: Any) -> None:
+        """Newton's method for the points that a model displaces to the targets, as
+        `solve_displacement` does it.
+        """
+        flat = True
+        for q in range(3, p):
+            flat = flat and theta[q] == 0.0
+        if flat:
             return
+        for step in range(_NEWTON_STEPS):
+            moving = 0.0
+            _written(key, theta, work, buf, m)
+            for i in range(m):
+                du, dv = buf[i] - work[3 * STRIDE + i], buf[STRIDE + i] - work[4 * STRIDE + i]
+                far = max(abs(du), abs(dv)) >= 1e-5
+                # Past a fold the determinant changes sign: that branch is not an image of the
+                # field.
+                lost = not buf[2 * STRIDE + i] > 0.0 or (far and step == _NEWTON_STEPS - 1)
+                moving += 1.0 if far and not lost else 0.0
+                work[3 * STRIDE + i] = np.nan if lost else buf[i]
+                work[4 * STRIDE + i] = np.nan if lost else buf[STRIDE + i]
+            if moving == 0.0:
+                return
 
+    function = root if what == "root" else visit
 
-def _nothing(model: Any, theta: Any, work: Any, m: Any) -> None:
-    pass
-
-
-def _solved(model: Any, theta: Any, work: Any, m: Any) -> None:
-    _solve_root(model, theta, work, m)
-
-
-def forward_root(model: Any, theta: Any, work: FloatArray, m: int) -> None:
-    """Points on the sensor of ideal ones, where the model is not explicit in that direction."""
-
-
-def backward_root(model: Any, theta: Any, work: FloatArray, m: int) -> None:
-    """Ideal points of those on the sensor, where the model is not explicit in that direction."""
-
-
-@overload(forward_root, prefer_literal=True)
-def _(model: Any, theta: Any, work: Any, m: Any) -> Callable[..., None]:
-    return _nothing if get_model(name_of(model)).direction == "forward" else _solved
-
-
-@overload(backward_root, prefer_literal=True)
-def _(model: Any, theta: Any, work: Any, m: Any) -> Callable[..., None]:
-    return _solved if get_model(name_of(model)).direction == "forward" else _nothing
+    return _kept(
+        lambda keep: cfunc(STAR_FUNCTION, cache=keep, fastmath=_FAST, error_model="numpy")(function)
+    )
 
 
 @compiled()
 def fill_directions(
-    model: Any,
+    root: int,
     theta: Any,
-    stars: Any,
-    starts: Any,
-    rotations: FloatArray,
+    sky: Any,
     s0: int,
     m: int,
     first: int,
-    work: FloatArray,
+    work: Any,
+    buf: Any,
 ) -> None:
-    """Directions of a chunk in the camera frame into rows 0 to 2 of `work`, roots into 3 and 4."""
-    r0, r1, r2 = stars[2:]
-    f, j = first, starts[0]
+    """Directions of a chunk in the camera frame into rows 0 to 2 of `work`, roots into 3 and 4.
+
+    `sky` are the stars' directions, where frames start, and rotations; `first` is the first frame.
+    """
+    (r0, r1, r2), starts, rotations = sky
+    f, j = first, 0
     while j < m:
         while starts[f + 1] <= s0 + j:
             f += 1
         end = min(starts[f + 1] - s0, m)
-        a00, a01, a02 = rotations[f, 0, 0], rotations[f, 0, 1], rotations[f, 0, 2]
-        a10, a11, a12 = rotations[f, 1, 0], rotations[f, 1, 1], rotations[f, 1, 2]
-        a20, a21, a22 = rotations[f, 2, 0], rotations[f, 2, 1], rotations[f, 2, 2]
+        k = 9 * f
+        a00, a01, a02 = rotations[k], rotations[k + 1], rotations[k + 2]
+        a10, a11, a12 = rotations[k + 3], rotations[k + 4], rotations[k + 5]
+        a20, a21, a22 = rotations[k + 6], rotations[k + 7], rotations[k + 8]
         for i in range(j, end):
             x, y, z = r0[s0 + i], r1[s0 + i], r2[s0 + i]
             work[i] = a00 * x + a01 * y + a02 * z
             work[STRIDE + i] = a10 * x + a11 * y + a12 * z
             work[2 * STRIDE + i] = a20 * x + a21 * y + a22 * z
         j = end
-    for i in range(m):
-        scale = theta[2] / work[2 * STRIDE + i]
-        work[6 * STRIDE + i] = scale * work[i]
-        work[7 * STRIDE + i] = scale * work[STRIDE + i]
-    forward_root(model, theta, work, m)
+    if root != 0:
+        for i in range(m):
+            scale = theta[2] / work[2 * STRIDE + i]
+            u, v = scale * work[i], scale * work[STRIDE + i]
+            work[3 * STRIDE + i] = work[6 * STRIDE + i] = u
+            work[4 * STRIDE + i] = work[7 * STRIDE + i] = v
+        call(root, theta, work, buf, m)
 
 
-def packed(i: int, j: int) -> int:
-    """Place of an entry of a symmetric matrix among its six unique ones."""
-    return 3 * min(i, j) - min(i, j) * (min(i, j) + 1) // 2 + max(i, j)
+class _Version:
+    """An argument of every entry: loops of another version are not taken for these."""
+
+    _numba_type_ = types.StringLiteral(_digest())
 
 
-class _Literal:
-    """A distortion model as an argument that is compiled for its name."""
-
-    def __init__(self, name: str) -> None:
-        # Numba looks at the file of a function that it kept; it depends on others, and on the model.
-        kernels = (
-            forward_kernel(name, "first"),
-            forward_kernel(name, "bent"),
-            backward_kernel(name, True),
-            newton_kernel(name),
-        )
-        text = "".join(path.read_text("utf-8") for path in _SOURCES)
-        text += "".join(str(kernel.function) for kernel in kernels)
-        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-        self._numba_type_ = types.StringLiteral(f"{name} {digest}")
+VERSION = _Version()
 
 
-literal_of = cache(_Literal)
+def root_of(model: str, explicit: str) -> int:
+    """Address of the search for points; zero where there is nothing to search for: no coefficients,
+    or a model that is explicit in this direction.
+    """
+    known = get_model(model)
+    there = known.direction == explicit or not known.coefficients
+    return 0 if there else star_function("root", model)
+
+
+def rows(n: int) -> FloatArray:
+    """A buffer of so many rows, each of whole lines of the cache."""
+    room = np.zeros(n * STRIDE + 8)
+    return room[-room.ctypes.data // 8 % 8 :][: n * STRIDE]
 
 
 def given(array: Any) -> Any:
@@ -201,12 +239,9 @@ def weighted(frames: StarFrames, rotations: FloatArray) -> tuple[Any, Any, Any, 
     return columns_of(frames), given(weight), given(frames.starts), given(rotations)
 
 
-def numbers_of(theta: FloatArray) -> tuple[float, ...]:
-    return tuple(theta.tolist())
-
-
 def symmetric(upper: FloatArray) -> FloatArray:
-    """A symmetric matrix from its upper triangle, zeros below."""
+    """A symmetric matrix from its upper triangle; what stands below does not count."""
+    upper = np.triu(upper)
     whole = upper + upper.T
     whole.flat[:: len(whole) + 1] = upper.diagonal()
     return whole

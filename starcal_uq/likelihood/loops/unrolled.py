@@ -1,5 +1,4 @@
-"""Straight-line code for compiled loops: a camera model's kernel at one star, sums of products of
-rows.
+"""Straight-line code for compiled loops: the kernels of a camera model, sums of products of rows.
 
 Written out, a formula keeps its values in registers; as Python source it would take Numba half a
 minute to read. Here the formula is ordinary Python that runs once, on `Number`s in the place of
@@ -13,10 +12,9 @@ knows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import reduce
-from itertools import chain
 from operator import add
 from typing import Any
 
@@ -24,7 +22,6 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils as _cgutils
 from numba.core import typing as _typing
-from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
 from starcal_uq.camera.kernels import Kernel
@@ -35,8 +32,6 @@ signature: Any = _typing.signature  # type: ignore[attr-defined]
 
 # More than a chunk of stars, and no multiple of what makes rows compete for places in the cache.
 STRIDE = 136
-# For short sums, which a compiler must not spread over more registers than there are.
-_ORDERED = ("contract",)
 
 
 class Number:
@@ -48,7 +43,7 @@ class Number:
     def _with(self, operation: str, other: Number | float, swapped: bool = False) -> Number:
         a, b = self.value, self.code.number(other).value
         write = getattr(self.code.builder, operation)
-        return Number(self.code, write(*((b, a) if swapped else (a, b)), flags=self.code.flags))
+        return Number(self.code, write(*((b, a) if swapped else (a, b))))
 
     def _of(self, function: Any, *others: Number | float) -> Number:
         return self.code.call(function, self, *others)
@@ -118,9 +113,8 @@ class Number:
 class Code:
     """The function that is being compiled, at the place where instructions are written."""
 
-    def __init__(self, context: Any, builder: Any, ordered: bool = False) -> None:
+    def __init__(self, context: Any, builder: Any) -> None:
         self.context, self.builder = context, builder
-        self.flags = _ORDERED if ordered else ()
 
     def number(self, value: Any) -> Number:
         """A constant, or an instruction's result."""
@@ -136,9 +130,20 @@ class Code:
         write = self.context.get_function(function, kind)
         return Number(self, write(self.builder, [self.number(value).value for value in values]))
 
-    def items(self, values: Any) -> list[Number]:
-        """The numbers of a tuple."""
-        return [self.number(item) for item in cgutils.unpack_tuple(self.builder, values)]
+    def items(self, data: Any, n: int) -> list[Number]:
+        """The first numbers at a pointer."""
+        at = (self.builder.gep(data, [ir.Constant(ir.IntType(64), i)]) for i in range(n))
+        return [self.number(self.builder.load(place)) for place in at]
+
+    @contextmanager
+    def stars(self, begin: Any, end: Any) -> Iterator[Any]:
+        """A loop over columns."""
+        kind = end.type
+        with cgutils.for_range_slice(self.builder, begin, end, ir.Constant(kind, 1), kind) as (
+            column,
+            _,
+        ):
+            yield column
 
     def array(self, kind: Any, value: Any) -> Any:
         """An array by its type and value."""
@@ -146,15 +151,14 @@ class Code:
 
 
 class Rows:
-    """Rows of a buffer from `first` on at one column, as numbers: ``rows[n]`` is read or written."""
+    """Rows of a buffer at one column, as numbers: ``rows[n]`` is read or written."""
 
-    def __init__(self, code: Code, data: Any, column: Any, first: int = 0) -> None:
-        self._code, self._column, self._row = code, column, first
+    def __init__(self, code: Code, data: Any, column: Any) -> None:
+        self._code, self._column = code, column
         self._first = code.builder.gep(data, [column])
 
     def _place(self, row: int) -> Any:
-        distance = ir.Constant(self._column.type, (self._row + row) * STRIDE)
-        return self._code.builder.gep(self._first, [distance])
+        return self._code.builder.gep(self._first, [ir.Constant(self._column.type, row * STRIDE)])
 
     def __getitem__(self, row: int) -> Number:
         return Number(self._code, self._code.builder.load(self._place(row)))
@@ -173,143 +177,142 @@ class _Output:
         self._rows[self._first + element] = value
 
 
-def star_kernel(
-    kernel_of: Callable[[str], Kernel],
-    reads: Sequence[Sequence[int]],
-    writes: Callable[[int], Sequence[int]],
-) -> Any:
-    """A kernel of a camera model at one star: ``f(model, theta, work, buf, i)``.
-
-    `reads` are the rows of `work` of its inputs after theta, `writes` gives the first row of `buf`
-    of each output from the number of parameters.
-    """
-
-    @intrinsic(prefer_literal=True)
-    def at_star(typingctx: Any, model: Any, theta: Any, work: Any, buf: Any, i: Any) -> Any:
-        kernel = kernel_of(name_of(model))
-
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            code = Code(context, builder)
-            given, taken = (
-                Rows(code, code.array(signature.args[n], args[n]).data, args[4]) for n in (2, 3)
-            )
-            inputs = [code.items(args[1]), *([given[row] for row in rows] for rows in reads)]
-            kernel.run(inputs, [_Output(taken, first) for first in writes(theta.count)])
-            return context.get_dummy_value()
-
-        return types.void(model, theta, work, buf, i), codegen
-
-    return at_star
-
-
-def name_of(model: Any) -> str:
-    """Name of the distortion model that a literal type stands for."""
-    if not isinstance(model, types.StringLiteral):
-        raise TypingError("a distortion model is no literal")
-    return str(model.literal_value.partition(" ")[0])
-
-
 class Stars:
-    """Columns `begin` to `end` of a buffer, for a function that writes loops over them.
-
-    `numbers` are those of a tuple, `into` is an array that sums are added to; the rows of
-    ``shifted`` begin `axis` rows later.
+    """The first columns of two buffers, and numbers that all stars share, for a function that
+    writes loops over them.
     """
 
-    def __init__(self, code: Code, model: str, kinds: Any, args: Any) -> None:
-        self._code, self.model = code, model
-        _, numbers, buf, self._begin, self._end, axis, into = args
-        self.numbers = code.items(numbers)
-        self._data = code.array(kinds[2], buf).data
-        step = code.builder.mul(axis, ir.Constant(axis.type, STRIDE))
-        self._shifted = code.builder.gep(self._data, [step])
-        self._into = code.array(kinds[6], into)
-        self._kind = kinds[6]
+    def __init__(self, code: Code, args: Sequence[Any]) -> None:
+        self._code = code
+        self._numbers, self._one, self._two, self._end = args
+
+    def numbers(self, n: int) -> list[Number]:
+        """The first numbers, to be read outside of a loop."""
+        return self._code.items(self._numbers, n)
 
     @contextmanager
-    def each(self, shift: int | None = None) -> Iterator[tuple[Rows, Rows]]:
-        """A loop: the rows at each star, and those from row `shift` on; by default the argument's."""
-        code, kind = self._code, self._end.type
-        with cgutils.for_range_slice(
-            code.builder, self._begin, self._end, ir.Constant(kind, 1), kind
-        ) as (column, _):
-            others = (
-                Rows(code, self._shifted, column)
-                if shift is None
-                else Rows(code, self._data, column, shift)
-            )
-            yield Rows(code, self._data, column), others
+    def each(self) -> Iterator[tuple[Rows, Rows]]:
+        """A loop: the rows of both buffers at each star."""
+        with self._code.stars(ir.Constant(self._end.type, 0), self._end) as column:
+            yield Rows(self._code, self._one, column), Rows(self._code, self._two, column)
 
-    def total(self) -> Total:
-        """A sum, zero before a loop."""
-        return Total(self._code)
+    def kernel(
+        self, kernel: Kernel, p: int, reads: Sequence[Sequence[int]], writes: Sequence[int]
+    ) -> None:
+        """Write a kernel of a camera model at every star.
 
-    def add(self, value: Number, *index: int) -> None:
-        """Add to an element of `into`."""
-        code = self._code
-        at = [ir.Constant(self._end.type, position) for position in index]
-        place = cgutils.get_item_pointer(
-            code.context, code.builder, self._kind, self._into, at, wraparound=False
-        )
-        code.builder.store((Number(code, code.builder.load(place)) + value).value, place)
+        `reads` are the rows of the first buffer of its inputs after theta, `writes` the first row
+        of the second buffer of each output.
+        """
+        theta = self.numbers(p)
+        with self.each() as (given, taken):
+            inputs = [theta, *([given[row] for row in rows] for rows in reads)]
+            kernel.run(inputs, [_Output(taken, first) for first in writes])
 
 
-class Total:
-    """A sum that grows in a loop."""
-
-    def __init__(self, code: Code) -> None:
-        zero = ir.Constant(ir.DoubleType(), 0.0)
-        self._code, self._place = code, cgutils.alloca_once_value(code.builder, zero)
-
-    def add(self, value: Number) -> None:
-        self._code.builder.store((self.value + value).value, self._place)
-
-    @property
-    def value(self) -> Number:
-        return Number(self._code, self._code.builder.load(self._place))
+_pointer_to: Any = types.CPointer
+_POINTER = _pointer_to(types.float64)
+# What is called for a chunk of stars: numbers, two buffers, how many stars.
+STAR_FUNCTION = types.void(_POINTER, _POINTER, _POINTER, types.int64)
 
 
-def over_stars(write: Callable[[Stars], None], ordered: bool = False) -> Any:
-    """Loops over stars that a function writes: ``f(model, numbers, buf, begin, end, axis, into)``."""
+def _data(typingctx: Any, array: Any) -> Any:
+    """Where the elements of a contiguous array begin: an index into that needs no checks."""
 
-    @intrinsic(prefer_literal=True)
-    def loops(
-        typingctx: Any,
-        model: Any,
-        numbers: Any,
-        buf: Any,
-        begin: Any,
-        end: Any,
-        axis: Any,
-        into: Any,
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return context.make_array(signature.args[0])(context, builder, args[0]).data
+
+    return _pointer_to(array.dtype)(array), codegen
+
+
+def _row(typingctx: Any, buf: Any, n: Any) -> Any:
+    """The rows of a buffer from one on."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        distance = builder.mul(args[1], ir.Constant(args[1].type, STRIDE))
+        return builder.gep(args[0], [distance])
+
+    return buf(buf, n), codegen
+
+
+def _call(typingctx: Any, address: Any, numbers: Any, one: Any, two: Any, m: Any) -> Any:
+    """Call a function of `STAR_FUNCTION` at an address."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kind = ir.FunctionType(ir.VoidType(), [each.type for each in args[1:]])
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), args[1:])
+        return context.get_dummy_value()
+
+    return types.void(address, numbers, one, two, m), codegen
+
+
+data: Any = intrinsic(_data)
+row: Any = intrinsic(_row)
+call: Any = intrinsic(_call)
+
+
+def block_products(a: int, b: int, axes: int) -> Any:
+    """Sums over stars of the products of `a` columns with `b` others, of so many axes each.
+
+    ``f(one, two, begin, end, into, i, j)`` adds them to ``into[i:, j:]``; the columns are the rows
+    from `one` and from `two` on. Nine sums are as many as registers hold with several stars in
+    each.
+    """
+
+    @intrinsic
+    def products(
+        typingctx: Any, one: Any, two: Any, begin: Any, end: Any, into: Any, i: Any, j: Any
     ) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            write(Stars(Code(context, builder, ordered), name_of(model), signature.args, args))
+            code, kind = Code(context, builder), args[3].type
+            sums = code.array(signature.args[4], args[4])
+            zero = ir.Constant(ir.DoubleType(), 0.0)
+            places = [cgutils.alloca_once_value(builder, zero) for _ in range(a * b)]
+            with code.stars(args[2], args[3]) as column:
+                rows, others = (Rows(code, args[n], column) for n in (0, 1))
+                left = [rows[n] for n in range(a * axes)]
+                right = [others[n] for n in range(b * axes)]
+                for n, place in enumerate(places):
+                    k, c = divmod(n, b)
+                    terms = [left[axes * k + x] * right[axes * c + x] for x in range(axes)]
+                    builder.store(added([code.number(builder.load(place)), *terms]).value, place)
+            for n, place in enumerate(places):
+                at = [
+                    builder.add(args[5 + d], ir.Constant(kind, step))
+                    for d, step in enumerate(divmod(n, b))
+                ]
+                target = cgutils.get_item_pointer(
+                    context, builder, signature.args[4], sums, at, wraparound=False
+                )
+                total = code.number(builder.load(target)) + code.number(builder.load(place))
+                builder.store(total.value, target)
             return context.get_dummy_value()
 
-        return types.void(model, numbers, buf, begin, end, axis, into), codegen
+        return types.void(one, two, begin, end, into, i, j), codegen
 
-    return loops
-
-
-# An entry of an array, and the pairs of rows whose products are summed into it.
-Sums = dict[tuple[int, ...], list[tuple[int, int]]]
+    return products
 
 
-def row_sums(sums_of: Callable[[str, int], Sums], ordered: bool = True) -> Any:
-    """Sums of products of rows; `sums_of` gives them from the model and its number of parameters."""
+def turned_rows(more: bool) -> Any:
+    """Three rows times a matrix (3, 3): ``f(rows, matrix, begin, end, into)`` writes them, or adds
+    them to what is there.
+    """
 
-    def write(stars: Stars) -> None:
-        sums = sums_of(stars.model, len(stars.numbers))
-        totals = [stars.total() for _ in sums]
-        with stars.each() as (rows, _):
-            value = {row: rows[row] for row in sorted({*chain(*chain(*sums.values()))})}
-            for total, pairs in zip(totals, sums.values(), strict=True):
-                total.add(added([value[a] * value[b] for a, b in pairs]))
-        for total, index in zip(totals, sums, strict=True):
-            stars.add(total.value, *index)
+    @intrinsic
+    def turned(typingctx: Any, rows: Any, matrix: Any, begin: Any, end: Any, into: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            code = Code(context, builder)
+            m = code.items(args[1], 9)
+            with code.stars(args[2], args[3]) as column:
+                v, out = (Rows(code, args[n], column) for n in (0, 4))
+                terms = [[v[a] * m[3 * a + c] for a in range(3)] for c in range(3)]
+                for c in range(3):
+                    out[c] = added([*([out[c]] if more else []), *terms[c]])
+            return context.get_dummy_value()
 
-    return over_stars(write, ordered)
+        return types.void(rows, matrix, begin, end, into), codegen
+
+    return turned
 
 
 def added(terms: Sequence[Number]) -> Any:

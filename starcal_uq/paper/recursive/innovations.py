@@ -150,10 +150,10 @@ def _attitudes(
     rotation.
     """
     slopes = np.sum(displaced[:, None] * db, axis=2)
-    information = frames.sum(np.sum(rotated[:, :, None] * rotated[:, None], axis=0)).transpose(
-        2, 0, 1
+    information, shifts = (
+        frames.sum(np.sum(rotated[:, :, None] * other[:, None], axis=0)).transpose(2, 0, 1)
+        for other in (rotated, slopes)
     )
-    shifts = frames.sum(np.sum(rotated[:, :, None] * slopes[:, None], axis=0)).transpose(2, 0, 1)
     if not np.isfinite(information).all():
         return np.full(shifts.shape, np.nan), np.full(information.shape, np.nan)
     noise = floats(np.linalg.inv(information))

@@ -17,7 +17,7 @@ from starcal_uq.estimation.assemble import (
     check_noise,
     noise_px,
 )
-from starcal_uq.estimation.stages import optics_stage
+from starcal_uq.estimation.stages import Search, optics_stage
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
@@ -57,7 +57,7 @@ def least_squares(
     likelihood = MarginalLikelihood(obs, "none")
     check_count(likelihood, plain)
     frames = likelihood.frames
-    stage = optics_stage(frames, plain, solver, max_iterations)
+    stage = optics_stage(frames, plain, Search(solver, max_iterations))
     covariance = PairObjective(frames, "none").godambe(stage.theta)
     # A mirror or wrong stars, which interstar angles do not see.
     status = (

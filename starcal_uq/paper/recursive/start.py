@@ -13,7 +13,7 @@ from starcal_uq.core.errors import CalibrationError, check_known
 from starcal_uq.core.settings import PairCovariance, RecursiveMethod
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, floats
-from starcal_uq.estimation.stages import Stage, optics_stage
+from starcal_uq.estimation.stages import Search, Stage, optics_stage
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.recursive.filter import REACH_SIGMAS, FrameSums, Recursion
 from starcal_uq.paper.recursive.innovations import PAIR_COVARIANCES
@@ -68,7 +68,7 @@ def begin(
     origin, stage = np.concatenate([camera.theta[:3], np.zeros(p - 3)]), None
     if method == "samaan":
         first = frames.part(0, min(options.start_frames, frames.n_frames))
-        stage = optics_stage(first, camera, "lm", _START_ITERATIONS)
+        stage = optics_stage(first, camera, Search("lm", _START_ITERATIONS))
         if stage.status in (Status.NOT_FINITE, Status.SINGULAR):
             raise CalibrationError(
                 f"the least-squares start on {first.n_frames} frames failed ({stage.status.name})",

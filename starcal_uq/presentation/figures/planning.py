@@ -68,7 +68,7 @@ def plot_forecast(plan: Plan) -> Figure:
         style.label(ax, title, "frames", "1 sigma [arcsec]")
     style.legend_above(figure, panels[0, 0].get_lines())
     _radius_panel(panels[1, 0], plan, n)
-    _parameter_panel(panels[1, 1], plan, table, n)
+    _parameter_panel(panels[1, 1], table, n)
     return figure
 
 
@@ -120,7 +120,7 @@ def _diamond(ax: Axes, x: Any, y: Any, **look: Any) -> None:
     ax.plot(x, y, linestyle="", marker="D", color=style.VERMILLION, **look)
 
 
-def _parameter_panel(ax: Axes, plan: Plan, table: pd.DataFrame, n: FloatArray) -> None:
+def _parameter_panel(ax: Axes, table: pd.DataFrame, n: FloatArray) -> None:
     _logarithmic(ax)
     point = np.sqrt(0.5 * (table["x0_px"] ** 2 + table["y0_px"] ** 2))
     shown = [

@@ -18,14 +18,9 @@ from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import template_environment
+from starcal_uq.presentation.sentences.budgeting import NOT_RESOLVED, axis_label, outcome_text
 from starcal_uq.presentation.tables import tex
-from starcal_uq.presentation.words.budgeting import (
-    NOT_RESOLVED,
-    axis_label,
-    headline,
-    outcome_text,
-    tables,
-)
+from starcal_uq.presentation.words.budgeting import headline, tables
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:

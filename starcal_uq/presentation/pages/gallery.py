@@ -122,7 +122,7 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
     from scipy.ndimage import gaussian_filter
 
     from starcal_uq.images.background import prepare_image
-    from starcal_uq.images.image import read_image
+    from starcal_uq.images.read import read_image
 
     image = read_image(path, camera)
     if flat:

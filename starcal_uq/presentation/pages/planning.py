@@ -43,6 +43,17 @@ from starcal_uq.presentation.words.planning import (
 PAGE = "plan.html"
 _TEMPLATE = "plan.html.j2"
 _FRAMES_SHOWN = 30
+# Settings that the record has as they are.
+_RECORDED = (
+    "sigma_px",
+    "max_mag",
+    "min_stars",
+    "mean_stars",
+    "sky_fraction",
+    "confidence",
+    "scope",
+    "target_arcsec",
+)
 # Columns of the table, under their groups.
 _GROUPS = (
     (
@@ -99,30 +110,12 @@ def plan_record(plan: Plan) -> AnyDict:
     return {
         "verdict": plan_text(plan),
         "camera": plan.camera.to_dict(),
-        "sigma_px": plan.sigma_px,
-        "max_mag": plan.max_mag,
-        "min_stars": plan.min_stars,
-        "mean_stars": plan.mean_stars,
-        "sky_fraction": plan.sky_fraction,
-        "confidence": plan.confidence,
-        "scope": plan.scope,
-        "target_arcsec": plan.target_arcsec,
+        **{name: getattr(plan, name) for name in _RECORDED},
         "distortion": None if plan.distortion is None else _finite(to_plain(plan.distortion)),
         "distortion_words": distortion_sentence(plan),
-        "needs": [
-            {
-                "scope": need.scope,
-                "frames": need.frames,
-                "frames_surely": need.frames_surely,
-                "floor_arcsec": need.floor_arcsec,
-            }
-            for need in plan.needs
-        ],
-        # What a campaign does not determine is infinite, for which JSON has no number.
-        "forecast": [
-            {key: value if np.isfinite(value) else None for key, value in row.items()}
-            for row in plan.to_dataframe().to_dict("records")
-        ],
+        "needs": to_plain(plan.needs),
+        # What a campaign does not determine is infinite.
+        "forecast": _finite(plan.to_dataframe().to_dict("records")),
         "provenance": plan.provenance,
     }
 

@@ -29,11 +29,10 @@ from starcal_uq.presentation.words.axes import axis_label, value_words
 from starcal_uq.presentation.words.studies import (
     study_answer,
     study_limits,
-    study_table,
     study_text,
-    summary_columns,
 )
 from starcal_uq.presentation.words.study_advice import study_advice
+from starcal_uq.presentation.words.study_tables import study_table, summary_columns
 from starcal_uq.studies.result import Study
 
 PAGE = "report.html"

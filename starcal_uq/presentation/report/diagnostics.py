@@ -9,13 +9,9 @@ from typing import TYPE_CHECKING
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import count, decimals_for, fixed, p_words, percent, significant
 from starcal_uq.core.types import AnyDict
-from starcal_uq.diagnostics.verdict.estimate import (
-    MISFIT_P,
-    models_sentence,
-    sensitivity,
-    star_sentence,
-)
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.inference.derived import derived_quantities
+from starcal_uq.presentation.sentences.estimate import models_sentence, star_sentence
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.diagnostics import (
     jackknife_table,
@@ -23,6 +19,7 @@ from starcal_uq.presentation.words.diagnostics import (
     misfit_table,
     models_table,
     predictive_table,
+    sensitivity,
     star_table,
 )
 

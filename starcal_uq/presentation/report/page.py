@@ -20,6 +20,8 @@ from starcal_uq.presentation.words.propagation import (
     corner_sentence,
     coupling_table,
     misfit_sentence,
+    onboard_sentence,
+    onboard_table,
     one_number_sentence,
 )
 
@@ -89,7 +91,10 @@ def context(results: Results) -> AnyDict:
         "required_level": worst(verdict.of(Question.REQUIRED)),
         "converged_words": _answer(converged),
         "trust_words": _answer(trust),
-        "limits": limits(obs, cal, results.coupling, results.attitude, results.diagnosis),
+        "limits": [
+            one.sentence
+            for one in limits(obs, cal, results.coupling, results.attitude, results.diagnosis)
+        ],
         "data_sentence": words.data_sentence(results),
         "results": results,
         "names": [p.name for p in tables.all_parameters(results)],
@@ -98,6 +103,10 @@ def context(results: Results) -> AnyDict:
         "alignment_sentence": ""
         if results.attitude is None
         else alignment_sentence(results.attitude),
+        "onboard_table": None
+        if results.attitude is None or not results.attitude.variants
+        else onboard_table(results.attitude),
+        "onboard_sentence": "" if results.attitude is None else onboard_sentence(results.attitude),
         "one_number_sentence": ""
         if results.attitude is None
         else one_number_sentence(results.attitude),

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+from starcal_uq.budgeting.result import requirement_checks
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.table import Observations
-from starcal_uq.presentation.words.budgeting import requirement_checks
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget

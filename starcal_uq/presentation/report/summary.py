@@ -17,15 +17,15 @@ from starcal_uq.core.constants import CROSS_BORESIGHT
 from starcal_uq.core.formatting import count, fixed, join_words, plural, significant
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.presentation.report.tables import parameter_rows
+from starcal_uq.presentation.sentences.budgeting import axis_label, bound
+from starcal_uq.presentation.sentences.propagation import two_figures
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.budgeting import axis_label, bound
 from starcal_uq.presentation.words.inputs import detector_words
 from starcal_uq.propagation.attitude_error import (
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
     WITH_MISFIT_FOUND,
-    choice_words,
-    two_figures,
+    choice,
 )
 
 if TYPE_CHECKING:
@@ -322,7 +322,8 @@ def terminal_summary(results: Results) -> list[str]:
         untested = f"{IF_MODEL_HOLDS}; {WITH_MISFIT_FOUND}: {NOT_ASSESSED}"
         differ = f"{WITH_MISFIT_FOUND}; in brackets {IF_MODEL_HOLDS}, where that differs"
         lines.append(f"  {untested if error.misfit is None else differ}")
-        lines += _wrapped(choice_words(error), "  ")
+        for other in choice(error):
+            lines += _wrapped(other.sentence, "  ")
     if (budget := results.budget) is not None:
         table = budget_summary(budget)
         lines.append(

@@ -5,7 +5,7 @@ begins.
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -64,27 +64,29 @@ def parameter_rows(results: Results) -> list[Row]:
         z[: len(cal.theta)] = truth_z(cal, truth, post)
     rows = []
     for i, parameter in enumerate(all_parameters(results)):
-        numbers = (mean[i], sd[i], low[i], high[i], prior[i], start[i], true[i], z[i])
-        rows.append(_parameter_row(parameter, parameter.scaled_unit, parameter.scale, *numbers))
+        numbers = _Numbers(mean[i], sd[i], low[i], high[i], prior[i], start[i], true[i], z[i])
+        rows.append(_parameter_row(parameter, parameter.scaled_unit, parameter.scale, numbers))
         if parameter.name == "f" and cal.camera.pixel_um is not None:
-            rows.append(_parameter_row(parameter, "mm", 1000.0 / cal.camera.pixel_um, *numbers))
+            rows.append(_parameter_row(parameter, "mm", 1000.0 / cal.camera.pixel_um, numbers))
             rows[-1]["description"] = "the same in millimetres"
     return rows
 
 
-def _parameter_row(
-    parameter: Parameter,
-    unit: str,
-    scale: float,
-    mean: float,
-    sd: float,
-    low: float,
-    high: float,
-    prior: tuple[float, float] | None,
-    start: float | None,
-    true: float | None,
-    z: float,
-) -> Row:
+class _Numbers(NamedTuple):
+    """Numbers of a parameter, with the prior's mean and spread."""
+
+    mean: float
+    sd: float
+    low: float
+    high: float
+    prior: tuple[float, float] | None
+    start: float | None
+    true: float | None
+    z: float
+
+
+def _parameter_row(parameter: Parameter, unit: str, scale: float, numbers: _Numbers) -> Row:
+    mean, sd, low, high, prior, start, true, z = numbers
     spread = sd / scale
     decimals = decimals_for(spread)
     # A noise that was given has no spread: show it, and leave the rest empty.

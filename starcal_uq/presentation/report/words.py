@@ -11,7 +11,7 @@ from starcal_uq.core.formatting import count, fixed, percent, plural, significan
 from starcal_uq.core.status import Code
 from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
-from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corrected_words
+from starcal_uq.diagnostics.verdict.observed import air, conditional, corrected
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.words.estimation import calibration_table, noise_kind
 from starcal_uq.presentation.words.inference import posterior_table
@@ -105,8 +105,8 @@ def _air_words(results: Results) -> str:
     """What refraction does to f, where the stars were or may have been seen through air."""
     obs, cal = results.observations, results.calibration
     if air(obs) == "corrected":
-        return f" {corrected_words(obs, cal)}"
-    return f" {conditional_words(cal)}" if air(obs) == "unknown" else ""
+        return f" {corrected(obs, cal).sentence}"
+    return f" {conditional(cal).sentence}" if air(obs) == "unknown" else ""
 
 
 def _noise_words(results: Results) -> str:

@@ -5,26 +5,30 @@ differ.
 from __future__ import annotations
 
 import math
-import re
+from typing import Any
 
-from starcal_uq.budgeting.file import SENSOR, Requirement
 from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
 from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, TOTAL_AXES
+from starcal_uq.core.findings import Finding
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
-from starcal_uq.core.status import Check, Code, Level
 from starcal_uq.core.types import AnyDict
+from starcal_uq.presentation.sentences.budgeting import (
+    NOT_RESOLVED,
+    axis_label,
+    bound,
+    outcome_text,
+    ranged,
+    without_numbers,
+)
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 Row = AnyDict
-NOT_RESOLVED = "not resolved"
 # Above what rounding makes of 2.968.
 _GAUSSIAN_TAIL = 2.98
-# A number, or a name in quotes with whatever numbers it has.
-_NUMBER = re.compile(r"'[^']*'|\"[^\"]*\"|\d+(?:\.\d+)?")
 _MIXED, *_OTHERS = ("mixed", "ensemble", "temporal")
 
 _MEANING = {
@@ -190,13 +194,6 @@ def class_rows(budget: Budget) -> list[Row]:
     return [{"name": name, "sigma": cells} for name, cells in found.items()]
 
 
-def bound(value: float, at_least: bool, digits: int = 3) -> str:
-    """A bound in arcsec, with "≥" while contributors are missing."""
-    if math.isnan(value):
-        return NOT_ASSESSED
-    return ("≥ " if at_least else "") + significant(value, digits)
-
-
 def _known(value: float) -> str:
     return "–" if math.isnan(value) else significant(value, 3)
 
@@ -237,12 +234,6 @@ def _pair(total: Total) -> dict[str, str]:
     return {"rule": bound(total.rule_arcsec, total.at_least), "sampled": _sampled(total)}
 
 
-def axis_label(asked: Requirement) -> str:
-    """Axis of a requirement, with the frame where it is not the sensor's."""
-    label = AXIS_LABELS[asked.axis]
-    return label if asked.frame == SENSOR else f"{label.split(' (')[0]} of {asked.frame}"
-
-
 def _requirement_row(outcome: Outcome) -> Row:
     asked = outcome.requirement
     return {
@@ -266,35 +257,19 @@ def _requirement_row(outcome: Outcome) -> Row:
 def explanations(budget: Budget) -> list[str]:
     """Why rule and sampling differ, one line per distinct reason, for the mixed interpretation.
 
-    Sentences that differ in their numbers alone are one, with the ranges of these.
+    Reasons that differ in their numbers alone are one, with the ranges of these.
     """
-    found: dict[str, tuple[list[str], list[str]]] = {}
+    found: dict[Any, tuple[list[str], list[Finding]]] = {}
     for entry in budget.totals:
-        if entry.interpretation == _MIXED and entry.explanation:
-            where, texts = found.setdefault(_NUMBER.sub(_quoted, entry.explanation), ([], []))
+        if entry.interpretation == _MIXED and entry.difference is not None:
+            where, alike = found.setdefault(without_numbers(entry.difference), ([], []))
             where.append(f"{AXIS_LABELS[entry.axis]}, {entry.scope}")
-            texts.append(entry.explanation)
+            alike.append(entry.difference)
     every = len(SCOPES) * len(TOTAL_AXES)
     return [
-        f"{'All totals' if len(where) == every else '; '.join(where)}: {_ranged(texts)}"
-        for where, texts in found.values()
+        f"{'All totals' if len(where) == every else '; '.join(where)}: {ranged(alike).sentence}"
+        for where, alike in found.values()
     ]
-
-
-def _quoted(match: re.Match[str]) -> str:
-    """A name in quotes as it is, and one sign for any number."""
-    return match[0] if match[0][0] in "'\"" else "#"
-
-
-def _ranged(texts: list[str]) -> str:
-    """Sentences that differ in numbers alone as one."""
-    columns = zip(*(_NUMBER.findall(text) for text in texts), strict=True)
-    shown = iter([values[0] if len(set(values)) == 1 else _range(values) for values in columns])
-    return _NUMBER.sub(lambda _: next(shown), texts[0])
-
-
-def _range(values: tuple[str, ...]) -> str:
-    return f"{min(values, key=float)} to {max(values, key=float)}"
 
 
 def factor_sentence(budget: Budget) -> str:
@@ -307,73 +282,6 @@ def factor_sentence(budget: Budget) -> str:
         f"{fixed(two_axis_radius(level, 1.0, 1.0), 3)} sigma per axis; "
         "for unequal ones the factor refers to the root mean square of both."
     )
-
-
-def outcome_text(outcome: Outcome) -> str:
-    """A requirement and what became of it, in one sentence."""
-    asked, total = outcome.requirement, outcome.total
-    axis = axis_label(asked)
-    what = f"{axis}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
-    limit = f"against a limit of {significant(asked.limit_arcsec, 3)}"
-    numbers = f"{significant(outcome.bound_arcsec, 3)} arcsec {limit}"
-    named = f"{asked.name!r} ({what}) is"
-    least = "at least " if total.at_least else ""
-    if outcome.unresolved:
-        return (
-            f"{named} open: {total.explanation.removesuffix('.')}. The rule, which knows Gaussian "
-            f"tails only, says {least}{significant(total.rule_arcsec, 3)} arcsec {limit}; "
-            "judged_by = 'rule' would let it judge alone."
-        )
-    if math.isnan(outcome.bound_arcsec):
-        return f"{named} open: no contributor is assessed."
-    lower = significant(outcome.least_arcsec, 3)
-    if outcome.verdict == "violated":
-        cause = f"; {total.dominant!r} dominates" if total.dominant else ""
-        if outcome.least_arcsec < outcome.bound_arcsec:
-            least = "at least "
-        return f"{named} violated: {least}{lower} arcsec {limit}{cause}."
-    if outcome.between:
-        so_far = " so far" if total.at_least else ""
-        return f"{named} open: at the least {lower} and at most {numbers}{so_far}."
-    if outcome.verdict == "open":
-        count = len(total.not_assessed)
-        missing = f"{count} contributors are" if count > 1 else "1 contributor is"
-        return f"{named} open: {numbers} so far, but {missing} not assessed."
-    return f"{named} met: {numbers}, margin {significant(outcome.margin_arcsec, 3)} arcsec."
-
-
-def requirement_checks(budget: Budget | None) -> tuple[Check, ...]:
-    """The requirements of a budget as checks of a run's verdict; none without a budget."""
-    return tuple(
-        _requirement_check(outcome) for outcome in (() if budget is None else budget.outcomes)
-    )
-
-
-def _requirement_check(outcome: Outcome) -> Check:
-    asked, total = outcome.requirement, outcome.total
-    reached = outcome.least_arcsec if outcome.level is Level.FAIL else outcome.bound_arcsec
-    return Check(
-        Code.REQUIREMENT,
-        level=outcome.level,
-        value=NOT_RESOLVED if outcome.unresolved else f"{bound(reached, total.at_least)} arcsec",
-        bound=f"at most {significant(asked.limit_arcsec, 3)} arcsec",
-        sentence=outcome_text(outcome),
-        advice=_requirement_advice(outcome),
-        title=f"Requirement {asked.name!r}",
-    )
-
-
-def _requirement_advice(outcome: Outcome) -> str:
-    """What brings a requirement nearer to being met."""
-    missing = outcome.total.not_assessed
-    if outcome.level is Level.PASS:
-        return ""
-    if outcome.unresolved:
-        return "Let the rule judge it alone, or state a confidence that the samples resolve."
-    if outcome.level is Level.WARN and not outcome.between:
-        return f"State in the budget file what is missing: {join_words(missing)}."
-    largest = repr(outcome.total.dominant) if outcome.total.dominant else "the largest contributors"
-    return f"Reduce {largest}, or relax the limit in the budget file."
 
 
 def contributors_table(budget: Budget) -> TextTable:

@@ -31,7 +31,7 @@ from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD
 from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES, Validation
-from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, sensitivity
+from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, MISFIT_P
 from starcal_uq.diagnostics.verdict.judge import Verdict
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.presentation.tables import TextTable, with_units
@@ -220,6 +220,31 @@ def predictive_table(found: PredictiveCheck) -> TextTable:
         rows.append((s.name, fixed(s.observed, decimals), f"{low} to {high}", p))
     return TextTable(
         ("Statistic", "Data", "Replicates (95 %)", "p"), tuple(rows), "Predictive checks"
+    )
+
+
+def sensitivity(diagnosis: Diagnosis) -> str:
+    """The smallest effects that the checks find nine times in ten, with as many data as there
+    were.
+    """
+    found, frames = diagnosis.misfit, diagnosis.jackknife
+    smooth = [test for test in found.tests if test.against == "radius" and test.detectable_px > 0.0]
+    seen = []
+    if smooth:
+        test = smooth[-1]
+        seen.append(
+            f"a {test.name} of {significant(test.detectable_px)} px (rms per axis, beyond what "
+            "the fit absorbs)"
+        )
+    if frames is not None:
+        ratio = float(frames.detectable(JACKKNIFE_P / len(frames.ratio)).min())
+        seen.append(f"frames that make sigma {significant(ratio)} times as large as stated")
+    if not seen:
+        return ""
+    data = f"{plural(found.n_frames, 'frame')} and {plural(found.n_stars, 'star')}"
+    return (
+        f"What {data} let these checks see nine times in ten: {join_words(seen)}; less may be "
+        "there."
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from starcal_uq.calibration.fallback import fallback_words
+from starcal_uq.calibration.fallback import fallback_facts
 from starcal_uq.calibration.screening.result import REASONS, Screening
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
@@ -18,9 +18,18 @@ from starcal_uq.core.formatting import (
 )
 from starcal_uq.estimation.merging import ALPHA, Consistency
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.presentation.sentences.estimate import fallback_sentence
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.effects import effects_table, effects_text
 
 _SHOWN_ROWS = 30
+
+
+def fallback_words(cal: Calibration) -> str:
+    """What the data do not determine of the camera's model, and what the sigmas rest on; empty
+    where they do.
+    """
+    return fallback_sentence(**fallback_facts(cal))
 
 
 def focal_length(cal: Calibration) -> str:
@@ -52,7 +61,18 @@ def calibration_text(cal: Calibration) -> str:
         f"{cal.status.name.lower().replace('_', ' ')}; focal length "
         f"{focal_length(cal)}.{fitted_noise_text(cal)}"
     )
-    return f"{first} {fallback_words(cal)}".strip()
+    return " ".join(filter(None, (first, *decided(cal))))
+
+
+def decided(cal: Calibration) -> list[str]:
+    """What was decided of model and effects on the way, a sentence or a few each."""
+    found = "" if cal.effects is None else effects_text(cal.effects)
+    return [words for words in (fallback_words(cal), found) if words]
+
+
+def calibration_tables(cal: Calibration) -> list[TextTable | None]:
+    """Its parameters, and the effects that it holds."""
+    return [calibration_table(cal), None if cal.effects is None else effects_table(cal.effects)]
 
 
 def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTable:

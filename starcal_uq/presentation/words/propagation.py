@@ -20,17 +20,19 @@ from starcal_uq.core.formatting import (
 )
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import FloatArray
+from starcal_uq.presentation.sentences.propagation import two_figures
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import (
     CHOICE_OF_MODEL,
+    CONTRIBUTORS,
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
     WITH_MISFIT_FOUND,
     Agreement,
     AttitudeError,
     MisfitFound,
-    choice_words,
-    two_figures,
+    choice,
+    with_cross,
 )
 from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
@@ -103,7 +105,8 @@ def misfit_sentence(error: AttitudeError, place: Place | None = None) -> str:
             f"What the errors are {WITH_MISFIT_FOUND} is {NOT_ASSESSED}: the model was not tested "
             f"(`{(tests if place is None else place.of(tests)).command}`)."
         )
-    return " ".join(filter(None, (_found_sentence(error.misfit), choice_words(error))))
+    others = (one.sentence for one in choice(error))
+    return " ".join(filter(None, (_found_sentence(error.misfit), *others)))
 
 
 def _found_sentence(found: MisfitFound) -> str:
@@ -138,12 +141,29 @@ def alignment_sentence(error: AttitudeError) -> str:
     return text
 
 
+def onboard_sentence(error: AttitudeError) -> str:
+    """What is taken to be aboard, and what the other onboard model would make of the rest; empty
+    without effects.
+    """
+    rests = {
+        own.onboard: significant(float(with_cross(own.rest_arcsec)[3])) for own in error.variants
+    }
+    if not rests:
+        return ""
+    return (
+        f"The calibration holds effects ({join_words([own.name for own in error.effects])}): the "
+        f"rest across the boresight is {rests['model']} arcsec where the software uses the "
+        f"parameters of the camera alone, and {rests['effects']} arcsec where it uses effects as "
+        f"well; stated is that with onboard={error.onboard!r}."
+    )
+
+
 def attitude_text(error: AttitudeError) -> str:
     """Whether first order holds, what a single number would hide, what alignment is, and what the
     misfit adds.
     """
     parts = (agreement_text(error.agreement), one_number_sentence(error), alignment_sentence(error))
-    return " ".join((*parts, misfit_sentence(error)))
+    return " ".join(filter(None, (*parts, onboard_sentence(error), misfit_sentence(error))))
 
 
 def attitude_table(error: AttitudeError) -> TextTable:
@@ -178,6 +198,39 @@ def attitude_table(error: AttitudeError) -> TextTable:
     heads = ("contributor", *TOTAL_AXES, "two-axis 95 %", "absorbed by alignment")
     which = f", {IF_MODEL_HOLDS}" if error.misfit is None else ""
     return TextTable(heads, tuple(rows), f"Attitude error, arcsec, 1 sigma{which}", "lrrrrrl")
+
+
+def onboard_table(error: AttitudeError) -> TextTable:
+    """The calibration's part by what the software aboard uses, and what every effect does by
+    itself.
+    """
+    parts = [
+        (f"onboard {own.onboard}", name, values)
+        for own in error.variants
+        for name, values in (
+            (CONTRIBUTORS[1], own.common_arcsec),
+            (CONTRIBUTORS[2], own.rest_arcsec),
+            (CONTRIBUTORS[3], own.total_arcsec),
+            *(
+                (f"{effect.name}, {part}", values)
+                for effect in own.effects
+                for part, values in (
+                    ("common rotation", effect.common_arcsec),
+                    ("rest", effect.rest_arcsec),
+                )
+            ),
+        )
+    ]
+    rows = tuple(
+        (aboard, name, *(significant(float(v)) for v in with_cross(values)))
+        for aboard, name, values in parts
+    )
+    return TextTable(
+        ("software", "part", *TOTAL_AXES),
+        rows,
+        f"With effects, arcsec, 1 sigma, {IF_MODEL_HOLDS}",
+        "llrrrr",
+    )
 
 
 def coupling_text(coupling: Coupling) -> str:

@@ -16,7 +16,6 @@ from starcal_uq.presentation.words.studies import (
     HARDLY,
     NATURE,
     TOLD,
-    correlations,
     dashed,
     error_effects,
     model_bias,
@@ -24,6 +23,7 @@ from starcal_uq.presentation.words.studies import (
     study_limits,
     the,
 )
+from starcal_uq.presentation.words.study_tables import correlations
 from starcal_uq.studies.findings import Curve, Pair, Sweep
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from starcal_uq.runs.steps.misfit import with_misfit
 from starcal_uq.runs.stored import StoredRun, save_results, writing
 
 if TYPE_CHECKING:
-    from starcal_uq.core.settings import Scalar, Sense
+    from starcal_uq.core.settings import OnboardModel, Scalar, Sense
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.field import FieldMap
@@ -95,6 +95,7 @@ def propagate(
     sky: MissionSky | None = None,
     alignment: str | PathLike = "random",
     alignment_frames: int | None = None,
+    onboard: OnboardModel = "model",
     force: bool = False,
 ) -> tuple[AttitudeError, FieldMap, ErrorSpectrum | None]:
     """Carry the posterior through QUEST on the observed frames or a mission's, and over the
@@ -113,6 +114,8 @@ def propagate(
         run, or a table.
     alignment_frames : int, optional
         Number of frames of the random sky; 100 by default.
+    onboard : {"model", "effects"}
+        What the mission's software uses: parameters of the camera alone, or effects as well.
     force : bool
         Whether to replace the attitude error of before.
     """
@@ -141,6 +144,8 @@ def propagate(
         seed=seed,
         alignment=aligning,
         alignment_frames=alignment_frames,
+        onboard=onboard,
+        calibrated=run.observations,
     )
     fields = field_map(posterior, run.observations)
     spectrum = None
@@ -161,6 +166,7 @@ def propagate(
         "sky": sky,
         "alignment": alignment,
         "alignment_frames": alignment_frames,
+        "onboard": onboard,
     }
     with run._step("propagate", seed, settings) as files:
         save_results(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _HARMONICS = 2
 _AZIMUTH_ORDERS = 3
 _RADIAL_DEGREE, _TWIST_DEGREE = 6, 3
-_TIME_DEGREE = 3
+TIME_DEGREE = 3
 _STARS_PER_CELL = 25.0
 MAX_CELLS = 8
 # Coordinates of shapes that keep their place in the field, and those of the directions of one
@@ -95,42 +95,72 @@ def shapes(
     same shapes are wanted on. What these do not state is drawn from the table: the time
         of a frame and its temperature together, the magnitude of a star by itself.
     """
-    seen = obs if seen is None else seen
+    known = Covariates.of(obs, seen)
     found = [*lens_shapes(camera), _aberration()]
-    clock, called = run_clock(obs)
-    like: Any = slice(None)
-    if seen is not obs:
-        rng = np.random.default_rng(0)
-        frame = np.repeat(_drawn(rng, obs.n_frames, seen.n_frames), np.diff(seen.frame_starts))
-        like = obs.frame_starts[frame]
-        clock = None if clock is None else clock[like]
-        star = _drawn(rng, obs.n_stars, seen.n_stars)
-    else:
-        star = like
-    warmth = _standardised(obs.temperature_c, seen.temperature_c, like)
-    magnitude = _standardised(obs.mag, seen.mag, star)
-    if clock is not None:
-        found.append(_drift(clock, called))
-    if warmth is not None and obs.temperature_c is not None:
+    if known.clock is not None:
+        found.append(_drift(known.clock, known.called))
+    if known.warmth is not None and obs.temperature_c is not None:
         spread = float(np.nanstd(obs.temperature_c))
         found.append(
             _focal_against(
-                warmth, "focal length with temperature", "temperature", ("df/dT", "px/K"), spread
+                known.warmth,
+                "focal length with temperature",
+                "temperature",
+                ("df/dT", "px/K"),
+                spread,
             )
         )
-    found += [_radius(camera), _azimuth(camera), _phase(0), _phase(1)]
-    if magnitude is not None:
-        found.append(_magnitude(magnitude, camera))
-    if clock is not None:
-        found.append(_over_time(clock, called))
+    found += [_radius(camera), _azimuth(camera), phase_shape(0), phase_shape(1)]
+    if known.magnitude is not None:
+        found.append(magnitude_shape(known.magnitude, camera))
+    if known.clock is not None:
+        found.append(over_time(known.clock, known.called))
     return (*found, _cells(obs, camera, max_cells))
+
+
+@dataclass(frozen=True)
+class Covariates:
+    """What shapes may change with, of every star (N,), standardised; None where nothing varies.
+
+    `clock` runs from -1 to 1 over the run, and is `called` so; `warmth` and `magnitude` are in
+    standard deviations of the table.
+    """
+
+    clock: FloatArray | None
+    called: str
+    warmth: FloatArray | None
+    magnitude: FloatArray | None
+
+    @classmethod
+    def of(cls, obs: Observations, seen: Observations | None = None) -> Covariates:
+        """Those of a table, or of other frames on which its shapes are wanted.
+
+        What these do not state is drawn from the table: the time of a frame and its temperature
+        together, the magnitude of a star by itself.
+        """
+        seen = obs if seen is None else seen
+        clock, called = run_clock(obs)
+        like: Any = slice(None)
+        star = like
+        if seen is not obs:
+            rng = np.random.default_rng(0)
+            frame = np.repeat(_drawn(rng, obs.n_frames, seen.n_frames), np.diff(seen.frame_starts))
+            like = obs.frame_starts[frame]
+            clock = None if clock is None else clock[like]
+            star = _drawn(rng, obs.n_stars, seen.n_stars)
+        return cls(
+            clock,
+            called,
+            _standardised(obs.temperature_c, seen.temperature_c, like),
+            _standardised(obs.mag, seen.mag, star),
+        )
 
 
 def lens_shapes(camera: Camera) -> tuple[Shape, ...]:
     """Terms that the lens of the fitted model lacks: of the other models, and scale and skew of the
     axes.
     """
-    return *_missing_terms(camera), _axes(camera)
+    return *_missing_terms(camera), axes_shape(camera)
 
 
 def focal_drift(obs: Observations) -> tuple[Shape, ...]:
@@ -150,7 +180,7 @@ def run_clock(obs: Observations) -> tuple[FloatArray | None, str]:
     """Time of every star from -1 to 1 over the run, or the order of frames where there is no time;
     and its name.
     """
-    seconds = None if obs.time_utc is None else _seconds(obs.time_utc)
+    seconds = None if obs.time_utc is None else seconds_utc(obs.time_utc)
     called = "time"
     if seconds is None or np.ptp(seconds) <= 0.0:
         seconds = np.searchsorted(obs.frame_ids, obs.frame).astype(np.float64)
@@ -161,7 +191,8 @@ def run_clock(obs: Observations) -> tuple[FloatArray | None, str]:
     return clock, called
 
 
-def _seconds(times: StrArray) -> FloatArray | None:
+def seconds_utc(times: StrArray) -> FloatArray | None:
+    """Seconds since 1970 of times (N,); None where one of them cannot be read."""
     unique, inverse = np.unique(times, return_inverse=True)
     try:
         parsed = [datetime.fromisoformat(str(text)) for text in unique]
@@ -255,7 +286,8 @@ class _TermColumns:
         return view.part.frames.in_pixels(np.stack(columns))
 
 
-def _axes(camera: Camera) -> Shape:
+def axes_shape(camera: Camera) -> Shape:
+    """Scale of x against y, and skew."""
     radius = camera.corner_radius_px
 
     def columns(view: View) -> FloatArray:
@@ -326,7 +358,8 @@ def _azimuth(camera: Camera) -> Shape:
     return Shape("smooth pattern over azimuth", "azimuth", 4 * _AZIMUTH_ORDERS, columns)
 
 
-def _phase(axis: int) -> Shape:
+def phase_shape(axis: int) -> Shape:
+    """Waves over a pixel along one axis, 0 or 1."""
     name = "xy"[axis]
 
     def columns(view: View) -> FloatArray:
@@ -352,7 +385,8 @@ def _phase(axis: int) -> Shape:
     )
 
 
-def _magnitude(z: FloatArray, camera: Camera) -> Shape:
+def magnitude_shape(z: FloatArray, camera: Camera) -> Shape:
+    """Shift and scale that change with the standardised magnitude (N,), to second order."""
     radius = camera.corner_radius_px
 
     def columns(view: View) -> FloatArray:
@@ -364,16 +398,18 @@ def _magnitude(z: FloatArray, camera: Camera) -> Shape:
     return Shape("shift and scale with magnitude", "magnitude", 6, columns)
 
 
-def _over_time(clock: FloatArray, called: str) -> Shape:
+def over_time(clock: FloatArray, called: str) -> Shape:
+    """Polynomials in the clock (N,) for x0, y0 and f, without constants."""
+
     def columns(view: View) -> FloatArray:
         from numpy.polynomial.legendre import legvander
 
-        powers = legvander(clock[view.rows], _TIME_DEGREE).T[1:]
+        powers = legvander(clock[view.rows], TIME_DEGREE).T[1:]
         moving = view.parameter_columns[:3]
         return np.concatenate([moving[i] * powers[:, None] for i in range(3)])
 
     return Shape(
-        f"smooth change of x0, y0 and f over the {called}", called, 3 * _TIME_DEGREE, columns
+        f"smooth change of x0, y0 and f over the {called}", called, 3 * TIME_DEGREE, columns
     )
 
 

@@ -1,0 +1,135 @@
+"""Effects planted by a sensor of a second make, chosen and estimated: each alone at one, two and
+five times the size that gains twice what it has to, and all pairs at twice that size.
+
+    python benchmarks/effects.py [--replicates 40] [--only field frame] [--pairs]
+
+One row a campaign: how often just the planted effects are chosen and how often one that is not
+there, how often the 95 % interval of the scale holds what was planted (where that is a standard
+deviation), and coverage of the camera's parameters by their 95 % intervals. Without an effect the
+camera is the one that is planted, with a field the one that is nearest to it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import starcal_uq as sc
+from starcal_uq.estimation.effects import penalty
+from tests.helpers import effects as planted
+from tests.helpers.outside import Campaign, campaign
+
+KINDS = ("axes", "field", "frame", "temperature", "time", "epoch", "star", "phase", "magnitude")
+# Scales that are standard deviations of what is drawn anew in every campaign.
+DRAWN = ("frame", "star")
+FRAMES, STARS, NIGHTS = 30, 20, 3
+
+
+def observed(seed: int, sizes: dict[str, float]) -> tuple[Campaign, sc.Observations, np.ndarray]:
+    """A campaign with effects of these sizes, its table, and the camera that is true."""
+    rng = np.random.default_rng([seed, 28])
+    warmth = rng.uniform(-1.7, 1.7, FRAMES)
+    night = np.repeat(np.arange(NIGHTS), FRAMES // NIGHTS)
+    clock = np.linspace(-1.0, 1.0, FRAMES)
+    field = planted.bump(sizes.get("field", 0.0))
+    shifts = [
+        planted.stretched(sizes.get("axes", 0.0)),
+        field,
+        planted.breathing(rng, FRAMES, sizes.get("frame", 0.0)),
+        planted.moving(sizes.get("temperature", 0.0), warmth),
+        planted.moving(sizes.get("time", 0.0), clock),
+        planted.moving(sizes.get("epoch", 0.0), np.array([-1.2, 0.1, 1.1])[night]),
+        planted.of_phase(sizes.get("phase", 0.0)),
+        planted.of_magnitude(sizes.get("magnitude", 0.0)),
+    ]
+    c = campaign(
+        rng,
+        n_frames=FRAMES,
+        stars_per_frame=STARS,
+        patch_stars=60,
+        star_sigma_px=sizes.get("star", 0.0),
+        displaced=planted.together(*shifts),
+    )
+    frame = c.columns["frame"]
+    hours = 24.0 * night + 3.0 * (np.arange(FRAMES) % (FRAMES // NIGHTS)) / (FRAMES // NIGHTS)
+    start = np.datetime64("2026-01-01T20:00:00", "ms")
+    times = start + (3.6e6 * hours).astype("timedelta64[ms]")
+    columns = {"temperature_c": 15.0 + 8.0 * warmth[frame]}
+    if "epoch" in sizes:
+        columns["time_utc"] = times.astype(str)[frame]
+    return c, planted.table(c, **columns), planted.nearest_camera(c.theta, field)
+
+
+def row(sizes: dict[str, float], replicates: int) -> dict[str, float]:
+    """Shares over campaigns."""
+    exact, extra, scales, z = [], [], [], []
+    for seed in range(replicates):
+        c, obs, truth = observed(seed, sizes)
+        cal = sc.calibrate(obs, planted.sheet(c), effects="auto")
+        assert cal.effects is not None
+        names = set(cal.effects.names)
+        exact.append(set(sizes) <= names)
+        extra.append(bool(names - set(sizes)))
+        z.append((cal.theta - truth) / cal.sigmas)
+        for effect in cal.effects.fitted:
+            if effect.name in DRAWN and effect.name in sizes:
+                scales.append(effect.low_px < sizes[effect.name] < effect.high_px)
+    return {
+        "chosen": float(np.mean(exact)),
+        "others": float(np.mean(extra)),
+        "scale": float(np.mean(scales)) if scales else float("nan"),
+        "covered": float(np.mean(np.abs(z) < 1.96)),
+        "rms": float(np.sqrt(np.mean(np.square(z)))),
+    }
+
+
+def limit(kind: str) -> float:
+    """Size, px, at which an effect gains twice the penalty, on average over three campaigns."""
+    low, high = 1e-3, 2.0
+    for _ in range(8):
+        size = float(np.sqrt(low * high))
+        gains = []
+        for seed in range(3):
+            c, obs, _ = observed(1000 + seed, {kind: size})
+            cal = sc.calibrate(obs, planted.sheet(c), effects=kind)
+            gains.append(cal.effects.fitted[0].gain_nat)
+        low, high = (low, size) if np.mean(gains) > 2.0 * penalty(len(KINDS)) else (size, high)
+    return high
+
+
+def campaigns(kinds: list[str], pairs: bool) -> Iterator[dict[str, float]]:
+    """Sizes of every campaign."""
+    limits = {kind: limit(kind) for kind in kinds}
+    yield {}
+    for kind in kinds:
+        for times in (1.0, 2.0, 5.0):
+            yield {kind: times * limits[kind]}
+    if pairs:
+        for one, other in combinations(kinds, 2):
+            yield {one: 2.0 * limits[one], other: 2.0 * limits[other]}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--replicates", type=int, default=40)
+    parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--pairs", action="store_true")
+    arguments = parser.parse_args()
+    print("| planted, px | chosen | others | scale | covered | rms z |")
+    print("|---|---|---|---|---|---|")
+    for sizes in campaigns(arguments.only, arguments.pairs):
+        found = row(sizes, arguments.replicates)
+        names = ", ".join(f"{name} {size:.3f}" for name, size in sizes.items()) or "nothing"
+        print(f"| {names} | " + " | ".join(f"{value:.3f}" for value in found.values()) + " |")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()

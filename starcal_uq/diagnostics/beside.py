@@ -1,0 +1,151 @@
+"""Residuals beside the effects of a calibration: less what these shift, or with their coefficients
+taken for free.
+
+Tests of shapes weigh the residuals by the covariance that effects give them. Tests of the noise
+need residuals that are independent but for linear combinations that are fitted: there, coefficients
+of effects have no prior, so that what is left is noise alone, however large the effects are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.camera.projection import project
+from starcal_uq.core.types import FloatArray, IntArray, floats
+from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.likelihood.effects import Columns, Effect, EffectLikelihood, effects_of
+from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import principal
+from starcal_uq.observations.frames import StarFrames
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.result import Calibration
+    from starcal_uq.observations.table import Observations
+
+# Directions of which what is fitted already takes all but this share of the square are not there.
+_ABSORBED = 1e-8
+
+
+def has_effects(cal: Calibration) -> bool:
+    """Whether a calibration has taken up effects."""
+    return cal.effects is not None and bool(cal.effects.names)
+
+
+def effects_beside(obs: Observations, cal: Calibration) -> list[Effect]:
+    """Effects of a calibration, in the order of its coefficients; none where it has none."""
+    return [] if cal.effects is None else cal.effects.of(effects_of(obs, cal.camera))
+
+
+def with_effects_of(
+    obs: Observations, cal: Calibration, rotations: FloatArray, whole: Observations
+) -> EffectLikelihood:
+    """Exact likelihood with the effects of a calibration, for frames of the table `whole` at these
+    attitudes (K, 3, 3).
+
+    Frames that are not all of the table lack effects of nights and stars.
+    """
+    assert cal.effects is not None
+    seen = None if obs.n_frames == whole.n_frames else obs
+    known = effects_of(whole, cal.camera, seen=seen)
+    effects = [known[name] for name in cal.effects.names if name in known]
+    frames = StarFrames.from_observations(obs, axes=True)
+    ratio = {effect.name: cal.effects.ratio(cal.sigma)[effect.name] for effect in effects}
+    at = (cal.theta, rotations, cal.sigma)
+    return EffectLikelihood(frames, cal.camera.distortion, effects, ratio, *at)
+
+
+def without_effects(obs: Observations, cal: Calibration) -> Observations:
+    """The table with its images where they would be without the effects of the calibration, as far
+    as these are known; itself where there are none.
+    """
+    if not has_effects(cal):
+        return obs
+    frames = StarFrames.from_observations(obs)
+    b = frames.rotated(quaternion_to_rotation(cal.quaternions))
+    x, y = project(cal.camera, b.T).T + cal.residuals_px.T
+    return replace(obs, x_px=x, y_px=y)
+
+
+def normals_beside(obs: Observations, cal: Calibration) -> FrameNormals:
+    """What each frame says about the parameters beside the effects of a calibration.
+
+    Those of frames are marginalised in each; those of the run and of stars, which frames share, are
+    as the calibration has them.
+    """
+    exact = with_effects_of(obs, cal, quaternion_to_rotation(cal.quaternions), obs)
+    state, _ = exact.profile(cal.theta, exact.rotations)
+    _, found = exact.conditioned(state, state.e[None])
+    shared = exact.shifts(state, replace(found, frame=0.0 * found.frame))
+    e = exact.project_out(state, state.e[None]) - shared
+    columns = np.concatenate([e, exact.slopes(cal.theta, state)])
+    gram = products_by_frame(exact.frames, columns, columns)
+    cross = products_by_frame(exact.frames, exact.columns.frame, columns)
+    solved = exact.solved
+    left = solved.frame_root[:, :, None] * (np.swapaxes(solved.frame_vectors, 1, 2) @ cross)
+    gram -= np.swapaxes(left, 1, 2) @ left
+    dof = 2 * exact.frames.sizes - 3
+    return FrameNormals.of(cal.theta, gram, state.log_determinant, state.rotations, dof)
+
+
+def by_frame(frames: StarFrames, columns: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Columns (c, 2, N) that span the same in every frame by itself, orthonormal or zero, and how
+    many of them are there in each (K,).
+    """
+    raw = np.sqrt(frames.sum(np.sum(columns**2, axis=1)))
+    columns = columns / frames.spread(np.where(raw > 0.0, raw, 1.0))[:, None]
+    values, vectors = np.linalg.eigh(products_by_frame(frames, columns, columns))
+    kept = values > _ABSORBED
+    root = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :]
+    spread = frames.spread(np.ascontiguousarray(np.moveaxis(root, 0, 2)))
+    found = np.einsum("axn,abn->bxn", columns, spread, optimize=True)
+    return np.ascontiguousarray(found), np.count_nonzero(kept, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Freed:
+    """Residuals without what attitudes, parameters and effects reproduce, all of them free."""
+
+    own: ByFrame  # Attitudes and effects of frames, orthonormal
+    h: FloatArray  # (r, 2, N): parameters and effects of the run beside these, orthonormal
+    e: FloatArray  # (2, N): whitened residuals
+    frame_dof: FloatArray  # (K,): degrees of freedom of every frame, `h` not fitted
+
+    @property
+    def dof(self) -> int:
+        """Degrees of freedom of the residuals."""
+        return int(self.frame_dof.sum()) - len(self.h)
+
+    @classmethod
+    def of(cls, obs: Observations, cal: Calibration, axes: bool) -> Freed:
+        """Those of a calibration with effects; with `axes` as in `MarginalLikelihood`. Stars have
+        what the calibration took for their error.
+        """
+        rotations = quaternion_to_rotation(cal.quaternions)
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes)
+        state, _ = likelihood.profile(cal.theta, rotations)
+        frames, e = likelihood.frames, state.e
+        effects = effects_beside(obs, cal)
+        if any(effect.grouping == "star" for effect in effects):
+            exact = with_effects_of(obs, cal, rotations, obs)
+            _, found = exact.conditioned(state, e[None])
+            e = e - exact.shifts(state, exact.of_effect("star", found))[0]
+        linear = [effect for effect in effects if effect.grouping != "star"]
+        columns = Columns.of(linear, likelihood, state, cal.theta, slice(None))
+        of_frames, rank = by_frame(frames, columns.frame)
+        basis = np.concatenate([likelihood.attitudes(state).orthonormal, of_frames])
+        unit = np.broadcast_to(np.eye(len(basis))[:, :, None], (len(basis),) * 2 + rank.shape)
+        own = ByFrame(frames, basis, unit)
+        h = np.concatenate([likelihood.slopes(cal.theta, state), columns.run])
+        scale = np.linalg.norm(h.reshape(len(h), -1), axis=1)
+        h = own.removed_from(h / np.where(scale > 0.0, scale, 1.0)[:, None, None])
+        flat = h.reshape(len(h), -1)
+        values, vectors = principal(flat @ flat.T, _ABSORBED)
+        h = np.tensordot((vectors / np.sqrt(values)).T, h, axes=1)
+        e = own.removed_from(e[None])[0]
+        e = e - np.tensordot(np.tensordot(h, e, axes=2), h, axes=1)
+        return cls(own, h, np.asarray(e), floats(2.0 * frames.sizes - 3.0 - rank))

@@ -1,0 +1,142 @@
+"""Effects that a calibration holds, and what they say of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from starcal_uq.core.display import Shown
+from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.likelihood.compressed import CompressedLikelihood
+from starcal_uq.likelihood.effects import Effect
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class FittedEffect:
+    """An effect that a calibration holds.
+
+    Attributes
+    ----------
+    name : str
+        Name in the list of effects.
+    scale_px, low_px, high_px : float
+        Standard deviation of its coefficients, px at the corner of the field, and its 95 %
+        interval.
+    size_px : float
+        Root mean square per axis over the stars of the shifts that it explains, px; attitudes and
+        parameters removed.
+    gain_nat : float
+        Log of the restricted likelihood gained when it was taken up; beside all others, for one
+        that was asked for.
+    moved_sigma : float
+        Largest change of a parameter when it was taken up, in its standard deviations.
+    moved_name : str
+        That parameter.
+    """
+
+    name: str
+    scale_px: float
+    low_px: float
+    high_px: float
+    size_px: float
+    gain_nat: float
+    moved_sigma: float
+    moved_name: str
+
+
+@dataclass(frozen=True, eq=False)
+class Effects(Shown):
+    """Effects of a calibration, the first that was taken up first, and what they say of the camera.
+
+    m coefficients belong to the run, in the order of the names; J nodes hold what is known of the
+    scales.
+    """
+
+    fitted: tuple[FittedEffect, ...]
+    selected: bool  # Whether the data chose them; otherwise they were asked for
+    # Candidates that were not taken up, and what the next one would have gained, nat
+    refused: tuple[tuple[str, float], ...]
+    penalty_nat: float  # Gain that an effect has to exceed
+    coefficients: FloatArray = field(default_factory=lambda: np.zeros(0))  # (m,): best ones
+    # (m, m): covariance of the coefficients at the best scales
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    # (p, m): covariance of the camera's parameters with them, px units
+    cross: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    # (J, q, q), (J,): Gram matrices of the compressed likelihood at the nodes, the best scales
+    # first, and log weights of the nodes in the mixture
+    node_grams: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    node_log_weights: FloatArray = field(default_factory=lambda: np.zeros(0))
+    # Where the camera's parameters hold, and what one standard deviation of the temperature is,
+    # degC; first and last time, seconds since 1970; NaN of what the table lacks
+    temperature_c: tuple[float, float] = (np.nan, np.nan)
+    time_s: tuple[float, float] = (np.nan, np.nan)
+    places: tuple[tuple[str, int], ...] = ()  # Number of the run's coefficients of each effect
+
+    SHAPES: ClassVar[Shapes] = {
+        "coefficients": ("m",),
+        "covariance": ("m", "m"),
+        "cross": ("p", "m"),
+        "node_grams": ("j", "q", "q"),
+        "node_log_weights": ("j",),
+    }
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(effect.name for effect in self.fitted)
+
+    def scale(self, name: str) -> float:
+        """Scale of an effect, px at the corner; zero of one that is not there."""
+        return next((e.scale_px for e in self.fitted if e.name == name), 0.0)
+
+    def ratio(self, sigma: float) -> dict[str, float]:
+        """Squares of the scales in units of `sigma` squared, by name."""
+        return {e.name: (e.scale_px / sigma) ** 2 for e in self.fitted}
+
+    def at(self, name: str) -> slice:
+        """Coefficients of an effect of the run; none of one that is not there."""
+        first = 0
+        for known, size in self.places:
+            if known == name:
+                return slice(first, first + size)
+            first += size
+        return slice(0, 0)
+
+    def of(self, effects: Mapping[str, Effect]) -> list[Effect]:
+        """Its effects among those that a table allows, in the order of the coefficients.
+
+        LookupError for one that the table does not allow.
+        """
+        return [effects[name] for name in self.names]
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per effect, those not taken up with their gain alone."""
+        import pandas as pd
+
+        fitted = [vars(effect) | {"taken": True} for effect in self.fitted]
+        refused = [{"name": n, "gain_nat": gain, "taken": False} for n, gain in self.refused]
+        columns = [*(each.name for each in fields(FittedEffect)), "taken"]
+        return pd.DataFrame([*fitted, *refused], columns=columns)
+
+    def mixed(
+        self, compressed: CompressedLikelihood, theta: FloatArray, sigma: FloatArray
+    ) -> FloatArray:
+        """Log likelihood (n,) at theta (n, p) and sigma (n,) with the scales integrated over their
+        nodes.
+        """
+        from scipy.special import logsumexp
+
+        z = compressed.whiten(theta)
+        plain = compressed.log_likelihood(theta, sigma)
+        squares = compressed.sum_of_squares(z)
+        others = np.stack(
+            [replace(compressed, gram=gram).sum_of_squares(z) for gram in self.node_grams]
+        )
+        apart = -0.5 * (others - squares) / np.square(sigma)
+        return np.asarray(plain + logsumexp(apart + self.node_log_weights[:, None], axis=0))

@@ -1,0 +1,59 @@
+"""Effects beyond the camera in sentences and tables."""
+
+from __future__ import annotations
+
+from starcal_uq.core.formatting import decimals_for, fixed, join_words, significant
+from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
+from starcal_uq.presentation.tables import TextTable
+
+# What every effect is, in one sentence.
+MEANINGS = {
+    "axes": "The pixels are longer along one axis than along the other, or the axes are skewed.",
+    "field": "The lens shifts images smoothly over the field, as no polynomial of the radius does.",
+    "frame": "Every frame has a scale and two shears of its own: breathing, refraction, seeing.",
+    "temperature": "Focal length and principal point change with the temperature.",
+    "time": "Focal length and principal point change smoothly over the run.",
+    "epoch": "Every night has a focal length and a principal point of its own.",
+    "star": "A star's direction errs alike in every frame: catalogue, blend, colour.",
+    "phase": "Centroids err with where within a pixel the star is.",
+    "magnitude": "Images shift, and the scale changes, with the brightness of the star.",
+}
+
+
+def effects_table(effects: Effects) -> TextTable | None:
+    """One row per effect of the calibration, in the order in which they were taken up; None without
+    any.
+    """
+    if not effects.fitted:
+        return None
+    rows = tuple(map(_row, effects.fitted))
+    heads = ("effect", "scale", "95 % interval", "shift rms", "gain [nat]", "moved most")
+    title = "Effects beyond the camera [px; scale: 1 sigma at the corner]"
+    return TextTable(heads, rows, title, "lrrrrl")
+
+
+def _row(effect: FittedEffect) -> tuple[str, ...]:
+    decimals = decimals_for(effect.low_px)
+    return (
+        effect.name,
+        fixed(effect.scale_px, decimals),
+        f"{fixed(effect.low_px, decimals)} – {fixed(effect.high_px, decimals)}",
+        significant(effect.size_px),
+        fixed(effect.gain_nat, 1),
+        f"{effect.moved_name} by {significant(effect.moved_sigma)} sigma",
+    )
+
+
+def effects_text(effects: Effects) -> str:
+    """Which effects the calibration holds, and which were not taken up, with their gains."""
+    held = join_words(effects.names)
+    if not effects.selected:
+        return f"Effects that were asked for: {held}; none were chosen by the data."
+    least = f"an effect has to gain {fixed(effects.penalty_nat, 1)} nat"
+    gains = ", ".join(f"{name} {fixed(gain, 1)}" for name, gain in effects.refused)
+    first = (
+        f"Effects that the data ask for: {held}."
+        if held
+        else "The data ask for no effect beyond the camera."
+    )
+    return f"{first} Not taken up ({least}): {gains}." if gains else first

@@ -1,0 +1,166 @@
+"""Frames as QUEST sees them: what displacements of their stars do to their attitudes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import left_error
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import unproject_jacobian, unproject_theta
+from starcal_uq.core.errors import DistortionError, ObservationError
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation.weights import weighed
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.shapes import View
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+
+_STARS_AT_ONCE = 1_000_000
+# Stars whose columns of shapes are held at once.
+_COLUMNS_AT_ONCE = 10_000
+# Half a pixel: the map is so smooth that the central difference errs by (h / f)^2, while rounding
+# stays below 1e-12.
+_STEP_PX = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class FrameGeometry:
+    """Frames as QUEST sees them at the posterior mean, with its first-order responses.
+
+    Displacements db of the directions turn the attitude by phi = [sum w (I - b b^T)]^-1 sum w b x
+    db; weights (N,) are None where all stars count alike. `noise_px` (N,) is the centroid noise per
+    axis; `response` (K, 3, p) is d phi / d theta, rad per px unit, `noise_response` (2, N, 3) the
+    turns of a star's frame by one standard deviation of its x and of its y, or of two independent
+    parts where a noise model has its axes correlate, rad, and `noise_covariance` (K, 3, 3) the
+    covariance of phi from centroid noise, rad^2.
+    """
+
+    post: Posterior
+    obs: Observations
+    weights: FloatArray | None
+    noise_px: FloatArray
+    response: FloatArray
+    noise_response: FloatArray
+    noise_covariance: FloatArray
+
+    @classmethod
+    def of(cls, post: Posterior, obs: Observations) -> FrameGeometry:
+        """Linearise QUEST on these frames."""
+        obs = weighed(obs, post)
+        noise_px, weights = _noise(post, obs)
+        model, xy, starts = post.camera.distortion, obs.xy, obs.frame_starts
+        b, per_theta = unproject_jacobian(model, post.mean, xy)
+        steps = _STEP_PX * np.eye(2)
+        per_pixel = [
+            (
+                unproject_theta(model, post.mean, xy + step)
+                - unproject_theta(model, post.mean, xy - step)
+            )
+            / (2.0 * _STEP_PX)
+            for step in steps
+        ]
+        w = np.ones(obs.n_stars) if weights is None else weights
+        inverse = np.linalg.inv(
+            _frame_sums(w[:, None, None] * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts)
+        )
+        by_theta = _frame_sums(
+            w[:, None, None] * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts
+        )
+        root = np.eye(2) if obs.noise_axes is None else np.linalg.cholesky(obs.noise_axes)
+        torque = np.stack([(w * noise_px)[:, None] * np.cross(b, column) for column in per_pixel])
+        torque = np.einsum("anj,ab->bnj", torque, root)
+        turns = np.einsum("nij,anj->ani", np.repeat(inverse, np.diff(starts), axis=0), torque)
+        return cls(
+            post=post,
+            obs=obs,
+            weights=weights,
+            noise_px=noise_px,
+            response=inverse @ np.swapaxes(by_theta, 1, 2),
+            noise_response=turns,
+            noise_covariance=_frame_sums(np.einsum("ani,anj->nij", turns, turns), starts),
+        )
+
+    def attitudes(self, thetas: FloatArray, xy: FloatArray) -> FloatArray:
+        """Quaternions (d, K, 4) by QUEST for parameters (d, p) and pixels (N, 2), or (d, N, 2)."""
+        model = self.post.camera.distortion
+        pixels = np.broadcast_to(xy, (len(thetas), *xy.shape[-2:]))
+        b = np.stack(
+            [unproject_theta(model, theta, own) for theta, own in zip(thetas, pixels, strict=True)]
+        )
+        folded = ~np.isfinite(b).all(axis=(1, 2))
+        if folded.any():
+            raise DistortionError(
+                f"at {int(folded.sum())} of {len(b)} posterior draws the distortion {model!r} "
+                "folds over within the "
+                "observed field: use more frames, a tighter prior or a model with fewer "
+                "coefficients."
+            )
+        obs = self.obs
+        return quest(
+            b, obs.directions_icrs, obs.frame_starts, self.weights, covariance=False
+        ).quaternions
+
+    def rotations(self, draws: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
+        """Left rotations (d, K, 3) rad of the attitudes at some draws from those at the posterior
+        mean.
+        """
+        xy = self.obs.xy
+        reference = self.attitudes(self.post.mean[None], xy)
+        for part in self.batches(len(draws)):
+            yield part, left_error(self.attitudes(draws[part], xy), reference)
+
+    def batches(self, count: int) -> Iterator[slice]:
+        """Ranges of draws whose stars fit into memory."""
+        step = max(1, _STARS_AT_ONCE // self.obs.n_stars)
+        return (slice(first, min(first + step, count)) for first in range(0, count, step))
+
+    def turned(
+        self, frames: Observations, camera: Camera, columns: Callable[[View], FloatArray]
+    ) -> FloatArray:
+        """Turns (K, 3, c), rad, of the frames by columns (c, 2, n) of shifts of their stars, px.
+
+        `frames` are those of the geometry, as they are stated; `camera` is what the columns are
+        around.
+        """
+        turns = self.noise_response / self.noise_px[:, None]
+        if self.obs.noise_axes is not None:
+            # Parts of the noise are combinations of both axes.
+            root = np.linalg.inv(np.linalg.cholesky(self.obs.noise_axes).T)
+            turns = np.einsum("ab,bni->ani", root, turns)
+        turned = []
+        likelihood = MarginalLikelihood(frames, camera.distortion)
+        for part, state, rows in likelihood.pieces(camera.theta, None, _COLUMNS_AT_ONCE):
+            found = columns(View.of(part, state, camera.theta, rows))
+            products = np.einsum("jan,ani->nij", found, turns[:, rows])
+            turned.append(np.add.reduceat(products, part.frames.starts[:-1], axis=0))
+        return np.concatenate(turned)
+
+
+def _noise(post: Posterior, obs: Observations) -> tuple[FloatArray, FloatArray | None]:
+    """Noise of every star (N,) in px at the posterior mean, its own direction error included, and
+    QUEST's weights.
+    """
+    sigma = float(np.mean(post.sigma_draws))
+    if post.sigma_name != "sigma_scale":
+        return np.full(obs.n_stars, np.hypot(sigma, post.star_error_px)), None
+    if obs.sigma_px is None:
+        raise ObservationError(
+            "the posterior scales the stated noise of the stars, but these observations have no "
+            "sigma_px: "
+            "pass the observations that it was sampled from, or mission_frames(..., "
+            "noise_like=observations).",
+            column="sigma_px",
+        )
+    return np.hypot(sigma * obs.sigma_px, post.star_error_px), obs.sigma_px**-2.0
+
+
+def _frame_sums(values: Any, starts: IntArray) -> FloatArray:
+    sums: FloatArray = np.add.reduceat(values, starts[:-1], axis=0)
+    return sums

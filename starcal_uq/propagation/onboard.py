@@ -1,0 +1,174 @@
+"""What effects of a calibration do to the attitudes of a mission.
+
+The software aboard knows the camera's parameters, and what was uploaded of the effects. With R_k
+the turn of frame k by the parameters, at the same pixels, and T_k its turn by the effects' columns
+of pixel shifts, its attitude errs by
+
+    phi_k = R_k (theta_aboard - theta) + T_k a + T_k a_k,
+
+with a the coefficients of the run, jointly known with theta, and a_k those that every frame draws
+for itself. Where theta alone is aboard, all of a is an error: its best value squared and its
+covariance; where effects are aboard, what is left is the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.likelihood.effects import Effect, effects_of
+from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.propagation.attitude_error import OBSERVED
+from starcal_uq.propagation.geometry import FrameGeometry
+
+if TYPE_CHECKING:
+    from starcal_uq.core.settings import OnboardModel
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.likelihood.shapes import View
+    from starcal_uq.observations.table import Observations
+
+# Effects whose columns change with what a table states, by its own mean and spread.
+_WITH_COVARIATES = {"temperature", "time", "magnitude"}
+# The effect of nights: a mission sees others than the calibration.
+NIGHT = "epoch"
+# Effects of the air, which a mission in space has not.
+_OF_AIR = {"zenith"}
+
+
+@dataclass(frozen=True, eq=False)
+class Turns:
+    """Turns of K frames, rad.
+
+    `response` (K, 3, q): by the parameters, and by the coefficients of the run with the other sign.
+    `own` (K, 3, 3) by effect: covariances of those that every frame draws for itself.
+    """
+
+    response: FloatArray
+    own: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Aboard:
+    """Parameters and coefficients that attitudes err by.
+
+    `calibrated` is the table of the calibration, which says what effects change with.
+    """
+
+    post: Posterior
+    calibrated: Observations
+
+    @cached_property
+    def _effects(self) -> list[Effect]:
+        """The effects of the calibration."""
+        found = self.post.effects
+        if found is None:
+            return []
+        try:
+            effects = found.of(effects_of(self.calibrated, self.post.camera))
+            if _WITH_COVARIATES & set(found.names) and not self._is_of_posterior:
+                raise LookupError("covariates of another table")
+        except LookupError as error:
+            raise ObservationError(
+                f"the effects of this posterior ({', '.join(found.names)}) are those of the table "
+                "that it was sampled from: give that table as `calibrated`."
+            ) from error
+        return effects
+
+    @property
+    def _is_of_posterior(self) -> bool:
+        return self.post.provenance.data_sha256 in (None, self.calibrated.data_hash)
+
+    @cached_property
+    def _run(self) -> dict[str, IntArray]:
+        """Places of the coefficients of every effect of the run that a mission shares."""
+        sizes = {e.name: e.columns.size for e in self._effects if e.grouping == "run"}
+        ends = np.cumsum([0, *sizes.values()])
+        places = zip(sizes, ends[:-1], ends[1:], strict=True)
+        return {name: np.arange(*ends) for name, *ends in places if name != NIGHT}
+
+    @cached_property
+    def _night(self) -> FloatArray:
+        """Variances (3,) of x0, y0 and f in another night; none where nights agree."""
+        camera, found = self.post.camera, self.post.effects
+        corner = np.array([1.0, 1.0, float(camera.focal_px) / camera.corner_radius_px])
+        here = found is not None and NIGHT in found.names
+        return np.square(found.scale(NIGHT) * corner) if found is not None and here else corner[:0]
+
+    @cached_property
+    def places(self) -> dict[str, slice]:
+        """Columns of the run's effects, behind those of the parameters; a night comes last."""
+        sizes = {name: len(place) for name, place in self._run.items()}
+        sizes |= {NIGHT: 3} if len(self._night) else {}
+        ends = (len(self.post.mean) + np.cumsum([0, *sizes.values()])).tolist()
+        return {n: slice(*at) for n, *at in zip(sizes, ends[:-1], ends[1:], strict=True)}
+
+    @cached_property
+    def _joint(self) -> tuple[FloatArray, FloatArray]:
+        """Expected values (q,), those of the parameters zero, and covariance (q, q)."""
+        found, p = self.post.effects, len(self.post.mean)
+        if found is None or not self.places:
+            return np.zeros(p), self.post.covariance
+        kept = np.concatenate([np.arange(0), *self._run.values()])
+        nothing = np.zeros((p + len(kept), len(self._night)))
+        cross = found.cross[:, kept]
+        covariance = np.block(
+            [[self.post.covariance, cross], [cross.T, found.covariance[np.ix_(kept, kept)]]]
+        )
+        return np.concatenate([np.zeros(p), found.coefficients[kept], nothing[0]]), np.block(
+            [[covariance, nothing], [nothing.T, np.diag(self._night)]]
+        )
+
+    def moments(self, onboard: OnboardModel) -> FloatArray:
+        """Second moments (q, q) of what is not known aboard."""
+        expected, covariance = self._joint
+        if not self.places or onboard == "effects":
+            return covariance
+        return covariance + np.outer(expected, expected)
+
+    def draws(self, theta: FloatArray, onboard: OnboardModel, seed: int) -> FloatArray:
+        """Draws (n, q) of it that belong to draws (n, p) of the parameters."""
+        shift, (expected, covariance) = theta - self.post.mean, self._joint
+        p = shift.shape[1]
+        if not self.places:
+            return np.asarray(shift)
+        follow = scaled_inverse(covariance[:p, :p]) @ covariance[:p, p:]
+        values, vectors = np.linalg.eigh(covariance[p:, p:] - covariance[p:, :p] @ follow)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        rng = np.random.default_rng((seed, 29))
+        own = shift @ follow + rng.standard_normal((len(shift), len(values))) @ root.T
+        return np.column_stack((shift, own + (expected[p:] if onboard == "model" else 0.0)))
+
+    def turns(self, geometry: FrameGeometry, frames: Observations) -> Turns:
+        """What parameters and effects do to the attitudes of some frames."""
+        found = self.post.effects
+        if found is None:
+            return Turns(geometry.response, {})
+        camera = self.post.camera
+        here = effects_of(self.calibrated, camera, seen=frames)
+        in_air = str(frames.origin.frames or OBSERVED) == OBSERVED
+        frame = [
+            effect
+            for effect in self._effects
+            if effect.grouping == "frame" and (in_air or effect.name not in _OF_AIR)
+        ]
+        shapes = [here[name].columns for name in self._run] + [e.columns for e in frame]
+
+        def columns(view: View) -> FloatArray:
+            every = [shape.columns(view) for shape in shapes]
+            every.insert(len(self._run), view.parameter_columns[: len(self._night)])
+            return np.concatenate(every)
+
+        turned = geometry.turned(frames, camera, columns)
+        size = len(self._joint[0]) - len(self.post.mean)
+        ends = np.cumsum([size, *(effect.columns.size for effect in frame)])
+        own = {}
+        for effect, first, last in zip(frame, ends[:-1], ends[1:], strict=True):
+            part = turned[:, :, first:last] * (found.scale(effect.name) * effect.prior)
+            own[effect.name] = part @ np.swapaxes(part, 1, 2)
+        return Turns(np.concatenate([geometry.response, -turned[:, :, :size]], axis=2), own)

@@ -1,0 +1,126 @@
+"""Effects planted by a sensor of a second make: chosen, estimated, and covered."""
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.errors import CalibrationError
+from tests.helpers.effects import breathing, bump, nearest_camera, sheet, table, together
+from tests.helpers.outside import campaign
+
+
+def test_field_and_frame_effects_are_found_and_their_scales_are_right() -> None:
+    rng = np.random.default_rng(11)
+    shifts = together(bump(0.5), breathing(rng, 40, 0.2))
+    c = campaign(rng, n_frames=40, displaced=shifts)
+    obs = table(c)
+    plain = sc.calibrate(obs, sheet(c))
+    cal = sc.calibrate(obs, sheet(c), effects="auto")
+    assert plain.sigma > 2.0 * cal.sigma
+    assert cal.sigma == pytest.approx(0.05, rel=0.08)
+    assert cal.effects is not None
+    assert set(cal.effects.names) == {"field", "frame"}
+    frame = next(e for e in cal.effects.fitted if e.name == "frame")
+    assert frame.low_px < 0.2 < frame.high_px
+    truth = nearest_camera(c.theta, bump(0.5))
+    assert np.abs((cal.theta - truth) / cal.sigmas).max() < 4.0
+    # Control: intervals this narrow refuse the camera that the field's own part is still on.
+    assert np.abs((cal.theta - c.theta) / cal.sigmas).max() > 6.0
+
+
+def test_clean_data_take_up_nothing_and_change_nothing() -> None:
+    c = campaign(np.random.default_rng(12), n_frames=30)
+    obs = table(c)
+    plain, cal = sc.calibrate(obs, sheet(c)), sc.calibrate(obs, sheet(c), effects="auto")
+    assert cal.effects is not None
+    assert not cal.effects.fitted
+    assert cal.effects.refused
+    assert all(gain < cal.effects.penalty_nat for _, gain in cal.effects.refused)
+    np.testing.assert_array_equal(cal.theta, plain.theta)
+    np.testing.assert_array_equal(cal.covariance, plain.covariance)
+
+
+@pytest.mark.parametrize(
+    ("effects", "match"),
+    [("fields", "effect 'fields'"), ("temperature", "'temperature' needs")],
+)
+def test_an_effect_that_cannot_be_is_refused(effects: str, match: str) -> None:
+    c = campaign(np.random.default_rng(12), n_frames=6)
+    with pytest.raises(CalibrationError, match=match):
+        sc.calibrate(table(c), sheet(c), effects=effects)
+
+
+def test_draws_hold_the_scales_and_agree_with_the_exact_likelihood() -> None:
+    rng = np.random.default_rng(5)
+    c = campaign(rng, n_frames=5, stars_per_frame=30, displaced=breathing(rng, 5, 0.3))
+    obs = table(c)
+    cal = sc.calibrate(obs, sheet(c), effects="frame")
+    post = sc.sample(obs, cal, seed=1)
+    np.testing.assert_allclose(post.theta_draws.std(axis=0), cal.sigmas, rtol=0.06)
+    # Control: scales at their best alone give narrower draws.
+    narrow = np.sqrt(np.diag(np.linalg.inv(cal.information)))
+    assert np.max(cal.sigmas / narrow) > 1.02
+
+
+def test_a_calibration_with_effects_survives_its_file(tmp_path) -> None:
+    rng = np.random.default_rng(5)
+    c = campaign(rng, n_frames=5, stars_per_frame=30, displaced=breathing(rng, 5, 0.3))
+    cal = sc.calibrate(table(c), sheet(c), effects="frame,field")
+    cal.save(tmp_path / "c.json")
+    again = sc.Calibration.load(tmp_path / "c.json")
+    assert again.effects is not None
+    assert again.effects.fitted == cal.effects.fitted
+    for name in ("coefficients", "covariance", "cross", "node_grams", "node_log_weights"):
+        np.testing.assert_array_equal(getattr(again.effects, name), getattr(cal.effects, name))
+
+
+@pytest.mark.slow
+def test_intervals_cover_with_the_effects_selected() -> None:
+    z, chosen = [], []
+    for seed in range(100):
+        rng = np.random.default_rng(1000 + seed)
+        shifts = together(bump(0.2), breathing(rng, 30, 0.2))
+        c = campaign(rng, n_frames=30, displaced=shifts)
+        cal = sc.calibrate(table(c), sheet(c), effects="auto")
+        chosen.append(set(cal.effects.names) == {"field", "frame"})
+        z.append((cal.theta - nearest_camera(c.theta, bump(0.2))) / cal.sigmas)
+    covered = np.mean(np.abs(z) < 1.96, axis=0)
+    print("covered", covered, "rms", np.sqrt(np.mean(np.square(z), axis=0)))
+    assert np.mean(chosen) > 0.97
+    assert np.all((covered > 0.88) & (covered <= 1.0))
+    assert 0.92 < covered.mean() < 0.98
+
+
+@pytest.mark.slow
+def test_selection_takes_up_nothing_on_clean_data() -> None:
+    taken = 0
+    for seed in range(300):
+        c = campaign(np.random.default_rng(seed), n_frames=12)
+        taken += bool(sc.calibrate(table(c), sheet(c), effects="auto").effects.names)
+    print("taken up", taken, "of 300")
+    # 1 % on average: more than 9 of 300 has a probability of 4e-4.
+    assert taken <= 9
+
+
+@pytest.mark.parametrize("options", [{"likelihood": "student_t"}, {"noise": "model"}])
+def test_weights_follow_what_effects_leave(options: dict[str, str]) -> None:
+    """Tails and a noise model of the camera alone would hold the field's displacement as well."""
+    c = campaign(np.random.default_rng(21), n_frames=40, displaced=bump(0.4))
+    obs = table(c)
+    cal = sc.calibrate(obs, sheet(c), effects="auto", **options)
+    assert cal.effects.names == ("field",)
+    truth = nearest_camera(c.theta, bump(0.4))
+    assert np.abs((cal.theta - truth) / cal.sigmas).max() < 3.5
+    if "noise" in options:
+        assert not cal.noise_model.varies
+        assert cal.sigma == pytest.approx(0.05, rel=0.06)
+    else:
+        # The noise is Gaussian: nearly every star keeps its weight, and the scale is that of a t.
+        assert cal.star_weights.shape == (len(obs),)
+        assert np.mean(cal.star_weights > 0.5) > 0.9
+    # Control: without effects either of them answers to the displacement.
+    plain = sc.calibrate(obs, sheet(c), **options)
+    if "noise" in options:
+        assert plain.noise_model.varies
+    else:
+        assert plain.sigma > 1.2 * cal.tail_scale

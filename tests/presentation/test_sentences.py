@@ -1,0 +1,104 @@
+"""Findings are facts: every code is worded in one table, and no wing below presentation words
+one.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from enum import Enum
+from pathlib import Path
+
+import pytest
+
+from starcal_uq.core import status
+from starcal_uq.presentation.sentences import SENTENCES
+
+PACKAGE = Path(status.__file__).parents[1]
+# Wings that show findings, or stand above those that do.
+ABOVE = ("presentation", "runs", "paper", "cli")
+MAKERS = ("Check", "Order", "Finding")
+
+
+def made(tree: ast.AST) -> Iterator[ast.Call]:
+    """The calls of a module that make findings."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in MAKERS:
+            yield node
+
+
+def below() -> Iterator[tuple[str, ast.Module]]:
+    """The modules of the wings below presentation."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        place = path.relative_to(PACKAGE)
+        if place.parts[0] not in ABOVE:
+            yield str(place), ast.parse(path.read_text(encoding="utf-8"))
+
+
+def worded(tree: ast.AST) -> list[str]:
+    """Texts of several words in the calls that make findings; titles are names of the user's."""
+    found = []
+    for call in made(tree):
+        inside = [*call.args, *(word.value for word in call.keywords if word.arg != "title")]
+        for node in (node for part in inside for node in ast.walk(part)):
+            if isinstance(node, ast.Constant) and " " in str(node.value):
+                found.append(str(node.value))
+        found += [word.arg or "" for word in call.keywords if word.arg in ("told", "sentence")]
+    return found
+
+
+def test_every_code_has_a_sentence() -> None:
+    kinds = {type(code) for code in SENTENCES} | {status.Code, status.Advice, status.Note}
+    assert [code for kind in kinds for code in kind if code not in SENTENCES] == []
+    # Codes of an enumeration of which none is worded.
+    names = {
+        node.value.id
+        for _, tree in below()
+        for call in made(tree)
+        for node in ast.walk(call)
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.attr.isupper()
+    }
+    assert names - {kind.__name__ for kind in kinds} <= {"Level", "Status"}
+    assert {"Code", "Advice", "Note", "Difference", "Limit", "Refusal"} <= names
+
+
+def test_a_code_without_words_is_noticed() -> None:
+    class Unknown(Enum):
+        NEW = 1
+
+    with pytest.raises(KeyError):
+        _ = status.Finding(Unknown.NEW).sentence
+
+
+def test_no_wing_below_presentation_words_a_finding() -> None:
+    assert {place: found for place, tree in below() if (found := worded(tree))} == {}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        'Finding(Note.A, {"why": "two words"})',
+        'Order(Advice.A, {"why": f"{x} px"})',
+        "Check(Code.A, level=level, told=words)",
+    ],
+)
+def test_words_in_a_finding_are_noticed(source: str) -> None:
+    assert worded(ast.parse(source))
+    # Control: facts, and the name that a user gave.
+    assert not worded(ast.parse('Check(Code.A, {"size_px": 2.0}, title=f"Requirement {x}")'))
+
+
+def test_advice_is_an_order_and_values_are_put_in() -> None:
+    for code in status.Advice:
+        if code not in (
+            status.Advice.LOOK_FOR_THE_CAUSE,
+            status.Advice.MEND_THE_ESTIMATE,
+            status.Advice.STATE_WHAT_IS_MISSING,
+            status.Advice.REDUCE_OR_RELAX,
+        ):
+            said = status.Order(code).sentence
+            assert said[0].isupper() and said.endswith("."), said
+    missing = status.Order(status.Advice.STATE_WHAT_IS_MISSING, {"missing": ("a", "b")})
+    assert missing.sentence == "State in the budget file what is missing: a and b."
