@@ -315,7 +315,7 @@ def _with_fallback(
     if evaluation == "auto" and (outcome is None or not compression.good):
         outcome = run.sample("exact", exact, _attempt(checkpoint, files))
     if outcome is None:
-        raise SamplingError("no polynomial stands for this likelihood: use evaluation='exact'.")
+        raise SamplingError("no polynomial stands for this likelihood: choose the evaluation 'exact'.")
     for path in files[:-1]:
         Path(path).unlink(missing_ok=True)
     return outcome, compression
