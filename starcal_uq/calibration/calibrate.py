@@ -141,8 +141,8 @@ def calibrate(
         ``student_t`` the stars keep the weights of their tails. It needs the ``efficient`` method.
     effects : {"none", "auto"} or sequence of str
         Effects beyond the camera, by name or joined by commas: ``axes``, ``field``, ``frame``,
-        ``temperature``, ``time``, ``epoch``, ``star``, ``phase``, ``magnitude``. Their scales are estimated
-        by restricted likelihood and marginalised in estimate, covariance and `compressed`;
+        ``zenith``, ``temperature``, ``time``, ``epoch``, ``star``, ``phase``, ``magnitude``. Their scales
+        are estimated by restricted likelihood and marginalised in estimate, covariance and `compressed`;
         ``auto`` takes up those that the data ask for (`Calibration.effects`). With ``student_t``
         the stars keep the weights of their tails. It needs the ``efficient`` method.
     recursion : RecursionOptions, optional

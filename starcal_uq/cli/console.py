@@ -14,7 +14,7 @@ from rich.table import Table
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import plural, significant
-from starcal_uq.core.status import Advice, Level, Order
+from starcal_uq.core.status import Advice, Level, Note, Order
 from starcal_uq.core.types import AnyDict, Progress
 from starcal_uq.presentation.tables import TextTable
 
@@ -184,11 +184,12 @@ def show_summary(run: Run, page: Path) -> None:
 
 def warn_air(obs: Observations | PartitionedObservations, cal: Calibration) -> None:
     """Say what refraction does to the focal length where nothing is known of the air."""
-    from starcal_uq.diagnostics.verdict.observed import air, conditional
+    from starcal_uq.diagnostics.verdict.observed import refraction
 
-    if air(obs) == "unknown":
+    found = refraction(obs, cal)
+    if found is not None and found.code is Note.CONDITIONAL_ON_REFRACTION:
         site = Order(Advice.STATE_THE_SITE)
-        tell(f"warning: {conditional(cal).sentence} {site.sentence}")
+        tell(f"warning: {found.sentence} {site.sentence}")
 
 
 def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera) -> None:

@@ -29,7 +29,16 @@ Solver = Literal["lm", "minpack", "ipopt"]
 ModelName = Literal["none", "k1", "brown", "brown3", "brown_tangential", "inverse"]
 NoiseKind = Literal["common", "model"]
 EffectName = Literal[
-    "axes", "field", "frame", "temperature", "time", "epoch", "star", "phase", "magnitude"
+    "axes",
+    "field",
+    "frame",
+    "zenith",
+    "temperature",
+    "time",
+    "epoch",
+    "star",
+    "phase",
+    "magnitude",
 ]
 OnboardModel = Literal["model", "effects"]
 MergedNoise = Literal["auto", "common", "own"]

@@ -15,7 +15,6 @@ lack are fitted beside the air. What these explain as well as air does cannot be
 
 from __future__ import annotations
 
-from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,8 +22,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from starcal_uq.attitude.earth import (
+    DENSITY_SPREAD,
+    LOWEST,
+    air_constants,
+    normalised,
+    raising,
+    sphere,
+    tangents,
+)
 from starcal_uq.attitude.rotations import quaternion_to_rotation
-from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, IntArray
@@ -37,10 +44,9 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.shapes import View, focal_drift, frame_shapes, lens_shapes
 from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood, star_numbers
+from starcal_uq.likelihood.zenith import frame_axes
 from starcal_uq.maths.linear import principal
 from starcal_uq.observations.splits import one_of_each
-from starcal_uq.sky.refraction import refraction_constants, site_among_stars
-from starcal_uq.sky.site import Site
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -50,17 +56,14 @@ if TYPE_CHECKING:
 
 # False alarms where there is no air.
 AIR_P = 1e-3
-# Density of the air in that of the standard air at sea level: its spread before any data, least (4
-# km) and most.
-_DENSITY_SPREAD, _THIN, _THICK = 0.2, 0.64, 1.06
+# Density of the air in that of the standard air at sea level: least (4 km) and most.
+_THIN, _THICK = 0.64, 1.06
 # What leaves all of these with less probability is another misfit: chi-square of the amplitude, or
 # a share of what air explains that refraction by two constants may leave.
 _AIR_CHI2, _INEXACT = 10.8, 0.01
 _PLACES, _DRAWS, _FRAMES, _STARS = 600, 4000, 200, 4000
 # Frames that get a zenith each.
 _FRAMES_APIECE = 80
-# Sine of the lowest altitude that is taken for possible.
-_LOWEST = np.sin(np.radians(5.0))
 # Damped steps towards the best zeniths, until chi-square falls by less than a tenth.
 _STEPS, _STEP_RAD, _LONGEST_RAD, _SETTLED = 24, 1e-3, 0.2, 0.1
 # Zeniths that are tried for a frame by itself: distances from its boresight, degrees, and
@@ -320,8 +323,8 @@ class _Air:
         own = self._apart(own)
         self._own = own.reshape(3, -1, *own.shape[1:])
         self._cal = cal
-        self._axes, self.timed = _earth(rest.obs)
-        self._constants = refraction_constants(Site(45.0, 0.0))
+        self._axes, self.timed = frame_axes(rest.obs)
+        self._constants = air_constants()
         self.seen_px = np.zeros((2, likelihood.frames.n_stars))
 
     def test(self, seed: int) -> AirTest | None:
@@ -364,9 +367,8 @@ class _Air:
 
     def _raised(self, zenith: FloatArray) -> FloatArray:
         """Whitened shifts (2, N) by standard air below zeniths (3, N), camera frame."""
-        a, b = self._constants
-        sine = np.maximum(np.sum(zenith * self._rest.state.b, axis=0), _LOWEST)
-        return self._rest.shift(zenith * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
+        sine = np.sum(zenith * self._rest.state.b, axis=0)
+        return self._rest.shift(zenith * raising(sine, self._constants)[0])
 
     def _above(self, places: FloatArray) -> FloatArray:
         """Zeniths (K, 3) of the frames, camera frame, at one place (1, 3)."""
@@ -386,12 +388,12 @@ class _Air:
         frames = self._rest.likelihood.frames
         turned = [frames.spread(np.ascontiguousarray(self._axes[:, axis].T)) for axis in range(3)]
         seen = np.stack([np.sum(axis * frames.r, axis=0) for axis in turned])
-        found: FloatArray = places[np.min(places @ seen, axis=1) > _LOWEST]
+        found: FloatArray = places[np.min(places @ seen, axis=1) > LOWEST]
         return found
 
     def of_one_place(self, seed: int) -> AirTest | None:
         """The air of one place; None where from no place all stars were above the horizon."""
-        places = self._possible(_sphere(_PLACES))
+        places = self._possible(sphere(_PLACES))
         if not len(places):
             return None
         alone, _ = self._alone.left(
@@ -511,22 +513,23 @@ class _Air:
         for _ in range(_STEPS):
             shift = trial_density * self._shift(above(trial))
             column = rest.left(shift[None])[0][0]
-            away = (trial_density - 1.0) / _DENSITY_SPREAD
+            away = (trial_density - 1.0) / DENSITY_SPREAD
             cost = float(np.sum((rest.residuals - column) ** 2)) / scale + away**2
             if cost < least:
                 gained, least, damping = least - cost, cost, 0.2 * damping
                 known, density, found = trial, trial_density, (shift, column)
-                tangents = _tangents(known)
+                ways = tangents(known)
                 moved = [
-                    self._shift(above(_unit(known + _STEP_RAD * way))) * density for way in tangents
+                    self._shift(above(normalised(known + _STEP_RAD * way))) * density
+                    for way in ways
                 ]
                 slopes = (np.stack(moved) - shift) / _STEP_RAD
                 if len(known) > 1:
                     slopes = self._apart(slopes)
                 rows = np.concatenate([rest.left(slopes)[0], column[None] / density])
                 matrix, pull = rows @ rows.T / scale, rows @ (rest.residuals - column) / scale
-                matrix[-1, -1] += _DENSITY_SPREAD**-2
-                pull[-1] -= away / _DENSITY_SPREAD
+                matrix[-1, -1] += DENSITY_SPREAD**-2
+                pull[-1] -= away / DENSITY_SPREAD
                 if gained < _SETTLED:
                     break
             else:
@@ -537,7 +540,7 @@ class _Air:
             )
             turn = step[:-1].reshape(2, -1)
             turn = turn * np.minimum(1.0, _LONGEST_RAD / np.maximum(np.hypot(*turn), 1e-12))
-            trial = _unit(known + turn[0][:, None] * tangents[0] + turn[1][:, None] * tangents[1])
+            trial = normalised(known + turn[0][:, None] * ways[0] + turn[1][:, None] * ways[1])
             trial_density = float(np.clip(density + step[-1], _THIN, _THICK))
         return _Settled(
             known, density, *found, np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True)))
@@ -556,7 +559,7 @@ class _Air:
         )
         lowest = np.minimum.reduceat(grid @ state.b, frames.starts[:-1], axis=1)
         columns = likelihood.project_out(state, shifts)
-        size = np.where(lowest > _LOWEST, frames.sum(np.sum(columns**2, axis=1)), np.inf)
+        size = np.where(lowest > LOWEST, frames.sum(np.sum(columns**2, axis=1)), np.inf)
         h = likelihood.slopes(self._cal.theta, state)
         e = likelihood.project_out(state, state.e[None])[0]
         basis = np.linalg.qr(h.reshape(len(h), -1).T)[0]
@@ -623,32 +626,6 @@ def _f_tail(explained: float, rank: int, rest: Remainder, total: float | None = 
     return float(fdtrc(rank, dof, max(explained, 0.0) / rank / ((total - explained) / dof)))
 
 
-def _earth(obs: Observations) -> tuple[FloatArray, bool]:
-    """Axes of the Earth among the stars for each frame, (K, 3, 3) by rows, and whether they are
-    known.
-
-    Without times of all frames one moment's will do, whose Earth is turned as if it did not matter.
-    """
-    first = obs.frame_starts[:-1]
-    if obs.time_utc is not None and not (obs.time_utc[first] == "").any():
-        with suppress(StarcalError):
-            axes = [
-                site_among_stars(Site(latitude, longitude), obs.time_utc[first])[0]
-                for latitude, longitude in ((0.0, 0.0), (0.0, 90.0), (90.0, 0.0))
-            ]
-            return np.stack(axes, axis=1), True
-    return np.broadcast_to(np.eye(3), (obs.n_frames, 3, 3)), False
-
-
-def _sphere(n: int) -> FloatArray:
-    """Directions (n, 3) evenly over the sphere, on a spiral."""
-    place = np.arange(n) + 0.5
-    z = 1.0 - 2.0 * place / n
-    angle = np.pi * (1.0 + np.sqrt(5.0)) * place
-    radius = np.sqrt(1.0 - z**2)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
-
-
 def _around(distances_deg: FloatArray) -> FloatArray:
     """Directions (g, 3) at some distances from +z, all around."""
     distance, angle = (
@@ -660,17 +637,3 @@ def _around(distances_deg: FloatArray) -> FloatArray:
     return np.column_stack(
         [np.sin(distance) * np.cos(angle), np.sin(distance) * np.sin(angle), np.cos(distance)]
     )
-
-
-def _tangents(places: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors (n, 3) to the north and to the east of places (n, 3)."""
-    east = np.column_stack([-places[:, 1], places[:, 0], np.zeros(len(places))])
-    at_pole = np.hypot(*places[:, :2].T) < 1e-6
-    east[at_pole] = (0.0, 1.0, 0.0)
-    east = _unit(east)
-    return np.cross(places, east), east
-
-
-def _unit(vectors: FloatArray) -> FloatArray:
-    found: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return found

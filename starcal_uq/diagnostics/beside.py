@@ -38,7 +38,7 @@ def has_effects(cal: Calibration) -> bool:
 
 def effects_beside(obs: Observations, cal: Calibration) -> list[Effect]:
     """Effects of a calibration, in the order of its coefficients; none where it has none."""
-    return [] if cal.effects is None else cal.effects.of(effects_of(obs, cal.camera))
+    return [] if cal.effects is None else cal.effects.of(obs, cal.camera)
 
 
 def with_effects_of(
@@ -51,7 +51,7 @@ def with_effects_of(
     """
     assert cal.effects is not None
     seen = None if obs.n_frames == whole.n_frames else obs
-    known = effects_of(whole, cal.camera, seen=seen)
+    known = effects_of(whole, cal.camera, seen=seen, zeniths=cal.effects.zeniths)
     effects = [known[name] for name in cal.effects.names if name in known]
     frames = StarFrames.from_observations(obs, axes=True)
     ratio = {effect.name: cal.effects.ratio(cal.sigma)[effect.name] for effect in effects}

@@ -138,6 +138,8 @@ def predictive_check(
         )
     elif has_effects(cal):
         shared = with_effects_of(some, cal, state.rotations, used)
+        # Its images are less what effects are expected to do.
+        state, _ = shared.profile(cal.theta, shared.rotations)
     if shared is not None:
         columns, _ = shared.conditioned(state, np.concatenate([h, e[None]]))
         h, e = columns[:-1], columns[-1]

@@ -28,6 +28,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.estimation.zenith import Images, candidates, found_air, pulled
 from starcal_uq.likelihood.compressed import (
     Optimum,
     expanded,
@@ -35,10 +36,19 @@ from starcal_uq.likelihood.compressed import (
     optimum,
     unit_covariance,
 )
-from starcal_uq.likelihood.effects import Effect, EffectLikelihood, EffectSums, Solved, effects_of
+from starcal_uq.likelihood.effects import (
+    Effect,
+    EffectLikelihood,
+    EffectSums,
+    Solved,
+    effects_of,
+    pull_of,
+    zenith_effect,
+)
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import seconds_utc
+from starcal_uq.likelihood.zenith import Zeniths
 from starcal_uq.maths.linear import scaled_cholesky
 
 if TYPE_CHECKING:
@@ -55,20 +65,24 @@ _RANGE = (-7.0, 7.0)
 # Half width of the differences that give the curvature in the logs of the scales.
 _STEP = 0.1
 _STARS_AT_ONCE = 10_000
+# Rounds in which the noise beside air is found; moves of the zeniths beside other effects, and the
+# gain, nat, that one has to bring.
+_ROUNDS, _MOVES, _LEAST_GAIN = 3, 8, 0.02
 
 
 class _Restricted:
     """Restricted likelihood of the scales of effects, linearised at an estimate."""
 
-    def __init__(self, sums: EffectSums, p: int, dof: int) -> None:
-        self._sums, self.p, self.dof = sums, p, dof - p
-        self.names = tuple(effect.name for effect in sums.effects)
+    def __init__(self, sums: EffectSums, p: int, dof: int, sigma: float) -> None:
+        self.sums, self.p, self.dof = sums, p, dof - p
+        # Logs of scales that are known, px, in units of the noise that is found about there.
+        self.known = {e.name: -float(np.log(sigma)) for e in sums.effects if e.known}
 
     def at(self, logs: Mapping[str, float]) -> tuple[float, Solved, float]:
         """Minus the log likelihood where the logs of the scales in units of sigma are these, the
         normal equations, and the noise there.
         """
-        solved = self._sums.solved({name: float(np.exp(2.0 * v)) for name, v in logs.items()})
+        solved = self.sums.solved(_squares(logs))
         gram, p = solved.gram, self.p
         rest = float(gram[p, p] - gram[:p, p] @ np.linalg.solve(gram[:p, :p], gram[:p, p]))
         value = self.dof * np.log(rest) + np.linalg.slogdet(gram[:p, :p])[1]
@@ -86,6 +100,8 @@ class _Restricted:
         """Best log of one scale beside others as they are, and the cost there."""
         from scipy.optimize import minimize_scalar
 
+        if name in self.known:
+            return self.known[name], self.cost({**logs, name: self.known[name]})
         grid = np.linspace(*_RANGE, 8)
         costs = [self.cost({**logs, name: float(value)}) for value in grid]
         best = int(np.argmin(costs))
@@ -102,17 +118,33 @@ class _Restricted:
         """Best logs of all scales, from these."""
         from scipy.optimize import minimize
 
-        names = list(logs)
+        logs = {name: self.known.get(name, value) for name, value in logs.items()}
+        names = [name for name in logs if name not in self.known]
         if len(names) == 1:
-            return {names[0]: self.alone({}, names[0])[0]}
+            return logs | {names[0]: self.alone(_but(logs, names[0]), names[0])[0]}
+        if not names:
+            return logs
         found = minimize(
-            lambda x: self.cost(dict(zip(names, x.tolist(), strict=True))),
+            lambda x: self.cost(logs | dict(zip(names, x.tolist(), strict=True))),
             np.array([logs[name] for name in names]),
             method="L-BFGS-B",
             bounds=[_RANGE] * len(names),
             options={"eps": 1e-3, "ftol": 1e-9},
         )
-        return dict(zip(names, found.x.tolist(), strict=True))
+        return logs | dict(zip(names, found.x.tolist(), strict=True))
+
+
+def _but(logs: Mapping[str, float], name: str) -> dict[str, float]:
+    return {other: value for other, value in logs.items() if other != name}
+
+
+def _squares(logs: Mapping[str, float]) -> dict[str, float]:
+    """Squares of scales with these logs."""
+    return {name: float(np.exp(2.0 * value)) for name, value in logs.items()}
+
+
+def _of_run(effects: Sequence[Effect]) -> list[Effect]:
+    return [effect for effect in effects if effect.grouping == "run"]
 
 
 def penalty(candidates: int) -> float:
@@ -156,6 +188,11 @@ def _selected(
         if not gains or gains[0][0] < least or len(steps) == _MOST:
             return logs, steps, [(name, gain) for gain, name in gains]
         gain, name = gains[0]
+        if name == "frame" and "zenith" in tried:
+            # Air is there wherever a camera may stand on the ground: what it explains about as well
+            # is no breathing.
+            air = now - tried["zenith"][1]
+            gain, name = (air, "zenith") if air > max(least, gain - least) else (gain, name)
         before = _parameters(solved, restricted.p)
         logs = restricted.together({**logs, name: tried[name][0]})
         logs = {n: v for n, v in logs.items() if n == name or v > _RANGE[0] + 0.1}
@@ -174,18 +211,20 @@ class _Nodes:
     logs: list[dict[str, float]]
     log_weights: FloatArray  # (J,): of the rule, and the prior there
     log_posterior: FloatArray  # (J,): with the restricted likelihood
-    sd: FloatArray  # (d,): standard deviation of the log of every scale
+    sd: dict[str, float]  # Standard deviation of the log of every scale that is not known
 
 
 def _nodes(restricted: _Restricted, logs: Mapping[str, float], sigma: float) -> _Nodes:
     """A centre and points on a sphere in the principal axes, whose weights reproduce the moments of
     a Gaussian; each counts as the posterior is there.
     """
-    names = list(logs)
+    names = [name for name in logs if name not in restricted.known]
     d, centre = len(names), np.array([logs[name] for name in names])
+    if not names:
+        return _Nodes([dict(logs)], np.zeros(1), np.zeros(1), {})
 
     def named(x: FloatArray) -> dict[str, float]:
-        return dict(zip(names, x.tolist(), strict=True))
+        return dict(logs) | dict(zip(names, x.tolist(), strict=True))
 
     def prior(x: FloatArray) -> float:
         # Of the log of the scale.
@@ -202,9 +241,8 @@ def _nodes(restricted: _Restricted, logs: Mapping[str, float], sigma: float) -> 
     at = [np.clip(centre + spread @ point, *_RANGE) for point in points]
     weights = rule + np.array([prior(x) for x in at])
     costs = np.array([restricted.cost(named(x)) for x in at])
-    return _Nodes(
-        [named(x) for x in at], weights, weights - costs, np.sqrt(np.sum(spread**2, axis=1))
-    )
+    sd = dict(zip(names, np.sqrt(np.sum(spread**2, axis=1)).tolist(), strict=True))
+    return _Nodes([named(x) for x in at], weights, weights - costs, sd)
 
 
 def _spread(density: Callable[[FloatArray], float], centre: FloatArray) -> FloatArray:
@@ -243,21 +281,15 @@ def with_effects(obs: Observations, cal: Calibration, wanted: Sequence[str] = ()
     """
     began = perf_counter()
     likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
-    known = effects_of(obs, cal.camera)
+    rotations = quaternion_to_rotation(cal.quaternions)
+    model = _Linearised(obs, cal, likelihood, rotations)
+    zeniths = model.zeniths() if not wanted or "zenith" in wanted else None
+    known = effects_of(obs, cal.camera, zeniths=zeniths)
     names = tuple(wanted) or tuple(known)
     for name in names:
         if name not in known:
-            raise CalibrationError(
-                f"the effect {name!r} needs what does not vary in this table: use some of "
-                f"{', '.join(known)}."
-            )
-    rotations = quaternion_to_rotation(cal.quaternions)
-    sums, scale = EffectSums([known[name] for name in names], cal.theta, cal.sigma), cal.sigmas
-    for part, state, rows in likelihood.pieces(cal.theta, rotations, _STARS_AT_ONCE):
-        h = part.derivatives(cal.theta, state) * scale[:, None, None]
-        columns = part.project_out(state, np.concatenate([h, state.e[None]]))
-        sums.add(part, state, columns, rows)
-    restricted = _Restricted(sums, len(cal.theta), likelihood.dof)
+            raise CalibrationError(_impossible(name, known))
+    restricted = model.restricted([known[name] for name in names])
     refused: list[tuple[str, float]] = []
     if not wanted:
         logs, steps, refused = _selected(restricted, names)
@@ -270,6 +302,10 @@ def with_effects(obs: Observations, cal: Calibration, wanted: Sequence[str] = ()
             effects=Effects((), True, tuple(refused), least),
             provenance=cal.provenance.with_settings(effects=[]),
         )
+    if zeniths is not None and "zenith" in logs:
+        zeniths, restricted, logs = model.settled(zeniths, restricted, logs)
+        known = effects_of(obs, cal.camera, zeniths=zeniths)
+    scale = cal.sigmas
     _, solved, sigma = restricted.at(logs)
     nodes = _nodes(restricted, logs, sigma)
     ahead, unit = _parameters(solved, len(scale))
@@ -280,16 +316,21 @@ def with_effects(obs: Observations, cal: Calibration, wanted: Sequence[str] = ()
     covariance, weights = _mixed(found, grams, nodes)
     theta = theta - 0.5 * found.compressed.whitening @ found.compressed.log_determinant_slope
     effects = [known[name] for name in logs]
-    ratio = {name: float(np.exp(2.0 * value)) for name, value in logs.items()}
+    ratio = {
+        name: sigma**-2.0 if name in restricted.known else float(np.exp(2.0 * value))
+        for name, value in logs.items()
+    }
     exact = EffectLikelihood(
         likelihood.frames, likelihood.model_name, effects, ratio, theta, rotations, sigma
     )
     state, _ = exact.profile(theta, exact.rotations)
     rest, coefficients = exact.conditioned(state, state.e[None])
+    coefficients = replace(coefficients, run=coefficients.run + exact.mean[:, None])
     turned = exact.attitude_response(state, state.e[None]) - exact.turns(state, coefficients)
     fitted = []
-    for step, sd in zip(steps, nodes.sd, strict=True):
-        best = float(np.exp(logs[step.name]) * sigma)
+    for step in steps:
+        sd = nodes.sd.get(step.name, 0.0)
+        best = float(np.exp(logs[step.name]) * sigma) if sd else 1.0
         own = exact.shifts(state, exact.of_effect(step.name, coefficients))
         shift = likelihood.frames.in_pixels(own[0])
         worst = int(np.argmax(np.abs(step.moved)))
@@ -316,8 +357,11 @@ def with_effects(obs: Observations, cal: Calibration, wanted: Sequence[str] = ()
         node_log_weights=weights,
         temperature_c=_moments(obs.temperature_c),
         time_s=_range(obs),
-        places=tuple((e.name, len(e.prior)) for e in effects if e.grouping == "run"),
+        places=tuple((e.name, len(e.prior)) for e in _of_run(effects)),
     )
+    if zeniths is not None and "zenith" in logs:
+        air = found_air(effects_found, zeniths, state.rotations)
+        effects_found = replace(effects_found, zeniths=zeniths, air=air)
     stage = Stage(
         "effects",
         np.array([cal.theta, theta]),
@@ -344,6 +388,95 @@ def with_effects(obs: Observations, cal: Calibration, wanted: Sequence[str] = ()
         provenance=cal.provenance.with_settings(effects=list(logs)),
         effects=effects_found,
     )
+
+
+def _impossible(name: str, known: Mapping[str, Effect]) -> str:
+    """Why a table does not allow an effect, and which it allows."""
+    lacking = "needs what does not vary in this table"
+    if name == "zenith":
+        lacking = (
+            "needs directions in which refraction may be missing, and stars that were above one "
+            "horizon"
+        )
+    return f"the effect {name!r} {lacking}: use some of {', '.join(known)}."
+
+
+class _Linearised:
+    """A table around an estimate."""
+
+    def __init__(
+        self,
+        obs: Observations,
+        cal: Calibration,
+        likelihood: MarginalLikelihood,
+        rotations: FloatArray,
+    ) -> None:
+        self._obs, self._cal = obs, cal
+        self._likelihood, self._rotations = likelihood, rotations
+
+    def restricted(self, effects: Sequence[Effect], sigma: float | None = None) -> _Restricted:
+        """Restricted likelihood of the scales of effects; `sigma` is about the noise beside those
+        whose scale is known.
+        """
+        cal, likelihood = self._cal, self._likelihood
+        sums, scale = EffectSums(effects, cal.theta, cal.sigma), cal.sigmas
+        for part, state, rows in likelihood.pieces(cal.theta, self._rotations, _STARS_AT_ONCE):
+            h = part.derivatives(cal.theta, state) * scale[:, None, None]
+            columns = part.project_out(state, np.concatenate([h, state.e[None]]))
+            sums.add(part, state, columns, rows)
+        p, dof = len(cal.theta), likelihood.dof
+        found = _Restricted(sums, p, dof, cal.sigma if sigma is None else sigma)
+        for _ in range(0 if sigma or not found.known else _ROUNDS):
+            found = _Restricted(sums, p, dof, found.at(found.known)[2])
+        return found
+
+    def zeniths(self) -> Zeniths | None:
+        """The zeniths, of a place or of each frame, that have the greater restricted likelihood."""
+        found = candidates(self._obs, self._cal, self._rotations)
+        return min(found, key=self._alone, default=None)
+
+    def _alone(self, zeniths: Zeniths) -> float:
+        restricted = self.restricted([zenith_effect(self._obs, zeniths)])
+        return restricted.cost(restricted.known)
+
+    def settled(
+        self, zeniths: Zeniths, restricted: _Restricted, logs: dict[str, float]
+    ) -> tuple[Zeniths, _Restricted, dict[str, float]]:
+        """The zeniths that are the best beside the other effects, and all scales there."""
+        cost, _, sigma = restricted.at(logs)
+        for _ in range(_MOVES):
+            trial = self._moved(zeniths, restricted, logs)
+            now = trial[1].cost(trial[2])
+            if now > cost - _LEAST_GAIN:
+                break
+            (zeniths, restricted, logs), cost = trial, now
+        if not zeniths.apiece:
+            return zeniths, restricted, logs
+        images = Images(self._obs, self._cal, self._rotations)
+        for _ in range(_ROUNDS):
+            zeniths = pulled(images, zeniths, sigma)
+            restricted = self._beside(zeniths, logs, sigma)
+            zeniths, restricted, logs = self._moved(zeniths, restricted, logs)
+        return zeniths, restricted, logs
+
+    def _moved(
+        self, zeniths: Zeniths, restricted: _Restricted, logs: dict[str, float]
+    ) -> tuple[Zeniths, _Restricted, dict[str, float]]:
+        """The zeniths that the coefficients point to, and the scales there."""
+        _, solved, sigma = restricted.at(logs)
+        ahead, unit = _parameters(solved, restricted.p)
+        found = restricted.sums.coefficients(_squares(logs))
+        pull = sigma**2 * pull_of(_of_run(restricted.sums.effects))
+        ahead = ahead - unit @ (pull @ found[:, :-1])
+        own = found[:, -1] - found[:, :-1] @ ahead + solved.run_covariance @ pull
+        place = restricted.sums.places["zenith"]
+        zeniths = zeniths.moved(own[place], self._rotations[:, 2])
+        beside = self._beside(zeniths, logs, sigma)
+        return zeniths, beside, beside.together(logs)
+
+    def _beside(self, zeniths: Zeniths, logs: Mapping[str, float], sigma: float) -> _Restricted:
+        known = effects_of(self._obs, self._cal.camera, zeniths=zeniths)
+        return self.restricted([known[name] for name in logs], sigma)
 
 
 def without_effects(obs: Observations, cal: Calibration) -> Observations:
@@ -375,7 +508,7 @@ def _forced(restricted: _Restricted, names: Sequence[str]) -> tuple[dict[str, fl
     best, unit = _parameters(solved, restricted.p)
     steps = []
     for name in names:
-        without = restricted.at({other: value for other, value in logs.items() if other != name})
+        without = restricted.at(_but(logs, name))
         moved_by = best - _parameters(without[1], restricted.p)[0]
         steps.append(_Step(name, without[0] - cost, moved_by / (sigma * np.sqrt(np.diag(unit)))))
     return logs, steps
@@ -396,12 +529,9 @@ def _expanded(
     `start`: estimate (p,), covariance (p, p) and noise by the linearised likelihood.
     """
     theta, covariance, sigma = start
-    sums, whitening = EffectSums(effects, theta, sigma), scaled_cholesky(covariance)
+    sums, whitening = EffectSums(effects, theta, sigma, 0), scaled_cholesky(covariance)
     plain = expanded(likelihood, theta, whitening, likelihood.sums(theta), sums.add)
-    solved = [
-        sums.solved({name: float(np.exp(2.0 * value)) for name, value in logs.items()})
-        for logs in nodes.logs
-    ]
+    solved = [sums.solved(_squares(logs)) for logs in nodes.logs]
     made = [
         replace(replace(plain, gram=own.gram).likelihood(theta, whitening), dof=likelihood.dof)
         for own in solved
@@ -411,17 +541,16 @@ def _expanded(
     here, p = found.compressed, len(theta)
     grams = np.stack([moved(own, here.theta_hat, here.whitening).gram for own in made])
     # Coefficients follow the whitened parameters of the last expansion.
-    outer = sums.sums[1]
-    run = solved[0].coefficients(outer).run
-    z = made[0].whiten(theta)[0]
-    follow = run[:, 1 : p + 1]
-    root = solved[0].run_root
-    half = np.linalg.solve(solved[0].run_factor, np.diag(root))
-    by_theta = np.linalg.solve(whitening, covariance).T
+    run = sums.coefficients(_squares(nodes.logs[0]))
+    follow = np.linalg.solve(whitening.T, run[:, 1 : p + 1].T).T
+    own, pull = found.sigma**2 * solved[0].run_covariance, pull_of(_of_run(effects))
+    slope = here.log_determinant_slope - 2.0 * (pull @ follow) @ here.whitening
+    found = replace(found, compressed=replace(here, log_determinant_slope=slope))
+    moved_by = theta - start[0] + covariance @ (pull @ follow)
     joint = (
-        run[:, 0] + follow @ z,
-        found.sigma**2 * half.T @ half + follow @ np.linalg.solve(whitening, by_theta) @ follow.T,
-        by_theta @ follow.T,
+        run[:, 0] + follow @ moved_by + own @ pull,
+        own + follow @ covariance @ follow.T,
+        covariance @ follow.T,
     )
     determinants = np.array([own.log_determinant for own in solved])
     nodes.log_weights[:] = nodes.log_weights - 0.5 * (determinants - determinants[0])

@@ -18,7 +18,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.compressed import compress
-from starcal_uq.likelihood.effects import EffectLikelihood, effects_of
+from starcal_uq.likelihood.effects import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarLikelihood
 from starcal_uq.observations.frames import StarFrames
@@ -52,7 +52,7 @@ class ExactMarginal:
             self._one.use_rotations(self._one.rotations_at(theta))
             return
         if cal.effects and cal.effects.names and not isinstance(obs, StarFrames):
-            effects = cal.effects.of(effects_of(obs, cal.camera))
+            effects = cal.effects.of(obs, cal.camera)
             frames = StarFrames.from_observations(obs, axes=True)
             at = (theta, quaternion_to_rotation(cal.quaternions), cal.sigma)
             self._one = EffectLikelihood(frames, model, effects, cal.effects.ratio(cal.sigma), *at)

@@ -315,7 +315,9 @@ def _with_fallback(
     if evaluation == "auto" and (outcome is None or not compression.good):
         outcome = run.sample("exact", exact, _attempt(checkpoint, files))
     if outcome is None:
-        raise SamplingError("no polynomial stands for this likelihood: choose the evaluation 'exact'.")
+        raise SamplingError(
+            "no polynomial stands for this likelihood: choose the evaluation 'exact'."
+        )
     for path in files[:-1]:
         Path(path).unlink(missing_ok=True)
     return outcome, compression
@@ -417,8 +419,10 @@ def _effects(cal: Calibration, theta: FloatArray) -> Effects | None:
     effects = cal.effects
     if effects is None or not effects.names:
         return None
-    # The draws hold the scales already.
-    effects = replace(effects, node_grams=np.zeros((0, 0, 0)), node_log_weights=np.zeros(0))
+    # The draws hold the scales already, and no camera that flies needs the zeniths.
+    effects = replace(
+        effects, node_grams=np.zeros((0, 0, 0)), node_log_weights=np.zeros(0), zeniths=None
+    )
     if not len(effects.coefficients):
         return effects
     best = optimum(cal.compressed).covariance

@@ -2,7 +2,8 @@
 
     pixel = project(theta; R_k r_s) + sum_e C_e a_e + noise,    a_e ~ N(0, tau_e^2 Lambda_e)
 
-An effect belongs to the run, with one set of coefficients, to every frame, or to every star. In
+An effect belongs to the run, with one set of coefficients, to every frame, or to every star. The
+coefficients of one whose prior is known may have an expected value that is not zero. In
 units of the noise, with rho = (tau / sigma)^2 Lambda, the data have the covariance ``V = I + C rho
 C^T``. Products with V^-1, the attitudes projected out, need the coefficients' own normal equations
 alone, which are eliminated where they are small: frames one by one, then stars, then the run,
@@ -41,6 +42,7 @@ from starcal_uq.likelihood.shapes import (
 )
 from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.likelihood.terms import Eliminated, TermSums, add_by_group
+from starcal_uq.likelihood.zenith import Zeniths
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -66,14 +68,28 @@ class Effect:
     columns: Shape
     prior: FloatArray  # (c,): standard deviations of the coefficients for a scale of 1 px
     stars: StarModel | None = None  # Of an effect of the stars, whose scale is px at the boresight
+    # (c,): expected coefficients of an effect of the run whose prior is known, its scale being 1
+    mean: FloatArray | None = None
+    # (c,): slopes of the log prior there beyond its Gaussian
+    pull: FloatArray | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether its prior is known, so that its scale is one and nothing to estimate."""
+        return self.mean is not None
 
 
 def effects_of(
-    obs: Observations, camera: Camera, *, seen: Observations | None = None
+    obs: Observations,
+    camera: Camera,
+    *,
+    seen: Observations | None = None,
+    zeniths: Zeniths | None = None,
 ) -> dict[str, Effect]:
     """Every effect that a table allows, by name; its scale is px at the corner of the field.
 
-    `camera`: the estimate. `seen`: other frames that the same effects are wanted on.
+    `camera`: the estimate. `seen`: other frames that the same effects are wanted on. `zeniths`:
+    those of the frames, for the effect of air.
     """
     known = Covariates.of(obs, seen)
     corner = corner_unit(camera)
@@ -94,6 +110,8 @@ def effects_of(
     if nights is not None:
         found.append(_run("epoch", _moving("epoch", nights), np.tile(corner, len(nights))))
     found.append(fixed["phase"])
+    if zeniths is not None:
+        found.append(zenith_effect(obs if seen is None else seen, zeniths))
     if known.magnitude is not None:
         found.append(_run("magnitude", magnitude_shape(known.magnitude, camera)))
     if seen is None:
@@ -102,6 +120,18 @@ def effects_of(
             shape = Shape("directions of the stars", "star", 2, lambda view: view.uv[None][:0])
             found.append(Effect("star", "star", shape, np.ones(2), model))
     return {effect.name: effect for effect in found}
+
+
+def zenith_effect(obs: Observations, zeniths: Zeniths) -> Effect:
+    """Refraction below zeniths, and their errors."""
+    return Effect(
+        "zenith",
+        "run",
+        zeniths.shape(obs),
+        zeniths.prior,
+        mean=zeniths.mean,
+        pull=zeniths.pull if len(zeniths.pull) else None,
+    )
 
 
 def corner_unit(camera: Camera) -> FloatArray:
@@ -250,7 +280,11 @@ class Columns:
             columns = np.concatenate([nothing, *own])
             part.frames.whiten(columns)
             left = attitudes.removed_from(columns) if own else columns
-            return left, attitudes.coefficients(columns)
+            turns = attitudes.coefficients(columns)
+            if grouping == "run":
+                # Air bends light: it does not turn the camera.
+                turns *= _repeated([not effect.known for effect in effects], effects)[:, None, None]
+            return left, turns
 
         (run, run_turns), (frame, frame_turns) = removed("run"), removed("frame")
         star, groups, n_stars = nothing, np.zeros(part.frames.n_stars, dtype=np.int64), 0
@@ -301,11 +335,15 @@ class EffectSums:
 
     `effects`: of the run, of frames and of stars. `theta` (p,): parameters of their columns, px
     units. `sigma`: noise that what the catalogue states of the stars is relative to. Added columns
-    are q others, such as parameters and residuals.
+    are q others, such as parameters and residuals; the residuals are the one at `place`, from which
+    what effects are expected to do is taken off.
     """
 
-    def __init__(self, effects: Sequence[Effect], theta: FloatArray, sigma: float = 1.0) -> None:
+    def __init__(
+        self, effects: Sequence[Effect], theta: FloatArray, sigma: float = 1.0, place: int = -1
+    ) -> None:
         self.effects, self._theta = tuple(effects), np.asarray(theta, dtype=np.float64)
+        self._place = place
         self._parts: list[tuple[FloatArray, Cross, Cross]] = []
         self.stars, self._sigma = stars_of(effects), sigma
         self.of_stars = None if self.stars is None else TermSums(self.stars.term())
@@ -351,7 +389,33 @@ class EffectSums:
             while len(self._local) > 2:
                 self._local.pop(next(iter(self._local)))
             self._local[key] = self._eliminated(ratio)
-        return replace(self._local[key], run_root=np.sqrt(self.ratios(ratio, "run")))
+        run_root = np.sqrt(self.ratios(ratio, "run"))
+        found = replace(self._local[key], run_root=run_root)
+        mean = self.mean(ratio)
+        return found.less(mean, self._place) if mean.any() and found.outer.size else found
+
+    @property
+    def places(self) -> dict[str, slice]:
+        """Places of the coefficients of effects of the run."""
+        sizes = {e.name: len(e.prior) for e in self.effects if e.grouping == "run"}
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        return {n: slice(*at) for n, *at in zip(sizes, ends[:-1], ends[1:], strict=True)}
+
+    def mean(self, ratio: Mapping[str, float]) -> FloatArray:
+        """Expected coefficients (m,) of the run, zero of effects that are not there."""
+        return expected([e for e in self.effects if e.grouping == "run"], ratio)
+
+    def coefficients(self, ratio: Mapping[str, float]) -> FloatArray:
+        """Best coefficients (m, q) of the run for the added columns."""
+        mean = self.mean(ratio)
+        outer, inner = self.sums[1:]
+        outer = Cross(outer.run.copy(), outer.frame.copy(), outer.star.copy())
+        outer.run[:, self._place] -= inner.run[:, : len(mean)] @ mean
+        outer.frame[:, :, self._place] -= inner.frame[:, :, : len(mean)] @ mean
+        outer.star[:, self._place] -= inner.star[:, : len(mean)] @ mean
+        run = self.solved(ratio).coefficients(outer).run
+        run[:, self._place] += mean
+        return run
 
     def _eliminated(self, ratio: Mapping[str, float]) -> Solved:
         """Frames and stars eliminated; coefficients of the run are none."""
@@ -423,11 +487,29 @@ class Solved:
     local_log_determinant: float
     run_root: FloatArray  # (m,)
 
+    def less(self, mean: FloatArray, place: int) -> Solved:
+        """The same with the added column at `place` less the run's columns times `mean` (m,)."""
+        cross, outer = self.cross.copy(), self.outer.copy()
+        taken = mean @ self.cross
+        outer[place] -= taken
+        outer[:, place] -= taken
+        outer[place, place] += mean @ self.own @ mean
+        cross[:, place] -= self.own @ mean
+        return replace(self, cross=cross, outer=outer)
+
     @cached_property
     def run_factor(self) -> FloatArray:
         """Cholesky factor (m, m) of ``1 + rho N`` of the run."""
         root = self.run_root
         return np.asarray(np.linalg.cholesky(self.own * np.outer(root, root) + np.eye(len(root))))
+
+    @property
+    def run_covariance(self) -> FloatArray:
+        """Covariance (m, m) of the coefficients of the run, the added columns given, in units of
+        sigma squared.
+        """
+        half = np.linalg.solve(self.run_factor, np.diag(self.run_root))
+        return np.asarray(half.T @ half)
 
     @cached_property
     def gram(self) -> FloatArray:
@@ -463,7 +545,8 @@ class EffectLikelihood(MarginalLikelihood):
     """Exact likelihood with effects marginalised at given scales, in units of sigma.
 
     Coefficients are linear over fractions of a pixel, and their columns and normal equations are
-    those at the estimate.
+    those at the estimate. What they are expected to be, `mean` (m,) of those of the run, is taken
+    off the images in `frames`; all others here are differences from that.
 
     `frames`: data, with any weights and axes of the noise. `ratio`: square of every effect's scale
     in units of `sigma` squared. `theta` (p,): estimate, px units. `rotations` (K, 3, 3): attitudes
@@ -482,8 +565,15 @@ class EffectLikelihood(MarginalLikelihood):
     ) -> None:
         super().__init__(frames, model_name)
         state, _ = self.profile(theta, rotations)
-        self.use_rotations(state.rotations)
         self.effects = tuple(effect for effect in effects if effect.name in ratio)
+        run = [effect for effect in self.effects if effect.grouping == "run"]
+        self.mean, self.pull = expected(run, ratio), pull_of(run)
+        if self.mean.any():
+            seen = Columns.of(self.effects, self, state, theta, slice(None))
+            shift = frames.in_pixels(np.tensordot(self.mean, seen.run, 1))
+            self.frames = replace(frames, pixel=np.ascontiguousarray(frames.pixel - shift))
+            state, _ = self.profile(theta, state.rotations)
+        self.use_rotations(state.rotations)
         sums = EffectSums(self.effects, theta, sigma)
         nothing = np.zeros((0, 2, frames.n_stars))
         self.columns = sums.add(self, state, nothing, slice(None))
@@ -567,11 +657,38 @@ class EffectLikelihood(MarginalLikelihood):
         if not np.isfinite(cost):
             return -np.inf
         left = self.whitened(state, state.e[None])
+        run = left[0, state.e.size : state.e.size + len(self.mean)] * self.solved.run_root
         return float(
-            -0.5 * np.sum(left**2) / sigma**2
+            self.pull @ run
+            - 0.5 * np.sum(left**2) / sigma**2
             - self.dof * np.log(sigma)
             - 0.5 * np.sum(state.log_determinant)
         )
+
+
+def _repeated(values: Sequence[Any], effects: Sequence[Effect]) -> FloatArray:
+    """Values of the effects for each coefficient of those of the run, (m,)."""
+    own = [
+        np.full(len(e.prior), v)
+        for v, e in zip(values, effects, strict=True)
+        if e.grouping == "run"
+    ]
+    return np.concatenate([np.zeros(0), *own])
+
+
+def expected(effects: Sequence[Effect], present: Mapping[str, Any]) -> FloatArray:
+    """Expected coefficients (m,) of effects, zero of those that are not present."""
+    own = [
+        effect.mean if effect.mean is not None and effect.name in present else 0.0 * effect.prior
+        for effect in effects
+    ]
+    return np.concatenate([np.zeros(0), *own])
+
+
+def pull_of(effects: Sequence[Effect]) -> FloatArray:
+    """Slopes (m,) of the log prior of the coefficients of effects beyond its Gaussian."""
+    own = [0.0 * effect.prior if effect.pull is None else effect.pull for effect in effects]
+    return np.concatenate([np.zeros(0), *own])
 
 
 def _over(values: FloatArray, root: FloatArray) -> FloatArray:

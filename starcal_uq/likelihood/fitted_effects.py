@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.likelihood.compressed import CompressedLikelihood
-from starcal_uq.likelihood.effects import Effect
+from starcal_uq.likelihood.effects import Effect, effects_of
+from starcal_uq.likelihood.zenith import Zeniths
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.observations.table import Observations
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class FittedEffect:
         Name in the list of effects.
     scale_px, low_px, high_px : float
         Standard deviation of its coefficients, px at the corner of the field, and its 95 %
-        interval.
+        interval; 1 for `zenith`, whose coefficients have a known prior.
     size_px : float
         Root mean square per axis over the stars of the shifts that it explains, px; attitudes and
         parameters removed.
@@ -48,6 +51,41 @@ class FittedEffect:
     gain_nat: float
     moved_sigma: float
     moved_name: str
+
+
+@dataclass(frozen=True)
+class FoundAir:
+    """Air that was found, and where.
+
+    Attributes
+    ----------
+    kind : {"place", "moment", "frames"}
+        Whether all frames share a place on the Earth, a zenith among the stars (one moment, where
+        times are not known), or have a zenith each.
+    density, density_std : float
+        Density of the air in that of the standard air at sea level, and its standard error.
+    least_deg, most_deg : float
+        Smallest and largest distance of a boresight from its zenith.
+    zenith_std_deg : float
+        Standard error of the zenith along the less certain of its two directions; median over the
+        frames where each has its own.
+    latitude_deg, latitude_std_deg : float
+        Latitude of the place, north positive, and its standard error; NaN where frames have a
+        zenith each.
+    longitude_deg, longitude_std_deg : float
+        Longitude, east positive, and its standard error; NaN without times.
+    """
+
+    kind: Literal["place", "moment", "frames"]
+    density: float
+    density_std: float
+    least_deg: float
+    most_deg: float
+    zenith_std_deg: float
+    latitude_deg: float = np.nan
+    latitude_std_deg: float = np.nan
+    longitude_deg: float = np.nan
+    longitude_std_deg: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +115,8 @@ class Effects(Shown):
     temperature_c: tuple[float, float] = (np.nan, np.nan)
     time_s: tuple[float, float] = (np.nan, np.nan)
     places: tuple[tuple[str, int], ...] = ()  # Number of the run's coefficients of each effect
+    air: FoundAir | None = None  # Of the effect `zenith`
+    zeniths: Zeniths | None = None  # Around which its coefficients are
 
     SHAPES: ClassVar[Shapes] = {
         "coefficients": ("m",),
@@ -108,12 +148,14 @@ class Effects(Shown):
             first += size
         return slice(0, 0)
 
-    def of(self, effects: Mapping[str, Effect]) -> list[Effect]:
-        """Its effects among those that a table allows, in the order of the coefficients.
+    def of(self, obs: Observations, camera: Camera) -> list[Effect]:
+        """Its effects, in the order of the coefficients, as columns at the stars of the table; air
+        is left out where its zeniths are not known.
 
         LookupError for one that the table does not allow.
         """
-        return [effects[name] for name in self.names]
+        known = effects_of(obs, camera, zeniths=self.zeniths)
+        return [known[n] for n in self.names if n != "zenith" or self.zeniths is not None]
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per effect, those not taken up with their gain alone."""

@@ -10,6 +10,7 @@ from starcal_uq.core.facts import Facts
 from starcal_uq.core.types import AnyDict
 
 Directions = Literal["apparent", "catalogue", "undeclared"]
+Air = Literal["corrected", "none", "unknown"]
 T = TypeVar("T", bound="Sourced")
 
 SIMULATED = "simulated"
@@ -128,6 +129,18 @@ class Origin(Facts):
     def without_air(self) -> bool:
         """Whether the observer is one that sees through no air."""
         return self.observer in _NO_AIR
+
+    @property
+    def air(self) -> Air:
+        """Whether refraction is in the directions, is out of the question, or is not known.
+
+        Directions that the user declared as apparent are what the camera saw, with all there is to
+        it.
+        """
+        if self.observer == "ground":
+            return "corrected"
+        declared = self.apparent and self.observer != "unknown"
+        return "none" if self.without_air or self.simulated or declared else "unknown"
 
 
 @dataclass(frozen=True)

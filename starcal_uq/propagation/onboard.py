@@ -24,7 +24,6 @@ from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.maths.linear import scaled_inverse
-from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.geometry import FrameGeometry
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ class Aboard:
         if found is None:
             return []
         try:
-            effects = found.of(effects_of(self.calibrated, self.post.camera))
+            effects = found.of(self.calibrated, self.post.camera)
             if _WITH_COVARIATES & set(found.names) and not self._is_of_posterior:
                 raise LookupError("covariates of another table")
         except LookupError as error:
@@ -87,10 +86,12 @@ class Aboard:
     @cached_property
     def _run(self) -> dict[str, IntArray]:
         """Places of the coefficients of every effect of the run that a mission shares."""
-        sizes = {e.name: e.columns.size for e in self._effects if e.grouping == "run"}
+        sizes = {} if self.post.effects is None else dict(self.post.effects.places)
         ends = np.cumsum([0, *sizes.values()])
         places = zip(sizes, ends[:-1], ends[1:], strict=True)
-        return {name: np.arange(*ends) for name, *ends in places if name != NIGHT}
+        # A mission has its own nights, and is above the air.
+        own = (NIGHT, *_OF_AIR)
+        return {name: np.arange(*ends) for name, *ends in places if name not in own}
 
     @cached_property
     def _night(self) -> FloatArray:
@@ -151,12 +152,7 @@ class Aboard:
             return Turns(geometry.response, {})
         camera = self.post.camera
         here = effects_of(self.calibrated, camera, seen=frames)
-        in_air = str(frames.origin.frames or OBSERVED) == OBSERVED
-        frame = [
-            effect
-            for effect in self._effects
-            if effect.grouping == "frame" and (in_air or effect.name not in _OF_AIR)
-        ]
+        frame = [effect for effect in self._effects if effect.grouping == "frame"]
         shapes = [here[name].columns for name in self._run] + [e.columns for e in frame]
 
         def columns(view: View) -> FloatArray:

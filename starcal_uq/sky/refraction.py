@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from starcal_uq.attitude.earth import air_constants, earth_axes
 from starcal_uq.attitude.rotations import unit_vectors
-from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.sky.site import Site
 
@@ -42,32 +42,23 @@ def site_among_stars(
     """
     import erfa
 
-    tt, ut1, inverse = julian_days(time_utc, ut1_minus_utc_s)
-    to_earth = np.asarray(erfa.c2t06a(tt[:, 0], tt[:, 1], ut1[:, 0], ut1[:, 1], 0.0, 0.0)).reshape(
-        -1, 3, 3
-    )
+    axes = earth_axes(time_utc, ut1_minus_utc_s)
     latitude, longitude = np.radians(site.latitude_deg), np.radians(site.longitude_deg)
     up = unit_vectors(site.longitude_deg, site.latitude_deg)
     place_km = floats(erfa.gd2gc(_WGS84, longitude, latitude, site.height_m)) / 1000.0
     velocity = _EARTH_RATE_RAD_S * np.array([-place_km[1], place_km[0], 0.0])
     # Rows times the rotation are columns times its transpose: from the axes of the Earth to those
     # of the stars.
-    zenith, moving = (up @ to_earth)[inverse], (velocity @ to_earth)[inverse]
-    return (zenith[0], moving[0]) if np.ndim(time_utc) == 0 else (zenith, moving)
+    return up @ axes, velocity @ axes
 
 
 def refraction_constants(site: Site) -> tuple[float, float]:
-    """A and B of the refraction R = A tan z + B tan^3 z, with z the zenith distance as seen; rad.
-
-    From `erfa.refco` (8 mas RMS, 62 mas at worst against ray tracing down to 15 degrees of
-    altitude).
+    """A and B of the refraction R = A tan z + B tan^3 z at a site, with z the zenith distance as
+    seen; rad (`air_constants`).
     """
-    import erfa
-
-    a, b = erfa.refco(
+    return air_constants(
         site.air_pressure_hpa, site.air_temperature_c, site.relative_humidity, site.wavelength_um
     )
-    return float(a), float(b)
 
 
 def refract(

@@ -11,7 +11,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.findings import Finding
 from starcal_uq.diagnostics.residuals import bin_residuals
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
-from starcal_uq.diagnostics.verdict.observed import PATTERN_P, air
+from starcal_uq.diagnostics.verdict.observed import PATTERN_P
 from starcal_uq.propagation.attitude_error import choice
 
 if TYPE_CHECKING:
@@ -58,7 +58,8 @@ def _systematic(obs: Observations, cal: Calibration) -> Finding | None:
         return Finding(Limit.PATTERN, {"pattern_arcsec": arcsec})
     if not obs.origin.apparent:
         return Finding(Limit.DIRECTIONS)
-    return Finding(Limit.AIR) if air(obs) == "unknown" else None
+    estimated = cal.effects is not None and cal.effects.air is not None
+    return Finding(Limit.AIR) if obs.origin.air == "unknown" and not estimated else None
 
 
 def _structure(cal: Calibration, diagnosis: Diagnosis) -> Finding | None:

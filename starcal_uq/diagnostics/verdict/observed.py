@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -74,7 +74,8 @@ def directions(
     rests on.
     """
     declared, code = obs.origin.directions, Code.CATALOGUE_DIRECTIONS
-    seen = air(obs)
+    seen = obs.origin.air
+    estimated = _estimated(cal)
     wrong = [] if times is None else [_of_times(obs, times)]
     if found is not None and found.is_air:
         orders = (Order(Advice.GIVE_THE_DIRECTIONS),) if seen == "none" else ()
@@ -89,7 +90,7 @@ def directions(
             remedies=next(filter(None, remedies), ()),
             orders=sum(orders_of_each, ()),
         )
-    if declared == "apparent" and seen == "unknown":
+    if declared == "apparent" and seen == "unknown" and estimated is None:
         first = (Finding(Note.WITHOUT_REFRACTION), rests, *_unsure(cal, found))
         parts = (*filter(None, first), Order(Advice.STATE_THE_SITE))
         facts = {"declared": declared, "parts": parts}
@@ -97,13 +98,15 @@ def directions(
     if declared == "apparent":
         site = Site.from_dict(obs.origin.site or {}) if seen == "corrected" else None
         held = {"in_space": obs.origin.observer == "space", "site": site}
-        parts = tuple(filter(None, (Finding(Note.APPARENT_DIRECTIONS, held), rests)))
+        parts = tuple(filter(None, (Finding(Note.APPARENT_DIRECTIONS, held), estimated, rests)))
         return Check(code, {"declared": declared, "parts": parts})
     stated = {"declared": obs.directions_declared, "timed": obs.time_utc is not None}
     parts = (Finding(Note.DIRECTIONS_WITHOUT_ABERRATION, stated), _of_aberration(cal))
     time = _time_of(obs) if obs.origin.from_images else {}
     remedies = _again(obs, **(time or {"directions": "apparent"}))
-    if seen == "unknown":
+    if estimated is not None:
+        parts = (*parts, estimated)
+    elif seen == "unknown":
         parts = (*parts, *_unsure(cal, found), Order(Advice.STATE_THE_SITE))
         remedies += _about_air(obs)
     return Check(code, {"declared": declared, "parts": parts}, Level.WARN, remedies=remedies)
@@ -134,7 +137,7 @@ def _of_air(obs: Observations, found: AirTest) -> Finding:
             "place": Site(found.latitude_deg, found.longitude_deg) if known else None,
             "place_std_deg": (found.latitude_std_deg, found.longitude_std_deg),
             "from_images": obs.origin.from_images,
-            "air": air(obs),
+            "air": obs.origin.air,
         },
     )
 
@@ -426,22 +429,25 @@ def _noise_px(obs: Observations, cal: Calibration) -> float:
     return cal.sigma * stated
 
 
-Air: TypeAlias = Literal["corrected", "none", "unknown"]
 _HIGH_DEG, _MIDDLE_DEG = 90.0, 45.0
 # What pressure and temperature of a place may differ from the standard atmosphere: 1.5 % and 4 %.
 _WEATHER = 0.04
 
 
-def air(obs: Observations | PartitionedObservations) -> Air:
-    """Whether refraction is in the directions, is out of the question, or is not known.
+def _estimated(cal: Calibration) -> Finding | None:
+    """The air that the calibration has estimated, and where; None where it has not."""
+    found = None if cal.effects is None else cal.effects.air
+    return None if found is None else Finding(Note.REFRACTION_ESTIMATED, {"found": found})
 
-    Directions that the user declared as apparent are what the camera saw, with all there is to it.
+
+def refraction(obs: Observations | PartitionedObservations, cal: Calibration) -> Finding | None:
+    """What refraction does to f: as it is in the directions, as it was estimated, or what f is
+    conditional on; None where there is none.
     """
-    origin = obs.origin
-    if origin.observer == "ground":
-        return "corrected"
-    declared = origin.apparent and origin.observer != "unknown"
-    return "none" if origin.without_air or origin.simulated or declared else "unknown"
+    if obs.origin.air == "corrected":
+        return corrected(obs, cal)
+    unknown = obs.origin.air == "unknown"
+    return _estimated(cal) or (conditional(cal) if unknown else None)
 
 
 def conditional(cal: Calibration) -> Finding:
@@ -459,7 +465,7 @@ def conditional(cal: Calibration) -> Finding:
     )
 
 
-def corrected(obs: Observations, cal: Calibration) -> Finding:
+def corrected(obs: Observations | PartitionedObservations, cal: Calibration) -> Finding:
     """Which air was taken at which site, and what it does to f."""
     site, atmosphere = Site.from_dict(obs.origin.site or {}), obs.origin.atmosphere or {}
     size = float(atmosphere["shrinking"]) * cal.camera.focal_px

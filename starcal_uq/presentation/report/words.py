@@ -11,7 +11,7 @@ from starcal_uq.core.formatting import count, fixed, percent, plural, significan
 from starcal_uq.core.status import Code
 from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
-from starcal_uq.diagnostics.verdict.observed import air, conditional, corrected
+from starcal_uq.diagnostics.verdict.observed import refraction
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.words.estimation import calibration_table, noise_kind
 from starcal_uq.presentation.words.inference import posterior_table
@@ -94,9 +94,9 @@ def data_sentence(results: Results) -> str:
 
 def _directions(obs: Observations) -> str:
     declared = obs.origin.directions
-    if declared == "apparent" and air(obs) == "corrected":
+    if declared == "apparent" and obs.origin.air == "corrected":
         return "apparent directions (aberration and refraction included)"
-    if declared == "apparent" and air(obs) == "unknown":
+    if declared == "apparent" and obs.origin.air == "unknown":
         return "directions that include aberration but no refraction"
     return _DIRECTIONS[declared]
 
@@ -104,9 +104,8 @@ def _directions(obs: Observations) -> str:
 def _air_words(results: Results) -> str:
     """What refraction does to f, where the stars were or may have been seen through air."""
     obs, cal = results.observations, results.calibration
-    if air(obs) == "corrected":
-        return f" {corrected(obs, cal).sentence}"
-    return f" {conditional(cal).sentence}" if air(obs) == "unknown" else ""
+    found = refraction(obs, cal)
+    return "" if found is None else f" {found.sentence}"
 
 
 def _noise_words(results: Results) -> str:

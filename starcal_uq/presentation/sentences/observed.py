@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from starcal_uq.attitude.earth import DENSITY_SPREAD
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.findings import Finding
-from starcal_uq.core.formatting import fixed, percent, plural, significant
+from starcal_uq.core.formatting import fixed, percent, plural, plus_minus, significant
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Code, Note
 from starcal_uq.core.times import TIMES_IN_NAMES
-from starcal_uq.diagnostics.verdict.observed import Air, aberration_size
+from starcal_uq.diagnostics.verdict.observed import aberration_size
+from starcal_uq.likelihood.fitted_effects import FoundAir
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.presentation.sentences.estimate import effect_sentence
 from starcal_uq.presentation.sentences.table import SENTENCES, Told, entry
@@ -97,7 +99,7 @@ def _air(
     place: Site | None,
     place_std_deg: tuple[float, float],
     from_images: bool,
-    air: Air,
+    air: str,
 ) -> str:
     first = (
         "The residuals hold refraction that the directions do not: f is too short by "
@@ -123,6 +125,28 @@ def _conditional(zenith_px: float, middle_px: float, f_sigma_px: float) -> str:
     return (
         "The focal length f is conditional on refraction: if the stars were seen through air, f "
         f"is too short by {high} at the zenith and by {middle} at 45° of altitude."
+    )
+
+
+@entry(Note.REFRACTION_ESTIMATED)
+def air_words(found: FoundAir) -> str:
+    """The air that was found, where, and what was assumed."""
+    distances = f"{fixed(found.least_deg, 0)}° to {fixed(found.most_deg, 0)}°"
+    if found.kind == "frames":
+        where = (
+            f"the frames look {distances} away from zeniths of their own, which are known to "
+            f"{significant(found.zenith_std_deg)}°"
+        )
+    else:
+        latitude = plus_minus(found.latitude_deg, found.latitude_std_deg)
+        where = f"the frames look {distances} away from the zenith of latitude {latitude}°"
+    if found.kind == "place":
+        where += f" and longitude {plus_minus(found.longitude_deg, found.longitude_std_deg)}°"
+    moment = "that all frames are of one moment, and " if found.kind == "moment" else ""
+    return (
+        f"Refraction is estimated: {where}, through air of "
+        f"{plus_minus(found.density, found.density_std)} times the standard density at sea level. "
+        f"Assumed is {moment}air of 1 ± {DENSITY_SPREAD} times that density before any data."
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, significant
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
+from starcal_uq.presentation.sentences.observed import air_words
 from starcal_uq.presentation.tables import TextTable
 
 # What every effect is, in one sentence.
@@ -11,6 +12,7 @@ MEANINGS = {
     "axes": "The pixels are longer along one axis than along the other, or the axes are skewed.",
     "field": "The lens shifts images smoothly over the field, as no polynomial of the radius does.",
     "frame": "Every frame has a scale and two shears of its own: breathing, refraction, seeing.",
+    "zenith": "Air raises stars towards a zenith that is estimated.",
     "temperature": "Focal length and principal point change with the temperature.",
     "time": "Focal length and principal point change smoothly over the run.",
     "epoch": "Every night has a focal length and a principal point of its own.",
@@ -34,10 +36,12 @@ def effects_table(effects: Effects) -> TextTable | None:
 
 def _row(effect: FittedEffect) -> tuple[str, ...]:
     decimals = decimals_for(effect.low_px)
+    interval = f"{fixed(effect.low_px, decimals)} – {fixed(effect.high_px, decimals)}"
+    known = effect.low_px == effect.high_px
     return (
         effect.name,
-        fixed(effect.scale_px, decimals),
-        f"{fixed(effect.low_px, decimals)} – {fixed(effect.high_px, decimals)}",
+        "known" if known else fixed(effect.scale_px, decimals),
+        "" if known else interval,
         significant(effect.size_px),
         fixed(effect.gain_nat, 1),
         f"{effect.moved_name} by {significant(effect.moved_sigma)} sigma",
@@ -47,8 +51,9 @@ def _row(effect: FittedEffect) -> tuple[str, ...]:
 def effects_text(effects: Effects) -> str:
     """Which effects the calibration holds, and which were not taken up, with their gains."""
     held = join_words(effects.names)
+    seen = "" if effects.air is None else f" {air_words(effects.air)}"
     if not effects.selected:
-        return f"Effects that were asked for: {held}; none were chosen by the data."
+        return f"Effects that were asked for: {held}; none were chosen by the data.{seen}"
     least = f"an effect has to gain {fixed(effects.penalty_nat, 1)} nat"
     gains = ", ".join(f"{name} {fixed(gain, 1)}" for name, gain in effects.refused)
     first = (
@@ -56,4 +61,5 @@ def effects_text(effects: Effects) -> str:
         if held
         else "The data ask for no effect beyond the camera."
     )
+    first += seen
     return f"{first} Not taken up ({least}): {gains}." if gains else first
