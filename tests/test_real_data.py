@@ -84,3 +84,25 @@ def test_posterior_of_few_frames_agrees_with_its_independent_check(camera, table
     assert post.diagnostics.ok, post.diagnostics.failures
     assert np.all(np.abs(post.mean - cal.theta) / cal.sigmas < 0.3)
     assert np.allclose(np.sqrt(np.diag(post.covariance)), cal.sigmas, rtol=0.1)
+
+
+def test_refraction_is_found_without_site_and_times(camera, table):
+    obs = sc.load_observations(table, camera)
+    cal = sc.calibrate(obs, camera, effects="auto")
+    assert "zenith" in cal.effects.names
+    air = cal.effects.air
+    assert air.kind == "moment"
+    # A refraction fit with the altitudes in the names of the images gives a latitude of 52 degrees.
+    assert abs(air.latitude_deg - 52.0) < 3.0 * air.latitude_std_deg
+    assert air.latitude_std_deg < 3.0
+    # The images' names state altitudes of 40 and 60 degrees.
+    assert 25.0 < air.least_deg < 35.0
+    assert 45.0 < air.most_deg < 55.0
+    with_site = sc.load_observations(
+        table, camera, columns={"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
+    ).with_meta(directions="apparent")
+    f = sc.calibrate(with_site, camera, effects="auto").theta[2]
+    assert abs(cal.theta[2] - f) < 3.0 * cal.sigmas[2]
+    # Control: what knows no air is further away.
+    plain = sc.calibrate(obs, camera)
+    assert f - plain.theta[2] > 5.0 * plain.sigmas[2]

@@ -204,6 +204,23 @@ def zeniths_of_frames(
     return np.einsum("ik,kij->kj", np.array(up), c.attitudes)
 
 
+def one_night(
+    rng: np.random.Generator,
+    n_frames: int,
+    zenith: np.ndarray,
+    high_deg: tuple[float, float] = (20.0, 60.0),
+) -> np.ndarray:
+    """Attitudes (n_frames, 3, 3) that look at some distances from one zenith, for the `path` of a
+    campaign.
+    """
+    level = np.linalg.svd(zenith[None])[2][1:]
+    distance = np.radians(rng.uniform(*high_deg, n_frames))
+    angle = rng.uniform(0.0, 2.0 * np.pi, n_frames)
+    across = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ level
+    looks = np.cos(distance)[:, None] * zenith + np.sin(distance)[:, None] * across
+    return np.array([frame_at(rng, boresight) for boresight in looks])
+
+
 def through_air(c: Campaign, zeniths: np.ndarray, arcsec: float = 58.0) -> Campaign:
     """The same images with directions that lack `arcsec` tan z of refraction towards zeniths (K,
     3).
