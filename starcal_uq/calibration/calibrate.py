@@ -247,6 +247,9 @@ def _of_table(
     again = fit_composed(without_effects(obs, found), calibration.nominal, settings)
     if not again.status.ok:
         return found
+    # It is still an estimate from the table as it is.
+    made_of = calibration.provenance.data_sha256
+    again = replace(again, provenance=again.provenance.adding(data_sha256=made_of))
     return _with_terms(obs, without_effects(obs, found), again, composed)
 
 

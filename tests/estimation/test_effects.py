@@ -40,6 +40,20 @@ def test_clean_data_take_up_nothing_and_change_nothing() -> None:
     np.testing.assert_array_equal(cal.covariance, plain.covariance)
 
 
+def test_effects_beside_a_noise_model_are_those_of_the_table_as_it_is() -> None:
+    rng = np.random.default_rng(15)
+    c = campaign(
+        rng,
+        n_frames=12,
+        stars_per_frame=25,
+        sigma_px=lambda radius, mag, frame: 0.03 + 0.09 * radius**2,
+        displaced=breathing(rng, 12, 0.3),
+    )
+    obs = table(c)
+    cal = sc.calibrate(obs, sheet(c), effects="frame", noise="model")
+    assert cal.provenance.data_sha256 == sc.calibrate(obs, sheet(c)).provenance.data_sha256
+
+
 @pytest.mark.parametrize(
     ("effects", "match"),
     [("fields", "effect 'fields'"), ("temperature", "'temperature' needs")],
