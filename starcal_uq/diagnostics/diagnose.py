@@ -24,7 +24,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, Progress
 from starcal_uq.diagnostics.air import AirTest, air_test
-from starcal_uq.diagnostics.beside import has_effects
+from starcal_uq.diagnostics.beside import has_effects, without_effects
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
@@ -291,8 +291,11 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
         (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
     )
     obs = by_noise_model(obs, cal)
-    if reached is not None and cal.tail_factors is not None:
-        # Tails have another cost than the sum of squares that their weights leave.
+    weighs = cal.tail_factors is not None or (has_effects(cal) and cal.noise_model is not None)
+    if reached is not None and weighs:
+        # Tails have another cost than the sum of squares that their weights leave; and beside
+        # effects, tails and noise are those of images that are freed of these.
+        obs = without_effects(obs, cal)
         reference, lowest = _optimum(obs, cal, cal.nominal)
     some, sigmas = _few(obs), cal.sigmas
     if some is not obs:

@@ -105,7 +105,9 @@ def directions(
     time = _time_of(obs) if obs.origin.from_images else {}
     remedies = _again(obs, **(time or {"directions": "apparent"}))
     if estimated is not None:
-        parts = (*parts, estimated)
+        # Apparent directions would hold the air as well.
+        parts, wanted = (*parts, estimated), {} if time else {"directions": "catalogue"}
+        remedies = _again(obs, **wanted, **_time_of(obs))
     elif seen == "unknown":
         parts = (*parts, *_unsure(cal, found), Order(Advice.STATE_THE_SITE))
         remedies += _about_air(obs)
