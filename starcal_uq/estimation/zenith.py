@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
-# Places of the grid; frames that get a zenith each, and fewest stars that tell one.
-_PLACES, _APIECE, _FEWEST = 500, 80, 4
+# Places of the grid; frames that get a zenith each, and fewest stars that tell one. What noise does
+# to the density of the air by way of each frame's zenith is known to first order: of more frames,
+# what is left of it would exceed the errors.
+_PLACES, _APIECE, _FEWEST = 500, 12, 4
 _STEPS, _SETTLED = 30, 0.05
 # Half width of differences, rad.
 _STEP_RAD = 0.02
