@@ -26,7 +26,7 @@ from starcal_uq.core.types import AnyDict, FloatArray, Progress
 from starcal_uq.diagnostics.air import AirTest, air_test
 from starcal_uq.diagnostics.beside import has_effects, without_effects
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
-from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
+from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
@@ -37,6 +37,7 @@ from starcal_uq.diagnostics.times import (
     time_test,
     unseen_aberration,
 )
+from starcal_uq.estimation.effects import with_effects
 from starcal_uq.estimation.fit import fit
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.weights import by_noise_model, weighed
@@ -128,6 +129,9 @@ class Diagnosis(Shown, Saved):
     aberration : UnseenAberration or None
         What aberration that is left out or applied twice would do to f unseen; None where it would
         be seen, or in a diagnosis of an earlier version.
+    effects : tuple of str
+        Effects that the data would take up: of a calibration without any in whose residuals the
+        tests find structure.
     """
 
     misfit: Misfit
@@ -142,6 +146,7 @@ class Diagnosis(Shown, Saved):
     cameras: MixedCameras | None = None
     times: TimeTest | None = None
     aberration: UnseenAberration | None = None
+    effects: tuple[str, ...] = ()
 
     FILE = "a diagnosis", Remedy("diagnose", (RUN,), {"force": True}, "to write it again")
 
@@ -164,6 +169,7 @@ class Apart:
     cameras: MixedCameras | None
     times: TimeTest | None
     aberration: UnseenAberration | None
+    effects: tuple[str, ...]
 
 
 @one_thread()
@@ -181,15 +187,29 @@ def diagnose_apart(
     sample.
     """
     stars, rest = star_test(obs, cal), remainder(obs, cal, seed)
+    misfit = misfit_tests(obs, whole or cal)
     return Apart(
-        misfit=misfit_tests(obs, whole or cal),
+        misfit=misfit,
         starts=multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None,
         stars=stars,
         air=air_test(obs, cal, seed=seed, stars=stars),
         cameras=MixedCameras.of(obs, cal.camera),
         times=time_test(obs, cal, seed=seed, rest=rest),
         aberration=unseen_aberration(obs, cal, seed=seed, rest=rest),
+        effects=_effects_that_help(obs, whole or cal, misfit),
     )
+
+
+def _effects_that_help(obs: Observations, cal: Calibration, misfit: Misfit) -> tuple[str, ...]:
+    """Effects that the data would take up, where tests find structure beside none."""
+    allowed = cal.method == "efficient" and cal.partitions is None and cal.star_errors is None
+    if cal.effects is not None or not allowed or not misfit.found(ALPHA):
+        return ()
+    try:
+        found = with_effects(obs, cal).effects
+    except StarcalError:
+        return ()
+    return () if found is None else found.names
 
 
 @bounded
@@ -259,6 +279,7 @@ def diagnose(
         cameras=rest.cameras,
         times=rest.times,
         aberration=rest.aberration,
+        effects=rest.effects,
     )
 
 

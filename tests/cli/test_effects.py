@@ -81,3 +81,26 @@ def test_a_wrong_name_is_one_sentence(cli, breathed, given, sentence) -> None:
 
 def test_every_effect_has_a_meaning_in_words() -> None:
     assert set(MEANINGS) == set(get_args(EffectName))
+
+
+def test_the_remedy_that_a_misfit_prints_first_leads_to_a_usable_answer(cli, tmp_path) -> None:
+    rng = np.random.default_rng(3)
+    c = campaign(rng, n_frames=30, displaced=breathing(rng, 30, 0.5))
+    obs = table(c)
+    obs.select(np.abs(obs.xy - 511.5).max(axis=1) < 511.0).save(tmp_path / "obs.csv")
+    sheet(c).save(tmp_path / "camera.toml")
+    small = ("--ensembles", "2", "--walkers", "16", "--steps", "100", "--draws", "50")
+    words = ("run", "obs.csv", "camera.toml", "-o", "run", "--in-space", *small)
+    status, _, _ = cli(*words)
+    run = sc.Run("run")
+    assert status == 1 and run.diagnosis.effects == ("frame",)
+    verdict = json.loads(Path("run/verdict.json").read_text("utf-8"))
+    structure = next(c for c in verdict["checks"] if c["name"] == "Unexplained structure")
+    assert "would take up the effect frame." in structure["sentence"]
+    command = verdict["commands"][0]
+    assert "--effects auto" in command
+    status, _, err = cli(*command.split()[1:])
+    verdict = json.loads(Path("run/verdict.json").read_text("utf-8"))
+    assert status == 0 and verdict["level"] != "fail", (err, verdict["headline"])
+    assert "with this effect: frame" in verdict["headline"]
+    assert command not in verdict["commands"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,6 +32,7 @@ from starcal_uq.diagnostics.verdict.effect import (
     on_directions,
 )
 from starcal_uq.diagnostics.verdict.observed import (
+    EFFECTS,
     NOISE,
     PLAUSIBLE_NOISE_PX,
     ROBUST,
@@ -69,6 +71,8 @@ _REMEDIES = {
     Status.STALLED: calibrated(solver="minpack"),
 }
 _INFLATE = calibrated(accept_inflation=True)
+# Effects that frames which disagree ask for.
+_OF_FRAMES_APART = {"frame", "zenith", "temperature", "time", "epoch"}
 
 
 def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
@@ -183,13 +187,16 @@ def model_checks(
     """
     inflated = cal.inflation is not None
     better = None if diagnosis.comparison is None else diagnosis.comparison.better
+    moving = EFFECTS if _OF_FRAMES_APART & set(diagnosis.effects) else ()
     checks = [
-        misfit(diagnosis.misfit, cal, attitude, better),
+        misfit(diagnosis.misfit, cal, attitude, better, diagnosis.effects),
         even_noise(diagnosis.misfit, inflated),
     ]
     checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
     checks += (
-        [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife, inflated, post)]
+        []
+        if diagnosis.jackknife is None
+        else [jackknife(diagnosis.jackknife, inflated, post, moving)]
     )
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
     checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison, attitude)]
@@ -213,9 +220,10 @@ def misfit(
     cal: Calibration,
     attitude: AttitudeError | None = None,
     better: str | None = None,
+    effects: Sequence[str] = (),
 ) -> Check:
     """Is there structure in the residuals, and does it do more than is stated? `better` as for
-    `lens_remedy`.
+    `lens_remedy`; `effects` are those that the data would take up.
     """
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
     facts: AnyDict = {"p_value": min(patterns, default=1.0), "n_tests": len(found.tests)}
@@ -233,6 +241,9 @@ def misfit(
     orders: tuple[Order, ...] = (Order(_NOT_OF_THE_LENS.get(rejected[0].against, _OF_FRAMES)),)
     if any(t.against in IN_FIELD for t in rejected):
         remedies, orders = lens_remedy(cal.camera.distortion, better)
+    if effects:
+        facts["effects"] = tuple(effects)
+        remedies, orders = EFFECTS + remedies, ()
     return Check(code, facts, level, bounds, remedies, orders)
 
 
@@ -278,14 +289,19 @@ def disagreeing(found: Jackknife) -> BoolArray:
     )
 
 
-def jackknife(found: Jackknife, inflated: bool = False, post: Posterior | None = None) -> Check:
-    """Do frames scatter as their formal errors say?"""
+def jackknife(
+    found: Jackknife,
+    inflated: bool = False,
+    post: Posterior | None = None,
+    moving: Remedies = (),
+) -> Check:
+    """Do frames scatter as their formal errors say? `moving`: what takes up how they differ."""
     worst, bad = int(np.argmax(found.ratio)), disagreeing(found)
     chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(bad))[1]
     remedies: Remedies = ()
     formal = inflated and post is not None and post.inflation is None
     if np.any(bad) and not inflated:
-        remedies = _INFLATE
+        remedies = moving + _INFLATE
     elif np.any(bad) and formal and post is not None:
         remedies = _resample(post)
     return Check(

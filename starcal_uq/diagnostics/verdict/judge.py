@@ -148,7 +148,9 @@ def judge(
     rests = observed.rests_on_aberration(used, unseen)
     checks += [observed.directions(used, cal, *asked, rests)]
     checks += [
-        observed.residual_pattern(used, cal, better),
+        observed.residual_pattern(
+            used, cal, better, () if diagnosis is None else diagnosis.effects
+        ),
         observed.outliers(used, cal),
         observed.screening(obs),
     ]
@@ -169,7 +171,8 @@ def judge(
         check if place is None else place.exact(check) for check in checks if check is not None
     )
     to_try, end = _way_on(found, place)
-    return Verdict(found, _summary(found, post is not None, rests), to_try, end)
+    held = () if cal.effects is None else cal.effects.names
+    return Verdict(found, _summary(found, post is not None, rests, held), to_try, end)
 
 
 def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[Remedies, Finding | None]:
@@ -214,9 +217,11 @@ def _whole_numbers(remedy: Remedy) -> list[int]:
     return [int(value) for value in values if value.isdigit()]
 
 
-def _summary(checks: tuple[Check, ...], sampled: bool, rests: Finding | None) -> Finding:
-    """What becomes of the requirements, whether the numbers can be used, and what f then rests
-    on.
+def _summary(
+    checks: tuple[Check, ...], sampled: bool, rests: Finding | None, effects: tuple[str, ...]
+) -> Finding:
+    """What becomes of the requirements, whether the numbers can be used, with which effects, and
+    what f then rests on.
     """
     required = [check for check in checks if check.question is Question.REQUIRED]
     others = [check for check in checks if check not in required]
@@ -229,6 +234,7 @@ def _summary(checks: tuple[Check, ...], sampled: bool, rests: Finding | None) ->
         "doubts": _phrases(doubts),
         "causes": tuple((cause, len(some)) for cause, some in by_cause(doubts).items()),
         "sampled": sampled,
+        "effects": effects,
         "rests": None if worst(checks) is Level.FAIL else rests,
     }
     return Finding(Note.HEADLINE, facts)

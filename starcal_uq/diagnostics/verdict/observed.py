@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -61,6 +62,9 @@ SCREEN = calibrated(screening=True)
 _RICHEST = "brown_tangential"
 ROBUST = calibrated("command", likelihood="student_t")
 NOISE = calibrated(noise="model")
+EFFECTS = calibrated(effects="auto")
+# Effects that bend directions where they keep their place in the field.
+_OF_THE_FIELD = {"axes", "field"}
 
 
 def directions(
@@ -233,8 +237,15 @@ def aberration_size(camera: Camera) -> dict[str, float]:
     }
 
 
-def residual_pattern(obs: Observations, cal: Calibration, better: str | None = None) -> Check:
-    """Do mean residuals over the field show more than noise? `better` as for `lens_remedy`."""
+def residual_pattern(
+    obs: Observations,
+    cal: Calibration,
+    better: str | None = None,
+    effects: Sequence[str] = (),
+) -> Check:
+    """Do mean residuals over the field show more than noise? `better` as for `lens_remedy`;
+    `effects` are those that the data would take up.
+    """
     binned = bin_residuals(cal, obs)
     pattern = binned.pattern_px
     facts: AnyDict = {
@@ -249,6 +260,8 @@ def residual_pattern(obs: Observations, cal: Calibration, better: str | None = N
     seen = 2.0 * float(binned.counts.sum()) * (pattern / _noise_px(obs, cal)) ** 2
     effect = on_directions(seen, len(cal.theta))
     remedies, orders = lens_remedy(cal.camera.distortion, better)
+    if _OF_THE_FIELD & set(effects):
+        remedies, orders = EFFECTS + remedies, ()
     return Check(code, facts | effect.facts, effect.level, bounds, remedies, orders)
 
 

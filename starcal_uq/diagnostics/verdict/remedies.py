@@ -57,7 +57,7 @@ _CAUSES = {
 _CALIBRATING = ("calibrate", "run")
 _OF_OPTIONS = {
     INPUT: {"site", "in_space", "directions", "time", "frames", "screening"},
-    LENS: {"model"},
+    LENS: {"model", "effects"},
     NOISE: {"noise", "likelihood", "star_errors", "accept_inflation"},
 }
 # Options that a new one makes meaningless: a place on the ground and one in space, directions made

@@ -126,6 +126,7 @@ def _misfit(
     effect_sigma: float = 0.0,
     moved: str = "",
     error_times: float = 1.0,
+    effects: Sequence[str] = (),
 ) -> Told:
     value = f"{p_words(p_value)}, corrected for {plural(n_tests, 'test')}"
     bound = f"p ≥ {p_least:g}"
@@ -149,6 +150,9 @@ def _misfit(
             f" These data hardly tell {tests[0][0]} from {moved}: with both fitted, the error of "
             f"{moved} would be {significant(error_times)} times as large."
         )
+    if effects:
+        called = "effect" if len(effects) == 1 else "effects"
+        sentence += f" The data would take up the {called} {join_words(list(effects))}."
     return value, bound, sentence
 
 

@@ -36,8 +36,10 @@ def _headline(
     causes: Sequence[tuple[str, int]],
     sampled: bool,
     rests: Finding | None,
+    effects: Sequence[str] = (),
 ) -> str:
     named = doubts
+    held = f" with {'this effect' if len(effects) == 1 else 'these effects'}: {join_words(effects)}"
     if len(doubts) > _NAMED:
         named = [f"{plural(number, 'check')} of {cause}" for cause, number in causes]
     sentences = [f"Violated: {join_words(violated)}."] if violated else []
@@ -48,10 +50,14 @@ def _headline(
         sentences.append(
             f"Converged; usable once {these} resolved or accepted: {join_words(named)}."
         )
+        sentences += [f"The numbers are to be used{held}."] if effects else []
     elif not sampled:
         sentences.append(
-            "The estimate converged and passed every check; the posterior has not been sampled yet."
+            f"The estimate converged{held if effects else ''} and passed every check; the posterior "
+            "has not been sampled yet."
         )
+    elif effects:
+        sentences.append(f"Converged, and every check passed: usable{held}.")
     else:
         sentences.append("Converged, and every check passed: the stated uncertainties can be used.")
     sentences += [rests.sentence] if rests is not None else []
