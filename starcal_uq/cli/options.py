@@ -151,10 +151,12 @@ def parse_dof(text: str | None) -> float | Literal["free"] | None:
     return student.parse_dof(value, typer.BadParameter)
 
 
-def check_effects(text: str) -> None:
+def check_effects(text: str | None) -> None:
     """Refuse what is neither ``auto`` nor ``none`` nor names of effects with commas."""
     from starcal_uq.likelihood.composed import EffectTerms
 
+    if text is None:
+        return
     if not _is_name(text):
         raise typer.BadParameter(f"{shown(text)} is no list of effects, such as field,frame.")
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +36,7 @@ from starcal_uq.cli.settings import (
     typed_words,
 )
 from starcal_uq.cli.steps import load_table, sample_run
+from starcal_uq.core.conflicts import conflict
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import OnboardModel
@@ -134,7 +136,12 @@ def run_command(
         "alignment_frames": alignment_frames,
         "onboard": onboard,
     }
-    refuse_conflicts(settings_of(estimation, sky, sampling, partitioned=folder, **aligning))
+    asked = settings_of(estimation, sky, sampling, partitioned=folder, **aligning)
+    refuse_conflicts(asked)
+    if estimation.effects is None:
+        selecting = replace(estimation, effects="auto")
+        asked = settings_of(selecting, sky, sampling, partitioned=folder, **aligning)
+        estimation = selecting if conflict(asked) is None else estimation
     settings = {
         "estimation": estimation,
         "sky": sky,

@@ -41,7 +41,7 @@ class EstimationSettings:
 
     star_errors: bool = False
     noise: settings.NoiseKind = "common"
-    effects: str = "none"
+    effects: str | None = None
     start: str | None = None
     pixel_um: float | None = None
     max_iterations: int | None = None

@@ -35,10 +35,16 @@ def test_there_are_thirty_misfits():
 
 
 @pytest.mark.parametrize("name", QUICK)
-def test_what_is_printed_is_followed_to_its_end(name, call, tmp_path):
+def test_effects_take_up_what_was_planted(name, call, tmp_path):
     steps = follow(call, plant(name, tmp_path), tmp_path)
+    assert len(steps) == 1 and steps[0].doubts[0] == 0
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_what_is_printed_without_effects_is_followed_to_its_end(name, call, tmp_path):
+    steps = follow(call, (*plant(name, tmp_path), "--effects", "none"), tmp_path)
     if name == "decentring, 0.5 px":
-        assert [step.options.get("--model") for step in steps] == [None, ("brown_tangential",)]
+        assert [step.options["--effects"] for step in steps] == [("none",), ("auto",)]
         assert steps[0].doubts[0] > 0 and steps[-1].doubts[0] == 0
     else:
         # Where the times are not known no command can be copied, and no other is printed before
