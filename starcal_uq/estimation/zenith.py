@@ -82,9 +82,11 @@ def candidates(obs: Observations, cal: Calibration, rotations: FloatArray) -> li
     """Zeniths of one place and of each frame, as far as the table allows them.
 
     `rotations` (K, 3, 3): attitudes. None where refraction is in the directions, or cannot be; none
-    of one place where from none all stars were above the horizon.
+    of one place where from none all stars were above the horizon. That directions are apparent is
+    what a user states, and the frames may show otherwise.
     """
-    if obs.origin.air != "unknown" or obs.n_frames == 0:
+    origin = obs.origin
+    if origin.air == "corrected" or origin.without_air or origin.simulated or obs.n_frames == 0:
         return []
     images = Images(obs, cal, rotations)
     axes, timed = frame_axes(obs)

@@ -103,7 +103,12 @@ def directions(
         site = Site.from_dict(obs.origin.site or {}) if seen == "corrected" else None
         held = {"in_space": obs.origin.observer == "space", "site": site}
         parts = tuple(filter(None, (Finding(Note.APPARENT_DIRECTIONS, held), estimated, rests)))
-        return Check(code, {"declared": declared, "parts": parts})
+        facts = {"declared": declared, "parts": parts}
+        if estimated is not None and seen == "none":
+            # The frames contradict what was declared.
+            orders = (Order(Advice.GIVE_THE_DIRECTIONS),)
+            return Check(code, facts, Level.WARN, remedies=_with_site(obs, found), orders=orders)
+        return Check(code, facts)
     stated = {"declared": obs.directions_declared, "timed": obs.time_utc is not None}
     parts = (Finding(Note.DIRECTIONS_WITHOUT_ABERRATION, stated), _of_aberration(cal))
     time = _time_of(obs) if obs.origin.from_images else {}
