@@ -103,4 +103,7 @@ def test_the_remedy_that_a_misfit_prints_first_leads_to_a_usable_answer(cli, tmp
     verdict = json.loads(Path("run/verdict.json").read_text("utf-8"))
     assert status == 0 and verdict["level"] != "fail", (err, verdict["headline"])
     assert "with this effect: frame" in verdict["headline"]
+    report = Path("run/report.html").read_text("utf-8")
+    section = report.partition('id="effects"')[2].partition('id="misfit"')[0]
+    assert "Every frame has a scale and two shears" in section and "not taken up" in section
     assert command not in verdict["commands"]

@@ -22,11 +22,23 @@ from starcal_uq.presentation.words.diagnostics import (
     sensitivity,
     star_table,
 )
+from starcal_uq.presentation.words.effects import MEANINGS, effects_table, effects_text
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
+
+
+def effects_context(cal: Calibration) -> AnyDict:
+    """What the section on effects shows; empty where none were looked for."""
+    if cal.effects is None:
+        return {}
+    return {
+        "effects_table": effects_table(cal.effects, path=True),
+        "effects_sentence": effects_text(cal.effects),
+        "effects_meanings": [(name, MEANINGS[name]) for name in cal.effects.names],
+    }
 
 
 def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> AnyDict:

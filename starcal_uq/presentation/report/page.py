@@ -131,6 +131,7 @@ def context(results: Results) -> AnyDict:
         ),
         "methods_rows": tables.methods_rows(results),
         "derived_table": None if post is None else model_tables.derived_table(post),
+        **model_tables.effects_context(cal),
         **model_tables.diagnosis_context(results.diagnosis, cal),
         **tables.image_context(results.images, cal),
         **budget_tables.budget_context(results.budget),

@@ -22,13 +22,17 @@ MEANINGS = {
 }
 
 
-def effects_table(effects: Effects) -> TextTable | None:
+def effects_table(effects: Effects, *, path: bool = False) -> TextTable | None:
     """One row per effect of the calibration, in the order in which they were taken up; None without
-    any.
+    any. With `path` those that were not taken up follow, with what they would gain.
     """
     if not effects.fitted:
         return None
     rows = tuple(map(_row, effects.fitted))
+    if path:
+        rows += tuple(
+            (name, "", "", "", fixed(gain, 1), "not taken up") for name, gain in effects.refused
+        )
     heads = ("effect", "scale", "95 % interval", "shift rms", "gain [nat]", "moved most")
     title = "Effects beyond the camera [px; scale: 1 sigma at the corner]"
     return TextTable(heads, rows, title, "lrrrrl")
