@@ -331,7 +331,6 @@ JOBS = (
                 for name in ("minpack", "ipopt")
             ),
             "calibrate plain.csv camera.toml -o tangential --model brown_tangential --directions apparent",
-            "calibrate stars.ecsv camera.toml -o inflated --accept-inflation",
             "calibrate stars.ecsv camera.toml -o run --screen --start x0_px=500",
             f"sample run --likelihood pairs --seed {{seed}} {SAMPLER}",
             f"sample run --likelihood pairs_naive --seed {{seed}} {SAMPLER} --force",

@@ -45,7 +45,6 @@ class EstimationSettings:
     start: str | None = None
     pixel_um: float | None = None
     max_iterations: int | None = None
-    accept_inflation: bool = False
     duplicates: settings.Duplicates = "refuse"
     scheduler: str | None = None
     workers: int | None = None

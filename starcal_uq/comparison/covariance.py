@@ -182,10 +182,7 @@ def is_efficient(result: Any) -> bool:
     """True for estimates by the attitude-marginalised Gaussian likelihood, where frames scatter as
     it says.
     """
-    if (
-        getattr(result, "inflation", None) is not None
-        or getattr(result, "coma_factors", None) is not None
-    ):
+    if result.provenance.inflation is not None or getattr(result, "coma_factors", None) is not None:
         return False
     diagnostics = getattr(result, "diagnostics", None)
     if diagnostics is not None:

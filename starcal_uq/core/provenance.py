@@ -115,7 +115,7 @@ class Provenance(dict[str, Any]):
 
     @property
     def inflation(self) -> AnyDict | None:
-        """Factors on sigmas, by parameter, of an accepted inflation."""
+        """Factors on sigmas, by parameter, that an earlier version widened a result by."""
         found: AnyDict | None = self.get("inflation", self.settings.get("inflation"))
         return found
 

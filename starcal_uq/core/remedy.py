@@ -21,9 +21,6 @@ _CALLS = {"calibrate": "sc.calibrate(obs, camera", "sample": "sc.sample(obs, cal
 # Arguments whose call is that of another function.
 _OTHER_CALLS = {
     "screening": "sc.calibration.screen(obs, camera)",
-    "accept_inflation": (
-        "sc.diagnostics.accept_inflation(cal, sc.diagnostics.jackknife_frames(obs, cal))"
-    ),
 }
 
 

@@ -3,7 +3,6 @@ from .air import air_test as air_test
 from .diagnose import Diagnosis as Diagnosis
 from .inflation import with_misfit as with_misfit
 from .jackknife import Jackknife as Jackknife
-from .jackknife import accept_inflation as accept_inflation
 from .jackknife import jackknife_frames as jackknife_frames
 from .misfit import Misfit as Misfit
 from .misfit import misfit_tests as misfit_tests

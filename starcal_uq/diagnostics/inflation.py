@@ -39,7 +39,7 @@ def with_misfit(
       which the larger counts. What is left of a move that exceeds the standard deviation within the
       fitted model is the choice of the model: stated beside the error.
     - Frames that disagree more than their formal errors allow multiply common rotation and rest by
-      the jackknife ratio, over what of it the draws hold already.
+      the jackknife ratio.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def with_misfit(
         # Of an earlier version, which had other shapes.
         return error
     models = _Models.of(error, diagnosis)
-    factor, frames = _frames(diagnosis, post)
+    factor, frames = _frames(diagnosis)
     phase = [name for name in diagnosis.misfit.pattern.families if "pixel phase" in name]
     notes: tuple[str, ...] = ()
     if phase:
@@ -164,7 +164,7 @@ class _Models:
         return (f"distortion model {names} predicts better than the fitted one, and moves it",)
 
 
-def _frames(diagnosis: Diagnosis, post: Posterior) -> tuple[float, tuple[str, ...]]:
+def _frames(diagnosis: Diagnosis) -> tuple[float, tuple[str, ...]]:
     """Factor by which frames disagree more than their formal errors allow."""
     found = diagnosis.jackknife
     if found is None:
@@ -172,8 +172,7 @@ def _frames(diagnosis: Diagnosis, post: Posterior) -> tuple[float, tuple[str, ..
     flagged = disagreeing(found)
     if not flagged.any():
         return 1.0, ()
-    held = 1.0 if post.inflation is None else post.inflation[flagged]
-    factor = float(np.max(found.ratio[flagged] / held))
+    factor = float(np.max(found.ratio[flagged]))
     if factor <= 1.0 + _ROUNDING:
         return 1.0, ()
     return factor, (

@@ -8,7 +8,7 @@ the leverage corrected (CR2 of Bell & McCaffrey 2002) it is unbiased for any num
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -150,17 +150,8 @@ class Jackknife(Shown):
         missed = np.sqrt(2.0 / self.dof * gammaincinv(0.5 * self.dof, 1.0 - power))
         return floats(found / missed)
 
-    @property
-    def factors(self) -> FloatArray:
-        """Factors (p,) by which the formal standard deviations grow if the inflation is accepted;
-        at least 1.
-        """
-        return np.maximum(self.ratio, 1.0)
-
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per parameter: formal, jackknife and cluster-robust sigma, their ratios, the
-        factor.
-        """
+        """One row per parameter: formal, jackknife and cluster-robust sigma, and their ratios."""
         import pandas as pd
 
         low, high = self.expected()
@@ -175,7 +166,6 @@ class Jackknife(Shown):
                 "expected_low": low,
                 "expected_high": high,
                 "p_value": self.p_values,
-                "factor": self.factors,
             }
         )
 
@@ -240,38 +230,4 @@ def _jackknife(found: FrameScatter, cal: Calibration, left_out: FloatArray) -> J
         n_frames=found.n_frames,
         residual_dof=found.dof - len(found.theta),
         tail_dof=tail_dof,
-    )
-
-
-def accept_inflation(cal: Calibration, jackknife: Jackknife) -> Calibration:
-    """The calibration with the inflated covariance; provenance says so, and draws made from it are
-    as wide.
-
-    Raises
-    ------
-    CalibrationError
-        When the jackknife is of another model, or the calibration is inflated already.
-    """
-    if cal.inflation is not None:
-        raise CalibrationError(
-            "the calibration's sigmas are inflated already: give the one that was estimated."
-        )
-    if jackknife.parameter_names != cal.parameter_names:
-        raise CalibrationError(
-            f"the jackknife is of the parameters {', '.join(jackknife.parameter_names)}, the "
-            "calibration of "
-            f"{', '.join(cal.parameter_names)}: make both from the same run."
-        )
-    factors = dict(zip(jackknife.parameter_names, jackknife.factors.tolist(), strict=True))
-    covariance = cal.covariance * np.outer(jackknife.factors, jackknife.factors)
-    # A sigma that frames were asked for has only their degrees of freedom.
-    dof = {
-        name: d
-        for name, d in zip(factors, jackknife.dof.tolist(), strict=True)
-        if factors[name] > 1.0
-    }
-    return replace(
-        cal,
-        covariance=covariance,
-        provenance=cal.provenance.with_settings(inflation=factors).adding(interval_dof=dof),
     )

@@ -362,13 +362,6 @@ class Calibration(Shown, Traced):
         return model if model is not None and model.varies else None
 
     @property
-    def inflation(self) -> FloatArray | None:
-        """Factors (p,) that `covariance` was accepted to be wider by, per sigma; None for that of
-        the likelihood.
-        """
-        return in_order(self.provenance.inflation, self.parameter_names)
-
-    @property
     def coma_factors(self) -> FloatArray | None:
         """Factors (p,) on the sigmas of the likelihood that leave out the coma of a distortion that
         may be none.
@@ -393,9 +386,10 @@ class Calibration(Shown, Traced):
 
     @property
     def width_factors(self) -> FloatArray:
-        """Factors (p,) on the sigmas of the likelihood that `covariance` holds, but for inflation."""
+        """Factors (p,) on the sigmas of the likelihood that `covariance` holds."""
         widths = np.ones(len(self.theta))
-        for factors in (self.coma_factors, self.tail_factors):
+        accepted = in_order(self.provenance.inflation, self.parameter_names)
+        for factors in (self.coma_factors, self.tail_factors, accepted):
             if factors is not None:
                 widths = widths * factors
         return widths

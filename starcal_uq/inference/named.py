@@ -62,10 +62,6 @@ class Source:
     checks: tuple[Check, ...] = ()  # Checks that need no draws
     # What `fast` leaves out, told by some of the frames; None where `exact` itself is compared.
     sample: FrameSample | None = None
-    scatters: bool = False  # True where the scatter of the frames is in the likelihood already
-    inflation: FloatArray | None = (
-        None  # (p,): factors on sigma that it holds, of a calibration that has accepted some
-    )
 
 
 def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bool) -> None:
@@ -120,13 +116,8 @@ def find_source(
         at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
         return Source(label_of(likelihood), *at, exact=likelihood.log_likelihood, fast=None)
     source = _named_source(likelihood, obs, cal, dof)
-    widths = cal.width_factors
-    if cal.inflation is not None or np.any(widths != 1.0):
-        accepted = cal.inflation
-        if accepted is not None and source.scatters:
-            accepted = np.ones_like(cal.theta)
-        wider = _inflated(source, widths if accepted is None else widths * accepted)
-        source = replace(wider, inflation=accepted)
+    if np.any(cal.width_factors != 1.0):
+        source = _widened(source, cal.width_factors)
     if (ignored := cal.provenance.settings.get("ignored_distortion")) is None:
         return source
     check = Check(
@@ -138,7 +129,7 @@ def find_source(
     return replace(source, checks=(check,))
 
 
-def _inflated(source: Source, factors: FloatArray) -> Source:
+def _widened(source: Source, factors: FloatArray) -> Source:
     """The likelihood that is wider by `factors` (p,) on each sigma, its maximum and correlations
     the same.
 
@@ -284,7 +275,6 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
         exact=expanded.exact_log_likelihood,
         fast=expanded.log_likelihood,
         about=about,
-        scatters=adjusted and expanded.variability == "empirical",
     )
 
 

@@ -19,7 +19,7 @@ from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import check_hdf5, ensure_new, reading, write_netcdf
-from starcal_uq.core.provenance import Provenance, Traced, in_order
+from starcal_uq.core.provenance import Provenance, Traced
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy, read_remedies
 from starcal_uq.core.settings import bounded
@@ -335,13 +335,6 @@ class Posterior(Shown, Traced):
     def sd(self) -> FloatArray:
         """Posterior standard deviations (p+1,), the noise last."""
         return np.asarray(self.draws.std(axis=0, ddof=1))
-
-    @property
-    def inflation(self) -> FloatArray | None:
-        """Factors (p,) of an accepted inflation that the draws hold; None where there is none, or
-        they do not.
-        """
-        return in_order(self.provenance.inflation, self.camera_names)
 
     @property
     def sampled(self) -> tuple[int, ...]:

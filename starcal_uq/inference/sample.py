@@ -96,8 +96,7 @@ def sample(
         partitioned ones, the sample of frames that the calibration has kept checks it, its error
         counted for all frames.
     cal : Calibration
-        Start, Fisher information and compressed likelihood. An inflation that it has accepted
-        widens the likelihood as much, priors and the given object of a likelihood are as they are.
+        Start, Fisher information and compressed likelihood.
     priors : Priors, optional
         ``Priors.default`` of the nominal camera otherwise.
     sigma : "sampled" or float
@@ -182,9 +181,8 @@ def sample(
         record = record.adding(partitions=cal.provenance.partitions)
     if cal.noise_model is not None:
         record = record.adding(noise_model=cal.noise_model.record(frames=False))
-    if source.inflation is not None:
-        factors = dict(zip(cal.parameter_names, source.inflation.tolist(), strict=True))
-        record = record.adding(inflation=factors)
+    if cal.provenance.inflation is not None:
+        record = record.adding(inflation=cal.provenance.inflation)
     given = None if sigma == "sampled" else float(sigma)
     run = _Run(cal, source, priors, settings, n_ensembles, seed, given, progress, record)
     if isinstance(likelihood, str):

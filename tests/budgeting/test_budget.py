@@ -128,7 +128,6 @@ POST = SimpleNamespace(
     mean=np.array([500.0, 530.0, 5850.0, 2e-10, -3.5e-15]),
     provenance=Provenance(data_sha256="0123456789abcdef"),
     camera=SimpleNamespace(distortion="brown"),
-    inflation=None,
 )
 OBS = SimpleNamespace(x_px=np.array([100.0, 900.0]), y_px=np.array([530.0, 530.0]))
 
@@ -398,12 +397,6 @@ def test_frames_that_disagree_multiply_both_calibration_rows() -> None:
     assert not rows[NEA, "pitch"].inflated
     chance = SimpleNamespace(ratio=np.array([1.0, 1.5]), p_values=np.array([0.5, 0.1]))
     assert not any(row.inflated for row in made(misfit=diagnosis(jackknife=chance)).rows)
-    # What draws hold of an accepted inflation is not counted again.
-    for held, factor in ((1.5, 1.0), (1.2, 1.25)):
-        post: Any = SimpleNamespace(**{**vars(POST), "inflation": np.array([1.0, held])})
-        assert with_misfit(
-            attitude(), diagnosis(jackknife=flagged), post, OBS
-        ).misfit.factor == pytest.approx(factor)
 
 
 def test_reasons_that_differ_in_numbers_alone_are_told_once() -> None:

@@ -32,7 +32,6 @@ VALUES = {
     "--effects": ("auto", "none", "field,frame", "star"),
     "--start": ("x0_px=500",),
     "--max-iterations": ("500",),
-    "--accept-inflation": (None,),
     "--duplicates": ("drop", "keep"),
     "--scheduler": ("tcp://127.0.0.1:9",),
     "--workers": ("0",),

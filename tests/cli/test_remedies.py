@@ -225,13 +225,13 @@ EXAMPLES = {
         for found in (whole, dataclasses.replace(whole, uneven=None))
     ],
     "diagnostics.verdict.estimate.jackknife": lambda s: [
-        estimate.jackknife(found, inflated, s.post)
+        estimate.jackknife(found, moving)
         for found in [
             dataclasses.replace(
                 s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance
             )
         ]
-        for inflated in (False, True)
+        for moving in ((), observed.EFFECTS)
     ],
     "diagnostics.verdict.estimate.stars": lambda s: [
         estimate.stars(sc.diagnostics.star_test(s.patch, sc.calibrate(s.patch, s.sheet)))
@@ -568,9 +568,9 @@ def test_every_argument_in_a_sentence_can_be_given(small):
         eval(call.format(clause), names)
 
 
-def test_start_limit_and_inflation_are_those_of_the_calibration(small, cli, tmp_path):
+def test_start_and_limit_are_those_of_the_calibration(small, cli, tmp_path):
     call = ("calibrate", small.folder / "OBS.csv", small.folder / "CAMERA.toml", "-o")
-    assert cli(*call, "run", "--start", "focal_mm=71,x0_px=500", "--accept-inflation")[0] == 0
+    assert cli(*call, "run", "--start", "focal_mm=71,x0_px=500")[0] == 0
     cal = sc.Run(tmp_path / "run").calibration
     assert (cal.nominal.focal_mm, cal.nominal.x0_px, cal.nominal.y0_px) == (
         71.0,
@@ -578,9 +578,7 @@ def test_start_limit_and_inflation_are_those_of_the_calibration(small, cli, tmp_
         small.camera.y0_px,
     )
     assert cal.theta == pytest.approx(small.cal.theta, rel=1e-4)
-    factors = cal.provenance["settings"]["inflation"]
-    assert max(factors.values()) > 1.0
-    assert cal.sigmas == pytest.approx(small.cal.sigmas * list(factors.values()), rel=1e-3)
+    assert cal.sigmas == pytest.approx(small.cal.sigmas, rel=1e-3)
     for wrong, words in (
         (
             ("--max-iterations", 1),

@@ -17,10 +17,11 @@ import starcal_uq as sc
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.diagnose import Diagnosis, diagnose, diagnose_apart, multi_start
-from starcal_uq.diagnostics.jackknife import Jackknife, accept_inflation, jackknife_frames
+from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
 from starcal_uq.diagnostics.models import ModelComparison, closed_form, compare_models
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
-from starcal_uq.diagnostics.verdict.judge import judge
+from starcal_uq.diagnostics.verdict import estimate
+from starcal_uq.diagnostics.verdict.observed import EFFECTS
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.runs.folder import DIAGNOSIS_TABLES
@@ -150,84 +151,15 @@ def test_frame_scatter_is_nominal_with_few_uneven_frames(k):
     assert np.mean([uncorrected_alarm(f) for f in found]) > (0.03 if k < 20 else 0.015)
 
 
-@pytest.mark.slow
-def test_accepted_inflation_covers_what_formal_errors_do_not():
-    """Truth within the interval: formal errors fail for frames with errors of their own, inflated
-    ones do not.
-    """
-    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    formal, inflated = [], []
-    for i in range(60):
-        one = sc.simulate(stars, camera(), n_frames=40, min_stars=10, sigma_px=0.05, seed=900 + i)
-        bad = clustered(one, i)
-        cal = sc.calibrate(bad, sc.paper.paper_start())
-        accepted = accept_inflation(cal, jackknife_frames(bad, cal))
-        error = np.abs(cal.theta - camera().theta)
-        formal.append((error < 1.96 * cal.sigmas)[2])
-        inflated.append((error < 0.5 * np.diff(accepted.interval())[:, 0])[2])
-    assert np.mean(formal) < 0.85
-    assert np.mean(inflated) > 0.86
-    assert np.mean(inflated) > np.mean(formal)
-
-
-def test_accepting_inflation_is_on_record_and_never_shrinks(obs, cal):
-    found = jackknife_frames(obs, cal)
-    accepted = accept_inflation(cal, found)
-    assert np.all(accepted.sigmas >= cal.sigmas * (1.0 - 1e-12))
-    assert accepted.correlation == pytest.approx(cal.correlation)
-    assert set(accepted.provenance["settings"]["inflation"]) == set(cal.parameter_names)
-    # An inflated sigma is known as well as frames know it, and its interval is as much longer.
-    grown = found.factors > 1.0
-    half, sigmas = 0.5 * np.diff(accepted.interval())[:, 0], accepted.sigmas
-    assert half[grown] == pytest.approx(stats.t.ppf(0.975, found.dof[grown]) * sigmas[grown])
-    assert half[~grown] == pytest.approx(stats.t.ppf(0.975, cal.dof) * sigmas[~grown])
-    assert np.all(np.linalg.eigvalsh(accepted.covariance / np.outer(cal.sigmas, cal.sigmas)) > 0.0)
-    other = sc.calibrate(obs, nominal(camera("k1")))
-    with pytest.raises(sc.errors.CalibrationError, match="same run"):
-        accept_inflation(other, found)
+def test_frames_that_disagree_are_warned_of_and_need_three(obs, cal):
+    checks = [estimate.jackknife(jackknife_frames(o, cal)) for o in (obs, clustered(obs))]
+    assert [check.level for check in checks] == [Level.PASS, Level.WARN]
+    assert "--only-frames" in checks[1].advice and "too small by a factor" in checks[1].sentence
+    effects = estimate.jackknife(jackknife_frames(clustered(obs), cal), EFFECTS)
+    assert "--effects auto" in effects.remedy
     with pytest.raises(sc.errors.CalibrationError, match="three or more"):
         two = obs.select_frames(obs.frame_ids[:2])
         jackknife_frames(two, sc.calibrate(two, sc.paper.paper_start()))
-
-
-def test_every_step_of_a_run_has_the_inflation_that_was_accepted(obs, tmp_path):
-    """Common rotation and verdict of draws with an accepted inflation; those of formal errors are
-    the control.
-    """
-    bad, common, checks = clustered(obs), {}, {}
-    for name, accept in (("formal", False), ("accepted", True)):
-        run = sc.Run(tmp_path / name)
-        cal = run.calibrate(bad, sc.paper.paper_start(), accept_inflation=accept)
-        post = run.sample(seed=1, n_ensembles=2, n_steps=100)
-        run.diagnose(n_starts=0)
-        run.propagate(seed=1)
-        held, found = run.attitude.if_model_holds_arcsec, run.budget()
-        response = np.rad2deg(cal.rotation_per_theta) * 3600.0
-        common[name] = np.sqrt(np.diag(response @ cal.covariance @ response.T))
-        assert held[1, :2] == pytest.approx(common[name][:2], rel=0.1)
-        assert post.sd[:-1] == pytest.approx(cal.sigmas, rel=0.1)
-        rows = [row for row in found.rows if row.name == "calibration, common rotation"]
-        checks[name] = next(c for c in run.verdict.checks if c.name == "Jackknife over frames")
-        assert any("jackknife" in row.conditions for row in rows) == (not accept)
-    factors = jackknife_frames(bad, sc.calibrate(bad, sc.paper.paper_start())).factors
-    assert min(common["accepted"][:2] / common["formal"][:2]) > 1.1 and max(factors) > 1.5
-    assert checks["formal"].level is Level.WARN and "--accept-inflation" in checks["formal"].remedy
-    assert (
-        checks["accepted"].level is Level.PASS and "has multiplied" in checks["accepted"].sentence
-    )
-    # Draws of a version before have the formal errors.
-    old = sc.Run(tmp_path / "accepted")
-    record = {
-        name: value for name, value in old.posterior.provenance.items() if name != "inflation"
-    }
-    post = dataclasses.replace(old.posterior, provenance=record)
-    verdict = judge(old.observations, old.calibration, post, diagnosis=old.diagnosis)
-    check = next(c for c in verdict.checks if c.name == "Jackknife over frames")
-    assert (
-        check.level is Level.WARN
-        and "sample RUN --force" in check.remedy
-        and "not that of the draws" in check.sentence
-    )
 
 
 # --- comparison of models

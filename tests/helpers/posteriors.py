@@ -21,5 +21,4 @@ def normal_posterior(cal: sc.Calibration) -> Any:
         provenance=cal.provenance,
         star_error_px=0.0,
         effects=None,
-        inflation=None,
     )

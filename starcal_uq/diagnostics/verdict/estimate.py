@@ -39,8 +39,6 @@ from starcal_uq.diagnostics.verdict.observed import (
     SCREEN,
     lens_remedy,
 )
-from starcal_uq.inference.checks import resample
-from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.likelihood.shapes import IN_FIELD
 from starcal_uq.maths.intervals import student_quantile
 
@@ -70,7 +68,6 @@ _REMEDIES = {
     Status.INCONSISTENT: SCREEN,
     Status.STALLED: calibrated(solver="minpack"),
 }
-_INFLATE = calibrated(accept_inflation=True)
 # Effects that frames which disagree ask for.
 _OF_FRAMES_APART = {"frame", "zenith", "temperature", "time", "epoch"}
 
@@ -179,25 +176,17 @@ _NOT_OF_THE_LENS = {
 def model_checks(
     diagnosis: Diagnosis,
     cal: Calibration,
-    post: Posterior | None = None,
     attitude: AttitudeError | None = None,
 ) -> list[Check]:
-    """Every check that a diagnosis allows, of a calibration whose inflation may be accepted, and of
-    its draws.
-    """
-    inflated = cal.inflation is not None
+    """Every check that a diagnosis allows."""
     better = None if diagnosis.comparison is None else diagnosis.comparison.better
     moving = EFFECTS if _OF_FRAMES_APART & set(diagnosis.effects) else ()
     checks = [
         misfit(diagnosis.misfit, cal, attitude, better, diagnosis.effects),
-        even_noise(diagnosis.misfit, inflated),
+        even_noise(diagnosis.misfit, EFFECTS if diagnosis.effects else ()),
     ]
     checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
-    checks += (
-        []
-        if diagnosis.jackknife is None
-        else [jackknife(diagnosis.jackknife, inflated, post, moving)]
-    )
+    checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife, moving)]
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
     checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison, attitude)]
     return [*checks, predictive(diagnosis.predictive)]
@@ -256,8 +245,8 @@ def _hardly_told(test: MisfitTest) -> AnyDict:
     return {"moved": test.moved_name, "error_times": float(np.hypot(1.0, test.moved_std))}
 
 
-def even_noise(found: Misfit, inflated: bool = False) -> Check:
-    """Is the noise what the weights of the stars say?"""
+def even_noise(found: Misfit, helping: Remedies = ()) -> Check:
+    """Is the noise what the weights of the stars say? `helping`: what the data would take up."""
     p_values = [test.p_holm for test in found.tests if test.is_of_noise]
     rejected = [test for test in found.found(MISFIT_P) if test.is_of_noise]
     facts: AnyDict = {
@@ -266,6 +255,7 @@ def even_noise(found: Misfit, inflated: bool = False) -> Check:
     }
     level = Level.PASS
     remedies: Remedies = ()
+    orders: tuple[Order, ...] = ()
     uneven = found.uneven
     if rejected and uneven is not None:
         facts |= {"noise": uneven.model}
@@ -276,10 +266,11 @@ def even_noise(found: Misfit, inflated: bool = False) -> Check:
                 "ratio": float(uneven.ratios[worst]),
             }
             level, remedies = Level.WARN, NOISE
-    elif rejected and not inflated:
-        level, remedies = Level.WARN, _INFLATE
+    elif rejected:
+        level, remedies = Level.WARN, helping
+        orders = () if helping else (Order(_OF_FRAMES),)
     bounds = {"p_least": MISFIT_P}
-    return Check(Code.EVENNESS_OF_THE_NOISE, facts, level, bounds, remedies)
+    return Check(Code.EVENNESS_OF_THE_NOISE, facts, level, bounds, remedies, orders)
 
 
 def disagreeing(found: Jackknife) -> BoolArray:
@@ -289,21 +280,11 @@ def disagreeing(found: Jackknife) -> BoolArray:
     )
 
 
-def jackknife(
-    found: Jackknife,
-    inflated: bool = False,
-    post: Posterior | None = None,
-    moving: Remedies = (),
-) -> Check:
+def jackknife(found: Jackknife, moving: Remedies = ()) -> Check:
     """Do frames scatter as their formal errors say? `moving`: what takes up how they differ."""
     worst, bad = int(np.argmax(found.ratio)), disagreeing(found)
     chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(bad))[1]
-    remedies: Remedies = ()
-    formal = inflated and post is not None and post.inflation is None
-    if np.any(bad) and not inflated:
-        remedies = moving + _INFLATE
-    elif np.any(bad) and formal and post is not None:
-        remedies = _resample(post)
+    good = not np.any(bad)
     return Check(
         Code.JACKKNIFE_OVER_FRAMES,
         {
@@ -313,23 +294,11 @@ def jackknife(
             "disagreeing": tuple(
                 name for name, flag in zip(found.parameter_names, bad, strict=True) if flag
             ),
-            "inflated": inflated,
-            "draws_left_out": formal,
         },
-        pass_or_warn(not remedies),
+        pass_or_warn(good),
         {"ratio_most": max(float(chance[worst]), JACKKNIFE_RATIO)},
-        remedies,
-    )
-
-
-def _resample(post: Posterior) -> Remedies:
-    """Sampling again; by the default likelihood where it was an object of the user's, which is used
-    as it is.
-    """
-    return (
-        resample(post)
-        if post.diagnostics.likelihood in LIKELIHOODS
-        else resample(post, likelihood="marginal")
+        () if good else moving,
+        () if good or moving else (Order(_OF_FRAMES),),
     )
 
 

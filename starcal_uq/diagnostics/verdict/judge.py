@@ -161,7 +161,7 @@ def judge(
         observed.coverage(used, cal),
     ]
     if diagnosis is not None:
-        checks += estimate.model_checks(diagnosis, cal, post, attitude)
+        checks += estimate.model_checks(diagnosis, cal, attitude)
     if attitude is not None:
         checks += [draws.propagation(attitude)]
     if truth is not None and truth.parameter_names == cal.parameter_names:

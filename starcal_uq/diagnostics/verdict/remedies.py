@@ -58,7 +58,7 @@ _CALIBRATING = ("calibrate", "run")
 _OF_OPTIONS = {
     INPUT: {"site", "in_space", "directions", "time", "frames", "screening"},
     LENS: {"model", "effects"},
-    NOISE: {"noise", "likelihood", "star_errors", "accept_inflation"},
+    NOISE: {"noise", "likelihood", "star_errors"},
 }
 # Options that a new one makes meaningless: a place on the ground and one in space, directions made
 # and declared.

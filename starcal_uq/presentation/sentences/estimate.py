@@ -158,7 +158,7 @@ def _misfit(
 
 @entry(Code.EVENNESS_OF_THE_NOISE)
 def _even_noise(
-    good: bool,
+    _: bool,
     p_value: float,
     tests: Sequence[str],
     p_least: float,
@@ -173,10 +173,7 @@ def _even_noise(
             "the weights know of it."
         )
     elif noise is None:
-        consequence = (
-            "; the accepted inflation holds it" if good else ": the stated sigmas may be wrong"
-        )
-        sentence = f"{changes}, which the weights of the stars do not know{consequence}."
+        sentence = f"{changes}, which the weights of the stars do not know: the stated sigmas may be wrong."
     elif not noise.varies:
         sentence = f"{changes}, too little of it to change a stated sigma."
     else:
@@ -193,27 +190,19 @@ def _even_noise(
 
 @entry(Code.JACKKNIFE_OVER_FRAMES)
 def _jackknife(
-    good: bool,
+    _: bool,
     least: float,
     most: float,
     parameter: str,
     disagreeing: Sequence[str],
-    inflated: bool,
-    draws_left_out: bool,
     ratio_most: float,
 ) -> Told:
     sentence = "Frames scatter as the formal errors say."
     if disagreeing:
-        accepted = (
-            "The inflation is accepted: it has multiplied"
-            if inflated
-            else "Accepting the inflation multiplies"
-        )
-        draws = ", but not that of the draws" if draws_left_out else ""
         sentence = (
             f"Frames disagree more than their formal errors allow, in {join_words(disagreeing)}: "
-            f"something makes stars of a frame err together. {accepted} sigma by up to "
-            f"{fixed(most, 2)}{draws}."
+            "something makes stars of a frame err together, and sigma is too small by a factor of "
+            f"up to {fixed(most, 2)}."
         )
     value = f"ratios {fixed(least, 2)} to {fixed(most, 2)} ({parameter})"
     return value, f"≤ {fixed(ratio_most, 2)}", sentence

@@ -122,7 +122,6 @@ def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTa
         [f"{fixed(a, 2)} to {fixed(b, 2)}" for a, b in zip(low, high, strict=True)],
         [fixed(v, 2) for v in found.jackknife_ratio],
         [significant(v) for v in found.p_values],
-        [fixed(v, 2) for v in found.factors],
     )
     heads = (
         "Formal σ",
@@ -131,7 +130,6 @@ def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTa
         "By chance (95 %)",
         "Jackknife ratio",
         "p",
-        "Factor if accepted",
     )
     rows = tuple(zip(found.parameter_names, *columns, strict=True))
     table = TextTable(("", *heads), rows, "Jackknife over frames")

@@ -32,7 +32,6 @@ def calibrate(
     *,
     screening: bool = False,
     undetermined: bool = False,
-    accept_inflation: bool = False,
     force: bool = False,
     words: Sequence[str] = (),
     progress: Progress | None = None,
@@ -55,9 +54,6 @@ def calibrate(
     undetermined : bool
         Whether to write an estimate that leaves parameters open, to be sampled with priors that
         determine them.
-    accept_inflation : bool
-        Whether to multiply sigma by how much more the frames scatter than their noise says
-        (`starcal_uq.diagnostics.accept_inflation`); draws are as wide.
     force : bool
         Whether to replace what the folder holds.
     words : sequence of str
@@ -77,7 +73,6 @@ def calibrate(
         options["throw"] = False
     refuse_conflicts(
         screening=screening,
-        accept_inflation=accept_inflation,
         method=options.get("method"),
         partitioned=isinstance(obs, PartitionedObservations),
     )
@@ -109,13 +104,6 @@ def calibrate(
         raise CalibrationError(
             f"the calibration did not end well ({status.name})", status, reason=calibration.remedy
         )
-    if accept_inflation:
-        from starcal_uq.diagnostics import jackknife
-
-        found = jackknife.jackknife_of_all(calibration) or jackknife.jackknife_frames(
-            obs, calibration
-        )
-        calibration = jackknife.accept_inflation(calibration, found)
     if not run._making:
         check_new_folder(run.path, force)
         run._words = tuple(words)
