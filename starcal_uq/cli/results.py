@@ -106,8 +106,7 @@ def _plan(result: Any) -> AnyDict:
 
 
 def _study(result: Any) -> AnyDict:
-    from starcal_uq.presentation.words.studies import study_answer, study_limits
-    from starcal_uq.presentation.words.study_advice import study_advice
+    from starcal_uq.presentation.words.studies import study_advice, study_answer, study_limits
 
     found, folder, page = result
     numbers = found.ok.any()

@@ -49,12 +49,9 @@ def study_command(
 
 
 def _show(found: sc.studies.Study, page: Path | None) -> None:
-    from starcal_uq.presentation.words.studies import study_answer
-    from starcal_uq.presentation.words.study_advice import study_advice
-    from starcal_uq.presentation.words.study_tables import study_table
+    from starcal_uq.presentation.words.studies import study_advice, study_answer, study_tables
 
-    table = study_table(found)
-    if table is not None:
+    for table in study_tables(found):
         print_table(table)
     for sentence in (*study_answer(found), *study_advice(found)):
         say(sentence)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from starcal_uq.attitude.profile import AttitudeProfile
@@ -97,8 +97,6 @@ from starcal_uq.presentation.words import (
     planning,
     propagation,
     studies,
-    study_advice,
-    study_tables,
 )
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError
 from starcal_uq.propagation.coupling import Coupling
@@ -112,7 +110,7 @@ from starcal_uq.studies.result import Study
 def _view(
     title: str,
     text: Callable[[Any], str],
-    table: Callable[[Any], TextTable | list[TextTable | None] | None],
+    table: Callable[[Any], TextTable | Sequence[TextTable | None] | None],
     notes: Callable[[Any], Iterable[str]] = lambda result: (),
     **figures: Callable[..., Any],
 ) -> View:
@@ -120,7 +118,7 @@ def _view(
 
     def html(result: Any) -> str:
         found = table(result)
-        tables = filter(None, found if isinstance(found, list) else [found])
+        tables = filter(None, [found] if isinstance(found, TextTable | None) else found)
         return card(title, text(result), *tables) + listed(notes(result))
 
     return View(text, html, figures)
@@ -272,8 +270,8 @@ VIEWS: Mapping[type, View] = {
     Study: _view(
         "Study",
         studies.study_text,
-        study_tables.study_table,
-        study_advice.study_notes,
+        studies.study_tables,
+        studies.study_notes,
         correlation=plot_study_correlation,
         map=plot_study_map,
         maps=plot_study_maps,

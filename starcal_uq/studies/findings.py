@@ -1,6 +1,4 @@
-"""What a study found: which pairs are coupled, which axis changes that, and where the weakest
-direction turns.
-"""
+"""What a study found: which pairs are coupled, and which axis changes that."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ import numpy as np
 
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, IntArray, floats
-from starcal_uq.propagation.coupling import ALONE, COUPLED, PART
+from starcal_uq.propagation.coupling import COUPLED
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,24 +30,22 @@ _MEDIAN, _EVEN = 1.25, 1.75
 # An axis of a Latin hypercube is cut into this many parts of equal number.
 _PARTS = 6
 
-Statistic = Literal["median", "low", "high", "mean", "count"]
+Statistic = Literal["median", "min", "max", "mean", "count", "sem"]
 
 
 @dataclass(frozen=True)
 class Curve:
     """A number along one axis, its median over seeds first and then over all other axes.
 
-    `values` are those of the axis, the median of each part where there are too many; median, least
-    and most (n,) are over the other axes. `change` is the largest less the smallest value along the
-    axis, the median of it over the other axes; `chance` is what other seeds (in a Latin hypercube,
-    the other drawn axes) make of it less than once in a thousand times, 0 with one seed.
+    `values` are those of the axis, the median of each part where there are too many, and `median`
+    (n,) belongs to them. `change` is the largest less the smallest value along the axis, the median
+    of it over the other axes; `chance` is what other seeds (in a Latin hypercube, the other drawn
+    axes) make of it less than once in a thousand times, 0 with one seed.
     """
 
     axis: str
     values: tuple[Any, ...]
     median: FloatArray
-    low: FloatArray
-    high: FloatArray
     change: float
     chance: float
 
@@ -64,9 +60,15 @@ class Curve:
         return int(np.argmin(self.median))
 
     @property
+    def factor(self) -> float:
+        """Largest over smallest median; infinite where the smallest is not above zero."""
+        least = float(self.median.min())
+        return float(self.median.max()) / least if least > 0.0 else np.inf
+
+    @property
     def exponent(self) -> float | None:
         """Exponent of the power law between the ends of the axis; None where there is none."""
-        if any(isinstance(value, str) for value in self.values) or len(self.values) < 2:
+        if isinstance(self.values[0], str):
             return None
         x, y = floats(self.values), self.median
         if np.any(x <= 0.0) or np.any(y <= 0.0):
@@ -126,31 +128,6 @@ def matters(cost: Curve) -> bool:
     return cost.change > max(float(np.log(MATTERS)), cost.chance)
 
 
-@dataclass(frozen=True)
-class Direction:
-    """A kind of weakest direction, and the share of the places of the sweep that have it.
-
-    Parameters grow together, and others shrink meanwhile; none of either where nothing is coupled.
-    """
-
-    together: tuple[str, ...]
-    against: tuple[str, ...]
-    share: float
-
-
-@dataclass(frozen=True)
-class Turn:
-    """The kinds of weakest direction along the axis that tells them apart best.
-
-    `runs` are neighbouring values that share a kind, with its number; `told` is the part of the
-    places that the axis alone tells right.
-    """
-
-    axis: str
-    runs: tuple[tuple[tuple[Any, ...], int], ...]
-    told: float
-
-
 class Sweep:
     """The cells of a study by their place: every number as a dense array over the axes.
 
@@ -185,19 +162,18 @@ class Sweep:
         Axes `pooled` count as seeds; the array has one value for them. Of `cells` (C,), those that
         are true count.
         """
+        import pandas as pd
+
         kept = [axis not in pooled for axis in self.axes]
         shape = tuple(n if keep else 1 for keep, n in zip(kept, self.shape, strict=True))
         good = self.ok & ~np.isnan(numbers) & cells
-        where = np.zeros(int(good.sum()), dtype=np.int64)
+        place = np.zeros(int(good.sum()), dtype=np.int64)
         if shape:
-            codes = [c[good] * keep for keep, c in zip(kept, self._codes, strict=True)]
-            where = np.ravel_multi_index(codes, shape)
+            codes = [code[good] * keep for keep, code in zip(kept, self._codes, strict=True)]
+            place = np.ravel_multi_index(codes, shape)
+        found = pd.Series(numbers[good]).groupby(place).agg(statistic)
         grid = np.full(math.prod(shape), np.nan)
-        values = numbers[good]
-        order = np.lexsort((values, where))
-        places, first, n = np.unique(where[order], return_index=True, return_counts=True)
-        if len(places):
-            grid[places] = _statistic(values[order], first, n, statistic)
+        grid[found.index.to_numpy()] = found.to_numpy()
         return grid.reshape(shape)
 
     def at(self, index: int) -> AnyDict:
@@ -229,15 +205,13 @@ class Sweep:
             axis,
             tuple(compress(self.values[axis], np.atleast_1d(has))),
             np.nanmedian(lines, axis=1),
-            np.nanmin(lines, axis=1),
-            np.nanmax(lines, axis=1),
             float(np.median(np.nanmax(lines, axis=0) - np.nanmin(lines, axis=0))),
             self._chance(numbers, pooled, len(lines)),
         )
 
     def seeds(self, numbers: FloatArray) -> float:
         """Range over seeds at a place, the median over all places."""
-        spread = self.over(numbers, "high") - self.over(numbers, "low")
+        spread = self.over(numbers, "max") - self.over(numbers, "min")
         return float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
 
     def _chance(self, numbers: FloatArray, pooled: Sequence[str], n_values: int) -> float:
@@ -247,15 +221,14 @@ class Sweep:
         from scipy.special import stdtrit
 
         n = self.over(numbers, "count", pooled)
-        scatter = self.over(numbers**2, "mean", pooled) - self.over(numbers, "mean", pooled) ** 2
         repeated = n >= 2.0
         if not repeated.any():
             return 0.0
-        variance = np.maximum(scatter, 0.0)[repeated] / (n[repeated] - 1.0)
-        factor = _EVEN if pooled or self.drawn else np.where(n[repeated] > 2.0, _MEDIAN, 1.0)
-        dof = float(np.sum(n[repeated] - 1.0))
-        quantile = float(stdtrit(dof, 1.0 - _FALSE_ALARM / (n_values * (n_values - 1))))
-        return float(np.sqrt(2.0 * np.mean(factor**2 * variance))) * quantile
+        n, error = n[repeated], self.over(numbers, "sem", pooled)[repeated]
+        factor = _EVEN if pooled or self.drawn else np.where(n > 2.0, _MEDIAN, 1.0)
+        p = 1.0 - _FALSE_ALARM / (n_values * (n_values - 1))
+        quantile = float(stdtrit(float(np.sum(n - 1.0)), p))
+        return float(np.sqrt(2.0 * np.mean((factor * error) ** 2))) * quantile
 
     def curves(self, numbers: FloatArray) -> tuple[Curve, ...]:
         """`along` every axis that has it."""
@@ -279,20 +252,18 @@ class Sweep:
         held = self.held(along, by, at)
         cells = self._cells(held)
         pooled = [axis for axis in self.axes if axis not in (along, by)]
-        order = [self.axes.index(axis) for axis in (by, along) if axis is not None]
-        rest = [i for i in range(len(self.axes)) if i not in order]
+        turned = by is not None and self.axes.index(by) > self.axes.index(along)
 
-        def laid_out(statistic: Statistic) -> FloatArray:
+        def laid_out(numbers: FloatArray, statistic: Statistic = "median") -> FloatArray:
             grid = self.over(numbers, statistic, pooled, cells)
-            return grid.transpose(*rest, *order).reshape(-1, len(self.values[along]))
+            grid = grid.squeeze(tuple(self.axes.index(axis) for axis in pooled))
+            return grid.T if turned else np.atleast_2d(grid)
 
         # Values at which no cell has numbers are left out.
-        seen = self.over(np.zeros(len(self.ok)), "median", pooled, cells).transpose(*rest, *order)
-        there = np.isfinite(seen.reshape(-1, len(self.values[along])))
+        there = np.isfinite(laid_out(np.zeros(len(self.ok))))
         rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
-        median, low, high = (
-            laid_out(statistic)[np.ix_(rows, columns)] for statistic in ("median", "low", "high")
-        )
+        kept = np.ix_(rows, columns)
+        median, low, high = (laid_out(numbers, of)[kept] for of in ("median", "min", "max"))
         values = tuple(self.values[along][i] for i in columns)
         by_values = () if by is None else tuple(self.values[by][i] for i in rows)
         return Lines(along, values, by, by_values, held, median, low, high)
@@ -403,75 +374,6 @@ class Sweep:
         )
 
     @cached_property
-    def directions(self) -> tuple[tuple[Direction, ...], IntArray]:
-        """The kinds of weakest direction, the most common first, and the kind of every place (-1
-        where unknown).
-        """
-        weights = np.nan_to_num(self.data["weak_direction"].values)
-        # Nothing takes part in a direction that is hardly worse than the parameters themselves.
-        part = (np.abs(weights) >= PART) & (self.data["weak_variance"].values >= ALONE[1])[:, None]
-        part &= part.sum(axis=1)[:, None] >= 2
-        first = weights[np.arange(len(weights)), np.argmax(part, axis=1)]
-        signs = np.where(part, np.sign(weights * first[:, None]), 0.0)[self.ok]
-        known, code = np.unique(signs, axis=0, return_inverse=True)
-        codes = np.full(len(self.ok), np.nan)
-        codes[self.ok] = code.ravel()
-        # At each place the kind of most seeds.
-        votes = np.stack(
-            [self.over(np.where(codes == i, 1.0, 0.0), "mean") for i in range(max(1, len(known)))]
-        )
-        seen = np.isfinite(votes[0])
-        places = np.where(seen, np.argmax(np.where(seen, votes, 0.0), axis=0), np.nan)
-        counts = Counter(places[np.isfinite(places)].astype(int).tolist())
-        order = [code for code, _ in counts.most_common()]
-        rank = {code: position for position, code in enumerate(order)}
-        whole = max(1, sum(counts.values()))
-        found = tuple(
-            Direction(
-                self._members(known[code] > 0.0),
-                self._members(known[code] < 0.0),
-                counts[code] / whole,
-            )
-            for code in order
-        )
-        where = np.array(
-            [rank[int(code)] if np.isfinite(code) else -1 for code in places.ravel()],
-            dtype=np.int64,
-        )
-        return found, where.reshape(self.shape)
-
-    def _members(self, flags: BoolArray) -> tuple[str, ...]:
-        return tuple(compress(self.names, flags))
-
-    @cached_property
-    def turn(self) -> Turn | None:
-        """Where the weakest direction becomes another one, along the axis that tells it best; None
-        where it stays.
-        """
-        kinds, _ = self.directions
-        if len(kinds) < 2:
-            return None
-        turns = [turn for turn in map(self._turn, range(len(self.axes))) if len(turn.runs) > 1]
-        return max(turns, key=lambda turn: turn.told, default=None)
-
-    def _turn(self, position: int) -> Turn:
-        axis, (_, where) = self.axes[position], self.directions
-        lines = np.moveaxis(where, position, 0).reshape(len(self.values[axis]), -1)
-        runs: list[tuple[list[Any], int]] = []
-        right = 0
-        for value, line in zip(self.values[axis], lines, strict=True):
-            if not (line >= 0).any():
-                continue
-            kind, times = Counter(line[line >= 0].tolist()).most_common(1)[0]
-            right += times
-            if runs and runs[-1][1] == kind:
-                runs[-1][0].append(value)
-            else:
-                runs.append(([value], kind))
-        told = right / max(1, int((where >= 0).sum()))
-        return Turn(axis, tuple((tuple(values), kind) for values, kind in runs), told)
-
-    @cached_property
     def failures(self) -> tuple[tuple[str, int], ...]:
         """Why cells failed, and how many, the most frequent first."""
         return tuple(Counter(map(str, self.data["status"].values[~self.ok])).most_common())
@@ -483,19 +385,6 @@ def cross(errors: xr.DataArray) -> xr.DataArray:
         "axis", skipna=False
     ) ** 0.5
     return across
-
-
-def _statistic(
-    values: FloatArray, first: IntArray, n: IntArray, statistic: Statistic
-) -> FloatArray:
-    """A statistic of groups of sorted values that begin at `first`."""
-    if statistic == "median":
-        return np.asarray(0.5 * (values[first + (n - 1) // 2] + values[first + n // 2]))
-    if statistic == "mean":
-        return np.asarray(np.add.reduceat(values, first) / n)
-    if statistic == "count":
-        return n.astype(np.float64)
-    return np.asarray(values[first] if statistic == "low" else values[first + n - 1])
 
 
 def _levels(values: Any, drawn: bool) -> tuple[IntArray, tuple[Any, ...]]:

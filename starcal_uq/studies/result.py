@@ -266,18 +266,17 @@ class Study(Shown):
 
         names: dict[str, Statistic] = {
             "median": "median",
-            "low": "low",
-            "high": "high",
+            "low": "min",
+            "high": "max",
             "n": "count",
         }
+        columns: AnyDict = {"value": self.sweep.values.get(along, ())}
         try:
-            columns = {
-                name: self.sweep.pooled(numbers, along, at, statistic)
-                for name, statistic in names.items()
-            }
+            for name, statistic in names.items():
+                columns[name] = self.sweep.pooled(numbers, along, at, statistic)
         except ValueError as error:
             raise StudyError(str(error)) from None
-        return pd.DataFrame({"value": self.sweep.values[along], **columns})
+        return pd.DataFrame(columns)
 
     def needed(
         self, along: str, target_arcsec: float | None = None, *, at: AnyMapping | None = None

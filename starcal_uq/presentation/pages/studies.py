@@ -27,12 +27,13 @@ from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.axes import axis_label, value_words
 from starcal_uq.presentation.words.studies import (
+    study_advice,
     study_answer,
     study_limits,
+    study_tables,
     study_text,
+    summary_columns,
 )
-from starcal_uq.presentation.words.study_advice import study_advice
-from starcal_uq.presentation.words.study_tables import study_table, summary_columns
 from starcal_uq.studies.result import Study
 
 PAGE = "report.html"
@@ -150,11 +151,11 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
         "created": data.attrs.get("created_utc", ""),
         "version": data.attrs.get("starcal_uq", ""),
         "verdict": study_text(study),
-        "answer": study_answer(study),
+        "answer": study_answer(study)[1:],
         "advice": study_advice(study),
         "limits": study_limits(study),
         "failed": failed,
-        "summary": study_table(study),
+        "tables": study_tables(study),
         "figures": figures,
         "cells": cells_table(study, _CELLS_SHOWN),
         "cells_words": (

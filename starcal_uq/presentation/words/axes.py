@@ -1,4 +1,4 @@
-"""What is swept, in words: the names, units and values of the axes of a study."""
+"""Names, units and values of the axes of a study."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from starcal_uq.core.formatting import count, fixed, join_words, pretty_unit
 from starcal_uq.core.types import AnyMapping
 from starcal_uq.studies.axes import AXES
 
-# Name, and how a value is said; the name of an axis that is missing here is said as it is.
-_AXES = {
-    "fov_deg": ("field of view", "a field of {}°"),
-    "focal_mm": ("focal length", "a focal length of {} mm"),
-    "pixels": ("detector's width", "{} px of detector"),
-    "pixel_um": ("pixel pitch", "pixels of {} µm"),
-    "x0_offset_px": ("offset of the principal point in x", "a principal point {} px off in x"),
-    "y0_offset_px": ("offset of the principal point in y", "a principal point {} px off in y"),
-    "distortion": ("distortion model", "the model {}"),
-    "distortion_px": ("distortion at the corner", "{} px of distortion"),
-    "max_mag": ("magnitude limit", "stars to magnitude {}"),
-    "stars": ("number of stars per frame", "{} stars a frame"),
-    "frames": ("number of frames", "{} frames"),
-    "min_stars": ("fewest stars of a frame", "at least {} stars a frame"),
-    "pointing": ("pointing", "{} pointing"),
-    "sigma_px": ("centroid noise", "{} px of noise"),
-    "noise_per_mag": ("growth of the noise per magnitude", "noise growing by {} dex per magnitude"),
-    "noise_mag": ("magnitude of the stated noise", "noise as stated at magnitude {}"),
-    "noise_floor_px": ("noise of bright stars", "a floor of {} px under the noise"),
-    "direction_mas": ("errors of the stars' directions", "star errors of {} mas"),
-    "prior": ("prior", "the prior {}"),
-    "method": ("method", "the method {}"),
-    "likelihood": ("likelihood", "the likelihood {}"),
+# An axis that is missing here goes by its own name.
+_NAMES = {
+    "fov_deg": "field of view",
+    "focal_mm": "focal length",
+    "pixels": "detector's width",
+    "pixel_um": "pixel pitch",
+    "x0_offset_px": "offset of the principal point in x",
+    "y0_offset_px": "offset of the principal point in y",
+    "distortion": "distortion model",
+    "distortion_px": "distortion at the corner",
+    "max_mag": "magnitude limit",
+    "stars": "number of stars per frame",
+    "frames": "number of frames",
+    "min_stars": "fewest stars of a frame",
+    "pointing": "pointing",
+    "sigma_px": "centroid noise",
+    "noise_per_mag": "growth of the noise per magnitude",
+    "noise_mag": "magnitude of the stated noise",
+    "noise_floor_px": "noise of bright stars",
+    "direction_mas": "errors of the stars' directions",
+    "prior": "prior",
+    "method": "method",
+    "likelihood": "likelihood",
 }
 # Units as they are printed, where that is not how they are written.
 _PRINTED = {"deg": "°", "um": "µm"}
@@ -40,13 +40,17 @@ _PRINTED = {"deg": "°", "um": "µm"}
 
 def axis_name(axis: str) -> str:
     """The axis in words, without its unit."""
-    return _AXES.get(axis, (axis,))[0]
+    return _NAMES.get(axis, axis)
+
+
+def _unit(axis: str) -> str:
+    unit = AXES[axis].unit if axis in AXES else ""
+    return _PRINTED.get(unit, pretty_unit(unit))
 
 
 def axis_label(axis: str) -> str:
     """The axis with its unit, for an axis of a figure or the head of a column."""
-    unit = AXES[axis].unit if axis in AXES else ""
-    unit = _PRINTED.get(unit, pretty_unit(unit))
+    unit = _unit(axis)
     return f"{axis_name(axis)} [{unit}]" if unit else axis_name(axis)
 
 
@@ -58,15 +62,15 @@ def value_words(value: Any) -> str:
     if not math.isfinite(number):
         return fixed(number, 0)
     if number == round(number) and abs(number) < 1e7:
-        whole = round(number)
-        return count(whole) if abs(whole) >= 10_000 else str(whole).replace("-", "\N{MINUS SIGN}")
+        return count(round(number)) if abs(number) >= 10_000 else fixed(number, 0)
     return f"{number:.3g}".replace("-", "\N{MINUS SIGN}")
 
 
 def said(axis: str, value: Any) -> str:
-    """A value with its axis: ``a field of 10°``."""
-    form = _AXES[axis][1] if axis in _AXES else axis + " {}"
-    return form.format(value_words(value))
+    """A value with its axis: ``field of view 10°``."""
+    unit = _unit(axis)
+    space = "" if unit in ("", "°") else " "
+    return f"{axis_name(axis)} {value_words(value)}{space}{unit}"
 
 
 def capital(text: str) -> str:
@@ -75,5 +79,5 @@ def capital(text: str) -> str:
 
 
 def place(values: AnyMapping) -> str:
-    """A place in the sweep: ``a field of 10° and 100 frames``."""
+    """A place in the sweep: ``field of view 10° and number of frames 100``."""
     return join_words([said(axis, value) for axis, value in values.items()])

@@ -1,13 +1,12 @@
-"""Coupling studies in words: what couples with what, what would decouple it, and what a designer
-can do about it.
+"""Answer of a coupling study: three tables, a sentence for each question, advice and limits.
 
-Every sentence is made from the numbers at hand: a study that finds no coupling says so.
+The tables hold the numbers: which pairs are coupled, what changes them and the errors, and medians
+along every axis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,71 +22,42 @@ from starcal_uq.core.formatting import (
     pretty_unit,
     significant,
 )
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
-from starcal_uq.presentation.words.axes import (
-    axis_name,
-    capital,
-    place,
-    said,
-    value_words,
-)
-from starcal_uq.propagation.coupling import COUPLED
-from starcal_uq.studies.findings import Curve, Direction, Pair, Sweep
+from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.axes import axis_label, axis_name, place, value_words
+from starcal_uq.propagation.coupling import ALONE, COUPLED, PART
+from starcal_uq.studies.findings import Curve, Pair, Sweep
 
 if TYPE_CHECKING:
     from starcal_uq.studies.result import Study
 
-# Pairs that are told one by one.
-TOLD = 4
-# A parameter and the common rotation cannot be told apart from this correlation on.
-_SAME = 0.99
 # An error that changes by less than this factor along an axis hardly depends on it.
-HARDLY = 1.1
-# What a lens and a catalogue are, and nobody chooses.
-NATURE = ("distortion", "distortion_px", "direction_mas", *COEFFICIENTS)
+_HARDLY = 1.1
+# Properties of a lens and a catalogue, which a designer does not choose.
+_GIVEN = ("distortion_px", "direction_mas", *COEFFICIENTS)
+_MISSING = "–"
 
 
 def study_text(study: Study) -> str:
-    """The answer in two sentences: what is coupled most, and what would decouple it."""
+    """The answer in two sentences: the strongest coupling, and what would decouple it."""
     sweep = study.sweep
     if not sweep.ok.any():
         return "No cell of the study has numbers."
-    if not sweep.coupled:
-        return _uncoupled(sweep)
-    pair = sweep.coupled[0]
-    text = f"{capital(' and '.join(pair.names))} are coupled most ({_range(pair)})."
-    if not sweep.axes:
-        return text
-    if "distortion" in sweep.axes:
-        text = f"{text} {_price_of_models(study)}".strip()
-    found = [(other, *other.decoupling()[0]) for other in sweep.coupled if other.decoupling()]
-    if not found:
-        return f"{text} {capital(_nothing_decouples(sweep))}."
-    # What can be chosen comes before what a lens is.
-    other, size, cost = max(found, key=lambda entry: (entry[1].axis not in NATURE, entry[2].change))
-    return (
-        f"{text} {capital(the(size.axis))} changes how {dashed(other)} are coupled: "
-        f"{_ends(size, cost)}."
-    )
+    return f"{_coupling(sweep)} {_decoupling(sweep)}".strip()
 
 
 def study_answer(study: Study) -> list[str]:
-    """The whole answer, a sentence or two for every question."""
-    sweep = study.sweep
-    if not sweep.ok.any():
+    """The whole answer, a sentence for every question."""
+    if not study.sweep.ok.any():
         return [study_text(study)]
     parts = [
-        _couplings(sweep),
-        *_what_decouples(sweep),
-        _weakest(sweep),
+        study_text(study),
+        _weakest(study),
         _price(study),
-        _gauge(study),
-        *_errors(sweep),
-        _target(study),
-        *_target_sigmas(study),
-        *_models(study),
+        _errors(study.sweep),
+        *_targets(study),
         *_simpler(study),
         *_simulated(study),
     ]
@@ -98,444 +68,135 @@ def dashed(pair: Pair) -> str:
     return "\N{EN DASH}".join(pair.names)
 
 
-def _range(pair: Pair) -> str:
-    """The correlations of a pair over the sweep, and how much other seeds change them."""
-    low, high = map(correlation_text, sorted((pair.strongest, pair.weakest)))
-    text = f"correlation {high if low == high else f'{low} to {high}'}"
-    seeds = f", ±{significant(0.5 * pair.seeds, 1)} over seeds" if pair.seeds >= 5e-4 else ""
-    return text + seeds
-
-
-def _uncoupled(sweep: Sweep) -> str:
+def _coupling(sweep: Sweep) -> str:
     if not sweep.pairs:
         return "No two parameters were estimated together: there is nothing to couple."
     pair = sweep.pairs[0]
-    at = f", with {place(pair.strongest_at)}" if pair.strongest_at else ""
-    return (
-        "No pair of parameters is coupled: the largest correlation anywhere is "
-        f"{correlation_text(pair.strongest)} ({' and '.join(pair.names)}{at})."
-    )
-
-
-def _couplings(sweep: Sweep) -> str:
     if not sweep.coupled:
-        return _uncoupled(sweep)
-    told = [
-        f"{dashed(pair)} ({_range(pair).removeprefix('correlation ')})"
-        for pair in sweep.coupled[:TOLD]
-    ]
-    more = len(sweep.coupled) - len(told)
-    rest = f"; {plural(more, 'more pair')} above {COUPLED:g} in size somewhere" if more > 0 else ""
-    others = len(sweep.pairs) - len(sweep.coupled)
-    free = f" The other {plural(others, 'pair')} stay below {COUPLED:g}." if others else ""
-    return f"Coupled are, with their correlations, {join_words(told)}{rest}.{free}"
+        return (
+            "No pair of parameters is coupled: the largest correlation anywhere is "
+            f"{correlation_text(pair.strongest)} ({dashed(pair)})."
+        )
+    low, high = map(correlation_text, sorted((pair.strongest, pair.weakest)))
+    ends = low if low == high else f"{low} to {high}"
+    return (
+        f"{len(sweep.coupled)} of {plural(len(sweep.pairs), 'pair')} of parameters are coupled "
+        f"(correlation {COUPLED:g} or more), {dashed(pair)} most: {ends}."
+    )
 
 
-def _what_decouples(sweep: Sweep) -> list[str]:
-    """What changes each of the couplings, and which axes do nothing about any."""
+def _decoupling(sweep: Sweep) -> str:
     if not sweep.axes or not sweep.coupled:
-        return []
-    # Pairs of which the same is to be said share a sentence.
-    told: dict[tuple[str, str], list[str]] = {}
-    for pair in sweep.coupled[:TOLD]:
-        for size, cost in pair.decoupling()[:1]:
-            told.setdefault((capital(the(size.axis)), _ends(size, cost)), []).append(dashed(pair))
-    parts = [
-        f"{axis} changes how {join_words(pairs)} are coupled: {ends}."
-        for (axis, ends), pairs in told.items()
-    ]
-    helping = {size.axis for pair in sweep.coupled for size, _ in pair.decoupling()}
-    idle = [axis for axis in sweep.axes if axis not in helping]
-    if not helping:
-        parts.append(capital(_nothing_decouples(sweep)) + ".")
-    elif idle:
-        changes = [c for pair in sweep.coupled for c in pair.sizes if c.axis in idle]
-        names = join_words([the(axis) for axis in idle])
-        do, them = ("does", "it") if len(idle) == 1 else ("do", "them")
-        most = (
-            f": along {them} no correlation changes by more than {_change(changes)}"
-            if changes
-            else ""
-        )
-        parts.append(f"{capital(names)} {do} little to the couplings{most}.")
-    return parts
-
-
-def _ends(size: Curve, cost: Curve) -> str:
-    """From what to what an axis changes a coupling."""
-    ends = [
-        f"{correlation_text(size.median[i])} with {said(size.axis, size.values[i])}"
-        for i in (cost.most, cost.least)
-    ]
-    prices = [fixed(np.exp(cost.median[i]), 1) for i in (cost.most, cost.least)]
-    return (
-        f"from {' to '.join(ends)} in size, which takes the price in sigma from "
-        f"{' to '.join(prices)}"
-    )
-
-
-def _nothing_decouples(sweep: Sweep) -> str:
-    names = join_words([axis_name(axis) for axis in sweep.axes])
-    changes = [curve for pair in sweep.coupled for curve in pair.sizes]
-    return (
-        f"nothing that was varied ({names}) decouples "
-        f"{'them' if len(sweep.coupled) == 1 else 'any pair'}: along no "
-        f"axis does a correlation change by more than {_change(changes)}"
-    )
-
-
-def _change(curves: Sequence[Curve]) -> str:
-    largest = max((curve.change for curve in curves), default=0.0)
-    return significant(max(largest, 0.001), 1)
-
-
-def the(axis: str) -> str:
-    return f"the {axis_name(axis)}"
-
-
-def _weakest(sweep: Sweep) -> str:
-    """The weakest direction, and where it becomes another one."""
-    kinds, _ = sweep.directions
-    if not kinds:
         return ""
-    variance = sweep.over(sweep.data["weak_variance"].values)
-    sizes = _span(variance)
-    if len(kinds) == 1:
-        if not kinds[0].together:
-            return (
-                "No combination of parameters is much worse determined than the parameters "
-                "themselves."
-            )
-        return (
-            f"The weakest direction is {_direction(kinds[0])} everywhere, with {sizes} times the "
-            "variance of uncoupled "
-            "parameters."
-        )
-    turn = sweep.turn
-    if turn is None or turn.told < max(0.75, kinds[0].share + 0.05):
-        told = [f"{_direction(kind)} in {percent(kind.share)}" for kind in kinds[:3]]
-        return (
-            f"The weakest direction is {join_words(told)} of the places, and no one axis tells "
-            "which."
-        )
-    runs = [
-        f"{_direction(kinds[kind])} {_run(turn.axis, values)}" for values, kind in turn.runs[:6]
-    ]
-    right = "" if turn.told > 0.999 else f" (so in {percent(turn.told)} of the places)"
-    return f"The weakest direction turns with {the(turn.axis)}: {'; '.join(runs)}{right}."
+    axes = {size.axis for pair in sweep.coupled for size, _ in pair.decoupling()}
+    helping = [axis_name(axis) for axis in sweep.axes if axis in axes]
+    idle = [axis_name(axis) for axis in sweep.axes if axis not in axes]
+    parts = []
+    if helping:
+        parts.append(f"Correlations change with {join_words(helping)}.")
+    if idle:
+        parts.append(f"No coupling changes with {join_words(idle)}.")
+    return " ".join(parts)
 
 
-def _direction(kind: Direction) -> str:
-    if not kind.together:
-        return "nothing in particular"
-    if not kind.against:
-        return f"{join_words(kind.together)} together"
-    return f"{join_words(kind.together)} against {join_words(kind.against)}"
+def _weakest(study: Study) -> str:
+    """The most common weakest direction."""
+    data, ok = study.data, study.sweep.ok
+    weights = data["weak_direction"].values[ok]
+    # Nothing takes part in a direction that is hardly worse than the parameters themselves.
+    weak = data["weak_variance"].values[ok] >= ALONE[1]
+    signs = np.where((np.abs(weights) >= PART) & weak[:, None], np.sign(weights), 0.0)
+    kinds = Counter(_direction(study.parameter_names, sign) for sign in signs)
+    kind, n = kinds.most_common(1)[0]
+    return f"The weakest direction is {kind} in {percent(n / len(signs))} of the cells."
 
 
-def _run(axis: str, values: Sequence[Any]) -> str:
-    if len(values) == 1 or isinstance(values[0], str):
-        return _with(axis, values)
-    return f"from {said(axis, values[0])} to {value_words(values[-1])}"
-
-
-def _with(axis: str, values: Sequence[Any]) -> str:
-    """Values of an axis, the first of them with its name."""
-    return f"with {join_words([said(axis, values[0]), *map(value_words, values[1:])])}"
+def _direction(names: tuple[str, ...], signs: FloatArray) -> str:
+    """Parameters that grow together, against those that shrink meanwhile."""
+    used = np.flatnonzero(signs)
+    if len(used) < 2:
+        return "no combination of parameters"
+    together = signs == signs[used[0]]
+    up = join_words([names[i] for i in used if together[i]])
+    down = join_words([names[i] for i in used if not together[i]])
+    return f"{up} against {down}" if down else f"{up} together"
 
 
 def _price(study: Study) -> str:
-    """How many times a sigma is what it would be if all other parameters were known."""
-    sweep = study.sweep
-    found = []
-    for i, name in enumerate(sweep.names):
-        factor = sweep.over(np.sqrt(study.data["variance_inflation"].values[:, i]))
-        if np.isfinite(factor).any():
-            found.append((float(np.nanmedian(factor)), name, _span(factor)))
-    dear = [entry for entry in sorted(found, reverse=True) if entry[0] >= HARDLY]
-    if not dear:
-        return (
-            "Coupling costs nothing: every sigma is what it would be if the other parameters "
-            "were known."
-        )
-    told = [f"{name} {words} times" for _, name, words in dear[:TOLD]]
+    factors = np.sqrt(study.data["variance_inflation"].values[study.sweep.ok])
+    known = np.isfinite(factors).any(axis=0)
+    words = [
+        f"{name} {significant(np.nanmedian(factors[:, i]))}"
+        for i, name in enumerate(study.parameter_names)
+        if known[i]
+    ]
+    return f"Coupling multiplies sigma (median over cells): {join_words(words)}."
+
+
+def _errors(sweep: Sweep) -> str:
+    frame, common = _span(sweep.frame_error), _span(sweep.common_rotation)
     return (
-        "The price, as sigma over what it would be if the other parameters were known: "
-        f"{join_words(told)}."
+        "Attitude errors of the calibration across the boresight, 1 sigma per axis: "
+        f"{frame} arcsec from frame to frame, {common} arcsec common to all frames."
     )
 
 
 def _span(values: FloatArray) -> str:
     """Least to most of what is finite."""
-    good = values[np.isfinite(values)]
-    low, high = (significant(v, 3 if abs(v) >= 0.1 else 2) for v in (good.min(), good.max()))
+    low, high = significant(np.nanmin(values), 3), significant(np.nanmax(values), 3)
     return low if low == high else f"{low} to {high}"
 
 
-def _gauge(study: Study) -> str:
-    """Parameters that cannot be told from a common rotation anywhere."""
-    sweep = study.sweep
-    found = []
-    for i, name in enumerate(sweep.names):
-        for j, axis in enumerate(AXES):
-            r = np.abs(sweep.over(study.data["attitude_correlation"].values[:, i, j]))
-            if np.isfinite(r).any() and np.nanmin(r) >= _SAME:
-                found.append((f"{name} with {axis}", np.nanmin(r)))
-    if not found:
-        return ""
-    least = correlation_text(min(0.9999, *(r for _, r in found)))
-    return (
-        f"In the whole sweep, {join_words([words for words, _ in found])} cannot be told apart "
-        f"(at least {least} in size): a rotation common to all frames, which an alignment with "
-        "the same parameters absorbs."
-    )
-
-
-@dataclass(frozen=True)
-class Effect:
-    """What an axis does to an error: the largest over the smallest median, and the law between if
-    there is one.
-    """
-
-    curve: Curve
-    factor: float
-    exponent: float | None
-
-
-def error_effects(sweep: Sweep, numbers: FloatArray) -> list[Effect]:
-    """What every axis does to an error, the strongest first."""
-    found = [
-        Effect(curve, float(curve.median.max() / curve.median.min()), curve.exponent)
-        for curve in sweep.curves(numbers)
-        if curve.median.min() > 0.0
-    ]
-    return sorted(found, key=lambda effect: -effect.factor)
-
-
-def _errors(sweep: Sweep) -> list[str]:
-    """Sizes of both attitude errors of the calibration, and what each axis does to them."""
-    return [
-        _error(
-            "Across the boresight, 1 sigma per axis, the error that differs from frame to frame is",
-            sweep,
-            sweep.frame_error,
-        ),
-        _error("The rotation common to all frames is", sweep, sweep.common_rotation),
-    ]
-
-
-def _error(head: str, sweep: Sweep, numbers: FloatArray) -> str:
-    effects = error_effects(sweep, numbers)
-    grid = sweep.over(numbers).ravel()
-    least, most = int(np.nanargmin(grid)), int(np.nanargmax(grid))
-    text = f"{head} {_span(grid)} arcsec"
-    if len(sweep.axes) > 1 and grid[most] >= HARDLY * grid[least]:
-        text += f", least with {place(sweep.at(least))}, most with {place(sweep.at(most))}"
-    strong = [_effect(effect) for effect in effects if effect.factor >= HARDLY]
-    weak = [axis_name(effect.curve.axis) for effect in effects if effect.factor < HARDLY]
-    if strong:
-        text += ". Medians: " if len(sweep.axes) > 1 else ". It goes from "
-        text += ", ".join(strong)
-    if weak:
-        so = "; it hardly depends on {}" if strong else ", whatever {} may be"
-        text += so.format(join_words(weak))
-    return text + "."
-
-
-def _effect(effect: Effect) -> str:
-    curve = effect.curve
-    first, last = 0, len(curve.values) - 1
-    if isinstance(curve.values[0], str):
-        ends = curve.least, curve.most
-    elif curve.most not in (first, last):
-        ends = curve.most, curve.least
-    else:
-        ends = first, last
-    words = " to ".join(
-        f"{significant(curve.median[i])} with {said(curve.axis, curve.values[i])}" for i in ends
-    )
-    if effect.exponent is None or curve.axis == "max_mag":
-        return words
-    return f"{words} (proportional to its power {fixed(effect.exponent, 2)})"
-
-
-def _target(study: Study) -> str:
-    """Where the target is met, and what it takes."""
-    target = study.definition.target_arcsec
-    if target is None:
-        return ""
-    sweep = study.sweep
-    errors = sweep.over(sweep.frame_error)
-    share = _share(sweep, errors <= target, np.isfinite(errors))
-    head = f"The target of {target:g} arcsec is met {share}{_crossings(study)}."
-    return f"{head} {_range_of_frames(sweep, study.frames_for(target))}".strip()
-
-
-def _share(sweep: Sweep, flag: BoolArray, known: BoolArray, everywhere: int | None = None) -> str:
-    """In which of the known places something holds: everywhere where it does in so many."""
-    holds = known & flag
-    if holds.sum() == (known.sum() if everywhere is None else everywhere):
-        return "everywhere"
-    if not holds.any():
-        return "nowhere"
-    return f"in {count(holds.sum())} of {count(known.sum())} places{_where(sweep, holds, known)}"
-
-
-def _crossings(study: Study) -> str:
-    """Where the median error comes to the target along an axis of numbers, between its values."""
-    sweep = study.sweep
-    told = []
-    for axis in sweep.axes:
-        if axis in sweep.drawn or isinstance(sweep.values[axis][0], str):
-            continue
-        places = study.met(axis)
-        if len(places) == 1:
-            told.append(said(axis, places[0]))
-    return f", and the median error comes to it with {join_words(told)}" if told else ""
-
-
-def _target_sigmas(study: Study) -> list[str]:
-    """The same for targets of single parameters."""
-    sweep = study.sweep
+def _targets(study: Study) -> list[str]:
+    """Share of the places that meet each target, and the frames that it takes."""
+    sweep, definition = study.sweep, study.definition
     parts = []
-    for name, target in study.definition.target_sigma.items():
+    if definition.target_arcsec is not None:
+        target = definition.target_arcsec
+        met = sweep.over(sweep.frame_error), target
+        parts.append(_target(f"{target:g} arcsec", sweep, *met, study.frames_for(target)))
+    for name, target in definition.target_sigma.items():
         spec = parameter_called(name)
+        text = f"{significant(target / spec.scale)} {pretty_unit(spec.scaled_unit)} for {name}"
         sigma = sweep.over(study.values("sigma", parameter=name))
-        known = np.isfinite(sigma)
-        if not known.any():
-            continue
-        unit = pretty_unit(spec.scaled_unit)
-        head = f"The target of {significant(target / spec.scale)} {unit} for {name} is met"
         needed = study.values("frames_needed_sigma", parameter=name)
-        text = f"{head} {_share(sweep, sigma <= target, known, known.size)}."
-        parts.append(f"{text} {_range_of_frames(sweep, needed)}".strip())
+        if np.isfinite(sigma).any():
+            parts.append(_target(text, sweep, sigma, target, needed))
     return parts
 
 
-def _range_of_frames(sweep: Sweep, cells: FloatArray) -> str:
-    """The fewest and the most frames that a target takes over the sweep, and where."""
-    needed = sweep.over(cells).ravel()
-    if not np.isfinite(needed).any():
-        return "No number of frames meets it." if np.isinf(needed).any() else ""
-    good = np.where(np.isfinite(needed), needed, np.nan)
-    least, most = int(np.nanargmin(good)), int(np.nanargmax(good))
-
-    def told(index: int) -> str:
-        at = place({axis: value for axis, value in sweep.at(index).items() if axis != "frames"})
-        return f"{plural(int(good[index]), 'frame')}{f' ({at})' if at else ''}"
-
+def _target(text: str, sweep: Sweep, found: FloatArray, target: float, cells: FloatArray) -> str:
+    known = int(np.isfinite(found).sum())
+    met = f"The target of {text} is met in {count(int(np.sum(found <= target)))} of {count(known)}"
+    needed = sweep.over(cells)
+    finite = needed[np.isfinite(needed)]
     never = int(np.isinf(needed).sum())
-    floor = (
-        f" In {plural(never, 'place')} no number of frames does: errors of the stars stay."
-        if never
-        else ""
-    )
-    if good[least] == good[most]:
-        return f"It takes {plural(int(good[least]), 'frame')}.{floor}"
-    return f"It takes from {told(least)} to {told(most)}.{floor}"
-
-
-def _where(sweep: Sweep, flag: BoolArray, known: BoolArray) -> str:
-    """The cut along one axis that tells best where something holds; nothing where none does."""
-    best = (0.0, "")
-    total = float(known.sum())
-    base = max(flag.sum(), (known & ~flag).sum()) / total
-
-    def right(inside: Any) -> float:
-        return float((known & (flag == inside)).sum()) / total
-
-    for position, axis in enumerate(sweep.axes):
-        values = sweep.values[axis]
-        index = np.arange(len(values)).reshape([-1] + [1] * (flag.ndim - position - 1))
-        if isinstance(values[0], str):
-            others = tuple(i for i in range(flag.ndim) if i != position)
-            chosen = 2 * flag.sum(axis=others) > known.sum(axis=others)
-            inside = [value for value, there in zip(values, chosen, strict=True) if there]
-            if 0 < len(inside) < len(values):
-                best = max(best, (right(chosen[index]), _with(axis, inside)))
-            continue
-        for cut in range(1, len(values)):
-            best = max(
-                best,
-                (right(index >= cut), f"from {said(axis, values[cut])} on"),
-                (right(index < cut), f"from {said(axis, values[cut - 1])} downwards"),
-                key=lambda entry: entry[0],
-            )
-    told, words = best
-    if told < max(0.8, base + 0.05):
-        return ""
-    return f": {words}" if told > 0.999 else f": {words} (so in {percent(told)} of the places)"
-
-
-def _price_of_models(study: Study) -> str:
-    """The sigma of f with richer models beside that with the simplest, medians."""
-    sweep = study.sweep
-    curve = sweep.along(study.values("sigma", parameter="f"), "distortion")
-    if curve is None:
-        return ""
-    first, *others = sorted(
-        range(len(curve.values)), key=lambda i: len(parameters(curve.values[i]))
-    )
-    told = [
-        f"{significant(curve.median[i] / curve.median[first])} with {curve.values[i]}"
-        for i in others
-    ]
-    return (
-        f"Beside the model {curve.values[first]}, the sigma of f is larger by factors of "
-        f"{join_words(told)}."
-    )
-
-
-def _models(study: Study) -> list[str]:
-    """What richer models cost, beside the simplest that was swept."""
-    sweep = study.sweep
-    if "distortion" not in sweep.axes:
-        return []
-    known = sweep.values["distortion"]
-    first, *others = sorted(known, key=lambda model: len(parameters(model)))
-    position = sweep.axes.index("distortion")
-    numbers = {
-        "the sigma of f": study.values("sigma", parameter="f"),
-        "the error from frame to frame": sweep.frame_error,
-        "the common rotation": sweep.common_rotation,
-    }
-    told = []
-    for model in others:
-        factors = []
-        for words, array in numbers.items():
-            grid = np.moveaxis(sweep.over(array), position, 0)
-            ratio = grid[known.index(model)] / grid[known.index(first)]
-            if np.isfinite(ratio).any():
-                factors.append(f"{_span(ratio)} times {words}")
-        if factors:
-            told.append(f"{model} has {join_words(factors)}")
-    return [f"Beside the model {first}: {'; '.join(told)}."] if told else []
+    if not len(finite):
+        return f"{met} places; no number of frames meets it."
+    low, high = (count(int(edge)) for edge in (finite.min(), finite.max()))
+    frames = f"{low} frames" if low == high else f"{low} to {high} frames"
+    floor = f"; errors of the stars prevent it in {count(never)}" if never else ""
+    return f"{met} places; it takes {frames}{floor}."
 
 
 def _simpler(study: Study) -> list[str]:
-    """Whether a simpler model would do."""
-    if "simpler" not in study.data.dims:
-        return []
-    sweep = study.sweep
+    """Share of the places where a simpler distortion model would do."""
+    models = map(str, study.data["simpler"].values) if "simpler" in study.data.dims else ()
     parts = []
-    for model in map(str, study.data["simpler"].values):
+    for model in models:
         bias = model_bias(study, model)
-        grid = sweep.over(bias)
-        error = sweep.over(np.where(np.isfinite(bias), sweep.frame_error, np.nan))
-        known = np.isfinite(grid) & np.isfinite(error)
-        if not known.any():
-            continue
+        left = study.sweep.over(bias)
+        error = study.sweep.over(np.where(np.isfinite(bias), study.sweep.frame_error, np.nan))
         # Where the coefficients that it leaves out are zero, nothing was tried.
-        known &= grid > 0.0
-        if not known.any():
+        tried = left > 0.0
+        if tried.any():
+            met = f"{count(int(np.sum(left[tried] < error[tried])))} of {count(int(tried.sum()))}"
             parts.append(
-                f"The model {model} lacks nothing here: the coefficients that it leaves out are "
-                "zero."
+                f"The distortion model {model} would do in {met} places: it leaves "
+                f"{_span(left[tried])} arcsec."
             )
-            continue
-        share = _share(sweep, grid < error, known)
-        size = f"{_span(grid[known])} arcsec against {_span(error[known])} of the calibration"
-        parts.append(f"The model {model} would do {share}: it leaves {size}.")
+        elif np.isfinite(left).any():
+            parts.append(f"The distortion model {model} lacks nothing here.")
     return parts
 
 
@@ -547,97 +208,282 @@ def model_bias(study: Study, simpler: str) -> FloatArray:
 
 
 def _simulated(study: Study) -> list[str]:
-    """Whether intervals of simulated cells hold the truth as often as they say, and posteriors are
-    as forecast.
-    """
+    """Coverage of the 95 % intervals of simulated cells, and their posteriors against forecasts."""
     if "covered_95" not in study.data:
         return []
     sweep = study.sweep
     covered = np.where(sweep.ok[:, None], study.data["covered_95"].values, np.nan)
-    groups = [("", np.ones_like(sweep.ok))]
-    for axis in ("method", "likelihood", "prior"):
-        if axis in sweep.axes:
-            names = study.data[axis].values
-            groups += [
-                (f" with {said(axis, value)}", names == value) for value in sweep.values[axis]
-            ]
-    told, wrong = [], []
+    groups = {"": np.ones_like(sweep.ok)}
+    for axis in {"method", "likelihood", "prior"} & set(sweep.axes):
+        for value in sweep.values[axis]:
+            groups[f" ({axis} {value})"] = study.data[axis].values == value
     # One false alarm in a hundred studies, however many intervals are looked at.
     level = 1.0 - 0.01 / (len(groups) * len(sweep.names))
-    for words, cells in groups:
-        for i, name in enumerate(sweep.names):
-            held = covered[cells, i]
-            held = held[np.isfinite(held)]
+    rates, wrong = [], []
+    for words, cells in groups.items():
+        for name, column in zip(sweep.names, covered[cells].T, strict=True):
+            held = column[np.isfinite(column)]
             if not len(held):
                 continue
-            n, hits = len(held), int(held.sum())
-            low, high = binomial_interval(hits, n, level)
+            low, high = binomial_interval(int(held.sum()), len(held), level)
+            rate = f"{name}{words} {percent(float(held.mean()), 3)}"
             if not words:
-                told.append(f"{name} {percent(hits / n, 3)}")
+                rates.append(rate)
             if not low <= 0.95 <= high:
-                wrong.append(f"{name}{words} ({percent(hits / n, 3)} of {count(n)})")
-    if not told:
+                wrong.append(rate)
+    if not rates:
         return []
-    text = (
-        f"In {count(sweep.ok.sum())} simulated cells the 95 % intervals hold the truth as often as "
-        f"this: {join_words(told)}"
-    )
-    if not wrong:
-        text += "; chance explains what differs from 95 %."
-    else:
-        text += (
-            f". That is not 95 % for {join_words(wrong)}: do not use these intervals as they are."
-        )
-    return [text, *_posteriors(study)]
+    text = f"95 % intervals hold the truth in {join_words(rates)} of {count(int(sweep.ok.sum()))}"
+    verdict = "chance explains the differences from 95 %"
+    if wrong:
+        verdict = f"chance does not explain {join_words(wrong)}: do not use these intervals"
+    return [f"{text} simulated cells; {verdict}.", *_posteriors(study)]
 
 
 def _posteriors(study: Study) -> list[str]:
-    """Sigmas of the posteriors beside what the information forecast."""
     if "posterior_sigma" not in study.data:
         return []
-    ratio = study.data["posterior_sigma"].values / study.data["sigma"].values
-    ratio = np.where(study.sweep.ok[:, None], ratio, np.nan)
+    ratio = (study.data["posterior_sigma"] / study.data["sigma"]).values[study.sweep.ok]
     if not np.isfinite(ratio).any():
         return []
     low, middle, high = (fixed(q, 2) for q in np.nanquantile(ratio, (0.05, 0.5, 0.95)))
-    return [
-        f"Sigmas of the posteriors are {middle} times what the information forecasts (median; "
-        f"{low} to {high} for 90 % "
-        "of cells and parameters)."
-    ]
+    return [f"Posterior sigma over forecast: median {middle}, 90 % between {low} and {high}."]
+
+
+def study_advice(study: Study) -> list[str]:
+    """What a designer can do with the answer."""
+    sweep = study.sweep
+    if not sweep.ok.any():
+        return ["Nothing can be advised: see why the cells failed."]
+    parts = [*_apart(study), _worth_most(sweep), _cheapest(study), _simplest(study)]
+    return [part for part in parts if part]
+
+
+def _apart(study: Study) -> list[str]:
+    """Where pairs are least coupled, if their sigmas are smaller there, and pairs that stay."""
+    best: dict[str, list[str]] = {}
+    stuck = []
+    for pair in study.sweep.coupled:
+        found = pair.decoupling()
+        costs = [cost for _, cost in found if cost.axis not in _GIVEN and _pays(study, pair, cost)]
+        if costs:
+            at = place({costs[0].axis: costs[0].values[costs[0].least]})
+            best.setdefault(at, []).append(dashed(pair))
+        elif not found:
+            stuck.append(dashed(pair))
+    parts = [f"To tell {join_words(names)} apart, choose {at}." for at, names in best.items()]
+    if stuck:
+        parts.append(
+            f"Nothing that was varied tells {join_words(stuck)} apart: report their covariance, "
+            "give one of each pair as a prior, or use a model with fewer coefficients."
+        )
+    return parts
+
+
+def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
+    """Whether both sigmas are smaller where the pair is least coupled than where it is most."""
+    known = np.isfinite(correlations(study, pair))
+    for name in pair.names:
+        sigma = np.where(known, study.values("sigma", parameter=name), np.nan)
+        curve = study.sweep.along(sigma, cost.axis)
+        if curve is None or curve.median[cost.least] >= curve.median[cost.most]:
+            return False
+    return True
+
+
+def _worth_most(sweep: Sweep) -> str:
+    """The axis of numbers that changes the attitude error most."""
+    curves = [curve for curve in sweep.curves(sweep.frame_error) if np.isfinite(curve.factor)]
+    curves = [curve for curve in curves if not isinstance(curve.values[0], str)]
+    curve = max(curves, key=lambda curve: curve.factor, default=None)
+    if curve is None or curve.factor < _HARDLY:
+        return ""
+    low, high = (value_words(curve.values[i]) for i in (curve.most, curve.least))
+    return (
+        f"The {axis_name(curve.axis)} is worth most for the attitude error: a factor of "
+        f"{significant(curve.factor)} between {low} and {high}."
+    )
+
+
+def _cheapest(study: Study) -> str:
+    """The fewest frames that keep the target whatever the lens is; the most to spare among them."""
+    target, sweep = study.definition.target_arcsec, study.sweep
+    if target is None or "frames" not in sweep.axes:
+        return ""
+    given = tuple(i for i, axis in enumerate(sweep.axes) if axis in ("distortion", *_GIVEN))
+    errors = sweep.over(sweep.frame_error)
+    worst = np.max(errors, axis=given, keepdims=True)
+    errors = np.broadcast_to(worst, errors.shape).ravel()
+    if not np.any(errors <= target):
+        return f"No place of this sweep keeps {target:g} arcsec: take more frames."
+    frames = np.array([sweep.at(i)["frames"] for i in range(errors.size)])
+    kept = errors <= target
+    best = int(np.argmin(np.where(kept & (frames == frames[kept].min()), errors, np.inf)))
+    at = {axis: v for axis, v in sweep.at(best).items() if sweep.axes.index(axis) not in given}
+    return f"The fewest frames that keep {target:g} arcsec: {place(at)}."
+
+
+def _simplest(study: Study) -> str:
+    """The simplest distortion model that is rich enough everywhere."""
+    models = list(map(str, study.data["simpler"].values)) if "simpler" in study.data.dims else []
+    for model in sorted(models, key=lambda model: len(parameters(model))):
+        bias = model_bias(study, model)
+        known = study.sweep.ok & np.isfinite(bias)
+        small = bias[known] < study.sweep.frame_error[known]
+        if np.any(bias[known] > 0.0) and small.all():
+            return f"The distortion model {model} is rich enough everywhere in this sweep."
+    return ""
 
 
 def study_limits(study: Study) -> list[str]:
     """What was not assessed, and which cells failed."""
     sweep = study.sweep
-    total, failed = len(sweep.ok), int((~sweep.ok).sum())
     parts = []
-    if failed:
+    if sweep.failures:
         reasons = [f"{count(n)}: {reason.rstrip('.')}" for reason, n in sweep.failures[:3]]
-        more = len(sweep.failures) - len(reasons)
-        rest = f"; {plural(more, 'further reason')}" if more > 0 else ""
-        parts.append(
-            f"{count(failed)} of {plural(total, 'cell')} have no numbers "
-            f"({'; '.join(reasons)}{rest})."
-        )
-    seeds = len(np.unique(study.data["seed_index"].values))
-    if seeds == 1 and not sweep.drawn:
-        parts.append("One seed: what another sky or other frames would change was not assessed.")
+        failed = f"{count(int((~sweep.ok).sum()))} of {plural(len(sweep.ok), 'cell')}"
+        parts.append(f"{failed} have no numbers ({'; '.join(reasons)}).")
     if sweep.drawn:
-        parts.append(
-            "Drawn from a Latin hypercube: "
-            f"{join_words([axis_name(axis) for axis in sweep.drawn])}. Each is told in "
-            "parts of equal number, by their middles."
-        )
+        drawn = join_words([axis_name(axis) for axis in sweep.drawn])
+        parts.append(f"Drawn from a Latin hypercube, and shown in parts of equal number: {drawn}.")
+    elif len(np.unique(study.data["seed_index"].values)) == 1:
+        parts.append("One seed: what another sky or other frames would change was not assessed.")
     if study.definition.mode == "simulate":
         parts.append(
             "Simulated with the noise and the distortion model that the calibration assumes."
         )
     else:
         parts.append(
-            "From Fisher information: Gaussian noise, right identifications and a right "
-            "distortion model are assumed. "
-            "Coverage, bias of the estimates and convergence were not assessed; mode = "
-            '"simulate" does.'
+            "Fisher information assumes Gaussian noise, right identifications and a right "
+            "distortion model. Coverage, bias and convergence were not assessed; "
+            'mode = "simulate" does.'
         )
     return parts
+
+
+def study_notes(study: Study) -> list[str]:
+    """Answer beyond the headline, advice and limits, for a notebook."""
+    return [*study_answer(study)[1:], *study_advice(study), *study_limits(study)]
+
+
+def study_tables(study: Study) -> list[TextTable]:
+    """Coupled pairs, what changes them and the errors, and medians along every axis."""
+    if not study.sweep.ok.any():
+        return []
+    tables = [_pairs_table(study)]
+    if study.sweep.axes:
+        tables += [_changes_table(study.sweep), _medians_table(study)]
+    return [table for table in tables if table.rows]
+
+
+def correlations(study: Study, pair: Pair) -> FloatArray:
+    """Correlation of a pair in every cell (C,)."""
+    return study.values("correlation", parameter=pair.names[0], parameter_2=pair.names[1])
+
+
+def _pairs_table(study: Study) -> TextTable:
+    sweep = study.sweep
+    rows = [
+        (
+            dashed(pair),
+            correlation_text(pair.strongest),
+            place(pair.strongest_at),
+            correlation_text(pair.weakest),
+            place(pair.weakest_at),
+            significant(0.5 * pair.seeds, 1),
+        )
+        for pair in sweep.coupled
+    ]
+    for i, name in enumerate(sweep.names):
+        for j, axis in enumerate(AXES):
+            r = study.data["attitude_correlation"].values[:, i, j]
+            grid = sweep.over(r).ravel()
+            size = np.abs(grid)
+            if np.isfinite(size).any() and np.nanmin(size) >= COUPLED:
+                row = [f"{name} and common {axis}"]
+                for index in (int(np.nanargmax(size)), int(np.nanargmin(size))):
+                    row += [correlation_text(grid[index]), place(sweep.at(index))]
+                rows.append((*row, significant(0.5 * sweep.seeds(r), 1)))  # type: ignore[arg-type]
+    heads = ("Coupled", "Strongest", "At", "Weakest", "At", "± over seeds")
+    return TextTable(heads, tuple(rows), "Correlations, median over seeds", "lrlrlr")
+
+
+def _changes_table(sweep: Sweep) -> TextTable:
+    """One row for every axis that changes a coupling or an attitude error."""
+    rows = []
+    for pair in sweep.coupled:
+        for size, cost in pair.decoupling():
+            most, least = (correlation_text(size.median[i]) for i in (cost.most, cost.least))
+            price = float(np.exp(cost.median.max() - cost.median.min()))
+            rows.append(_change(dashed(pair), cost, most, least, price))
+    errors = {"Error from frame to frame": sweep.frame_error, "Common": sweep.common_rotation}
+    for words, numbers in errors.items():
+        for curve in sweep.curves(numbers):
+            if curve.factor >= _HARDLY:
+                most, least = (
+                    f'{significant(curve.median[i])}"' for i in (curve.most, curve.least)
+                )
+                law = None if curve.axis == "max_mag" else curve.exponent
+                power = _MISSING if law is None else fixed(law, 2)
+                rows.append(_change(words, curve, most, least, curve.factor, power))
+    heads = ("What", "Along", "Most", "At", "Least", "At", "Factor in sigma", "Power")
+    return TextTable(heads, tuple(rows), "What changes couplings and attitude errors", "llrlrlrr")
+
+
+def _change(
+    words: str, curve: Curve, most: str, least: str, factor: float, power: str = _MISSING
+) -> tuple[str, ...]:
+    at_most, at_least = (value_words(curve.values[i]) for i in (curve.most, curve.least))
+    ends = most, at_most, least, at_least
+    return (words, axis_label(curve.axis), *ends, significant(factor), power)
+
+
+def _medians_table(study: Study) -> TextTable:
+    """One row for every value of every axis, all else at its median."""
+    sweep = study.sweep
+    columns = summary_columns(study)
+    rows = []
+    for axis in sweep.axes:
+        grids = [sweep.pooled(numbers, axis) for _, numbers, _ in columns]
+        for i, value in enumerate(sweep.values[axis]):
+            cells = [
+                form(float(grid[i])) for (_, _, form), grid in zip(columns, grids, strict=True)
+            ]
+            rows.append((axis_label(axis) if i == 0 else "", value_words(value), *cells))
+    heads = ("Along", "Value", *(head for head, _, _ in columns))
+    return TextTable(
+        heads, tuple(rows), "Medians over seeds and all other axes", "ll" + "r" * len(columns)
+    )
+
+
+def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
+    """Heads, numbers (C,) and forms of what a row of a table shows of a cell."""
+    sweep = study.sweep
+    coupled = sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)
+    unit = pretty_unit(parameter_called("f").scaled_unit)
+    inflation = np.sqrt(study.values("variance_inflation", parameter="f"))
+    columns: list[tuple[str, FloatArray, Any]] = [
+        *((dashed(pair), correlations(study, pair), _correlation) for pair in coupled[:2]),
+        (f"Sigma f [{unit}]", study.values("sigma", parameter="f"), _number),
+        ("Price f", inflation, _number),
+        ("Common [arcsec]", sweep.common_rotation, _number),
+        ("Rest [arcsec]", sweep.frame_error, _number),
+    ]
+    target = study.definition.target_arcsec
+    if target is not None:
+        columns.append((f"Frames for {target:g} arcsec", study.frames_for(target), _frames))
+    return columns
+
+
+def _correlation(value: float) -> str:
+    return _MISSING if np.isnan(value) else correlation_text(value)
+
+
+def _number(value: float) -> str:
+    return _MISSING if np.isnan(value) else significant(value, 3)
+
+
+def _frames(value: float) -> str:
+    if np.isfinite(value):
+        return count(int(np.ceil(value)))
+    return "never" if np.isinf(value) else _MISSING
