@@ -13,11 +13,18 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from starcal_uq.budgeting.file import BudgetFile, checked_confidence, load_budget_file
-from starcal_uq.budgeting.posterior import alignment_rows, misfit_notes, posterior_rows
+from starcal_uq.budgeting.posterior import (
+    alignment_rows,
+    effect_rows,
+    misfit_notes,
+    posterior_rows,
+    stated_instead,
+)
 from starcal_uq.budgeting.result import Budget, by_contributor, judge
 from starcal_uq.budgeting.rows import (
     AXIS_LABELS,
     FROM_FILE,
+    OF_EFFECTS,
     UNTESTED,
     Contributor,
     Expected,
@@ -27,7 +34,7 @@ from starcal_uq.budgeting.sampling import N_SAMPLES
 from starcal_uq.budgeting.totals import totals
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
-from starcal_uq.core.formatting import join_words
+from starcal_uq.core.formatting import join_words, significant
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import one_thread
@@ -40,6 +47,9 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
 
 _CONFIDENCE = 0.997
+# A row of the file that may hold what effects fill rows with.
+_DRIFT = "drift of focal length and distortion"
+_OF_TIME_OR_WARMTH = [OF_EFFECTS[name].name for name in ("temperature", "time", "epoch")]
 
 
 @bounded
@@ -107,9 +117,11 @@ def budget(
 
         attitude = with_misfit(attitude, misfit, post, obs)
     untested = () if attitude.misfit is not None else (UNTESTED,)
+    effects, replaced = stated_instead(effect_rows(attitude, post), stated.contributors)
+    known = (*alignment_rows(attitude), *effects)
     rows = (
         *posterior_rows(attitude, post),
-        *_from_file(stated, (*untested, *FROM_FILE), alignment_rows(attitude)),
+        *_from_file(stated, (*untested, *FROM_FILE), known),
     )
     found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
     settings: AnyDict = {
@@ -129,6 +141,7 @@ def budget(
         notes=(
             f"After alignment: an alignment calibration on {attitude.alignment}.",
             *misfit_notes(attitude),
+            *_effect_notes(effects, replaced, stated),
             *_notes(rows),
         ),
         provenance=provenance(seed, settings, post.provenance.data_sha256),
@@ -171,6 +184,30 @@ def _silent(stated: Contributor, axis: str) -> Contributor:
         source="not assessed",
         applies=True,
     )
+
+
+def _effect_notes(
+    effects: tuple[Contributor, ...], replaced: tuple[Contributor, ...], stated: BudgetFile
+) -> tuple[str, ...]:
+    """What the file states in place of computed rows, and what may be stated twice."""
+    notes = []
+    for name, axes in by_contributor(replaced).items():
+        sizes = [
+            f"{significant(math.hypot(row.mean_arcsec, row.sigma_arcsec))} arcsec about "
+            f"{AXIS_LABELS[axis]}"
+            for axis, row in axes.items()
+        ]
+        notes.append(
+            f"{name!r} is as the file states it; the calibration gives {join_words(sizes)}, "
+            "which is in no total."
+        )
+    computed = {row.name for row in effects if row.applies} & set(_OF_TIME_OR_WARMTH)
+    if computed and any(row.name == _DRIFT and row.applies for row in stated.contributors):
+        notes.append(
+            f"{_DRIFT!r} is stated in the file, and {join_words(sorted(map(repr, computed)))} "
+            "computed from the calibration: state in the first what the calibration does not hold."
+        )
+    return tuple(notes)
 
 
 def _notes(rows: tuple[Contributor, ...]) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from starcal_uq.budgeting.rows import (
     FROM_POSTERIOR,
     INTERACTING,
     INTERPRETATIONS,
+    OF_EFFECTS,
     SCOPES,
     Contributor,
     Expected,
@@ -46,6 +47,8 @@ _REQUIREMENT_AXES = {key: names for key, names in _AXIS_NAMES.items() if key != 
 # What the starter's names bring along, and nobody can guess for others.
 _OWN_KEYS = ("ecss_class", "interpretation", "absorbed_by_alignment")
 _OWN = Expected("", "other", "ensemble", "no", "gaussian", "")
+# What a file may state by name alone.
+_STATED = (*FROM_FILE, *OF_EFFECTS.values())
 # Names as similar as this are one name mistyped.
 _SAME_NAME = 0.9
 JUDGED_BY = ("both", "rule", "sampling")
@@ -300,7 +303,7 @@ def _contributor(data: Any, where: str) -> list[Contributor]:
             "or propagate over other "
             "frames."
         )
-    known = {entry.name: entry for entry in FROM_FILE}.get(name)
+    known = {entry.name: entry for entry in _STATED}.get(name)
     if known is None:
         _check_own(table, where, name, close)
     stated: AnyDict = {
@@ -325,7 +328,7 @@ def _known_name(written: str) -> tuple[str, str]:
     """The name as the starter has it, whatever its case; else as written, with the most similar one
     of the starter.
     """
-    names = {entry.name.lower(): entry.name for entry in (*FROM_FILE, *FROM_POSTERIOR, INTERACTING)}
+    names = {entry.name.lower(): entry.name for entry in (*_STATED, *FROM_POSTERIOR, INTERACTING)}
     plain = " ".join(written.lower().split())
     if plain in names:
         return names[plain], ""

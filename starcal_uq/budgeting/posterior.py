@@ -5,6 +5,7 @@ tested.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,8 +19,10 @@ from starcal_uq.budgeting.rows import (
     GAUSSIAN_997,
     INTERACTING,
     NEA,
+    OF_EFFECTS,
     REST,
     Contributor,
+    Expected,
     not_assessed,
 )
 from starcal_uq.core.constants import AXES
@@ -32,16 +35,27 @@ from starcal_uq.propagation.attitude_error import (
     WITH_MISFIT_FOUND,
     choice,
 )
+from starcal_uq.propagation.onboard_error import with_cross
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.onboard_error import EffectError
+
+# What alignment takes up of an effect is a row of its own.
+_IN_COMMON = ", common rotation"
+# What is below this is rounding, arcsec.
+_NOTHING_ARCSEC = 1e-9
 
 
 def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributor, ...]:
     """Common rotation, rest, centroid noise, and their interaction where it was propagated; each on
     three axes.
+
+    Where the calibration holds effects, these are the shares of the camera's parameters and of the
+    noise alone: effects have rows of their own.
     """
+    attitude = without_effects(attitude)
     hash_text = (post.provenance.data_sha256 or "")[:12]
     provenance = f"posterior of {plural(len(post.draws), 'draw')}" + (
         f", data {hash_text}" if hash_text else ""
@@ -96,6 +110,143 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
                 )
             )
     return tuple(rows)
+
+
+def without_effects(attitude: AttitudeError) -> AttitudeError:
+    """The attitude error less the shares of effects."""
+    own = None if attitude.aboard is None else attitude.aboard.parameters
+    if own is None:
+        return attitude
+    star = next((each for each in attitude.effects if each.name == "star"), None)
+    noise = attitude.nea_arcsec
+    if star is not None:
+        noise = np.sqrt(np.maximum(noise**2 - star.rest_arcsec**2, 0.0))
+    sigmas = np.stack([noise, own.common_arcsec, own.rest_arcsec])
+    before = attitude.if_model_holds_arcsec[:3, :3]
+    scale = np.divide(sigmas, before, out=np.zeros((3, 3)), where=before > 0.0)
+    covariance = attitude.covariance_arcsec2.copy()
+    covariance[0] *= np.outer(scale[0], scale[0])
+    covariance[1], covariance[2] = own.common_covariance_arcsec2, own.rest_covariance_arcsec2
+    scale = np.stack([with_cross(line) for line in scale])
+    widths = attitude.p95_arcsec.copy(), attitude.p997_arcsec.copy()
+    for width in widths:
+        width[:3] *= scale
+    return replace(
+        attitude,
+        nea_arcsec=noise,
+        common_arcsec=own.common_arcsec,
+        rest_arcsec=own.rest_arcsec,
+        p95_arcsec=widths[0],
+        p997_arcsec=widths[1],
+        total_arcsec=np.hypot(own.common_arcsec, own.rest_arcsec),
+        rest_constant_arcsec=own.rest_constant_arcsec,
+        covariance_arcsec2=covariance,
+        variants=(),
+    )
+
+
+def effect_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributor, ...]:
+    """What the software aboard leaves of each effect, on three axes; its common rotation by
+    itself.
+    """
+    if attitude.aboard is None or attitude.aboard.parameters is None:
+        return ()
+    rows = [row for share in attitude.effects for row in _rows_of(share, attitude)]
+    if post.effects is not None and "zenith" in post.effects.names:
+        expected = OF_EFFECTS["zenith"]
+        rows += [
+            replace(
+                not_assessed(expected, axis),
+                mean_arcsec=0.0,
+                sigma_arcsec=0.0,
+                applies=False,
+                conditions="the calibration saw stars through air; a mission above it sees none",
+                provenance="effect 'zenith' of the calibration",
+                source="posterior",
+            )
+            for axis in AXES
+        ]
+    return tuple(rows)
+
+
+def _rows_of(share: EffectError, attitude: AttitudeError) -> list[Contributor]:
+    """The rest of an effect, and what is in common; of frames by themselves nothing is."""
+    expected = OF_EFFECTS[share.name]
+    constant = share.rest_constant_arcsec**2 > 0.5 * np.diag(share.rest_covariance_arcsec2)
+    kinds = ["ensemble" if one else expected.interpretation for one in constant]
+    rest = share.rest_mean_arcsec, share.rest_covariance_arcsec2
+    rows = _of_axes(expected, attitude, rest, kinds)
+    common = share.common_mean_arcsec, share.common_covariance_arcsec2
+    if share.name != "frame" and share.common_arcsec.max() > _NOTHING_ARCSEC:
+        shared = replace(
+            expected,
+            name=expected.name + _IN_COMMON,
+            ecss_class="bias",
+            # Alignment and mission may have different nights.
+            absorbed_by_alignment="in part" if share.name == "epoch" else "yes",
+        )
+        rows = _of_axes(shared, attitude, common, ["ensemble"] * len(AXES)) + rows
+    return rows
+
+
+def _of_axes(
+    expected: Expected,
+    attitude: AttitudeError,
+    moments: tuple[FloatArray, FloatArray],
+    kinds: Sequence[str],
+) -> list[Contributor]:
+    """A row on three axes from means (3,) and covariance (3, 3), arcsec."""
+    mean, covariance = moments
+    sigma = np.sqrt(np.diag(covariance))
+    uses = (
+        "the camera's parameters alone" if attitude.onboard == "model" else "what effects tell it"
+    )
+    return [
+        replace(
+            not_assessed(expected, axis),
+            mean_arcsec=float(mean[index]),
+            sigma_arcsec=float(sigma[index]),
+            interpretation=kinds[index],
+            axis_correlation=correlation,
+            conditions=f"star geometry of {plural(attitude.n_frames, 'frame')} "
+            f"({attitude.frames}); the software uses {uses}",
+            provenance="effect of the calibration, propagated with the posterior",
+            source="posterior",
+            if_model_holds_arcsec=float(sigma[index]),
+            with_misfit_found_arcsec=math.nan if attitude.misfit is None else float(sigma[index]),
+        )
+        for index, (axis, correlation) in enumerate(
+            zip(AXES, axis_correlations(covariance, np.ones(3)), strict=True)
+        )
+    ]
+
+
+def stated_instead(
+    rows: Sequence[Contributor], stated: Sequence[Contributor]
+) -> tuple[tuple[Contributor, ...], tuple[Contributor, ...]]:
+    """Rows of effects that count, and those in whose place a file states its own on that axis.
+
+    A statement is of the whole effect: the row of its common rotation then counts as none.
+    """
+    given = {(row.name, row.axis) for row in stated}
+    kept, replaced = [], []
+    for row in rows:
+        whole = row.name.removesuffix(_IN_COMMON)
+        if (whole, row.axis) not in given and (row.name, row.axis) not in given:
+            kept.append(row)
+            continue
+        replaced.append(row)
+        if row.name != whole and (row.name, row.axis) not in given:
+            kept.append(
+                replace(
+                    row,
+                    mean_arcsec=0.0,
+                    sigma_arcsec=0.0,
+                    applies=False,
+                    conditions=f"in the row {whole!r}, which the file states",
+                )
+            )
+    return tuple(kept), tuple(replaced)
 
 
 def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:

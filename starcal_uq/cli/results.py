@@ -126,6 +126,12 @@ def _study(result: Any) -> AnyDict:
     }
 
 
+def _attitude(result: Any) -> AnyDict:
+    from starcal_uq.propagation.onboard_error import side_by_side
+
+    return {"contributors": result.to_dataframe(), "aboard": side_by_side(result.variants)}
+
+
 def _table_as(key: str) -> Callable[[Any], AnyDict]:
     """A result whose table stands under a key."""
     return lambda result: {key: result.to_dataframe()}
@@ -136,7 +142,7 @@ TAKEN: Mapping[str, Callable[[Any], Mapping[str, Any]]] = {
     "Effects": _effects,
     "Posterior": _posterior,
     "Coupling": _coupling,
-    "Attitude": _table_as("contributors"),
+    "Attitude": _attitude,
     "Budget": _budget,
     "Consistency": _consistency,
     "Diagnosis": _diagnosis,

@@ -29,6 +29,7 @@ from starcal_uq.core.status import Note
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, PathLike, floats
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
+from starcal_uq.propagation.onboard_error import EffectError, OnboardError, with_cross
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,6 +43,8 @@ CONTRIBUTORS = (
     "calibration, total",
     INTERACTION,
 )
+# The rows of the calibration, as parts of what is left with an onboard model.
+_OF_CALIBRATION = ("common rotation", "rest", "total")
 OBSERVED = "observed frames"
 # What alignment was taken to be where nothing is said about it.
 SAME_FRAMES = "the frames themselves"
@@ -141,46 +144,6 @@ class MisfitFound:
     def reasons(self) -> tuple[str, ...]:
         """Reasons for either, each once."""
         return tuple(dict.fromkeys((*self.common_reasons, *self.rest_reasons)))
-
-
-@dataclass(frozen=True, eq=False)
-class EffectError:
-    """What one effect does to attitudes by itself.
-
-    Attributes
-    ----------
-    name : str
-        The effect.
-    common_arcsec, rest_arcsec : (3,) array
-        Root mean squares of its common rotation and, over frames, of its rest, arcsec.
-    """
-
-    name: str
-    common_arcsec: FloatArray
-    rest_arcsec: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class OnboardError:
-    """The calibration's part of the attitude error with one onboard model, effects included.
-
-    Attributes
-    ----------
-    onboard : {"model", "effects"}
-        What the mission's software uses: parameters of the camera alone, or what can be uploaded of
-        the effects as well.
-    common_arcsec, rest_arcsec, total_arcsec : (3,) array
-        Root mean squares of common rotation, rest, and both together, arcsec.
-    effects : tuple of EffectError
-        What every effect does by itself. They are correlated with the parameters, so that squares
-        need not add up.
-    """
-
-    onboard: OnboardModel
-    common_arcsec: FloatArray
-    rest_arcsec: FloatArray
-    total_arcsec: FloatArray
-    effects: tuple[EffectError, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,9 +253,14 @@ class AttitudeError(Shown):
     effects_per_frame_arcsec: FloatArray | None = None
 
     @property
+    def aboard(self) -> OnboardError | None:
+        """The calibration's part with the onboard model; None without effects."""
+        return next((own for own in self.variants if own.onboard == self.onboard), None)
+
+    @property
     def effects(self) -> tuple[EffectError, ...]:
         """What effects of the calibration do to attitudes, with the onboard model."""
-        return next((own.effects for own in self.variants if own.onboard == self.onboard), ())
+        return () if self.aboard is None else self.aboard.effects
 
     @property
     def told_frames(self) -> str:
@@ -502,6 +470,10 @@ class AttitudeError(Shown):
         if self.variants:
             aboard = json.dumps(to_plain(_Aboard(self.onboard, self.variants)))
             table = table.assign(onboard=[aboard] + [""] * (len(table) - 1))
+            for own in self.variants:
+                figures = np.full((len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
+                figures[1:4] = [with_cross(own.parts[name]) for name in _OF_CALIBRATION]
+                table[f"onboard_{own.onboard}_arcsec"] = figures.ravel()
         # Once is enough: it is the same for all rows.
         write_csv(table.assign(misfit=[misfit] + [""] * (len(table) - 1)), path)
 
@@ -593,10 +565,3 @@ def _gaussian_tails(sigmas: FloatArray, confidence: float, one_axis: float) -> F
         for row in sigmas
     ]
     return np.column_stack((np.full((len(sigmas), 3), one_axis), across))
-
-
-def with_cross(sigma: FloatArray) -> FloatArray:
-    """Sigmas of the three axes (3,), then the root mean square of the two across the boresight:
-    (4,).
-    """
-    return np.append(sigma, np.sqrt(np.mean(sigma[:2] ** 2)))

@@ -87,6 +87,16 @@ class FrameGeometry:
             noise_covariance=_frame_sums(np.einsum("ani,anj->nij", turns, turns), starts),
         )
 
+    @property
+    def of_stars(self) -> FloatArray | None:
+        """The part (3, 3) of the mean noise covariance that is the stars' own direction errors,
+        rad^2; None where the posterior holds none.
+        """
+        if not self.post.star_error_px > 0.0:
+            return None
+        turns = self.noise_response * (self.post.star_error_px / self.noise_px)[:, None]
+        return np.asarray(np.einsum("ani,anj->ij", turns, turns) / self.obs.n_frames)
+
     def attitudes(self, thetas: FloatArray, xy: FloatArray) -> FloatArray:
         """Quaternions (d, K, 4) by QUEST for parameters (d, p) and pixels (N, 2), or (d, N, 2)."""
         model = self.post.camera.distortion

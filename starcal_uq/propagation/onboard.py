@@ -25,6 +25,7 @@ from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.propagation.geometry import FrameGeometry
+from starcal_uq.propagation.onboard_error import PARAMETERS
 
 if TYPE_CHECKING:
     from starcal_uq.core.settings import OnboardModel
@@ -38,6 +39,8 @@ _WITH_COVARIATES = {"temperature", "time", "magnitude"}
 NIGHT = "epoch"
 # Effects of the air, which a mission in space has not.
 _OF_AIR = {"zenith"}
+# Share of the largest eigenvalue below which one is rounding.
+_ROUNDING = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,16 +128,36 @@ class Aboard:
             [[covariance, nothing], [nothing.T, np.diag(self._night)]]
         )
 
+    @cached_property
+    def shares(self) -> list[tuple[str, slice, FloatArray]]:
+        """Parts of the joint covariance: name, own columns, and a root (q, m); of the parameters
+        first, then of what is left of each effect when all before it are known. The squares of the
+        roots add up to it.
+        """
+        left, found = self._joint[1].copy(), []
+        for name, at in {PARAMETERS: slice(0, len(self.post.mean)), **self.places}.items():
+            unit = np.sqrt(np.diag(left)[at])
+            unit = np.where(unit > 0.0, unit, 1.0)
+            values, vectors = np.linalg.eigh(left[at, at] / np.outer(unit, unit))
+            good = values > _ROUNDING * max(values[-1], 0.0)
+            root = left[:, at] @ (vectors[:, good] / (unit[:, None] * np.sqrt(values[good])))
+            found.append((name, at, root))
+            left = left - root @ root.T
+        return found
+
+    def expected(self, onboard: OnboardModel) -> FloatArray:
+        """Expected values (q,) of what the software does not correct."""
+        expected, _ = self._joint
+        return expected if onboard == "model" else np.zeros_like(expected)
+
     def moments(self, onboard: OnboardModel) -> FloatArray:
         """Second moments (q, q) of what is not known aboard."""
-        expected, covariance = self._joint
-        if not self.places or onboard == "effects":
-            return covariance
-        return covariance + np.outer(expected, expected)
+        expected = self.expected(onboard)
+        return self._joint[1] + np.outer(expected, expected)
 
     def draws(self, theta: FloatArray, onboard: OnboardModel, seed: int) -> FloatArray:
         """Draws (n, q) of it that belong to draws (n, p) of the parameters."""
-        shift, (expected, covariance) = theta - self.post.mean, self._joint
+        shift, covariance = theta - self.post.mean, self._joint[1]
         p = shift.shape[1]
         if not self.places:
             return np.asarray(shift)
@@ -143,7 +166,7 @@ class Aboard:
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         rng = np.random.default_rng((seed, 29))
         own = shift @ follow + rng.standard_normal((len(shift), len(values))) @ root.T
-        return np.column_stack((shift, own + (expected[p:] if onboard == "model" else 0.0)))
+        return np.column_stack((shift, own + self.expected(onboard)[p:]))
 
     def turns(self, geometry: FrameGeometry, frames: Observations) -> Turns:
         """What parameters and effects do to the attitudes of some frames."""

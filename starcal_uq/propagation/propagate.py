@@ -46,11 +46,10 @@ from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.attitude_error import (
     OBSERVED,
     AttitudeError,
-    EffectError,
-    OnboardError,
 )
 from starcal_uq.propagation.geometry import FrameGeometry
 from starcal_uq.propagation.onboard import Aboard, Turns
+from starcal_uq.propagation.onboard_error import PARAMETERS, EffectError, OnboardError
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -191,7 +190,7 @@ def propagate(
         alignment_covariance_arcsec2=alignment_covariance * ARCSEC**2,
         aligned=aligning,
         onboard=onboard,
-        variants=_variants(aboard, split, sampled),
+        variants=_variants(aboard, split, sampled, frames),
         effects_per_frame_arcsec=(
             np.sqrt(_diagonal(_total(turns.own))) * ARCSEC if turns.own else None
         ),
@@ -265,6 +264,38 @@ class _Split:
             ),
         ]
 
+    def share(
+        self,
+        name: str,
+        root: FloatArray,
+        expected: FloatArray,
+        at: slice,
+        sampled: _Sampled | None,
+    ) -> EffectError:
+        """The share of a root (q, m) of the covariance, whose own columns `at` have expected values;
+        with what draws show beyond first order.
+        """
+        spread_out, mean = self.apart @ root, self.apart[:, :, at] @ expected
+        constant, drift = spread_out.mean(axis=0), mean - mean.mean(axis=0)
+        common = self.together @ root
+        covariances = [
+            common @ common.T,
+            np.einsum("kim,kjm->ij", spread_out, spread_out) / len(mean),
+        ]
+        if sampled is not None:
+            beyond = sampled.beyond_common, sampled.beyond_rest.mean(axis=0)
+            covariances = [
+                _with_sigmas(own, np.sqrt(np.maximum(np.diag(own) + more, 0.0)))
+                for own, more in zip(covariances, beyond, strict=True)
+            ]
+        covariances[1] += drift.T @ drift / len(mean)
+        return EffectError.of(
+            name,
+            (self.together[:, at] @ expected * ARCSEC, covariances[0] * ARCSEC**2),
+            (mean.mean(axis=0) * ARCSEC, covariances[1] * ARCSEC**2),
+            np.sum(constant**2, axis=1) * ARCSEC**2,
+        )
+
 
 def _total(own: Mapping[str, FloatArray]) -> FloatArray:
     """Sum over effects of covariances (..., 3, 3); zero where there is none."""
@@ -298,32 +329,35 @@ class _Variances:
         return np.sqrt(self.common), _rms(self.rest), _rms(self.whole)
 
 
-def _variants(aboard: Aboard, split: _Split, sampled: _Sampled) -> tuple[OnboardError, ...]:
+def _variants(
+    aboard: Aboard, split: _Split, sampled: _Sampled, frames: FrameGeometry
+) -> tuple[OnboardError, ...]:
     """The calibration's part with every onboard model; none without effects."""
-    if not (aboard.places or split.own):
+    stars = frames.of_stars
+    if aboard.post.effects is None or not (aboard.places or split.own or stars is not None):
         return ()
+    nothing = np.zeros(3), np.zeros((3, 3))
+    own = [
+        EffectError.of(
+            name,
+            (nothing[0], split.own_together.get(name, nothing[1]) * ARCSEC**2),
+            (nothing[0], apart.mean(axis=0) * ARCSEC**2),
+            nothing[0],
+        )
+        for name, apart in split.own_apart.items()
+    ]
+    if stars is not None:
+        own.append(EffectError.of("star", nothing, (nothing[0], stars * ARCSEC**2), nothing[0]))
     made = []
     for onboard in get_args(OnboardModel):
-        moments = aboard.moments(onboard)
-        common, rest, both = split.variances(moments).with_sampled(sampled).sigmas
-        effects = [
-            EffectError(
-                name,
-                np.sqrt(spread(split.together[:, at], moments[at, at])) * ARCSEC,
-                _rms(spread(split.apart[:, :, at], moments[at, at])) * ARCSEC,
-            )
-            for name, at in aboard.places.items()
-        ]
-        effects += [
-            EffectError(
-                name,
-                np.sqrt(_diagonal(split.own_together.get(name, np.zeros((3, 3))))) * ARCSEC,
-                _rms(_diagonal(own)) * ARCSEC,
-            )
-            for name, own in split.own_apart.items()
-        ]
-        arcsec = common * ARCSEC, rest * ARCSEC, both * ARCSEC
-        made.append(OnboardError(onboard, *arcsec, tuple(effects)))
+        moments, expected = aboard.moments(onboard), aboard.expected(onboard)
+        sigmas = split.variances(moments).with_sampled(sampled).sigmas
+        camera, *effects = (
+            split.share(name, root, expected[at], at, sampled if name == PARAMETERS else None)
+            for name, at, root in aboard.shares
+        )
+        common, rest, both = (sigma * ARCSEC for sigma in sigmas)
+        made.append(OnboardError(onboard, common, rest, both, (*effects, *own), camera))
     return tuple(made)
 
 

@@ -128,12 +128,14 @@ POST = SimpleNamespace(
     mean=np.array([500.0, 530.0, 5850.0, 2e-10, -3.5e-15]),
     provenance=Provenance(data_sha256="0123456789abcdef"),
     camera=SimpleNamespace(distortion="brown"),
+    effects=None,
 )
 OBS = SimpleNamespace(x_px=np.array([100.0, 900.0]), y_px=np.array([530.0, 530.0]))
 
 
 def made(file: Any = None, **changes: Any) -> Budget:
-    return budget(POST, OBS, attitude(), file=file, **{"n_samples": 20_000, **changes})  # type: ignore[arg-type]
+    settings = {"n_samples": 20_000, "attitude": attitude(), **changes}
+    return budget(POST, OBS, file=file, **settings)  # type: ignore[arg-type]
 
 
 @pytest.fixture

@@ -5,9 +5,12 @@ frames (NumPy alone): with the camera's parameters aboard, and with effects aboa
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
 import starcal_uq as sc
+from starcal_uq.presentation.words.propagation import onboard_table
 from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.propagation.onboard_error import side_by_side
 from tests.helpers.effects import breathing, bump, nearest, sheet, table, together
 from tests.helpers.outside import attitude_errors, campaign
 
@@ -59,5 +62,28 @@ def test_the_rest_of_new_frames_is_that_of_a_sensor_with_a_field_and_frames_of_i
     read = AttitudeError.load(tmp_path / "a.csv")
     assert read.variants[1].effects[0].name == effects.effects[0].name
     np.testing.assert_array_equal(read.variants[1].total_arcsec, effects.total_arcsec)
+    # Shares add up to the whole: in squares, but for the two known means of the rest.
+    for own in found.variants:
+        parts = (own.parameters, *own.effects)
+        for whole, kind in ((own.common_arcsec, "common"), (own.rest_arcsec, "rest")):
+            spread = sum(np.diag(getattr(part, f"{kind}_covariance_arcsec2")) for part in parts)
+            mean = sum(getattr(part, f"{kind}_mean_arcsec") for part in parts)
+            np.testing.assert_allclose(np.sqrt(spread + mean**2), whole, rtol=1e-3)
+    # Both stand side by side in files, documents and the terminal.
+    rows = {row["part"]: row for _, row in side_by_side(found.variants).iterrows()}
+    row = rows["rest"]
+    cross = np.sqrt(np.mean(np.array([model.rest_arcsec, effects.rest_arcsec])[:, :2] ** 2, axis=1))
+    assert [row["onboard_model_arcsec"], row["onboard_effects_arcsec"]] == cross.tolist()
+    written = pd.read_csv(tmp_path / "a.csv").set_index(["contributor", "axis"])
+    kept = written.loc[("calibration, rest", "roll")]
+    assert kept["onboard_effects_arcsec"] == effects.rest_arcsec[2]
+    assert np.isnan(written.loc[("centroid noise (NEA)", "roll")]["onboard_model_arcsec"])
+    shown = [row[:2] for row in onboard_table(found).rows]
+    assert shown[:4] == [
+        ("common rotation", "model"),
+        ("", "effects"),
+        ("rest", "model"),
+        ("", "effects"),
+    ]
     assert "onboard='model'" in found.text
     assert "effects" in found.text

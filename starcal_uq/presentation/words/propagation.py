@@ -24,7 +24,6 @@ from starcal_uq.presentation.sentences.propagation import two_figures
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import (
     CHOICE_OF_MODEL,
-    CONTRIBUTORS,
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
     WITH_MISFIT_FOUND,
@@ -32,11 +31,11 @@ from starcal_uq.propagation.attitude_error import (
     AttitudeError,
     MisfitFound,
     choice,
-    with_cross,
 )
 from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
 from starcal_uq.propagation.field import FieldMap
+from starcal_uq.propagation.onboard_error import with_cross
 from starcal_uq.propagation.spectrum import ErrorSpectrum
 
 if TYPE_CHECKING:
@@ -201,34 +200,19 @@ def attitude_table(error: AttitudeError) -> TextTable:
 
 
 def onboard_table(error: AttitudeError) -> TextTable:
-    """The calibration's part by what the software aboard uses, and what every effect does by
-    itself.
+    """The calibration's part by what the software aboard uses, one beside the other, and the share
+    of every effect.
     """
-    parts = [
-        (f"onboard {own.onboard}", name, values)
+    rows = [
+        (part if own is error.variants[0] else "", own.onboard, *map(significant, values))
+        for part in (error.variants[0].parts if error.variants else {})
         for own in error.variants
-        for name, values in (
-            (CONTRIBUTORS[1], own.common_arcsec),
-            (CONTRIBUTORS[2], own.rest_arcsec),
-            (CONTRIBUTORS[3], own.total_arcsec),
-            *(
-                (f"{effect.name}, {part}", values)
-                for effect in own.effects
-                for part, values in (
-                    ("common rotation", effect.common_arcsec),
-                    ("rest", effect.rest_arcsec),
-                )
-            ),
-        )
+        for values in [with_cross(own.parts[part]).tolist()]
     ]
-    rows = tuple(
-        (aboard, name, *(significant(float(v)) for v in with_cross(values)))
-        for aboard, name, values in parts
-    )
     return TextTable(
-        ("software", "part", *TOTAL_AXES),
-        rows,
-        f"With effects, arcsec, 1 sigma, {IF_MODEL_HOLDS}",
+        ("part", "aboard", *TOTAL_AXES),
+        tuple(rows),
+        f"Calibration's part with effects, arcsec, 1 sigma, {IF_MODEL_HOLDS}",
         "llrrrr",
     )
 
