@@ -23,7 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_vector
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.likelihood.effects import Columns, effects_of
+from starcal_uq.likelihood.effect_sums import Columns
+from starcal_uq.likelihood.effects import effects_of
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.zenith import frame_axes
 

@@ -17,7 +17,8 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.camera.projection import project
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation.normals import FrameNormals
-from starcal_uq.likelihood.effects import Columns, Effect, EffectLikelihood, effects_of
+from starcal_uq.likelihood.effect_sums import Columns, EffectLikelihood
+from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import principal

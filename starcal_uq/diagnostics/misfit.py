@@ -44,7 +44,8 @@ from starcal_uq.estimation.noise_model import (
     sigma_ratios,
 )
 from starcal_uq.estimation.weights import weighed
-from starcal_uq.likelihood.effects import Effect, EffectSums
+from starcal_uq.likelihood.effect_sums import EffectSums
+from starcal_uq.likelihood.effects import Effect
 from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel, noise_model_of
@@ -468,7 +469,7 @@ class _Sums(Fit):
         ratio, p = cal.effects.ratio(cal.sigma), self.p
         self.before, self.gram = self.gram, sums.solved(ratio).gram
         if "frame" not in ratio:
-            size = np.mean(np.einsum("kaa->ka", sums.sums[2].frame[:, -3:, -3:]))
+            size = np.mean(np.einsum("kaa->ka", sums.total.inner.frame[:, -3:, -3:]))
             self.blocks = self.gram - sums.solved(ratio | {"frame": _FREE / float(size)}).gram
         self.plain = self.gram[: p + 1, : p + 1]
         free = Freed.of(obs, cal, axes=True)

@@ -36,15 +36,8 @@ from starcal_uq.likelihood.compressed import (
     optimum,
     unit_covariance,
 )
-from starcal_uq.likelihood.effects import (
-    Effect,
-    EffectLikelihood,
-    EffectSums,
-    Solved,
-    effects_of,
-    pull_of,
-    zenith_effect,
-)
+from starcal_uq.likelihood.effect_sums import EffectLikelihood, EffectSums, Solved, pull_of
+from starcal_uq.likelihood.effects import Effect, effects_of, zenith_effect
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import seconds_utc
@@ -64,7 +57,7 @@ PRIOR_PX = 10.0
 _RANGE = (-7.0, 7.0)
 # Half width of the differences that give the curvature in the logs of the scales.
 _STEP = 0.1
-_STARS_AT_ONCE = 10_000
+_STARS_AT_ONCE = 2_000
 # Rounds in which the noise beside air is found; moves of the zeniths beside other effects, and the
 # gain, nat, that one has to bring.
 _ROUNDS, _MOVES, _LEAST_GAIN = 3, 8, 0.02
@@ -419,7 +412,7 @@ class _Linearised:
         whose scale is known.
         """
         cal, likelihood = self._cal, self._likelihood
-        sums, scale = EffectSums(effects, cal.theta, cal.sigma), cal.sigmas
+        sums, scale = EffectSums(effects, cal.theta, cal.sigma, apart=False), cal.sigmas
         for part, state, rows in likelihood.pieces(cal.theta, self._rotations, _STARS_AT_ONCE):
             h = part.derivatives(cal.theta, state) * scale[:, None, None]
             columns = part.project_out(state, np.concatenate([h, state.e[None]]))
@@ -529,7 +522,7 @@ def _expanded(
     `start`: estimate (p,), covariance (p, p) and noise by the linearised likelihood.
     """
     theta, covariance, sigma = start
-    sums, whitening = EffectSums(effects, theta, sigma, 0), scaled_cholesky(covariance)
+    sums, whitening = EffectSums(effects, theta, sigma, 0, apart=False), scaled_cholesky(covariance)
     plain = expanded(likelihood, theta, whitening, likelihood.sums(theta), sums.add)
     solved = [sums.solved(_squares(logs)) for logs in nodes.logs]
     made = [

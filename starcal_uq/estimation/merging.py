@@ -294,6 +294,12 @@ def check_mergeable(
                 "calibrate all "
                 "observations together, or calibrate it without star errors."
             )
+        if cal.effects is not None and cal.effects.names:
+            raise CalibrationError(
+                f"{name}: holds effects ({', '.join(cal.effects.names)}), whose scales and "
+                "coefficients the frames of all runs share: calibrate all observations together, "
+                "or calibrate each run with effects 'none'."
+            )
         for value in data_hashes(cal.provenance) if duplicates == "refuse" else ():
             if value in seen:
                 raise CalibrationError(

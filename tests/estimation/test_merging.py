@@ -423,3 +423,11 @@ def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
     # Five degrees of freedom each: the mean of 100 has a standard error of 0.063.
     assert abs(np.mean(squares) - 1.0) < 0.2
     assert (kstest(old, "uniform").pvalue < 1e-3) == (ratio > 1.0)
+
+
+def test_runs_that_hold_effects_are_not_merged() -> None:
+    one, two = calibrated(1), calibrated(2)
+    held = calibrate(simulated(1), NOMINAL, effects="field")
+    merge([one, two])
+    with pytest.raises(CalibrationError, match=r"run 1: holds effects \(field\).*together"):
+        merge([held, two])

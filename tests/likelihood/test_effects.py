@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.likelihood.effects import EffectLikelihood, EffectSums, effects_of
+from starcal_uq.likelihood.effect_sums import EffectLikelihood, EffectSums
+from starcal_uq.likelihood.effects import effects_of
+from starcal_uq.likelihood.frame_products import FrameProducts
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
 from tests.helpers.effects import sheet, table
@@ -98,3 +100,26 @@ def test_the_exact_likelihood_is_that_of_the_dense_covariance(
     state, _ = exact.profile(cal.theta, exact.rotations)
     left = exact.whitened(state, state.e[None])
     assert float(np.sum(left**2)) == pytest.approx(float(x[0] @ w @ x[0]), rel=1e-9)
+
+
+def test_frames_are_summed_up_at_any_scale() -> None:
+    """Of many frames the sums take what these take one by one, whatever the scale."""
+    rng = np.random.default_rng(8)
+    size = np.exp(rng.uniform(-2.0, 1.0, (3000, 1, 1)))
+    columns = size * rng.standard_normal((3000, 12, 3))
+    others = rng.standard_normal((3000, 12, 5))
+    own = np.einsum("kni,knj->kij", columns, columns)
+    cross = np.einsum("kni,knw->kiw", columns, others)
+    halves = [FrameProducts.of(own[some], cross[some]) for some in (slice(1000), slice(1000, None))]
+    summed = FrameProducts.joined(halves)
+    assert summed.rows.size < 0.1 * cross.size
+    for ratio in np.exp([-14.0, -3.0, 0.0, 5.0, 14.0]):
+        inner = np.linalg.inv(np.eye(3) / ratio + own)
+        wanted = np.einsum("kiw,kij,kjv->wv", cross, inner, cross, optimize=True)
+        taken, volume = summed.taken(float(ratio))
+        assert np.abs(taken - wanted).max() < 1e-11 * np.abs(wanted).max()
+        determinants = np.linalg.slogdet(np.eye(3) + ratio * own)[1]
+        assert volume == pytest.approx(determinants.sum(), rel=1e-11)
+    # Control: at a scale that is a hundredth off, it would be seen.
+    wrong = summed.taken(1.01)[0]
+    assert np.abs(wrong - summed.taken(1.0)[0]).max() > 1e-4 * np.abs(wrong).max()
