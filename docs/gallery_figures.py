@@ -71,6 +71,22 @@ post = sc.sample(obs, cal, seed=1)""",
         },
     ),
     Scene(
+        "Effects beyond the camera",
+        "Real pictures of the sky, whose place nobody gave ([effects](explanation/effects.md)).",
+        """\
+esa = sc.example_data("esa")
+table = sc.sky.make_apparent(esa.observations)
+held = "zenith,field,phase,magnitude"
+lens = sc.calibrate(table, esa.camera, noise="model", effects=held)""",
+        {
+            "Calibration.effects": (
+                "What does each effect do?",
+                "lens.plot.effects(table, site=esa.site)",
+            ),
+            "Effects.scales": ("How large are they?", "lens.effects.plot.scales()"),
+        },
+    ),
+    Scene(
         "Attitude and budget",
         "What the posterior means for directions and attitudes.",
         """\

@@ -27,6 +27,7 @@ from starcal_uq.camera.projection import project
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.local_effects import local_coefficients
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.zenith import Images, candidates, found_air, pulled
 from starcal_uq.likelihood.compressed import (
@@ -351,6 +352,9 @@ def with_effects(obs: Observations, cal: Calibration, wanted: Sequence[str] = ()
         temperature_c=_moments(obs.temperature_c),
         time_s=_range(obs),
         places=tuple((e.name, len(e.prior)) for e in _of_run(effects)),
+    )
+    effects_found = local_coefficients(
+        effects_found, exact, state, coefficients, theta, covariance, sigma
     )
     if zeniths is not None and "zenith" in logs:
         air = found_air(effects_found, zeniths, state.rotations)

@@ -9,6 +9,7 @@ seen draws offsets of its own.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -88,10 +89,13 @@ def predicted(
 
 
 def displacement(
-    estimate: PredictedCamera, effects: Effects | None, xy: FloatArray
+    estimate: PredictedCamera,
+    effects: Effects | None,
+    xy: FloatArray,
+    names: Collection[str] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Shifts (n, 2), px, and their covariances (n, 2, 2) by effects of the place at pixels (n, 2);
-    see `Calibration.displacement`.
+    """Shifts (n, 2), px, and their covariances (n, 2, 2) by effects of the place at pixels (n, 2),
+    those of some `names` or all; see `Calibration.displacement`.
     """
     n = len(xy)
     if effects is None:
@@ -99,7 +103,7 @@ def displacement(
     view, known = pixels_of(estimate.camera, xy.T), place_effects(estimate.camera)
     columns = np.zeros((len(effects.coefficients), 2, n))
     for name, effect in known.items():
-        if name in effects.names:
+        if name in effects.names and (names is None or name in names):
             columns[effects.at(name)] = effect.columns.columns(view)
     shift = np.einsum("m,mxn->nx", effects.coefficients, columns)
     spread = np.einsum("mxn,mk,kyn->nxy", columns, effects.covariance, columns, optimize=True)

@@ -5,6 +5,7 @@ loss.
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -432,13 +433,17 @@ class Calibration(Shown, Traced):
         estimate = PredictedCamera(self.camera, self.covariance)
         return predicted(estimate, self.effects, temperature_c, time_utc, new_night)
 
-    def displacement(self, xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def displacement(
+        self, xy: ArrayLike, names: Collection[str] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """What effects of the place on the detector do beyond the camera: axes, field, pixel phase.
 
         Parameters
         ----------
         xy : (n, 2) array
             Pixels.
+        names : collection of str, optional
+            Which of these effects; all by default.
 
         Returns
         -------
@@ -448,7 +453,8 @@ class Calibration(Shown, Traced):
             Its covariance, px^2.
         """
         pixels = np.atleast_2d(np.asarray(xy, dtype=np.float64))
-        return displacement(PredictedCamera(self.camera, self.covariance), self.effects, pixels)
+        estimate = PredictedCamera(self.camera, self.covariance)
+        return displacement(estimate, self.effects, pixels, names)
 
     def directions(self, xy: ArrayLike) -> FloatArray:
         """Unit vectors (n, 3) in the camera frame of what is seen at pixels (n, 2), by the camera

@@ -117,6 +117,13 @@ class Effects(Shown):
     places: tuple[tuple[str, int], ...] = ()  # Number of the run's coefficients of each effect
     air: FoundAir | None = None  # Of the effect `zenith`
     zeniths: Zeniths | None = None  # Around which its coefficients are
+    # (K, c), px at the corner: coefficients of the frames' effect and their standard deviations;
+    # (S, 2), px at the boresight: those of the stars along two axes on the sky. None where there is
+    # no such effect, and in files of earlier versions.
+    frames: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    frame_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    stars: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    star_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     SHAPES: ClassVar[Shapes] = {
         "coefficients": ("m",),
@@ -124,6 +131,10 @@ class Effects(Shown):
         "cross": ("p", "m"),
         "node_grams": ("j", "q", "q"),
         "node_log_weights": ("j",),
+        "frames": ("k", "c"),
+        "frame_sigmas": ("k", "c"),
+        "stars": ("s", 2),
+        "star_sigmas": ("s", 2),
     }
 
     @property

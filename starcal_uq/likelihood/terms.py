@@ -255,6 +255,14 @@ class Eliminated:
         b, first = self._coupling, self._own_solve(cross)
         return np.asarray(first + self._own_solve(b @ self._solve(b.T @ first)))
 
+    @property
+    def variances(self) -> FloatArray:
+        """Variances (G c,) of the coefficients in units of sigma^2, attitudes known."""
+        sums = self._sums
+        precision = (1.0 / self.ratio).reshape(-1, sums.size, 1) * np.eye(sums.size)
+        inverse = np.linalg.inv(sums.own + precision)
+        return np.asarray(np.diagonal(inverse, axis1=1, axis2=2)).ravel()
+
     def correction(self) -> FloatArray:
         """What the term takes off the Gram matrix (q, q) of the columns that were added."""
         cross = self._sums.cross

@@ -51,6 +51,7 @@ from starcal_uq.presentation.figures.diagnostics import (
     plot_misfit,
     plot_validation,
 )
+from starcal_uq.presentation.figures.effects import plot_effect_scales, plot_effects
 from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
 from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
 from starcal_uq.presentation.figures.planning import (
@@ -158,9 +159,15 @@ VIEWS: Mapping[type, View] = {
         estimation.calibration_text,
         estimation.calibration_tables,
         convergence=plot_convergence,
+        effects=plot_effects,
         residuals=plot_residuals,
     ),
-    Effects: _view("Effects beyond the camera", effects.effects_text, effects.effects_table),
+    Effects: _view(
+        "Effects beyond the camera",
+        effects.effects_text,
+        effects.effects_table,
+        scales=plot_effect_scales,
+    ),
     Screening: _view("Screening", estimation.screening_text, estimation.screening_table),
     Consistency: _view(
         "Consistency", estimation.consistency_text, estimation.consistency_table, _messages

@@ -64,11 +64,13 @@ def test_every_view_is_of_a_result(cls: type) -> None:
 
 
 def test_figures_are_found_by_name(paper_calibration: sc.Calibration) -> None:
-    assert dir(paper_calibration.plot) == ["convergence", "residuals"]
-    assert "convergence, residuals" in repr(paper_calibration.plot)
+    assert dir(paper_calibration.plot) == ["convergence", "effects", "residuals"]
+    assert "convergence, effects, residuals" in repr(paper_calibration.plot)
     assert isinstance(paper_calibration.plot.convergence(), Figure)
     assert "iteration" in (paper_calibration.plot.convergence.__doc__ or "")
-    with pytest.raises(AttributeError, match="no figure 'nonsense'; it has convergence, residuals"):
+    with pytest.raises(
+        AttributeError, match="no figure 'nonsense'; it has convergence, effects, residuals"
+    ):
         paper_calibration.plot.nonsense()
     with pytest.raises(AttributeError, match="it has none"):
         paper_calibration.camera.plot.anything()

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.scales import round_below, round_levels, ticks_at_levels
+from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,7 +54,8 @@ def plot_camera_comparison(comparison: CameraComparison) -> Figure:
             norm,
             "Expected from both uncertainties (1 sigma)",
         )
-    _arrows(panels[0], comparison)
+    if length.max() > 0.0:
+        _arrows(panels[0], comparison)
     bar = figure.colorbar(image, ax=list(panels), fraction=0.046, pad=0.02)
     style.dress_bar(bar, "difference of directions [arcsec]")
     ticks_at_levels(bar, levels)
@@ -96,34 +96,4 @@ def _arrows(ax: Axes, comparison: CameraComparison) -> None:
     step = max(1, (len(comparison.x_px) - 1) // (_ARROWS - 1))
     some = slice(step // 2, None, step)
     d = comparison.difference_arcsec[some, some]
-    x, y = np.meshgrid(comparison.x_px[some], comparison.y_px[some])
-    # The largest are in the corners and would leave nothing to see elsewhere.
-    typical = np.percentile(np.linalg.norm(d, axis=-1), 85.0)
-    if typical < _NOTHING:
-        return
-    spacing = comparison.x_px[step] - comparison.x_px[0]
-    arrows = ax.quiver(
-        x,
-        y,
-        d[..., 0],
-        d[..., 1],
-        angles="xy",
-        scale_units="xy",
-        scale=typical / (0.8 * spacing),
-        color="white",
-        edgecolor=style.INK,
-        linewidth=0.6,
-        width=0.006,
-    )
-    key = round_below(typical)
-    ax.quiverkey(
-        arrows,
-        0.93,
-        1.033,
-        key,
-        f"{significant(key, 1)}″",
-        labelpos="W",
-        fontproperties={"size": style.TICK_SIZE},
-        labelcolor=style.INK,
-        color=style.INK,
-    )
+    style.arrows(ax, comparison.x_px[some], comparison.y_px[some], d, "″")

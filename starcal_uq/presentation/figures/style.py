@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.formatting import MINUS, superscript
+from starcal_uq.core.formatting import MINUS, significant, superscript
 from starcal_uq.core.types import AnyDict
+from starcal_uq.presentation.figures.scales import round_below
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -257,6 +258,36 @@ def detector(ax: Axes, x: Any, y: Any, title: str) -> None:
     ax.set_ylim(y[-1], y[0])
     ax.set_aspect("equal")
     label(ax, title, "x [px]", "y [px]")
+
+
+def arrows(ax: Axes, x: Any, y: Any, shifts: Any, unit: str) -> None:
+    """White arrows of shifts (ny, nx, 2) at places x (nx,), y (ny,) of the detector, with a key."""
+    # The largest are in the corners and would leave nothing to see elsewhere.
+    typical = np.percentile(np.linalg.norm(shifts, axis=-1), 85.0)
+    key = round_below(typical)
+    found = ax.quiver(
+        *np.meshgrid(x, y),
+        shifts[..., 0],
+        shifts[..., 1],
+        angles="xy",
+        scale_units="xy",
+        scale=typical / (0.8 * (x[1] - x[0])),
+        color="white",
+        edgecolor=INK,
+        linewidth=0.6,
+        width=0.006,
+    )
+    ax.quiverkey(
+        found,
+        0.93,
+        1.033,
+        key,
+        f"{significant(key, 1)}{unit}",
+        labelpos="W",
+        fontproperties={"size": TICK_SIZE},
+        labelcolor=INK,
+        color=INK,
+    )
 
 
 def legend(ax: Axes, **keywords: Any) -> None:

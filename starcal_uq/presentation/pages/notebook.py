@@ -32,6 +32,12 @@ _PARTS = (
         ],
     ),
     (
+        "effects",
+        "Effects beyond the camera",
+        "Estimated beside the camera; every interval contains them.",
+        ["run.calibration.effects", "run.calibration.plot.effects(run.observations)"],
+    ),
+    (
         "posterior",
         "What is known of the parameters",
         "Where prior and posterior are alike, the data have said nothing.",
@@ -84,7 +90,8 @@ def write_cells(name: str, parts: Collection[str], folder: str) -> Iterator[tupl
     """Kind (``markdown``, ``code``, or ``parameters``) and source of each cell of the notebook on a
     run in `folder`.
 
-    `parts` are names of the files that the run holds, such as ``posterior``.
+    `parts` are names of the files that the run holds, such as ``posterior``, and ``effects`` where
+    its calibration holds some.
     """
     written = Remedy("report", (RUN,), {"notebook": True})
     yield (

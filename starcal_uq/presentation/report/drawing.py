@@ -13,6 +13,7 @@ from starcal_uq.pipeline.inspection import Frames
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
 from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
+from starcal_uq.presentation.figures.effects import plot_effects
 from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
 from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
 from starcal_uq.presentation.figures.propagation import (
@@ -27,7 +28,7 @@ from starcal_uq.presentation.report.results import Results
 T = TypeVar("T")
 
 # Figures by the step after which they can be drawn.
-AFTER_CALIBRATION = ("residuals", "residual_profiles", "convergence")
+AFTER_CALIBRATION = ("residuals", "residual_profiles", "effects", "convergence")
 AFTER_SAMPLING = (
     "corner",
     "prior_posterior",
@@ -79,6 +80,8 @@ def _figure(results: Results, name: str) -> Any:
         return plot_residuals(cal, obs)
     if name == "residual_profiles":
         return plot_residual_profiles(cal, obs)
+    if name == "effects" and cal.effects is not None and cal.effects.names:
+        return plot_effects(cal, obs)
     if name == "convergence":
         return plot_convergence(cal, truth)
     if name == "misfit" and results.diagnosis is not None:

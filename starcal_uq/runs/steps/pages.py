@@ -133,6 +133,8 @@ def notebook(
     # What is wrong with the run is told here, and not by a cell.
     _ = run.results
     parts = [name for name in FILES if run.has(name)] + ["images"] * (run.images is not None)
+    found = run.calibration.effects
+    parts += ["effects"] * (found is not None and bool(found.names))
     # A folder that moves takes its notebook along.
     folder = "." if to is None else str(run.path.resolve())
     content = executed(write_cells(run.name, parts, folder), place.resolve().parent, progress)
