@@ -209,15 +209,7 @@ def check_samples(
             f"{time_s[i - 1]:.9g} s; "
             "sort the rows by time and remove repeated ones."
         )
-    with np.errstate(over="ignore"):
-        length = np.linalg.norm(q, axis=1)
-    off = np.abs(length - 1.0)
-    if np.any(off > _NEARLY_UNIT):
-        i = int(np.argmax(off > _NEARLY_UNIT))
-        raise AttitudeProfileError(
-            f"{where}{word} {numbers[i]}: the quaternion has the length {length[i]:.6g}, not 1; "
-            "check its columns."
-        )
+    off = check_quaternions(where, word, numbers, q)
     uneven = int(np.sum(off > _UNIT))
     if not uneven:
         return ()
@@ -226,6 +218,21 @@ def check_samples(
         f"{significant(off.max())} and "
         f"{'was' if uneven == 1 else 'were'} normalised.",
     )
+
+
+def check_quaternions(where: str, word: str, numbers: IntArray, q: FloatArray) -> FloatArray:
+    """Refuse quaternions (K, 4) far from unit length; by how much each length is off, (K,)."""
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(q, axis=1)
+    off: FloatArray = np.abs(length - 1.0)
+    bad = ~(off <= _NEARLY_UNIT)
+    if np.any(bad):
+        i = int(np.argmax(bad))
+        raise AttitudeProfileError(
+            f"{where}{word} {numbers[i]}: the quaternion has the length {length[i]:.6g}, not 1; "
+            "check its columns."
+        )
+    return off
 
 
 NAMED = ("qx", "qy", "qz", "qw")
@@ -248,8 +255,24 @@ class ProfileTable:
     word: str
 
 
-def read_profile(path: PathLike, scalar: str | None) -> ProfileTable:
-    """Read times and quaternions; see `starcal_uq.attitude.profile.load_attitude_profile`."""
+@dataclass(frozen=True)
+class TableColumns:
+    """Cells of a file by column, and the line (CSV, ECSV) or row from 1 (Parquet) of each."""
+
+    path: Path
+    cells: AnyDict
+    numbers: IntArray
+    word: str
+
+    def numbers_of(self, name: str) -> FloatArray:
+        """One column (K,) as numbers."""
+        return _numbers(self.path, self.word, self.numbers, name, self.cells[name])
+
+
+def read_columns(path: PathLike, content: str) -> TableColumns:
+    """Read a table; AttitudeProfileError for one without rows, each of which should hold
+    `content`.
+    """
     path = Path(path)
     with reading(
         path, "a readable table", "check the path, or write it again", AttitudeProfileError
@@ -261,11 +284,18 @@ def read_profile(path: PathLike, scalar: str | None) -> ProfileTable:
             columns, numbers, word = _text(path, ecsv=ending == ".ecsv")
         if not len(numbers):
             raise AttitudeProfileError(
-                f"{path}: holds no attitudes; give a table with a time and a quaternion per row."
+                f"{path}: holds no attitudes; give a table with {content} per row."
             )
-        names = _components(path, columns, scalar)
-        q = np.column_stack([_numbers(path, word, numbers, name, columns[name]) for name in names])
-        return ProfileTable(_times(path, word, numbers, columns), q, numbers, word)
+        return TableColumns(path, columns, numbers, word)
+
+
+def read_profile(path: PathLike, scalar: str | None) -> ProfileTable:
+    """Read times and quaternions; see `starcal_uq.attitude.profile.load_attitude_profile`."""
+    table = read_columns(path, "a time and a quaternion")
+    names = _components(table.path, table.cells, scalar)
+    q = np.column_stack([table.numbers_of(name) for name in names])
+    time_s = _times(table.path, table.word, table.numbers, table.cells)
+    return ProfileTable(time_s, q, table.numbers, table.word)
 
 
 def _components(path: Path, columns: AnyDict, scalar: str | None) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.robust import with_tail_weights
 from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
+from starcal_uq.estimation.ties import with_ties
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood import paths
 from starcal_uq.likelihood.composed import Likelihood
@@ -145,6 +146,15 @@ def calibrate(
         are estimated by restricted likelihood and marginalised in estimate, covariance and `compressed`;
         ``auto`` takes up those that the data ask for (`Calibration.effects`). With ``student_t``
         the stars keep the weights of their tails. It needs the ``efficient`` method.
+    relative_attitudes : RelativeAttitudes or path, optional
+        Rotations of the camera between frames that were measured without stars, with their errors
+        (`starcal_uq.attitude.load_relative_attitudes` describes the file): they tie the attitudes,
+        so that the principal point is told apart from the boresight. It needs the ``efficient``
+        method.
+    mount : {"free", "fixed"}
+        ``fixed``: the Earth turns the camera, and nothing else. It needs times in the table.
+    mount_sigma_arcsec : float, optional
+        How far a fixed mount moves from frame to frame about each axis, standard deviation.
     recursion : RecursionOptions, optional
         Options of ``samaan`` and ``griffith`` (`starcal_uq.paper.RecursionOptions`).
     duplicates : {"refuse", "drop", "keep"}
@@ -233,7 +243,7 @@ def _of_table(
     calibration = fit_determined(
         obs,
         camera,
-        lambda start: fit_composed(obs, start, settings),
+        lambda start: _tied(obs, fit_composed(obs, start, settings), composed),
         sheet=sheet,
         asked=settings.model is not None,
         throw=throw,
@@ -263,6 +273,17 @@ def _with_terms(
     if composed.effects is not None:
         return with_effects(obs, calibration, composed.effects.names)
     return with_star_errors(obs, calibration)
+
+
+def _tied(obs: Observations, calibration: Calibration, composed: Likelihood) -> Calibration:
+    """The calibration with known rotations between its frames, which may tell what the stars leave
+    open.
+    """
+    if composed.ties is None or not (calibration.status.ok or calibration.undetermined):
+        return calibration
+    if composed.tails is not None:
+        calibration = with_tail_weights(weighed(obs, calibration), calibration)
+    return with_ties(weighed(obs, calibration), calibration, composed.ties)
 
 
 def _enough(workers: int | None, obs: PartitionedObservations) -> int | None:

@@ -61,6 +61,18 @@ RULES = (
     Rule("effects", (), "method", (None, "efficient")),
     Rule("effects", (), "star_errors", (None,)),
     Rule("effects", (), "partitioned", (None,)),
+    Rule("relative_attitudes", (), "mount", (None,)),
+    Rule("mount_sigma_arcsec", (), "mount", ("fixed",)),
+    *(
+        Rule(name, (), *other)
+        for name in ("relative_attitudes", "mount")
+        for other in (
+            ("method", (None, "efficient")),
+            ("star_errors", (None,)),
+            ("effects", (None,)),
+            ("partitioned", (None,)),
+        )
+    ),
     Rule("dof", (), "likelihood", ("student_t",)),
     Rule("recursion", (), "method", _RECURSIVE),
     Rule("method", _IN_MEMORY, "partitioned", (None,)),

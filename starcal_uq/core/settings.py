@@ -28,6 +28,7 @@ RecursiveMethod = Literal["samaan", "griffith"]
 Solver = Literal["lm", "minpack", "ipopt"]
 ModelName = Literal["none", "k1", "brown", "brown3", "brown_tangential", "inverse"]
 NoiseKind = Literal["common", "model"]
+MountKind = Literal["free", "fixed"]
 EffectName = Literal[
     "axes",
     "field",

@@ -32,6 +32,7 @@ from starcal_uq.estimation.undetermined import remedy_of
 from starcal_uq.likelihood.compressed import CompressedLikelihood
 from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.likelihood.star_errors import StarErrors
+from starcal_uq.likelihood.ties import FittedTies
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, is_positive
 from starcal_uq.observations.repeats import Fingerprints
@@ -57,6 +58,9 @@ _APART = (
     "xy_px",
     "error_px",
     "star_weights",
+    "frame_a",
+    "frame_b",
+    "sigma_arcsec",
 )
 # Fields of the document, in the order in which it is read.
 _DOCUMENT = (
@@ -91,6 +95,7 @@ _DOCUMENT = (
         "partitions",
         "undetermined",
         "effects",
+        "ties",
     ),
 )
 # Hash of the archive that belongs to the document.
@@ -220,6 +225,9 @@ class Calibration(Shown, Traced):
     effects : Effects or None
         Effects beyond the camera, where they were asked for: `covariance`, `information` and
         `compressed` hold them, and residuals and attitudes are those after them.
+    ties : FittedTies or None
+        Known rotations between frames, where they were given: `covariance`, `information`, `dof`
+        and `compressed` hold them, and residuals and attitudes are those with them.
     undetermined : tuple of str
         Names of parameters that the data leave open; `status` is then SINGULAR.
     """
@@ -253,6 +261,7 @@ class Calibration(Shown, Traced):
     undetermined: tuple[str, ...] = ()
     effects: Effects | None = None
     star_weights: FloatArray | None = None
+    ties: FittedTies | None = None
 
     SHAPES: ClassVar[Shapes] = {
         **{

@@ -7,10 +7,18 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Protocol, TypedDict, get_args
 
+from starcal_uq.attitude.relative import RelativeAttitudes, load_relative_attitudes
 from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.settings import Duplicates, Method, NoiseKind, Solver
-from starcal_uq.likelihood.composed import EffectTerms, Likelihood, StarDirections, StudentTails
+from starcal_uq.core.settings import Duplicates, Method, MountKind, NoiseKind, Solver
+from starcal_uq.core.types import PathLike
+from starcal_uq.likelihood.composed import (
+    EffectTerms,
+    FixedMount,
+    Likelihood,
+    StarDirections,
+    StudentTails,
+)
 from starcal_uq.likelihood.student import parse_dof
 
 METHODS = get_args(Method)
@@ -21,6 +29,7 @@ _WORDS = {
     "solver": get_args(Solver),
     "likelihood": ("marginal", "student_t"),
     "noise": get_args(NoiseKind),
+    "mount": get_args(MountKind),
 }
 
 
@@ -43,6 +52,9 @@ class EstimationOptions(TypedDict, total=False):
     noise: str
     star_errors: bool
     effects: str | Sequence[str]
+    relative_attitudes: RelativeAttitudes | PathLike | None
+    mount: str
+    mount_sigma_arcsec: float | None
     recursion: MethodOptions | None
     duplicates: str
 
@@ -51,8 +63,8 @@ class EstimationOptions(TypedDict, total=False):
 class EstimationSettings:
     """How a calibration is made; `calibrate` describes the fields, which are its keywords.
 
-    `likelihood` is a composed one, or its name, to which `dof`, `noise`, `star_errors`
-    and `effects` add parts.
+    `likelihood` is a composed one, or its name, to which `dof`, `noise`, `star_errors`,
+    `effects`, `relative_attitudes` and `mount` add parts.
 
     Raises
     ------
@@ -69,6 +81,9 @@ class EstimationSettings:
     noise: str = "common"
     star_errors: bool = False
     effects: str | Sequence[str] = "none"
+    relative_attitudes: RelativeAttitudes | PathLike | None = None
+    mount: str = "free"
+    mount_sigma_arcsec: float | None = None
     recursion: MethodOptions | None = None
     duplicates: Duplicates | str = "refuse"
 
@@ -91,6 +106,8 @@ class EstimationSettings:
                 "noise": self.composed.noise,
                 "star_errors": self.composed.star_errors,
                 "effects": self.composed.effects,
+                "mount": None if self.mount == "free" else self.mount,
+                "relative_attitudes": None if self.mount == "fixed" else self.composed.ties,
                 **others,
             }
         )
@@ -106,7 +123,17 @@ class EstimationSettings:
         noise: NoiseKind = "model" if self.noise == "model" else "common"
         effects = EffectTerms.parsed(self.effects)
         terms = (StarDirections(),) if self.star_errors else ()
-        return Likelihood(noise, tails, terms if effects is None else (*terms, effects))
+        terms = terms if effects is None else (*terms, effects)
+        return Likelihood(noise, tails, terms, self._ties)
+
+    @property
+    def _ties(self) -> RelativeAttitudes | FixedMount | None:
+        if self.mount == "fixed":
+            return FixedMount(self.mount_sigma_arcsec or 0.0)
+        known = self.relative_attitudes
+        if known is None or isinstance(known, RelativeAttitudes):
+            return known
+        return load_relative_attitudes(known)
 
     @property
     def weighs(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -108,7 +109,7 @@ def undetermined(
     size = float(k @ scaled_inverse(covariance[3:, 3:]) @ k)
     if fdtrc(len(k), dof, size / len(k)) < _NONE_P:
         return (), as_found
-    without = MarginalLikelihood(likelihood.frames, likelihood.model_name)
+    without = copy(likelihood)
     if likelihood.rotations is not None:
         without.use_rotations(likelihood.rotations)
     plain = np.concatenate([theta[:3], np.zeros(len(k))])

@@ -21,6 +21,7 @@ from starcal_uq.likelihood.compressed import compress
 from starcal_uq.likelihood.effect_sums import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarLikelihood
+from starcal_uq.likelihood.ties import TiedLikelihood, Ties
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import frame_sample
 
@@ -50,6 +51,11 @@ class ExactMarginal:
                 obs, model, theta, start, cal.star_errors, cal.sigma
             )
             self._one.use_rotations(self._one.rotations_at(theta))
+            return
+        if cal.ties is not None and not isinstance(obs, StarFrames):
+            ties = Ties.of(obs.frame_ids, cal.ties.known)
+            self._one = TiedLikelihood(obs, model, ties, cal.ties.sigma)
+            self._one.use_rotations(quaternion_to_rotation(cal.quaternions))
             return
         if cal.effects and cal.effects.names and not isinstance(obs, StarFrames):
             effects = cal.effects.of(obs, cal.camera)
@@ -91,7 +97,7 @@ class FrameSample:
         )
         frames = StarFrames.from_observations(some, axes=True)
         frame = np.repeat(np.arange(some.n_frames), frames.sizes)
-        plain = replace(cal, star_errors=None, effects=None)
+        plain = replace(cal, star_errors=None, effects=None, ties=None)
         self._batches = []
         for first in range(min(BATCHES, some.n_frames)):
             batch = frames.select(frame % BATCHES == first)

@@ -170,6 +170,12 @@ def _named_source(
             f"the calibration holds effects, which the likelihood {likelihood!r} does not know: "
             "sample with likelihood='marginal', or calibrate with effects='none'."
         )
+    if cal.ties is not None:
+        raise SamplingError(
+            "the calibration holds known rotations between frames, which the likelihood "
+            f"{likelihood!r} does not know: sample with likelihood='marginal', or calibrate "
+            "without relative_attitudes and mount."
+        )
     if cal.star_errors is not None:
         raise SamplingError(
             f"the calibration holds errors of the stars, which the likelihood {likelihood!r} "

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
+from starcal_uq.attitude.relative import RelativeAttitudes
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import EffectName, NoiseKind
 from starcal_uq.likelihood.student import DEFAULT_DOF, DOF_RANGE
@@ -75,6 +76,26 @@ class EffectTerms:
 
 
 @dataclass(frozen=True)
+class FixedMount:
+    """A camera that the Earth turns, and nothing else.
+
+    Attributes
+    ----------
+    sigma_arcsec : float
+        How far the mount moves from frame to frame about each axis, standard deviation, arcsec.
+    """
+
+    sigma_arcsec: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.sigma_arcsec < float("inf"):
+            raise CalibrationError(
+                f"mount_sigma_arcsec is {self.sigma_arcsec!r}: state how far the mount moves from "
+                "frame to frame, such as 1.0."
+            )
+
+
+@dataclass(frozen=True)
 class Likelihood:
     """What the refinement maximises, the attitudes marginalised.
 
@@ -87,11 +108,14 @@ class Likelihood:
         Tails of the residuals; None for Gaussian ones.
     terms : tuple of StarDirections or EffectTerms
         Terms that are linear in the pixels and have a prior, marginalised.
+    ties : RelativeAttitudes, FixedMount or None
+        Known rotations between frames; None where every attitude is free.
     """
 
     noise: NoiseKind = "common"
     tails: StudentTails | None = None
     terms: tuple[StarDirections | EffectTerms, ...] = ()
+    ties: RelativeAttitudes | FixedMount | None = None
 
     @property
     def name(self) -> str:

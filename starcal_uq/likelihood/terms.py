@@ -172,14 +172,14 @@ class TermSums:
 
     def matrix_without(self, coupling: Any) -> Any:
         """The same less the square of a coupling, sparse."""
-        return (_block_diagonal(self.own) - coupling @ coupling.T).tocsr()
+        return (block_diagonal(self.own) - coupling @ coupling.T).tocsr()
 
     def eliminated(self, ratio: FloatArray) -> Eliminated:
         """Eliminate coefficients of variances `ratio` (G c,), in units of sigma^2."""
         return Eliminated(self, ratio)
 
 
-def _block_diagonal(blocks: FloatArray) -> Any:
+def block_diagonal(blocks: FloatArray) -> Any:
     """A block-diagonal matrix of blocks (G, c, c), sparse."""
     from scipy.sparse import bsr_array
 
@@ -187,8 +187,11 @@ def _block_diagonal(blocks: FloatArray) -> Any:
     return bsr_array((blocks, np.arange(n), np.arange(n + 1)), shape=(size * n, size * n)).tocsr()
 
 
-def _factor(matrix: Any, term: Term) -> tuple[Callable[[FloatArray], FloatArray], float]:
-    """What solves with a sparse positive definite matrix, and the log of its determinant."""
+def factor(matrix: Any, name: str, option: str) -> tuple[Callable[[FloatArray], FloatArray], float]:
+    """What solves with a sparse positive definite matrix, and the log of its determinant.
+
+    CalibrationError for a matrix that is too large, of what `name` says and `option` asks for.
+    """
     from scipy.linalg import cho_factor, cho_solve
     from scipy.sparse.linalg import splu
 
@@ -196,8 +199,8 @@ def _factor(matrix: Any, term: Term) -> tuple[Callable[[FloatArray], FloatArray]
     density = matrix.nnz / n**2
     if n > _LARGEST and density > _THIN:
         raise CalibrationError(
-            f"the {term.name} need a full matrix of {n} rows, and {_LARGEST} are possible: "
-            f"calibrate fewer frames, or leave {term.option} out."
+            f"the {name} need a full matrix of {n} rows, and {_LARGEST} are possible: "
+            f"calibrate fewer frames, or leave {option} out."
         )
     if density > _FULL:
         dense = cho_factor(matrix.toarray(), lower=True, overwrite_a=True, check_finite=False)
@@ -240,13 +243,13 @@ class Eliminated:
             self._inverse: FloatArray = np.asarray(np.linalg.inv(own), dtype=np.float64)
             log_own = float(np.sum(np.log(np.linalg.det(own))))
             left = eye_array(b.shape[1]) - b.T @ self._own_solve(b)
-        self._solve, log_factor = _factor(left, sums.term)
+        self._solve, log_factor = factor(left, sums.term.name, sums.term.option)
         # log |I + Lambda Z^T (I-P) Z|; of free coefficients, that of their own matrix.
         finite = self.ratio[np.isfinite(self.ratio)]
         self.log_determinant = log_factor + log_own + float(np.sum(np.log(finite)))
 
     def _own_solve(self, values: Any) -> Any:
-        return _block_diagonal(self._inverse) @ values
+        return block_diagonal(self._inverse) @ values
 
     def coefficients(self, cross: FloatArray) -> FloatArray:
         """``G^-1 c`` (G c, q): best coefficients for ``c = Z^T (I-P) X``."""

@@ -1,0 +1,177 @@
+"""The estimate with attitudes tied by known rotations between frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.relative import RelativeAttitudes
+from starcal_uq.attitude.rotations import (
+    exp_rotation,
+    quaternion_to_rotation,
+    rotation_to_quaternion,
+)
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.status import Status
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.stages import Search, Stage
+from starcal_uq.estimation.undetermined import coma_record, undetermined
+from starcal_uq.likelihood.composed import FixedMount
+from starcal_uq.likelihood.compressed import settled, unit_covariance
+from starcal_uq.likelihood.sums import Attitudes, frame_sums
+from starcal_uq.likelihood.ties import FittedTies, TiedLikelihood, Ties
+from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.result import Calibration
+    from starcal_uq.observations.table import Observations
+
+# Rotations whose errors are so many times the stated ones are those of other frames or axes.
+_ASTRAY = 100.0
+# Standard deviations of the last step, which Newton's method on the expansion follows.
+_STEP = 1e-3
+
+
+def ties_of(obs: Observations, given: RelativeAttitudes | FixedMount) -> Ties:
+    """The ties between frames of a table.
+
+    CalibrationError for frames that it does not hold, and for a fixed mount without times.
+    """
+    if isinstance(given, FixedMount):
+        if obs.time_utc is None:
+            raise CalibrationError(
+                "a fixed mount turns with the Earth, and the table states no time_utc: add the "
+                "times of the frames, or leave mount='fixed' (--mount fixed) out."
+            )
+        times = obs.time_utc[obs.frame_starts[:-1]]
+        given = RelativeAttitudes.of_earth(obs.frame_ids, times.tolist(), given.sigma_arcsec)
+    return Ties.of(obs.frame_ids, given)
+
+
+def with_ties(
+    obs: Observations, cal: Calibration, given: RelativeAttitudes | FixedMount
+) -> Calibration:
+    """The calibration with known rotations between its frames.
+
+    Parameters
+    ----------
+    obs, cal
+        The table, with the weights of the calibration, and the estimate by its marginal
+        likelihood, which may leave parameters open.
+    given : RelativeAttitudes or FixedMount
+        The rotations.
+
+    Raises
+    ------
+    CalibrationError
+        For frames that the table does not hold, for a fixed mount without times, and for
+        rotations that have nothing to do with these frames.
+    """
+    began = perf_counter()
+    likelihood = TiedLikelihood(obs, cal.camera.distortion, ties_of(obs, given), cal.sigma)
+    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    checked = _checked(likelihood, cal)
+    if checked.error_factor > _ASTRAY:
+        what = "a fixed mount contradicts" if checked.known.of_mount else "the rotations contradict"
+        raise CalibrationError(
+            f"{what} the stars: errors would have to be more than {_ASTRAY:g} times the stated "
+            "ones; check the numbers and times of the frames and the sense of the quaternions, or "
+            "leave the known rotations out."
+        )
+    dof = likelihood.dof - len(cal.theta)
+    found = Search(tolerance=_STEP**2 / dof).minimum(likelihood.evaluate, cal.theta)
+    theta, sigma, status = found.theta, float(np.sqrt(found.normal.cost / dof)), found.status
+    names, factors = undetermined(
+        likelihood, theta, found.normal.matrix, sigma, cal.nominal, status
+    )
+    covariance = scaled_inverse(found.normal.matrix) * sigma**2
+    compressed = likelihood.compressed(theta, covariance)
+    if not names:
+        compressed = settled(compressed)
+        sigma = float(np.sqrt(compressed.gram[0, 0] / dof))
+        covariance = unit_covariance(compressed) * sigma**2
+    theta = compressed.theta_hat - 0.5 * compressed.whitening @ compressed.log_determinant_slope
+    trajectory = np.vstack([found.trajectory, theta])
+    cost = np.append(found.costs, compressed.gram[0, 0])
+    seconds = perf_counter() - began
+    stage = Stage("ties", trajectory, cost, status, found.evaluations, seconds)
+    residuals, turned, attitudes = _tied(likelihood, theta)
+    tails = cal.tail_factors
+    factors = factors if tails is None else factors * tails
+    record = {n: v for n, v in cal.provenance.items() if n != "without_coma"}
+    known = likelihood.ties.known
+    settings: AnyDict = {"relative_attitudes": len(known)}
+    if known.of_mount:
+        settings = {"mount": "fixed", "mount_sigma_arcsec": float(known.sigma_arcsec[0, 0])}
+    provenance = type(cal.provenance)(record | coma_record(cal.nominal, factors))
+    return cal.moved(
+        theta,
+        sigma,
+        dof,
+        Status.SINGULAR if names else status,
+        covariance=covariance * np.outer(factors, factors),
+        stages=(*cal.stages, stage),
+        undetermined=names,
+        quaternions=rotation_to_quaternion(turned),
+        residuals_px=residuals.T,
+        chi2=float(compressed.gram[0, 0]),
+        information=symmetric_inverse(covariance),
+        rotation_per_theta=np.mean(attitudes.response, axis=2),
+        attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
+        compressed=compressed,
+        provenance=provenance.with_settings(**settings),
+        ties=checked,
+    )
+
+
+def _tied(
+    likelihood: TiedLikelihood, theta: FloatArray
+) -> tuple[FloatArray, FloatArray, Attitudes]:
+    """Residuals (2, N), px, and attitudes (K, 3, 3) that the ties leave, and those of each frame
+    alone.
+    """
+    attitudes = likelihood.sums(theta)[1]
+    turned = exp_rotation(likelihood.tied(attitudes).turns().T) @ attitudes.at(theta)
+    frames, residuals = likelihood.frames, np.empty((2, likelihood.frames.n_stars))
+    frame_sums(frames, likelihood.model_name, theta, turned, residuals)
+    return frames.in_pixels(residuals), turned, attitudes
+
+
+def _checked(likelihood: TiedLikelihood, cal: Calibration) -> FittedTies:
+    """How the ties agree with the stars, at the estimate without them."""
+    from scipy.optimize import brentq
+    from scipy.special import fdtrc
+
+    sums, attitudes = super(TiedLikelihood, likelihood).sums(cal.theta)
+    ties, scale = likelihood.ties, cal.sigmas
+    matrix = sums.matrix * np.outer(scale, scale)
+    rotations = attitudes.at(cal.theta)
+
+    def added(known: RelativeAttitudes) -> float:
+        """What the ties add to the sum of squares, parameters following."""
+        tied = replace(ties, known=known).around(rotations, attitudes.inverse, cal.sigma)
+        columns = np.column_stack([tied.rest, tied.columns(attitudes.response) * scale])
+        gram = columns.T @ tied.solve(columns)
+        step = np.linalg.solve(matrix + gram[1:, 1:], gram[1:, 0])
+        return float(gram[0, 0] - gram[0, 1:] @ step) / cal.sigma**2
+
+    chi2, factor = added(ties.known), 1.0
+    if chi2 > ties.dof:
+
+        def excess(log: float) -> float:
+            return added(ties.known.scaled(float(np.exp(log)))) - ties.dof
+
+        top = float(np.log(_ASTRAY))
+        factor = float(np.exp(brentq(excess, 0.0, top, xtol=1e-3))) if excess(top) < 0 else np.inf
+    return FittedTies(
+        ties.known,
+        chi2,
+        ties.dof,
+        float(fdtrc(ties.dof, cal.dof, chi2 / ties.dof)),
+        factor,
+        cal.sigma,
+        cal.sigmas,
+    )
