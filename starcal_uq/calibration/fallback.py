@@ -119,7 +119,7 @@ def _left_open(obs: Observations, cal: Calibration, richer: str) -> tuple[str, .
     likelihood, theta = _as_richer(obs, cal, richer)
     if likelihood.dof < len(theta):
         return ()
-    camera = cal.nominal.replace(distortion=richer, coefficients=(0.0,) * (len(theta) - 3))
+    camera = cal.nominal.replace(distortion=richer)
     return open_parameters(likelihood.evaluate(theta).matrix, cal.sigma, camera) or None
 
 
@@ -131,8 +131,7 @@ def _as_richer(
     """
     likelihood = MarginalLikelihood(weighed(obs, cal), richer)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
-    extra = len(get_model(richer).coefficients) - len(get_model(cal.camera.distortion).coefficients)
-    return likelihood, np.concatenate([cal.theta, np.zeros(extra)])
+    return likelihood, cal.camera.replace(distortion=richer).theta
 
 
 def _simpler(

@@ -18,12 +18,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcal_uq.camera.distortion import get_model, model_names, parameter_names
+from starcal_uq.camera.distortion import (
+    AXES_SUFFIX,
+    PARAMETERS,
+    get_model,
+    model_names,
+    parameter_names,
+    shared_names,
+    undistorted,
+    with_axes,
+)
 from starcal_uq.camera.formats import read_pinhole
 from starcal_uq.camera.opencv import from_opencv, to_opencv
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
-from starcal_uq.core.files import reading
+from starcal_uq.core.files import reading, shown
 from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
 from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, PathLike, floats
@@ -31,22 +40,25 @@ from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, Pa
 
 @dataclass(frozen=True)
 class Camera(Shown):
-    """A star camera with square pixels.
+    """A star camera.
 
     Attributes
     ----------
     width_px, height_px : int
         Size of the detector, pixels.
     pixel_um : float or None
-        Pixel pitch, micrometres; None where it is unknown, and then nothing has millimetres.
+        Pixel pitch along x, micrometres; None where it is unknown, and then nothing has
+        millimetres.
     focal_mm : float or None
         Focal length, millimetres; None where the pitch is unknown. It may be left to `focal_px`.
     x0_px, y0_px : float
         Principal point, pixels; it may lie outside the detector.
     distortion : str
-        Name of the distortion model (`starcal_uq.camera.distortion.model_names`).
+        Name of the distortion model (`starcal_uq.camera.distortion.model_names`); with ``+axes``
+        behind it, the pixels need not be square.
     coefficients : tuple of float
-        Coefficients of that model in its order, on offsets in pixels; zeros by default.
+        Coefficients of that model in its order, on offsets in pixels, with ``+axes`` followed by
+        stretch and skew of the axes; zeros by default.
     name : str
         Free text.
     focal_px : float
@@ -104,6 +116,8 @@ class Camera(Shown):
                 f"give {len(names)} ({', '.join(names) or 'none'}), or leave them out for zeros."
             )
         self._set("coefficients", tuple(_finite(n, k) for n, k in zip(names, given, strict=True)))
+        if self.axes[0] <= -1.0:
+            raise CameraError(f"camera: stretch is {self.axes[0]!r}; it must be above -1.")
 
     def _set(self, key: str, value: object) -> None:
         object.__setattr__(self, key, value)
@@ -117,6 +131,12 @@ class Camera(Shown):
     def parameter_names(self) -> tuple[str, ...]:
         """Names of `theta`."""
         return parameter_names(self.distortion)
+
+    @property
+    def axes(self) -> tuple[float, float]:
+        """Stretch (scale along y over that along x, less one) and skew; zeros of square pixels."""
+        stretch, skew = self.coefficients[-2:] if get_model(self.distortion).axes else (0.0, 0.0)
+        return stretch, skew
 
     @property
     def fov_deg(self) -> tuple[float, float]:
@@ -204,26 +224,36 @@ class Camera(Shown):
         return self.replace(x0_px=x0, y0_px=y0, focal_px=f, coefficients=tuple(coefficients))
 
     def data_sheet(self) -> Camera:
-        """The camera as its data sheet gives it: principal point in the centre, no distortion."""
+        """The camera as its data sheet gives it: principal point in the centre, no distortion;
+        the axes stay.
+        """
         x0, y0 = self.centre_px
-        return self.replace(x0_px=x0, y0_px=y0, coefficients=(0.0,) * len(self.coefficients))
+        return self.with_theta(undistorted(self.distortion, self.theta)).replace(x0_px=x0, y0_px=y0)
 
     def replace(self, **changes: Any) -> Camera:
         """A copy with some attributes changed.
 
         With another `distortion` and no `coefficients`, those of the same name are kept and the
-        others are zero; between a forward and an inverse model nothing can be kept. A `pixel_um`
-        where there was none keeps `focal_px`, and so does None.
+        others are zero; between a forward and an inverse model only the axes can be kept. A
+        `pixel_um` where there was none keeps `focal_px`, and so does None.
+
+        Raises
+        ------
+        CameraError
+            For an unknown attribute, or a `distortion` that would make square what is not.
         """
         if "distortion" in changes and "coefficients" not in changes:
             try:
                 new = get_model(changes["distortion"])
             except DistortionError as error:
                 raise CameraError(f"camera: {error}") from None
-            old = get_model(self.distortion)
-            kept: dict[str, float] = {}
-            if new.direction == old.direction:
-                kept = dict(zip((c.name for c in old.coefficients), self.coefficients, strict=True))
+            if not new.axes and any(self.axes):
+                raise CameraError(
+                    f"camera: distortion {new.name!r} has square pixels, and those of this camera "
+                    f"are not square or have skewed axes; use {with_axes(new.name)!r}."
+                )
+            own = dict(zip(self.parameter_names[3:], self.coefficients, strict=True))
+            kept = {name: own[name] for name in shared_names(self.distortion, new.name)}
             changes["coefficients"] = tuple(kept.get(c.name, 0.0) for c in new.coefficients)
         known = {field.name for field in dataclasses.fields(self)}
         if unknown := sorted(set(changes) - known):
@@ -303,7 +333,8 @@ class Camera(Shown):
             If the file exists and `force` is false, or cannot be written.
         """
         header = _HEADER if self.pixel_um is not None else _HEADER.replace(_LENGTHS, _PIXELS)
-        header += _DIRECTION[get_model(self.distortion).direction] + "\n"
+        model = get_model(self.distortion)
+        header += (_AXES_HEADER if model.axes else "") + _DIRECTION[model.direction] + "\n"
         write_section(path, "camera", self.to_dict(), header, force)
 
     def to_opencv(self) -> tuple[FloatArray, FloatArray]:
@@ -351,7 +382,7 @@ class Camera(Shown):
             The detector, of which OpenCV keeps no record; the pitch may be None.
         distortion
             Distortion model to use; by default the smallest of brown, brown3 and brown_tangential
-            that holds the coefficients.
+            that holds the coefficients, with ``+axes`` for fx != fy or skew.
 
         Raises
         ------
@@ -401,6 +432,10 @@ _HEADER = """\
 # x0_px, y0_px: principal point. Distortion coefficients act on offsets in pixels from it:
 # k1 px^-2, k2 px^-4, k3 px^-6, p1 and p2 px^-1.
 """
+_AXES_HEADER = """\
+# stretch: scale along y over that along x, less one. skew: shift along x with the offset along y.
+# pixel_um and the focal length are those along x.
+"""
 
 _LENGTHS = "pixel_um: micrometres. focal_mm: millimetres."
 _PIXELS = "focal_px: pixels; where the pitch is known, pixel_um and focal_mm."
@@ -413,8 +448,8 @@ _WORDS = {
     "width_px": "the width of the detector in pixels",
     "height_px": "the height of the detector in pixels",
     "pixel_um": (
-        "the pitch of the square pixels in micrometres (if it is unknown, focal_px in place of "
-        "focal_mm)"
+        "the pitch of the pixels in micrometres, or [along x, along y] (if it is unknown, focal_px "
+        "in place of focal_mm)"
     ),
     "focal_mm": "the focal length in millimetres",
     "focal_px": "the focal length in pixels",
@@ -423,7 +458,11 @@ _WORDS = {
 }
 _KEYS = {
     **{name: Key.number(KEYS[name], words, required=True) for name, words in _WORDS.items()},
-    "distortion": Key(str, "the name of the distortion model, one of " + ", ".join(model_names())),
+    "distortion": Key(
+        str,
+        f"the name of the distortion model, one of {', '.join(model_names())}, with {AXES_SUFFIX} "
+        "behind it for free axes",
+    ),
     "name": Key(str, "a name in quotes"),
 }
 
@@ -436,7 +475,9 @@ class _CameraSection(Section):
 
     def unknown(self, key: str) -> str:
         own = [c.name for c in get_model(self.distortion).coefficients]
-        models = [n for n in model_names() if key in {c.name for c in get_model(n).coefficients}]
+        models = [n for n in model_names() if key in {c.name for c in get_model(n).lens}]
+        if key in PARAMETERS and not models:
+            models = [with_axes(self.distortion)]
         if key == "focal_mm":
             return "keys focal_mm and focal_px both state the focal length; remove one"
         if not models:
@@ -473,6 +514,8 @@ def _checked(table: AnyMapping, where: str) -> AnyDict:
             f"{where}: key distortion is {distortion!r}; write {_KEYS['distortion'].wanted}."
         )
     try:
+        if isinstance(table.get("pixel_um"), (list, tuple)):
+            table, distortion = _pitches(table, with_axes(distortion), where), with_axes(distortion)
         coefficients = get_model(distortion).coefficients
     except DistortionError as error:
         raise CameraError(f"{where}: key distortion: {error}") from None
@@ -480,3 +523,25 @@ def _checked(table: AnyMapping, where: str) -> AnyDict:
     values = {"pixel_um": None, "focal_mm": None, **values}
     values["coefficients"] = tuple(values.pop(c.name, 0.0) for c in coefficients)
     return values
+
+
+def _pitches(table: AnyMapping, distortion: str, where: str) -> AnyDict:
+    """The table with the pitch along x, and the stretch of the axes that both pitches state."""
+    pitches, limit = list(table["pixel_um"]), KEYS["pixel_um"]
+    numbers = [v for v in pitches if isinstance(v, int | float) and not isinstance(v, bool)]
+    if len(pitches) != 2 or len(numbers) != 2 or not limit.holds(numbers):
+        raise CameraError(
+            f"{where}: key pixel_um is {shown(pitches)}; write one pitch in micrometres, or two in "
+            f"brackets, [along x, along y], each {limit.wanted().removeprefix('give ')}."
+        )
+    if "stretch" in table:
+        raise CameraError(
+            f"{where}: key pixel_um states two pitches, and key stretch their ratio; remove one."
+        )
+    along_x, along_y = map(float, numbers)
+    return {
+        **table,
+        "pixel_um": along_x,
+        "distortion": distortion,
+        "stretch": along_x / along_y - 1.0,
+    }

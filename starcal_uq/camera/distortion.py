@@ -8,10 +8,12 @@ parameter order are those of ``docs/explanation/conventions.md``.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 from starcal_uq.core.errors import DistortionError
+from starcal_uq.core.types import FloatArray
 
 Displacement = Callable[[Any, Any, Sequence[Any]], tuple[Any, Any]]
 
@@ -43,27 +45,64 @@ class DistortionModel:
     ----------
     name : str
         Word that users write in ``distortion = "..."``.
-    coefficients : tuple of Coefficient
-        In the order in which they follow x0, y0 and f.
+    lens : tuple of Coefficient
+        Coefficients of the displacement, in the order in which they follow x0, y0 and f.
     direction : {"forward", "inverse"}
         ``forward`` maps ideal to distorted points, ``inverse`` maps distorted to ideal points.
-    displacement : callable
+    formula : callable
         ``(u, v, k) -> (du, dv)``: displacement in pixels at offset (u, v) px from the principal
         point.
     source : str
         Source of the formula.
+    axes : bool
+        Whether stretch and skew of the detector's axes follow the coefficients of the lens.
     """
 
     name: str
-    coefficients: tuple[Coefficient, ...]
+    lens: tuple[Coefficient, ...]
     direction: Literal["forward", "inverse"]
-    displacement: Displacement
+    formula: Displacement
     source: str
+    axes: bool = False
+
+    @property
+    def coefficients(self) -> tuple[Coefficient, ...]:
+        """All parameters that follow x0, y0 and f: of the lens, then of the axes."""
+        return self.lens + (_AXES if self.axes else ())
 
     @property
     def radial(self) -> bool:
-        """Whether it is the same in all directions from the principal point."""
-        return self.displacement in (_radial, _none)
+        """Whether the lens is the same in all directions from the principal point."""
+        return self.formula in (_radial, _none)
+
+    @property
+    def of_lens(self) -> slice:
+        """Place of the lens's coefficients among the parameters."""
+        return slice(3, 3 + len(self.lens))
+
+    @property
+    def bare(self) -> str:
+        """Name of the model without distortion whose axes are free where these are."""
+        return "none" + (AXES_SUFFIX if self.axes else "")
+
+    def displacement(self, u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
+        """Displacement by the lens, px, for coefficients k of which the first are the lens's."""
+        return self.formula(u, v, k[: len(self.lens)])
+
+    def stretched(self, u: Any, v: Any, theta: Sequence[Any]) -> tuple[Any, Any]:
+        """Offset on the detector of the point (u, v) behind the lens, px, for parameters theta."""
+        if not self.axes:
+            return u, v
+        stretch, skew = theta[3 + len(self.lens)], theta[4 + len(self.lens)]
+        return u + skew * v, v + stretch * v
+
+    def unstretched(self, x: Any, y: Any, theta: Sequence[Any]) -> tuple[Any, Any]:
+        """Inverse of `stretched`."""
+        if not self.axes:
+            return x, y
+        stretch, skew = theta[3 + len(self.lens)], theta[4 + len(self.lens)]
+        v = y / (1.0 + stretch)
+        return x - skew * v, v
 
 
 def _radial(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
@@ -93,6 +132,13 @@ _K2 = Coefficient("k2", "px^-4", 1e-15, "1e-15 px^-4", "radial distortion, quint
 _K3 = Coefficient("k3", "px^-6", 1e-20, "1e-20 px^-6", "radial distortion, seventh-order term", 7)
 _P1 = Coefficient("p1", "px^-1", 1e-7, "1e-7 px^-1", "decentring distortion along y", 2)
 _P2 = Coefficient("p2", "px^-1", 1e-7, "1e-7 px^-1", "decentring distortion along x", 2)
+
+_AXES = (
+    Coefficient("stretch", "1", 1e-6, "1e-6", "scale along y over that along x, less one", 1),
+    Coefficient("skew", "1", 1e-6, "1e-6", "shift along x with the offset along y", 1),
+)
+# What a model's name ends in where stretch and skew of the axes are parameters too.
+AXES_SUFFIX = "+axes"
 
 _EQ14 = "Ye & Yang 2017, eq. 14 (ideal to distorted), in pixels"
 _MODELS = {
@@ -132,39 +178,84 @@ _SIGMA_SCALE = Parameter(
 )
 
 
-def model_names() -> tuple[str, ...]:
-    """Names of all distortion models."""
-    return tuple(_MODELS)
+def model_names(*, axes: bool = False) -> tuple[str, ...]:
+    """Names of all distortion models; with `axes` also those with free axes of the detector."""
+    names = tuple(_MODELS)
+    return names + tuple(name + AXES_SUFFIX for name in names) if axes else names
 
 
+@lru_cache
 def get_model(name: str) -> DistortionModel:
     """Look a distortion model up; DistortionError for a name that is not in the registry."""
-    try:
-        return _MODELS[name]
-    except KeyError:
+    base = name.removesuffix(AXES_SUFFIX)
+    if base not in _MODELS:
         raise DistortionError(
-            f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}."
-        ) from None
+            f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}, each "
+            f"also as NAME{AXES_SUFFIX}."
+        )
+    return replace(_MODELS[base], name=name, axes=name != base)
+
+
+def with_axes(name: str) -> str:
+    """Name of the same model with free axes of the detector."""
+    return name.removesuffix(AXES_SUFFIX) + AXES_SUFFIX
+
+
+def like(name: str, other: str) -> str:
+    """Name of a model with the axes of the `other`: free, or square."""
+    return with_axes(name) if get_model(other).axes else name.removesuffix(AXES_SUFFIX)
+
+
+def shared_names(one: str, other: str) -> tuple[str, ...]:
+    """Names of the coefficients that mean the same in both models."""
+    a, b = get_model(one), get_model(other)
+    common = set(b.coefficients) - (set(b.lens) if a.direction != b.direction else set())
+    return tuple(c.name for c in a.coefficients if c in common)
+
+
+def is_special_case(small: str, large: str) -> bool:
+    """Whether a model is another one, or becomes it when some of the other's coefficients are
+    zero; without distortion, both directions are one.
+    """
+    a, b = get_model(small), get_model(large)
+    return set(a.coefficients) <= set(b.coefficients) and (a.direction == b.direction or not a.lens)
 
 
 def simpler_models(name: str) -> tuple[str, ...]:
-    """Models that a model becomes when some of its coefficients are zero; without any, both
-    directions are one.
+    """Models that a model becomes when some coefficients of its lens are zero; the axes stay, as
+    no lack of data makes pixels square.
     """
-    own, names = get_model(name), {c.name for c in get_model(name).coefficients}
+    own = get_model(name)
     return tuple(
-        other.name
-        for other in _MODELS.values()
-        if {c.name for c in other.coefficients} < names
-        and (other.direction == own.direction or not other.coefficients)
+        other
+        for other in (like(base, name) for base in model_names())
+        if len(get_model(other).lens) < len(own.lens) and is_special_case(other, name)
     )
+
+
+def rivals(name: str) -> tuple[str, ...]:
+    """Models to compare with one: those from ideal to distorted points, with its axes."""
+    forward = (base for base in model_names() if get_model(base).direction == "forward")
+    return tuple(like(base, name) for base in forward)
+
+
+def next_richer(name: str) -> str:
+    """The richest of `rivals` that has all terms of a model and more; empty where there is none."""
+    own = set(get_model(name).lens)
+    richer = [other for other in rivals(name) if own < set(get_model(other).lens)]
+    return max(richer, key=lambda other: len(get_model(other).lens), default="")
 
 
 def next_simpler(name: str) -> str:
     """The richest of `simpler_models`; empty where there is none."""
-    return max(
-        simpler_models(name), key=lambda other: len(get_model(other).coefficients), default=""
-    )
+    return max(simpler_models(name), key=lambda other: len(get_model(other).lens), default="")
+
+
+def undistorted(model_name: str, theta: FloatArray) -> FloatArray:
+    """The same optics and axes (p,) without distortion."""
+    found = theta.copy()
+    found[get_model(model_name).of_lens] = 0.0
+    return found
 
 
 def parameters(model_name: str) -> tuple[Parameter, ...]:
@@ -178,7 +269,9 @@ def parameter_names(model_name: str) -> tuple[str, ...]:
 
 
 # Coefficients and parameters of all models, by name.
-COEFFICIENTS = {spec.name: spec for model in _MODELS.values() for spec in model.coefficients}
+COEFFICIENTS = {spec.name: spec for model in _MODELS.values() for spec in model.lens} | {
+    spec.name: spec for spec in _AXES
+}
 PARAMETERS: dict[str, Parameter] = {spec.name: spec for spec in _OPTICS} | COEFFICIENTS
 
 

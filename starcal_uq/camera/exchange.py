@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, shared_names, with_axes
 from starcal_uq.camera.formats import TEXT_FORMATS, Pinhole, write_pinhole
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CameraError
@@ -78,22 +78,28 @@ def _grid(camera: Camera, points: int) -> FloatArray:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def nearest(camera: Camera, distortion: str) -> tuple[Camera, float]:
+def nearest(camera: Camera, distortion: str, without: tuple[str, ...] = ()) -> tuple[Camera, float]:
     """The camera with this distortion model that differs least over the detector, and by how much
     at most, px.
 
-    All its parameters are fitted to the directions of a grid of pixels; the axes of the camera
-    stay.
+    All its parameters but those `without` are fitted to the directions of a grid of pixels; the
+    orientation of the camera stays.
     """
     from scipy.optimize import least_squares
 
     model = get_model(distortion)
-    start = camera.replace(distortion=distortion)
+    known = dict(zip(camera.parameter_names, camera.theta, strict=True))
+    common = set(shared_names(camera.distortion, distortion)) - set(without)
+    start = camera.replace(
+        distortion=distortion,
+        coefficients=tuple(known[c.name] if c.name in common else 0.0 for c in model.coefficients),
+    )
     pixels = _grid(camera, _POINTS)
     seen = unproject(camera, pixels)
     # Parameters of like size: pixels, and displacements at the corner.
     radius = camera.corner_radius_px
     scale = np.array([1.0, 1.0, 1.0, *(radius**-c.order for c in model.coefficients)])
+    scale *= [name not in without for name in start.parameter_names]
 
     def off(step: FloatArray) -> FloatArray:
         moved = start.with_theta(start.theta + scale * step)
@@ -119,13 +125,12 @@ def _held(camera: Camera, kept: tuple[str, ...]) -> tuple[Camera, float]:
     }
     if not used or (model.direction == "forward" and used <= set(kept)):
         return camera, 0.0
-    wanted = (
-        "brown3"
-        if model.radial and "k3" in kept
-        else "brown"
-        if model.radial
-        else "brown_tangential"
-    )
+    wanted = "brown_tangential"
+    if model.radial:
+        wanted = "brown3" if "k3" in kept else "brown"
+    axes = ("stretch", "skew")
+    if model.axes and set(axes) & set(kept):
+        return nearest(camera, with_axes(wanted), tuple(name for name in axes if name not in kept))
     return nearest(camera, wanted)
 
 
@@ -145,15 +150,24 @@ def _pinhole_file(to: str, camera: Camera, path: Path) -> tuple[float, str]:
     size = held.width_px, held.height_px
     plain = Pinhole(*size, *bare.to_opencv(), held.pixel_um, held.name)
     path.write_text(write_pinhole(plain, to), encoding="utf-8")
-    return error, _said(error, TEXT_FORMATS[to].title)
+    title, skew = TEXT_FORMATS[to].title, plain.matrix[0, 1]
+    if not skew:
+        return error, _said(error, title)
+    # The functions of OpenCV, which are also those of ROS, read fx, fy, cx and cy alone.
+    ideal = unproject(held, _grid(held, 2))
+    error = float(np.max(np.abs(skew * ideal[:, 1] / ideal[:, 2])))
+    return error, (
+        f"{title}: the same camera, with the skew in the camera matrix; functions of OpenCV leave "
+        f"it out, which is up to {error:.2g} px over the detector."
+    )
 
 
 def _tetra3rs(camera: Camera, path: Path) -> tuple[float, str]:
     with extra("tetra3rs", "cameras for tetra3rs"):
         import tetra3rs as library
     held, error = _held(camera, ("k1", "k2", "k3", "p1", "p2"))
-    names = [c.name for c in get_model(held.distortion).coefficients]
-    terms: AnyDict = dict(zip(names, held.coefficients, strict=True))
+    names = [c.name for c in get_model(held.distortion).lens]
+    terms: AnyDict = dict(zip(names, held.coefficients, strict=False))
     centre = np.subtract((held.x0_px, held.y0_px), held.centre_px)
     distortion = library.RadialDistortion(**terms) if any(terms.values()) else None
     library.CameraModel(
@@ -213,7 +227,11 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
     pixels = _grid(camera, _POINTS)
     seen = unproject(camera, pixels)
     measured = pixels - [camera.x0_px, camera.y0_px]
+    model, theta = get_model(camera.distortion), camera.theta
     ideal = camera.focal_px * seen[:, :2] / seen[:, 2:]
+    # SIP has no linear terms: the axes of the detector are part of CD.
+    ideal = np.column_stack(model.stretched(ideal[:, 0], ideal[:, 1], theta))
+    axes = np.stack(model.unstretched(*np.eye(2), theta))
     scale = camera.corner_radius_px
     header = fits.Header()
     header.update(WCSAXES=2, IMAGEW=camera.width_px, IMAGEH=camera.height_px)
@@ -221,10 +239,10 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
     for axis, (kind, centre) in enumerate(sides, 1):
         # x and y of a pixel run against right ascension and declination for who looks at the sky
         # from within.
-        step = -np.degrees(1.0 / camera.focal_px)
+        step = -np.degrees(1.0 / camera.focal_px) * axes[axis - 1]
         own = {"CTYPE": kind, "CRPIX": centre + 1.0, "CRVAL": 0.0, "CUNIT": "deg"}
         header.update({f"{name}{axis}": value for name, value in own.items()})
-        header.update({f"CD{axis}_{axis}": step, f"CD{axis}_{3 - axis}": 0.0})
+        header.update({f"CD{axis}_{i}": float(value) for i, value in enumerate(step, 1)})
     worst = 0.0
     for names, start, end in ((("A", "B"), measured, ideal), (("AP", "BP"), ideal, measured)):
         order, coefficients, error = _polynomial(start / scale, (end - start) / scale, scale)

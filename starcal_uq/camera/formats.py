@@ -43,7 +43,7 @@ class Pinhole:
 @dataclass(frozen=True)
 class TextFormat:
     """How a program writes a camera: its name, the ending of its files, what they keep of k1, k2,
-    p1, p2, k3, and their text.
+    p1, p2, k3, stretch and skew, and their text.
     """
 
     title: str
@@ -53,11 +53,12 @@ class TextFormat:
 
 
 _ALL = ("k1", "k2", "p1", "p2", "k3")
+_MATRIX = ("stretch", "skew")
 TEXT_FORMATS = {
     "opencv": TextFormat(
         "OpenCV",
         ".yaml",
-        _ALL,
+        (*_ALL, *_MATRIX),
         """\
 %YAML:1.0
 ---
@@ -68,7 +69,7 @@ camera_matrix: !!opencv-matrix
    rows: 3
    cols: 3
    dt: d
-   data: [ {f}, 0.0, {x0}, 0.0, {f}, {y0}, 0.0, 0.0, 1.0 ]
+   data: [ {fx}, {skew}, {x0}, 0.0, {fy}, {y0}, 0.0, 0.0, 1.0 ]
 distortion_coefficients: !!opencv-matrix
    rows: 1
    cols: 5
@@ -79,7 +80,7 @@ distortion_coefficients: !!opencv-matrix
     "ros": TextFormat(
         "ROS camera_info",
         ".yaml",
-        _ALL,
+        (*_ALL, *_MATRIX),
         """\
 {pitch}image_width: {width}
 image_height: {height}
@@ -87,7 +88,7 @@ camera_name: "{name}"
 camera_matrix:
   rows: 3
   cols: 3
-  data: [{f}, 0.0, {x0}, 0.0, {f}, {y0}, 0.0, 0.0, 1.0]
+  data: [{fx}, {skew}, {x0}, 0.0, {fy}, {y0}, 0.0, 0.0, 1.0]
 distortion_model: plumb_bob
 distortion_coefficients:
   rows: 1
@@ -100,17 +101,17 @@ rectification_matrix:
 projection_matrix:
   rows: 3
   cols: 4
-  data: [{f}, 0.0, {x0}, 0.0, 0.0, {f}, {y0}, 0.0, 0.0, 0.0, 1.0, 0.0]
+  data: [{fx}, {skew}, {x0}, 0.0, 0.0, {fy}, {y0}, 0.0, 0.0, 0.0, 1.0, 0.0]
 """,
     ),
     "kalibr": TextFormat(
         "Kalibr",
         ".yaml",
-        _ALL[:4],
+        (*_ALL[:4], "stretch"),
         """\
 {pitch}cam0:
   camera_model: pinhole
-  intrinsics: [{f}, {f}, {x0}, {y0}]
+  intrinsics: [{fx}, {fy}, {x0}, {y0}]
   distortion_model: radtan
   distortion_coeffs: [{terms}]
   resolution: [{width}, {height}]
@@ -120,13 +121,13 @@ projection_matrix:
     "mrcal": TextFormat(
         "mrcal",
         ".cameramodel",
-        _ALL,
+        (*_ALL, "stretch"),
         """\
 {pitch}{{
     'lensmodel': 'LENSMODEL_OPENCV5',
 
     # fx, fy, cx, cy, k1, k2, p1, p2, k3
-    'intrinsics': [{f}, {f}, {x0}, {y0}, {terms}],
+    'intrinsics': [{fx}, {fy}, {x0}, {y0}, {terms}],
 
     'extrinsics': [0, 0, 0, 0, 0, 0],
 
@@ -140,14 +141,18 @@ projection_matrix:
 def write_pinhole(camera: Pinhole, to: str) -> str:
     """Content of a file in one of the `TEXT_FORMATS`."""
     form = TEXT_FORMATS[to]
-    matrix, terms = camera.matrix.tolist(), camera.dist_coeffs[: len(form.kept)].tolist()
+    matrix = camera.matrix.tolist()
+    coefficients = zip(_ALL, camera.dist_coeffs.tolist(), strict=True)
+    terms = [value for name, value in coefficients if name in form.kept]
     return form.text.format(
         pitch="" if camera.pixel_um is None else f"# pixel_um: {camera.pixel_um!r}\n",
         # A name is free text; these files get what cannot end a line or a quotation.
         name=re.sub(r"[^\w .+-]", "_", camera.name, flags=re.ASCII) or "star_camera",
         width=camera.width_px,
         height=camera.height_px,
-        f=matrix[0][0],
+        fx=matrix[0][0],
+        fy=matrix[1][1],
+        skew=matrix[0][1],
         x0=matrix[0][2],
         y0=matrix[1][2],
         terms=", ".join(map(repr, terms)),
@@ -168,14 +173,16 @@ def read_pinhole(text: str) -> Pinhole:
         isinstance(value, (int, float)) and not isinstance(value, bool) for value in numbers
     ):
         raise ValueError("a value of the optics is no number")
-    fx, fy, x0, y0 = intrinsics
+    fx, fy, x0, y0, *skew = intrinsics
     if any(coefficients[5:]):
         raise ValueError(
             "it has rational, thin-prism or tilt terms, which have no counterpart here"
         )
     found = np.zeros(5)
     found[: min(5, len(coefficients))] = coefficients[:5]
-    matrix = np.array([[fx, 0.0, x0], [0.0, fy, y0], [0.0, 0.0, 1.0]], dtype=np.float64)
+    matrix = np.array(
+        [[fx, *(skew or [0.0]), x0], [0.0, fy, y0], [0.0, 0.0, 1.0]], dtype=np.float64
+    )
     return Pinhole(width, height, matrix, found, float(pitch[1]) if pitch else None, name)
 
 
@@ -205,13 +212,13 @@ def _opencv(content: Mapping[str, Any]) -> _Read:
             f"its distortion model is {kind!r}, and only plumb_bob has a counterpart here"
         )
     matrix = [float(value) for value in content["camera_matrix"]["data"]]
-    if len(matrix) != 9 or matrix[1] or matrix[3]:
-        raise ValueError("its camera matrix has skew, or not nine numbers")
+    if len(matrix) != 9 or matrix[3]:
+        raise ValueError("its camera matrix has not nine numbers, or one below its diagonal")
     return (
         int(content["image_width"]),
         int(content["image_height"]),
         str(content.get("camera_name", "")),
-        (matrix[0], matrix[4], matrix[2], matrix[5]),
+        (matrix[0], matrix[4], matrix[2], matrix[5], matrix[1]),
         list(content["distortion_coefficients"]["data"]),
     )
 

@@ -126,6 +126,7 @@ def build_kernel(
     """
     import casadi as ca
 
+    name = name.replace("+", "_")
     function = ca.Function(
         name, list(inputs), [ca.densify(ca.vec(ca.SX(output))) for output in outputs], {"cse": True}
     )

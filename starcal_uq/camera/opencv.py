@@ -2,7 +2,8 @@
 
 OpenCV distorts normalised coordinates (x - x0) / f, this package offsets in pixels; the pixel
 origin is the same. So k1_cv = k1 f^2, k2_cv = k2 f^4, k3_cv = k3 f^6 and p_cv = p f (OpenCV,
-"Camera Calibration and 3D Reconstruction").
+"Camera Calibration and 3D Reconstruction"). Both apply the camera matrix last, so that fx = f, fy =
+f (1 + stretch), and the matrix's element (0, 1) is f skew.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, with_axes
 from starcal_uq.core.errors import CameraError, DistortionError
 from starcal_uq.core.types import FloatArray, floats
 
@@ -38,17 +39,18 @@ def to_opencv(distortion: str, theta: FloatArray) -> tuple[FloatArray, FloatArra
         )
     x0, y0, f, *coefficients = theta.tolist()
     dist = np.zeros(5)
-    for coefficient, value in zip(model.coefficients, coefficients, strict=True):
+    for coefficient, value in zip(model.lens, coefficients, strict=False):
         index, power = _OPENCV[coefficient.name]
         dist[index] = value * f**power
-    return np.array([[f, 0.0, x0], [0.0, f, y0], [0.0, 0.0, 1.0]]), dist
+    stretch, skew = coefficients[-2:] if model.axes else (0.0, 0.0)
+    return np.array([[f, f * skew, x0], [0.0, f * (1.0 + stretch), y0], [0.0, 0.0, 1.0]]), dist
 
 
 def from_opencv(
     camera_matrix: ArrayLike, dist_coeffs: ArrayLike | None, distortion: str | None
 ) -> tuple[str, list[float]]:
     """Distortion model and x0, y0, f, k... in pixels; see ``Camera.from_opencv``."""
-    x0, y0, f = _pinhole(floats(camera_matrix))
+    x0, y0, f, axes = _pinhole(floats(camera_matrix))
     dist = np.zeros(0) if dist_coeffs is None else floats(dist_coeffs).ravel()
     if not np.all(np.isfinite(dist)):
         raise CameraError("dist_coeffs: give finite numbers.")
@@ -60,10 +62,16 @@ def from_opencv(
     dist = np.concatenate([dist, np.zeros(5)])[:5]
     values = {key: float(dist[index]) / f**power for key, (index, power) in _OPENCV.items()}
     try:
-        model = get_model(distortion or _smallest_model(values))
+        smallest = _smallest_model(values)
+        model = get_model(distortion or (with_axes(smallest) if any(axes) else smallest))
     except DistortionError as error:
         raise CameraError(f"camera: {error}") from None
-    own = [c.name for c in model.coefficients]
+    if any(axes) and not model.axes:
+        raise CameraError(
+            f"camera_matrix: it has fx != fy or skew, and distortion {model.name!r} has square "
+            f"pixels; use {with_axes(model.name)!r}."
+        )
+    own = [c.name for c in model.lens]
     lost = [key for key, value in values.items() if value != 0.0 and key not in own]
     if model.direction != "forward":
         lost = ["coefficients that map ideal to distorted points"]
@@ -73,26 +81,27 @@ def from_opencv(
             "another distortion, "
             "or repeat OpenCV's calibration with k3, or p1 and p2, fixed at zero."
         )
-    return model.name, [x0, y0, f, *(values[key] for key in own)]
+    return model.name, [x0, y0, f, *(values[key] for key in own), *(axes if model.axes else ())]
 
 
-def _pinhole(matrix: FloatArray) -> tuple[float, float, float]:
+def _pinhole(matrix: FloatArray) -> tuple[float, float, float, tuple[float, float]]:
+    """x0, y0 and f in px, and stretch and skew of the axes."""
     if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
         raise CameraError("camera_matrix: give a 3x3 matrix of finite numbers.")
     fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
-    if fx <= 0.0:
-        raise CameraError(f"camera_matrix: the focal length is {fx!r}; it must be above 0.")
-    if abs(fy - fx) > _SQUARE_RTOL * fx:
+    if min(fx, fy) <= 0.0:
         raise CameraError(
-            f"camera_matrix: fx = {fx!r} and fy = {fy!r} differ, but pixels are square here; "
-            "repeat OpenCV's calibration with CALIB_FIX_ASPECT_RATIO."
+            f"camera_matrix: the focal lengths are {fx!r} and {fy!r}; they must be above 0."
         )
-    if matrix[0, 1] != 0.0 or matrix[1, 0] != 0.0 or tuple(matrix[2]) != (0.0, 0.0, 1.0):
+    if matrix[1, 0] != 0.0 or tuple(matrix[2]) != (0.0, 0.0, 1.0):
         raise CameraError(
-            "camera_matrix: it has skew or a scaled last row; give [[f, 0, x0], [0, f, y0], [0, "
-            "0, 1]]."
+            "camera_matrix: it has a scaled last row, or a number below its diagonal; give "
+            "[[fx, s, x0], [0, fy, y0], [0, 0, 1]]."
         )
-    return float(matrix[0, 2]), float(matrix[1, 2]), fx
+    stretch = (fy - fx) / fx
+    if abs(stretch) <= _SQUARE_RTOL:
+        stretch = 0.0
+    return float(matrix[0, 2]), float(matrix[1, 2]), fx, (stretch, float(matrix[0, 1]) / fx)
 
 
 def _smallest_model(values: Mapping[str, float]) -> str:

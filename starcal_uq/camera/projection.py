@@ -2,9 +2,10 @@
 
 A direction ``b`` in the camera frame falls on the ideal point ``(u, v) = f (b_x, b_y) / b_z``
 relative to the principal point; a distortion model of the registry moves it (``forward``) or moves
-the measured point back (``inverse``). The direction in which a model is not explicit is found by
-Newton's method, and its derivatives by taking further Newton steps symbolically from the root: one
-step carries exact first derivatives, two carry exact second derivatives.
+the point behind the lens back (``inverse``). The axes of the detector stretch that point, where
+they are free. The direction in which a model is not explicit is found by Newton's method, and its
+derivatives by taking further Newton steps symbolically from the root: one step carries exact first
+derivatives, two carry exact second derivatives.
 
 Arrays inside have the star axis last (structure of arrays), the layout in which sums over stars are
 matrix products.
@@ -57,9 +58,23 @@ def _displaced(model_name: str, point: Any, theta: Any) -> Any:
     import casadi as ca
 
     model = get_model(model_name)
-    k = [theta[3 + j] for j in range(len(model.coefficients))]
+    k = [theta[3 + j] for j in range(len(model.lens))]
     du, dv = model.displacement(point[0], point[1], k)
     return ca.vertcat(point[0] + du, point[1] + dv)
+
+
+def _elements(theta: Any) -> list[Any]:
+    return [theta[i] for i in range(theta.numel())]
+
+
+def _behind_lens(model_name: str, offset: Any, theta: Any) -> Any:
+    """Point (casadi.SX, 2) behind the lens, before the detector's axes stretch it, of an offset
+    on the detector.
+    """
+    import casadi as ca
+
+    model = get_model(model_name)
+    return ca.vertcat(*model.unstretched(offset[0], offset[1], _elements(theta)))
 
 
 def _newton_step(model_name: str, point: Any, target: Any, theta: Any) -> tuple[Any, Any]:
@@ -95,19 +110,21 @@ def forward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
 
     direction = _rotated(s.b, s.phi)
     ideal = s.theta[2] * direction[:2] / direction[2]
-    if get_model(model_name).direction == "forward":
-        return s.theta[:2] + _displaced(model_name, ideal, s.theta)
-    point = s.root
-    for _ in range(newton_steps):
-        point, _ = _newton_step(model_name, point, ideal, s.theta)
-    return s.theta[:2] + ca.vertcat(point[0], point[1])
+    model = get_model(model_name)
+    if model.direction == "forward":
+        point = _displaced(model_name, ideal, s.theta)
+    else:
+        point = s.root
+        for _ in range(newton_steps):
+            point, _ = _newton_step(model_name, point, ideal, s.theta)
+    return s.theta[:2] + ca.vertcat(*model.stretched(point[0], point[1], _elements(s.theta)))
 
 
 def backward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
     """Unit vector in the camera frame of a measured pixel position (casadi.SX, 3)."""
     import casadi as ca
 
-    offset = s.pixel - s.theta[:2]
+    offset = _behind_lens(model_name, s.pixel - s.theta[:2], s.theta)
     if get_model(model_name).direction == "forward":
         point = s.root
         for _ in range(newton_steps):
@@ -228,17 +245,21 @@ def backward_second_kernel(model_name: str) -> Kernel:
 def newton_kernel(model_name: str) -> Kernel:
     """Kernel of one Newton step: next point (2,) and Jacobian determinant at the present one
     (1,).
+
+    The target is an offset on the detector (forward), or an ideal point (inverse).
     """
     s = _symbols(model_name)
-    point, determinant = _newton_step(model_name, s.root, s.pixel, s.theta)
+    forward = get_model(model_name).direction == "forward"
+    target = _behind_lens(model_name, s.pixel, s.theta) if forward else s.pixel
+    point, determinant = _newton_step(model_name, s.root, target, s.theta)
     return build_kernel(
         f"newton_{model_name}", [s.theta, s.pixel, s.root], [point, determinant], [(2,), (1,)]
     )
 
 
 def solve_displacement(model_name: str, theta: FloatArray, target: FloatArray) -> FloatArray:
-    """Offsets (2, n) from the principal point, px, that solve ``point + displacement(point) =
-    target``.
+    """Points (2, n) that the model displaces to targets (2, n), px from the principal point: to
+    offsets on the detector (forward), or to ideal points (inverse).
 
     Newton's method starts from the target, whence it converges monotonically for radial distortion
     that does not fold. Where it meets a fold they are not finite, but it may step over one
@@ -288,10 +309,10 @@ def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolAr
 
     `theta` is (p,), or a column (p, n) each.
     """
-    coefficients = get_model(model_name).coefficients
+    model = get_model(model_name)
     before = np.ones(point.shape[1], dtype=bool)
     with np.errstate(all="ignore"):
-        square, size = point[0] ** 2 + point[1] ** 2, np.abs(theta[3:])
+        square, size = point[0] ** 2 + point[1] ** 2, np.abs(theta[model.of_lens])
         if (
             not _bend(
                 model_name, np.sqrt(np.fmax.reduce(square, initial=0.0)), [np.max(k) for k in size]
@@ -303,7 +324,7 @@ def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolAr
         far = np.flatnonzero((bend > 1.0) & np.isfinite(bend))
         if far.size:
             own = theta if theta.ndim == 1 else theta[:, far]
-            safe = bend[far] ** (1.0 / (1 - min(c.order for c in coefficients)))
+            safe = bend[far] ** (1.0 / (1 - min(c.order for c in model.lens)))
             # From there on in steps of 4 % at most, each point on its own way.
             inner = outer = np.full(far.size, np.nan)
             for step in np.geomspace(safe, 1.0, 2 + int(-np.log(safe.min()) / 0.04)):
@@ -325,7 +346,7 @@ def _bend(model_name: str, radius: FloatArray, k: Iterable[FloatArray]) -> Float
     """Largest change of the displacement, px per px, up to a radius; below one, nothing folds."""
     # A radial term k r^m bends by m k r^(m - 1) px per px at most, a decentring one (even m) by
     # three times that.
-    terms = get_model(model_name).coefficients
+    terms = get_model(model_name).lens
     steep = [(1.0 if c.order % 2 else 3.0) * c.order * radius ** (c.order - 1) for c in terms]
     return sum((a * b for a, b in zip(steep, k, strict=True)), np.zeros(1))
 
@@ -334,15 +355,18 @@ def cannot_fold(model_name: str, thetas: FloatArray, xy: FloatArray) -> bool:
     """Whether no parameters (D, p) fold at any pixel (N, 2), by a bound; False where that takes a
     closer look.
     """
-    if get_model(model_name).direction != "forward":
+    model = get_model(model_name)
+    if model.direction != "forward":
         return False
     low, high = thetas[:, :2].min(axis=0), thetas[:, :2].max(axis=0)
     reach = np.hypot(*np.maximum(np.abs(xy - low), np.abs(xy - high)).max(axis=0))
     # Where nothing bends by more than a half, an ideal point is at most twice as far out as its
-    # image.
-    return bool(
-        _bend(model_name, np.array([2.0 * reach]), list(np.abs(thetas[:, 3:]).max(axis=0)))[0] < 0.5
-    )
+    # image; axes that are stretched or skewed add a half at most.
+    if model.axes and np.abs(thetas[:, model.of_lens.stop :]).max() > 0.2:
+        return False
+    reach *= 1.5 if model.axes else 1.0
+    size = list(np.abs(thetas[:, model.of_lens]).max(axis=0))
+    return bool(_bend(model_name, np.array([2.0 * reach]), size)[0] < 0.5)
 
 
 def unproject_theta(model_name: str, theta: FloatArray, xy: FloatArray) -> FloatArray:
@@ -372,7 +396,8 @@ def _unprojected(
     root = backward_root(model_name, theta, pixel)
     outputs = backward_kernel(model_name, derivatives)(pixel.shape[1], theta, pixel, root)
     # The displacement acts on ideal points (forward) or on measured ones (inverse).
-    point = root if root.ndim == 2 else pixel - (theta[:2] if theta.ndim == 2 else theta[:2, None])
+    offset = pixel - (theta[:2] if theta.ndim == 2 else theta[:2, None])
+    point = root if root.ndim == 2 else np.stack(get_model(model_name).unstretched(*offset, theta))
     before = before_fold(model_name, theta, point)
     if not before.all():
         outputs[0][:, ~before] = np.nan
@@ -495,7 +520,7 @@ def monotonic_expression(model_name: str, theta: Any, max_radius_px: float) -> A
     """
     import casadi as ca
 
-    if not get_model(model_name).coefficients:
+    if not get_model(model_name).lens:
         return ca.SX.zeros(0, 1)
     values = []
     for radius in np.linspace(0.25, 1.0, 4) * max_radius_px:

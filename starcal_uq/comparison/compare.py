@@ -30,7 +30,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import rotation_vector
 from starcal_uq.attitude.wahba import aligned
 from starcal_uq.calibration.calibrate import calibrate
-from starcal_uq.camera.distortion import get_model, parameters
+from starcal_uq.camera.distortion import parameters, shared_names
 from starcal_uq.camera.fields import area_weights, detector_axes, grid_points, tangent_axes
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.comparison.covariance import Rule, difference_rule
@@ -234,10 +234,8 @@ def _check(a: Any, b: Any, labels: tuple[str, str], level: float) -> None:
 def _shared_parameters(a: Estimate, b: Estimate, rule: Rule) -> AnyDict:
     """Parameters that mean the same in both models."""
     specs = {p.name: (i, p.unit) for i, p in enumerate(parameters(a.camera.distortion))}
-    names = [p.name for p in parameters(b.camera.distortion)]
-    if get_model(a.camera.distortion).direction != get_model(b.camera.distortion).direction:
-        names = names[:3]
-    names = [name for name in names if name in specs]
+    common = shared_names(b.camera.distortion, a.camera.distortion)
+    names = [*b.camera.parameter_names[:3], *common]
     rows_a = [specs[name][0] for name in names]
     rows_b = [b.camera.parameter_names.index(name) for name in names]
     variances = [np.diag(a.covariance)[rows_a], np.diag(b.covariance)[rows_b]]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import is_special_case
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.inference.priors import GaussianPriors
@@ -172,10 +172,7 @@ def _within(one: Any, other: Any) -> bool:
     """True if the distortion model of `one` is that of `other` with some coefficients zero, or
     none.
     """
-    small, large = get_model(one.camera.distortion), get_model(other.camera.distortion)
-    names = {c.name for c in large.coefficients}
-    nested = all(c.name in names for c in small.coefficients)
-    return nested and (small.direction == large.direction or not small.coefficients)
+    return is_special_case(one.camera.distortion, other.camera.distortion)
 
 
 def is_efficient(result: Any) -> bool:

@@ -26,7 +26,20 @@ R = TypeVar("R")
 Method = Literal["efficient", "three_stage", "least_squares", "samaan", "griffith"]
 RecursiveMethod = Literal["samaan", "griffith"]
 Solver = Literal["lm", "minpack", "ipopt"]
-ModelName = Literal["none", "k1", "brown", "brown3", "brown_tangential", "inverse"]
+ModelName = Literal[
+    "none",
+    "k1",
+    "brown",
+    "brown3",
+    "brown_tangential",
+    "inverse",
+    "none+axes",
+    "k1+axes",
+    "brown+axes",
+    "brown3+axes",
+    "brown_tangential+axes",
+    "inverse+axes",
+]
 NoiseKind = Literal["common", "model"]
 MountKind = Literal["free", "fixed"]
 EffectName = Literal[

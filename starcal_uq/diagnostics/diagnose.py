@@ -15,6 +15,7 @@ import numpy as np
 
 from starcal_uq.calibration.calibrate import METHODS, calibrate
 from starcal_uq.calibration.cameras import MixedCameras
+from starcal_uq.camera.distortion import rivals
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.provenance import Provenance, provenance
@@ -27,7 +28,7 @@ from starcal_uq.diagnostics.air import AirTest, air_test
 from starcal_uq.diagnostics.beside import has_effects, without_effects
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
-from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
+from starcal_uq.diagnostics.models import ModelComparison, compare_models, of_all_stars
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.diagnostics.times import (
@@ -219,7 +220,7 @@ def diagnose(
     cal: Calibration,
     post: Posterior | None = None,
     *,
-    models: Sequence[str] = MODELS,
+    models: Sequence[str] | None = None,
     n_starts: int = 5,
     seed: int = 0,
     progress: Progress | None = None,
@@ -235,8 +236,9 @@ def diagnose(
         sample.
     post : Posterior, optional
         For the posterior predictive check; the calibration's normal approximation otherwise.
-    models : sequence of str
-        Distortion models to compare; none to leave the comparison out.
+    models : sequence of str, optional
+        Distortion models to compare, by default `starcal_uq.camera.distortion.rivals`; none to
+        leave the comparison out.
     n_starts : int
         Fits from other starts; 0 leaves them out.
     seed : int
@@ -248,6 +250,7 @@ def diagnose(
         asked for here again.
     """
     step = progress or (lambda done, total: None)
+    models = rivals(cal.camera.distortion) if models is None else models
     obs, whole = weighed(obs, cal), cal
     if obs.n_frames < whole.n_frames and whole.partitions is not None:
         cal = calibrate(obs, whole.nominal, model=whole.nominal.distortion, duplicates="keep")

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.attitude.rotations import left_error, quaternion_to_rotation, rotation_to_quaternion
+from starcal_uq.camera.distortion import rivals
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
-MODELS = ("none", "k1", "brown", "brown3", "brown_tangential")
 KHAT_BOUND = 0.7
 # A model is rejected when another one predicts better beyond the Student quantile for so many
 # frames, and by more than chance between equal models (Sivula et al. 2020: below four, a difference
@@ -177,7 +177,7 @@ class ModelComparison(Shown):
 def compare_models(
     obs: Observations,
     cal: Calibration,
-    models: Sequence[str] = MODELS,
+    models: Sequence[str] | None = None,
     *,
     n_draws: int = _DRAWS,
     seed: int = 0,
@@ -189,8 +189,8 @@ def compare_models(
     obs, cal
         The data and the calibration whose model is in question; its own model is always among those
         compared. Images are compared without its effects.
-    models : sequence of str
-        Names of the registry.
+    models : sequence of str, optional
+        Names of the registry; by default `starcal_uq.camera.distortion.rivals`.
     n_draws : int
         Posterior draws of each model.
     seed : int
@@ -205,7 +205,8 @@ def compare_models(
     obs = without_effects(obs, cal)
     if cal.star_errors is not None:
         cal = _without_star_errors(obs, cal)
-    names = tuple(dict.fromkeys((cal.camera.distortion, *models)))
+    own = cal.camera.distortion
+    names = tuple(dict.fromkeys((own, *(rivals(own) if models is None else models))))
     fits, failed = {}, {}
     for name in names:
         try:

@@ -16,6 +16,7 @@ from starcal_uq.attitude.rotations import (
     rotation_to_quaternion,
 )
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import undistorted
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.status import Status
@@ -147,7 +148,7 @@ def failed(
     """
     noise = _USUAL_NOISE_PX if likelihood.frames.weight is None else 1.0
     # Where coefficients ended that nothing holds, others may seem to be open as well.
-    plain = np.concatenate([theta[:3], np.zeros(len(theta) - 3)])
+    plain = undistorted(nominal.distortion, theta)
     found = []
     for at in (theta, plain, nominal.theta) if status in EXPLAINED else ():
         own = MarginalLikelihood(likelihood.frames, likelihood.model_name)

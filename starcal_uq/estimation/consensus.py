@@ -15,6 +15,7 @@ import numpy as np
 
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import undistorted
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.observations.frames import StarFrames
@@ -242,7 +243,7 @@ def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
     `focal_lengths`.
     """
     if not np.isfinite(measured_directions(camera, frames)).all():
-        camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))
+        camera = camera.with_theta(undistorted(camera.distortion, camera.theta))
     ideal = ideal_frames(camera, frames)
     camera = camera.replace(focal_px=float(focal_lengths(ideal, camera.focal_px)[0]))
     b = directions(ideal.pixel, camera.focal_px)

@@ -8,7 +8,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, undistorted
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
@@ -143,15 +143,11 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
     CalibrationError when neither they nor the nominal camera lead to an estimate.
     """
     likelihood = MarginalLikelihood(obs, model, axes=True)
-    start = cal.nominal.replace(
-        distortion=model, coefficients=(0.0,) * len(get_model(model).coefficients)
-    )
+    start = cal.nominal.replace(distortion=model)
+    start = start.with_theta(undistorted(model, start.theta))
     check_count(likelihood, start)
-    known = dict(zip(cal.parameter_names, cal.theta, strict=True))
-    if get_model(model).direction != get_model(cal.camera.distortion).direction:
-        known = dict(list(known.items())[:3])
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
-    theta = np.array([known.get(name, 0.0) for name in start.parameter_names])
+    theta = cal.camera.replace(distortion=model).theta
     search = Search(tolerance=_gain(likelihood, _LAST_STEP), last="unseen")
     stage = refinement_stage(likelihood, theta, search)
     try:
@@ -399,14 +395,14 @@ def _pair_stages(pairs: PairObjective, camera: Camera, search: Search) -> list[S
     stages = [optics_stage(frames, camera, search)]
     # Without an optical axis there is nothing to attach the distortion to; later stages would only
     # hide it.
-    if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
+    if get_model(camera.distortion).lens and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
         stages.append(joint_stage(pairs, camera, stages[1].theta, search))
         if not stages[-1].status.ok or _far(stages[0], camera):
             # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the
             # linear stage may then lead to another minimum or into a fold; the nominal optics
             # without distortion are the safer start.
-            start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
+            start = undistorted(camera.distortion, camera.theta)
             again = joint_stage(pairs, camera, start, search)
             stages[-1] = min(stages[-1], again, key=_badness)
     return stages

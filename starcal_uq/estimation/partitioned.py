@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, model_names, simpler_models
+from starcal_uq.camera.distortion import like, model_names, simpler_models
 from starcal_uq.core.cluster import Cluster
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import provenance
@@ -131,15 +131,9 @@ class _Residuals:
 
 def _richer(camera: Camera) -> list[Camera]:
     """The same camera by every model with more terms."""
-    values = dict(zip(camera.parameter_names, camera.theta, strict=True))
     return [
-        camera.replace(
-            distortion=name,
-            coefficients=tuple(
-                float(values.get(c.name, 0.0)) for c in get_model(name).coefficients
-            ),
-        )
-        for name in model_names()
+        camera.replace(distortion=name)
+        for name in (like(base, camera.distortion) for base in model_names())
         if camera.distortion in simpler_models(name)
     ]
 

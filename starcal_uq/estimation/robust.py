@@ -13,6 +13,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.distortion import undistorted
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
@@ -124,7 +125,7 @@ def robust_start(
     """
     trusted = np.zeros(frames.n_stars, dtype=np.bool_)
     # Coefficients start from zero, as in the paper: a nominal distortion is a guess.
-    at = np.concatenate([theta[:3], np.zeros(len(theta) - 3)])
+    at = undistorted(model_name, theta)
     stages: list[Stage] = []
     for round_ in range(_ROUNDS):
         scores = star_scores(frames, model_name, at)

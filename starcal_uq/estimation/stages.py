@@ -13,7 +13,7 @@ import numpy as np
 
 from starcal_uq.attitude.wahba import DegenerateFrameError
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import DistortionModel, get_model
 from starcal_uq.camera.projection import monotonic_expression
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
@@ -127,8 +127,11 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
     lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
     lower[:3] = (0.0, 0.0, 0.01 * camera.focal_px)
     upper[:3] = (camera.width_px - 1.0, camera.height_px - 1.0, 100.0 * camera.focal_px)
+    model = get_model(camera.distortion)
+    if model.axes:
+        lower[model.of_lens.stop] = -0.99
     if n_parameters < p:
-        return Constraints(lower[:n_parameters], upper[:n_parameters])
+        return Constraints(*(np.delete(bound, model.of_lens) for bound in (lower, upper)))
     radius = camera.half_diagonal_px
     return Constraints(
         lower, upper, lambda theta: monotonic_expression(camera.distortion, theta, radius)
@@ -148,14 +151,16 @@ def _solve(objective: PairObjective, start: FloatArray, camera: Camera, search: 
     return search.minimum(objective.evaluate, start)
 
 
-def _timed(name: str, run: Callable[[], Solution], zeros: int = 0) -> Stage:
-    """The stage of a solver's run, which leaves the last so many parameters at zero."""
+def _timed(name: str, run: Callable[[], Solution], without: DistortionModel | None = None) -> Stage:
+    """The stage of a solver's run, which leaves the coefficients of a lens at zero."""
     began = perf_counter()
     solution = run()
-    padding = np.zeros((len(solution.trajectory), zeros))
+    trajectory = solution.trajectory
+    if without is not None:
+        trajectory = np.insert(trajectory, [3] * len(without.lens), 0.0, axis=1)
     return Stage(
         name=name,
-        trajectory=np.hstack([solution.trajectory, padding]),
+        trajectory=trajectory,
         cost=solution.costs,
         status=solution.status,
         evaluations=solution.evaluations,
@@ -178,18 +183,22 @@ def begun_on_sample(sample: Stage, whole: Stage, scale: float) -> Stage:
 
 
 def optics_stage(frames: StarFrames, camera: Camera, search: Search) -> Stage:
-    """Stage 1: x0, y0 and f on interstar angles, distortion ignored (the paper's section 2.1)."""
-    objective = PairObjective(frames, "none")
-    start = np.array(camera.theta[:3])
-    return _timed("optics", lambda: _solve(objective, start, camera, search), len(camera.theta) - 3)
+    """Stage 1: x0, y0 and f on interstar angles, distortion ignored (the paper's section 2.1);
+    also the axes of the detector, where they are free.
+    """
+    model = get_model(camera.distortion)
+    objective = PairObjective(frames, model.bare)
+    start = np.delete(camera.theta, model.of_lens)
+    return _timed("optics", lambda: _solve(objective, start, camera, search), model)
 
 
 def focal_stage(frames: StarFrames, camera: Camera, max_iterations: int) -> Stage:
     """Stage 1 for stars that do not determine the principal point without distortion: f alone, on
     positions.
     """
-    own, start = MarginalLikelihood(frames, "none"), camera.theta[:3]
-    return _timed("optics", lambda: _held(own, start, max_iterations), len(camera.theta) - 3)
+    model = get_model(camera.distortion)
+    own, start = MarginalLikelihood(frames, model.bare), np.delete(camera.theta, model.of_lens)
+    return _timed("optics", lambda: _held(own, start, max_iterations), model)
 
 
 def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> Stage:
@@ -201,8 +210,9 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     began = perf_counter()
     model = get_model(camera.distortion)
     f = theta[2]
-    offset = frames.pixel - theta[:2, None]
-    rotations = sums_for(frames).attitudes(frames, "none", theta[:3])
+    offset = np.stack(model.unstretched(*(frames.pixel - theta[:2, None]), theta))
+    bare = np.delete(theta, model.of_lens)
+    rotations = sums_for(frames).attitudes(frames, model.bare, bare)
     if not np.isfinite(rotations).all():
         raise DegenerateFrameError(np.flatnonzero(np.isnan(rotations[:, 0, 0])))
     b = frames.rotated(rotations)
@@ -211,7 +221,7 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     # measured points.
     forward = model.direction == "forward"
     at, target = (ideal, offset - ideal) if forward else (offset, ideal - offset)
-    n = len(model.coefficients)
+    n = len(model.lens)
     design = np.array(
         [model.displacement(at[0], at[1], tuple(unit)) for unit in np.eye(n)]
     ).reshape(n, -1)
@@ -219,9 +229,7 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     scale = np.sqrt(np.diag(matrix))
     k = np.linalg.lstsq(matrix / np.outer(scale, scale), shift / scale, rcond=None)[0] / scale
     cost = [float(np.sum(target**2)), float(np.sum((target.ravel() - k @ design) ** 2))]
-    trajectory = np.array(
-        [np.concatenate([theta[:3], np.zeros(n)]), np.concatenate([theta[:3], k])]
-    )
+    trajectory = np.stack([np.insert(bare, [3] * n, found) for found in (np.zeros(n), k)])
     return Stage(
         "distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began
     )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, undistorted
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.status import Status
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -101,24 +101,24 @@ def undetermined(
     if status not in EXPLAINED or not noise > 0.0:
         return (), as_found
     found = open_parameters(matrix, noise, camera)
-    if found or len(theta) == 3:
+    lens = get_model(camera.distortion).of_lens
+    if found or not len(k := theta[lens]):
         return found, as_found
     covariance = scaled_inverse(matrix) * noise**2
-    k, dof = theta[3:], max(likelihood.dof - len(theta), 1)
+    dof = max(likelihood.dof - len(theta), 1)
     # Chi-square of no distortion.
-    size = float(k @ scaled_inverse(covariance[3:, 3:]) @ k)
+    size = float(k @ scaled_inverse(covariance[lens, lens]) @ k)
     if fdtrc(len(k), dof, size / len(k)) < _NONE_P:
         return (), as_found
     without = copy(likelihood)
     if likelihood.rotations is not None:
         without.use_rotations(likelihood.rotations)
-    plain = np.concatenate([theta[:3], np.zeros(len(k))])
-    matrix = without.evaluate(plain).matrix
+    matrix = without.evaluate(undistorted(camera.distortion, theta)).matrix
     if found := open_parameters(matrix, noise, camera):
         return found, as_found
     told = scaled_inverse(matrix) * noise**2
     unsure = np.sqrt(np.diag(told)) > _POINT * _natural(camera)
-    factors = _without_coma(covariance, told, size)
+    factors = _without_coma(covariance, told, size, lens)
     by_coma = unsure[:2] & (factors[:2] > COMA_MATTERS)
     if by_coma.any() and not status.ok:
         # It is then also why no optimum was found.
@@ -128,7 +128,7 @@ def undetermined(
     return (), factors if unsure[:2].any() else as_found
 
 
-def _without_coma(covariance: FloatArray, told: FloatArray, size: float) -> FloatArray:
+def _without_coma(covariance: FloatArray, told: FloatArray, size: float, lens: slice) -> FloatArray:
     """Factors (p,), at least 1, on the standard deviations of an estimate whose distortion may be
     none.
 
@@ -141,7 +141,7 @@ def _without_coma(covariance: FloatArray, told: FloatArray, size: float) -> Floa
     """
     seeming = np.diag(told)[:2] / np.diag(covariance)[:2] - 1.0
     growth = float(np.sum(np.maximum(seeming, 0.0))) / size
-    by_coefficients = told[:, 3:] @ scaled_inverse(told[3:, 3:]) @ told[3:]
+    by_coefficients = told[:, lens] @ scaled_inverse(told[lens, lens]) @ told[lens]
     variance = np.diag(told + growth * by_coefficients)
     return np.maximum(np.sqrt(variance / np.diag(covariance)), 1.0)
 
@@ -171,7 +171,7 @@ def what_is_missing(names: tuple[str, ...]) -> str:
         return f"{what_is_open(names)}: more frames, or stars over a wider field, are needed"
     where = (
         "over the whole field, along both axes,"
-        if set(names) & {"x0", "y0", "p1", "p2"}
+        if set(names) & {"x0", "y0", "p1", "p2", "stretch", "skew"}
         else "at more radii"
     )
     fewer = (

@@ -22,12 +22,12 @@ def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
 
     That in mm is left out where the pixel pitch is unknown.
     """
-    draws = post.theta_draws
+    draws, model = post.theta_draws, get_model(post.camera.distortion)
     rotation = (draws - post.mean) @ post.rotation_per_theta.T * ARCSEC
     values: dict[tuple[str, str], FloatArray] = {}
     if post.camera.pixel_um is not None:
         values["focal length", "mm"] = draws[:, 2] * post.camera.pixel_um / 1000.0
-    if draws.shape[1] > 3:
+    if model.lens:
         values["distortion at the corner", "px"] = corner_displacement_px(post)
     for i, axis in enumerate(AXES):
         values[f"common rotation, {axis}", "arcsec"] = rotation[:, i]

@@ -269,6 +269,8 @@ class PhysicalPriors(Priors):
         Name of the distortion model, which gives names and orders of the coefficients.
     per_star_sigma : bool
         True where the noise parameter is a common factor on stated noises.
+    axes : tuple of float
+        Means of stretch and skew, in a model that has them.
     """
 
     principal_point_px: float
@@ -281,6 +283,7 @@ class PhysicalPriors(Priors):
     sigma_log_sd: float
     distortion: str = "brown"
     per_star_sigma: bool = False
+    axes: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         centre = tuple(float(v) for v in self.principal_point_centre_px)
@@ -290,6 +293,7 @@ class PhysicalPriors(Priors):
                 "two finite numbers."
             )
         object.__setattr__(self, "principal_point_centre_px", centre)
+        object.__setattr__(self, "axes", tuple(float(v) for v in self.axes))
         for name in _POSITIVE:
             object.__setattr__(self, name, positive_number(name, getattr(self, name)))
         with np.errstate(all="ignore"):
@@ -319,27 +323,31 @@ class PhysicalPriors(Priors):
             sigma_log_sd=log_sd,
             distortion=camera.distortion,
             per_star_sigma=per_star_sigma,
+            axes=camera.axes,
         )
 
     def theta_moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean (p,) and diagonal covariance (p, p), px units."""
         x0, y0 = self.principal_point_centre_px
-        coefficients = get_model(self.distortion).coefficients
+        model = get_model(self.distortion)
         sd = [self.principal_point_px, self.principal_point_px, self.focal_fraction * self.focal_px]
         sd += [
             self.distortion_corner_px / np.float64(self.corner_radius_px) ** c.order
-            for c in coefficients
+            for c in model.coefficients
         ]
-        return np.array([x0, y0, self.focal_px, *(0.0 for _ in coefficients)]), np.diag(
-            np.square(sd)
-        )
+        mean = [x0, y0, self.focal_px, *(0.0 for _ in model.lens)]
+        return np.array(mean + list(self.axes if model.axes else ())), np.diag(np.square(sd))
 
     def to_dict(self) -> AnyDict:
         """Plain values, for files."""
-        return {
+        table = {
             **dataclasses.asdict(self),
             "principal_point_centre_px": list(self.principal_point_centre_px),
+            "axes": list(self.axes),
         }
+        if not get_model(self.distortion).axes:
+            del table["axes"]
+        return table
 
     def _statement(self, name: str) -> str:
         if name in ("x0", "y0"):
@@ -348,6 +356,9 @@ class PhysicalPriors(Priors):
         if name == "f":
             return f"normal, {self.focal_px:g} px with sd {100 * self.focal_fraction:g} %"
         sd, radius = self.distortion_corner_px, self.corner_radius_px
+        if name in ("stretch", "skew"):
+            mean = self.axes[("stretch", "skew").index(name)]
+            return f"normal, {mean:g} with sd {sd / radius:.3g}"
         return f"normal, displacement 0 with sd {sd:.3g} px at {radius:.4g} px"
 
 
@@ -355,7 +366,7 @@ _FIELDS = tuple(field.name for field in dataclasses.fields(PhysicalPriors))
 _POSITIVE = tuple(
     name
     for name in _FIELDS
-    if name not in ("principal_point_centre_px", "distortion", "per_star_sigma")
+    if name not in ("principal_point_centre_px", "distortion", "per_star_sigma", "axes")
 )
 _NUMBER = "a number above zero and below 1e12"
 

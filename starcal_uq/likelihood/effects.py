@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.settings import EffectName
 from starcal_uq.core.types import FloatArray
@@ -84,8 +85,7 @@ def effects_of(
     corner = corner_unit(camera)
     fixed = place_effects(camera)
     found = [
-        fixed["axes"],
-        fixed["field"],
+        *(fixed[name] for name in ("axes", "field") if name in fixed),
         Effect("frame", "frame", frame_shapes(camera), np.ones(3)),
     ]
     if known.warmth is not None:
@@ -239,5 +239,7 @@ def pixels_of(camera: Camera, xy: FloatArray) -> View:
 
 def place_effects(camera: Camera) -> dict[str, Effect]:
     """Effects of the place on the detector alone, by name."""
-    found = _run("axes", axes_shape(camera)), field_effect(camera), _run("phase", _phase())
+    found = [field_effect(camera), _run("phase", _phase())]
+    if not get_model(camera.distortion).axes:
+        found.append(_run("axes", axes_shape(camera)))
     return {effect.name: effect for effect in found}

@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.camera.distortion import (
+    COEFFICIENTS,
+    get_model,
+    parameter_names,
+    rivals,
+    shared_names,
+)
 from starcal_uq.core.constants import LIGHT_SPEED_KM_S
 from starcal_uq.core.types import FloatArray, IntArray, StrArray, floats
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
@@ -157,10 +163,11 @@ class Covariates:
 
 
 def lens_shapes(camera: Camera) -> tuple[Shape, ...]:
-    """Terms that the lens of the fitted model lacks: of the other models, and scale and skew of the
+    """Terms that the fitted model lacks: of the lens in other models, and scale and skew of the
     axes.
     """
-    return *_missing_terms(camera), axes_shape(camera)
+    axes = () if get_model(camera.distortion).axes else (axes_shape(camera),)
+    return *_missing_terms(camera), *axes
 
 
 def focal_drift(obs: Observations) -> tuple[Shape, ...]:
@@ -239,13 +246,10 @@ def _missing_terms(camera: Camera) -> list[Shape]:
     """Terms of the other registered models that the fitted one lacks: radial ones, and the rest."""
     fitted = set(camera.parameter_names)
     lacking: dict[str, tuple[str, int]] = {}
-    for name in model_names():
-        model = get_model(name)
-        if model.direction == "forward":
-            for index, coefficient in enumerate(model.coefficients):
-                if coefficient.name not in fitted:
-                    lacking.setdefault(coefficient.name, (name, index))
-    orders = {c.name: c.order for name in model_names() for c in get_model(name).coefficients}
+    for name in rivals(camera.distortion):
+        for index, coefficient in enumerate(get_model(name).lens):
+            if coefficient.name not in fitted:
+                lacking.setdefault(coefficient.name, (name, index))
     found = []
     for title, radial in (
         ("radial distortion beyond the model", True),
@@ -260,7 +264,9 @@ def _missing_terms(camera: Camera) -> list[Shape]:
                     len(names),
                     _TermColumns(camera, tuple(lacking[name] for name in names)),
                     tuple((f"{name} at the corner", "px") for name in names),
-                    tuple(float(camera.corner_radius_px ** orders[name]) for name in names),
+                    tuple(
+                        float(camera.corner_radius_px ** COEFFICIENTS[name].order) for name in names
+                    ),
                 )
             )
     return found
@@ -275,12 +281,11 @@ class _TermColumns:
 
     def __call__(self, view: View) -> FloatArray:
         own = dict(zip(self.camera.parameter_names, self.camera.theta.tolist(), strict=True))
-        if get_model(self.camera.distortion).direction == "inverse":
-            own = {name: own[name] for name in ("x0", "y0", "f")}
         columns = []
         for model_name, index in self.terms:
-            names = ("x0", "y0", "f", *(c.name for c in get_model(model_name).coefficients))
-            theta = np.array([own.get(name, 0.0) for name in names])
+            shared = ("x0", "y0", "f", *shared_names(model_name, self.camera.distortion))
+            names = parameter_names(model_name)
+            theta = np.array([own[name] if name in shared else 0.0 for name in names])
             richer = MarginalLikelihood(view.part.frames, model_name)
             columns.append(richer.derivatives(theta, view.state)[3 + index])
         return view.part.frames.in_pixels(np.stack(columns))

@@ -108,7 +108,7 @@ def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
     ]
     if camera.pixel_um is not None:
         chosen.append(_quantity("f_mm", unit[2:3] * camera.pixel_um / 1000.0))
-    if p > 3:
+    if get_model(camera.distortion).lens:
         chosen.append(_quantity("distortion_corner_px", _corner_displacement(mission)))
     for axis, name in enumerate(AXES):
         chosen.append(_quantity(f"common_{name}_arcsec", ARCSEC * mission.common[axis : axis + 1]))
@@ -148,7 +148,7 @@ def _corner_displacement(mission: FrameSet) -> FloatArray:
         for side, point in zip(edges(camera), camera.theta[:2], strict=True)
     )
     columns = np.zeros((2, len(camera.theta)))
-    for j, one in enumerate(np.eye(len(model.coefficients)).tolist()):
+    for j, one in enumerate(np.eye(len(model.lens)).tolist()):
         columns[:, 3 + j] = model.displacement(u, v, one)
     return columns
 

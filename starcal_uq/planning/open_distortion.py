@@ -21,7 +21,7 @@ from itertools import product
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, undistorted
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import DistortionError, PlanningError
 from starcal_uq.core.types import FloatArray
@@ -94,7 +94,8 @@ def open_range(
     is given, it is barrel distortion up to that of an f-theta lens, and as much pincushion, as far
     as neither folds on the detector.
     """
-    stated = calibrated or not camera.coefficients or any(camera.coefficients)
+    model = get_model(camera.distortion)
+    stated = calibrated or not model.lens or any(camera.coefficients[: len(model.lens)])
     if given is None:
         if stated:
             return None
@@ -149,7 +150,8 @@ def with_distortion(camera: Camera, percent: float) -> Camera:
     model = get_model(camera.distortion)
     sign = 1.0 if model.direction == "forward" else -1.0
     coefficient = sign * 0.01 * percent / camera.half_diagonal_px**2
-    return camera.replace(coefficients=(coefficient, *(0.0 for _ in camera.coefficients[1:])))
+    others = undistorted(camera.distortion, camera.theta)[4:]
+    return camera.replace(coefficients=(coefficient, *others.tolist()))
 
 
 def nodes(camera: Camera, bounds: tuple[float, float]) -> FloatArray:

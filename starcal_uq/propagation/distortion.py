@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import DistortionModel, get_model
 from starcal_uq.camera.projection import unproject, unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
@@ -155,22 +155,23 @@ def distortion_curve(
             f"a curve needs at least 2 radii and a level between 0 and 1, not {n} and {level:g}."
         )
     model = get_model(post.camera.distortion)
-    if not model.coefficients:
+    if not model.lens:
         raise DistortionError(
-            "the camera's distortion model is 'none', so there is no curve: choose another model."
+            f"the camera's distortion model is {model.name!r}, so there is no curve: choose "
+            "another model."
         )
-    decentred = any(not c.name.startswith("k") for c in model.coefficients)
+    decentred = not model.radial
     chosen = _AZIMUTHS_DEG if azimuths_deg is None else tuple(azimuths_deg)
     azimuth = np.array(chosen if decentred else (0.0,), dtype=np.float64)
     camera = post.calibrated_camera
     radius = np.linspace(0.0, _farthest(camera.width_px, camera.height_px, post.mean), n)
     outward = np.column_stack([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))])
     offsets = (radius[None, :, None] * outward[:, None]).reshape(-1, 2)
-    unproject(camera, offsets + post.mean[:2])
+    unproject(camera, _on_detector(model, offsets, post.mean) + post.mean[:2])
     draws = post.thin(n_draws, seed)[:, :-1]
     step = max(1, _POINTS_AT_ONCE // len(offsets))
     parts = (draws[first : first + step] for first in range(0, len(draws), step))
-    curves = np.concatenate([_radial(model.name, part, offsets, outward) for part in parts])
+    curves = np.concatenate([_radial(model, part, offsets, outward) for part in parts])
     if not np.isfinite(curves).all():
         raise DistortionError(
             f"at some posterior draws the distortion {model.name!r} folds over within the "
@@ -211,13 +212,21 @@ def _farthest(width: int, height: int, theta: FloatArray) -> float:
     return float(np.hypot(x, y))
 
 
-def _radial(model: str, thetas: FloatArray, offsets: FloatArray, outward: FloatArray) -> FloatArray:
+def _on_detector(model: DistortionModel, offsets: FloatArray, theta: FloatArray) -> FloatArray:
+    """Offsets (N, 2) on the detector of points (N, 2) behind the lens."""
+    return np.column_stack(model.stretched(offsets[:, 0], offsets[:, 1], theta))
+
+
+def _radial(
+    model: DistortionModel, thetas: FloatArray, offsets: FloatArray, outward: FloatArray
+) -> FloatArray:
     """Radial part (d, A, n) of distorted minus ideal points, at offsets (A * n, 2) from each draw's
     principal point.
     """
     count, directions = len(thetas), len(outward)
     theta = np.repeat(thetas, len(offsets), axis=0)
-    b = unproject_theta(model, theta.T, np.tile(offsets, (count, 1)) + theta[:, :2])
+    xy = _on_detector(model, np.tile(offsets, (count, 1)), theta.T) + theta[:, :2]
+    b = unproject_theta(model.name, theta.T, xy)
     ideal = (theta[:, 2:3] * b[:, :2] / b[:, 2:]).reshape(count, directions, -1, 2)
     displacement = offsets.reshape(directions, -1, 2) - ideal
     radial: FloatArray = np.sum(displacement * outward[:, None], axis=3)

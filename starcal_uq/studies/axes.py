@@ -82,7 +82,7 @@ AXES = {
         _number("pixel_um", "pixel pitch", "um"),
         _number("x0_offset_px", "offset of the principal point along x", "px"),
         _number("y0_offset_px", "offset of the principal point along y", "px"),
-        Axis("distortion", "distortion model", "", choices=model_names()),
+        Axis("distortion", "distortion model", "", choices=model_names(axes=True)),
         _number("distortion_px", "displacement of the corner by the distortion", "px"),
         *(_number(name, c.description, c.unit, key="coefficient") for name, c in COEFFICIENTS.items()),
         _number("max_mag", "magnitude limit", "mag", base=6.0),
@@ -105,7 +105,10 @@ AXES = {
 CAMERA_AXES = tuple(AXES)[: tuple(AXES).index("max_mag")]
 # Both set the focal length; the coefficients and the size of the distortion both set the
 # distortion.
-EXCLUSIVE = (("fov_deg", "focal_mm"), *((name, "distortion_px") for name in COEFFICIENTS))
+EXCLUSIVE = (
+    ("fov_deg", "focal_mm"),
+    *((name, "distortion_px") for name, c in COEFFICIENTS.items() if c.order > 1),
+)
 
 
 def base_settings(given: AnyMapping) -> AnyDict:
@@ -150,7 +153,7 @@ def camera_of(base: Camera, settings: AnyMapping) -> Camera:
     if own:
         known = dict(zip(names, camera.coefficients, strict=True)) | own
         camera = camera.replace(coefficients=tuple(known.values()))
-    if "distortion_px" in settings and names:
+    if "distortion_px" in settings and get_model(camera.distortion).lens:
         camera = _with_displacement(camera, settings["distortion_px"])
     radius = camera.corner_radius_px
     if fold_radius_px(camera.distortion, camera.theta, radius) <= radius:
@@ -182,11 +185,10 @@ def _with_displacement(camera: Camera, wanted_px: float) -> Camera:
     where all are 0.
     """
     model = get_model(camera.distortion)
-    given = (
-        camera.coefficients
-        if any(camera.coefficients)
-        else (1.0, *(0.0 for _ in camera.coefficients[1:]))
-    )
+    n = len(model.lens)
+    given, axes = camera.coefficients[:n], camera.coefficients[n:]
+    if not any(given):
+        given = (1.0, *given[1:])
     terms = [
         _outwards(camera, [k * (i == j) for j in range(len(given))]) for i, k in enumerate(given)
     ]
@@ -198,7 +200,7 @@ def _with_displacement(camera: Camera, wanted_px: float) -> Camera:
             "change the coefficients of [camera], or set them to zero."
         )
     sign = 1.0 if model.direction == "forward" else -1.0
-    return camera.replace(coefficients=tuple(sign * wanted_px / total * k for k in given))
+    return camera.replace(coefficients=(*(sign * wanted_px / total * k for k in given), *axes))
 
 
 def _outwards(camera: Camera, coefficients: list[float]) -> float:

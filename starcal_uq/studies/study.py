@@ -320,7 +320,8 @@ def dataset(
     place = {key: number for number, key in enumerate(table["key"].to_pylist())}
     rows = np.array([place.get(key, -1) for key in keys])
     simpler = sorted(
-        {m for model in definition.models for m in simpler_models(model)}, key=model_names().index
+        {m for model in definition.models for m in simpler_models(model)},
+        key=model_names(axes=True).index,
     )
     labels = {
         "parameter": list(definition.parameter_names),

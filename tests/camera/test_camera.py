@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.camera.distortion import get_model, model_names, simpler_models
 from starcal_uq.core.errors import CameraError, RunFolderError
 
 PAPER = Camera(1024, 1024, 12.0, 70.2262, 500.0, 530.0, "brown", (2.0e-10, -3.5e-15))
@@ -315,15 +315,16 @@ def test_opencv_scales_by_powers_of_the_focal_length():
 
 
 def matrix(fx=5000.0, fy=5000.0, skew=0.0):
-    return [[fx, skew, 500.0], [0.0, fy, 500.0], [0.0, 0.0, 1.0]]
+    return np.array([[fx, skew, 500.0], [0.0, fy, 500.0], [0.0, 0.0, 1.0]])
 
 
 @pytest.mark.parametrize(
     ("camera_matrix", "dist", "options", "message"),
     [
-        (matrix(fy=5001.0), None, {}, "fx = 5000.0 and fy = 5001.0 differ.*CALIB_FIX_ASPECT_RATIO"),
-        (matrix(skew=0.1), None, {}, "skew"),
-        (matrix(fx=-1.0, fy=-1.0), None, {}, "focal length is -1.0"),
+        (matrix(fy=5001.0), None, {"distortion": "k1"}, "square pixels; use 'k1\\+axes'"),
+        (matrix(skew=0.1), None, {"distortion": "brown"}, "skew.*use 'brown\\+axes'"),
+        (matrix().T, None, {}, "below its diagonal"),
+        (matrix(fx=-1.0, fy=-1.0), None, {}, "focal lengths are -1.0"),
         (np.eye(2), None, {}, "3x3"),
         (matrix(), [0, 0, 0, 0, 0, 1e-3, 0, 0], {}, "rational"),
         (matrix(), [np.nan], {}, "finite"),
@@ -336,6 +337,63 @@ def matrix(fx=5000.0, fy=5000.0, skew=0.0):
 def test_from_opencv_refuses_what_it_cannot_hold(camera_matrix, dist, options, message):
     with pytest.raises(CameraError, match=message):
         Camera.from_opencv(camera_matrix, dist, 1000, 1000, 10.0, **options)
+
+
+def test_two_focal_lengths_and_skew_of_opencv_are_axes_of_the_detector():
+    camera = Camera.from_opencv(matrix(fy=5001.0, skew=0.5), [0.1], 1000, 1000, 10.0)
+    assert camera.distortion == "brown+axes"
+    assert camera.focal_px == 5000.0
+    assert camera.axes == pytest.approx((2e-4, 1e-4), rel=1e-12)
+    np.testing.assert_allclose(camera.to_opencv()[0], matrix(fy=5001.0, skew=0.5), rtol=1e-15)
+
+
+def stated(**changes):
+    table = {"width_px": 1000, "height_px": 1000, "pixel_um": 14.0, "focal_mm": 150.0}
+    return table | {"x0_px": 500.0, "y0_px": 500.0} | changes
+
+
+def test_two_pitches_state_the_stretch_of_the_axes(tmp_path):
+    camera = Camera.from_dict(stated(pixel_um=[14.004, 13.995], distortion="k1", k1=1e-9))
+    assert (camera.distortion, camera.pixel_um) == ("k1+axes", 14.004)
+    matrix = camera.to_opencv()[0]
+    assert matrix[0, 0] == pytest.approx(150e3 / 14.004, rel=1e-15)
+    assert matrix[1, 1] == pytest.approx(150e3 / 13.995, rel=1e-15)
+    camera.save(tmp_path / "camera.toml")
+    assert Camera.load(tmp_path / "camera.toml") == camera
+    path = tmp_path / "pair.toml"
+    path.write_text(
+        "[camera]\nwidth_px = 10\nheight_px = 10\npixel_um = [8, 9]\nfocal_mm = 1\n"
+        "x0_px = 5\ny0_px = 5\n"
+    )
+    assert Camera.load(path).axes == (8.0 / 9.0 - 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pixel_um": [14.0]}, r"pixel_um is \[14.0\]; write one pitch"),
+        ({"pixel_um": [14.0, "x"]}, "write one pitch"),
+        ({"pixel_um": [14.0, -1.0]}, "write one pitch"),
+        ({"pixel_um": [14.0, 13.9], "stretch": 0.1}, "stretch their ratio; remove one"),
+        ({"stretch": 0.1}, "set distortion to 'brown\\+axes'"),
+        ({"distortion": "brown+axes", "stretch": -1.0}, "stretch is -1.0; it must be above -1"),
+        ({"distortion": "brown+tilt"}, "unknown: use one of none"),
+    ],
+)
+def test_axes_that_make_no_sense_are_refused(changes, message):
+    with pytest.raises(CameraError, match=message):
+        Camera.from_dict(stated(**changes))
+
+
+def test_no_other_model_makes_pixels_square():
+    camera = PAPER.replace(distortion="brown+axes", coefficients=(2e-10, -3.5e-15, 0.1, 0.0))
+    assert simpler_models("brown+axes") == ("none+axes", "k1+axes")
+    with pytest.raises(CameraError, match="use 'k1\\+axes'"):
+        camera.replace(distortion="k1")
+    assert camera.replace(distortion="inverse+axes").axes == (0.1, 0.0)
+    assert camera.data_sheet().coefficients == (0.0, 0.0, 0.1, 0.0)
+    square = PAPER.replace(distortion="brown+axes")
+    assert square.replace(distortion="brown") == PAPER
 
 
 def test_inverse_model_has_no_opencv_form():

@@ -119,7 +119,7 @@ def test_words_with_explanations_are_those_of_the_lists():
     from starcal_uq.paper.field.published import READINGS
     from starcal_uq.planning.forecast import SCOPES
 
-    assert model_names() == get_args(settings.ModelName)
+    assert model_names(axes=True) == get_args(settings.ModelName)
     assert tuple(SCOPES) == get_args(settings.Scope)
     assert tuple(CONVENTIONS) == get_args(settings.Convention)
     assert tuple(READINGS) == get_args(settings.FieldReading)
@@ -193,8 +193,9 @@ def test_cells_at_the_limits_of_an_axis_have_numbers_or_a_reason(name):
     content = {**STUDY, "camera": sc.paper.paper_camera().to_dict(), "sweep": {name: [limit.low]}}
     if name not in ("frames", "max_mag"):
         content["sweep"][name].append(limit.high)
-    if name in ("k3", "p1", "p2"):
-        content["camera"]["distortion"] = "brown3" if name == "k3" else "brown_tangential"
+    models = {"k3": "brown3", "p1": "brown_tangential", "p2": "brown_tangential"}
+    models |= dict.fromkeys(("stretch", "skew"), "brown+axes")
+    content["camera"]["distortion"] = models.get(name, "brown")
     found = sc.study(StudyDefinition.from_dict(content), workers=0)
     assert found.ok.sum() + sum(found.problems.values()) == found.n_cells
     assert not found.ok.any() or np.isfinite(found.values("sigma", parameter="f")[found.ok]).all()

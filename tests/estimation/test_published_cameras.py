@@ -126,3 +126,16 @@ def test_the_slope_of_mdis_is_found() -> None:
         there = cal.at(temperature_c=temperature)
         truth = (at_zero_mm + slope_mm * temperature) / 0.014
         assert abs(there.camera.focal_px - truth) < 3.0 * there.sigmas[2]
+
+
+def test_the_aspect_of_dawn_is_a_parameter_of_its_camera() -> None:
+    focal_px, shift = CAMERAS["Dawn FC2"]
+    c = observed(5, focal_px, shift, n_frames=60, stars=25)
+    cal = sc.calibrate(table(c), sheet(c), model="brown+axes")
+    stretch, skew = cal.theta[5:7]
+    wanted = (1.0 - 0.00032) / (1.0 + 0.00032) - 1.0
+    print("stretch", stretch, "+-", cal.sigmas[5], "wanted", wanted, "skew", skew)
+    assert abs(stretch - wanted) < 3.0 * cal.sigmas[5] < 0.1 * abs(wanted)
+    assert abs(skew) < 3.0 * cal.sigmas[6]
+    assert map_error_px(c, cal, shift) < 0.5 * SIGMA_PX
+    assert cal.sigma == pytest.approx(SIGMA_PX, rel=0.05)

@@ -219,7 +219,7 @@ def narrow_priors(camera: Camera, sigma_px: float) -> Priors:
     from starcal_uq.camera.distortion import get_model
 
     radius = camera.corner_radius_px
-    terms = zip(camera.coefficients, get_model(camera.distortion).coefficients, strict=True)
+    terms = zip(camera.coefficients, get_model(camera.distortion).lens, strict=False)
     displacements = [abs(value) * radius**term.order for value, term in terms]
     return Priors.default(camera).replace(
         principal_point_px=_PRIOR_POINT_PX,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import next_richer
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import (
@@ -59,7 +59,6 @@ MIN_FRAMES = 5
 _SMALL_SIGMA = 1.0
 # Remedies that several checks give.
 SCREEN = calibrated(screening=True)
-_RICHEST = "brown_tangential"
 ROBUST = calibrated("command", likelihood="student_t")
 NOISE = calibrated(noise="model")
 EFFECTS = calibrated(effects="auto")
@@ -276,9 +275,7 @@ def lens_remedy(fitted: str, better: str | None = None) -> tuple[Remedies, tuple
     `better` is the model that a comparison prefers, empty if none; without a comparison, one with
     further terms.
     """
-    has_all = {coefficient.name for coefficient in get_model(_RICHEST).coefficients}
-    further = {coefficient.name for coefficient in get_model(fitted).coefficients} < has_all
-    model = better if better is not None else _RICHEST if further else ""
+    model = better if better is not None else next_richer(fitted)
     return (with_model(model), ()) if model else ((), (Order(Advice.COUNT_THE_PATTERN),))
 
 

@@ -9,6 +9,7 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.estimation.assemble import (
     PairEstimate,
@@ -53,19 +54,20 @@ def least_squares(
     although the model is wrong and pairs are dependent: the spread over repeated data sets, not the
     distance from the truth.
     """
-    plain = camera.replace(distortion="none", coefficients=())
-    likelihood = MarginalLikelihood(obs, "none")
+    plain = camera.replace(distortion=get_model(camera.distortion).bare)
+    likelihood = MarginalLikelihood(obs, plain.distortion)
     check_count(likelihood, plain)
     frames = likelihood.frames
     stage = optics_stage(frames, plain, Search(solver, max_iterations))
-    covariance = PairObjective(frames, "none").godambe(stage.theta)
+    covariance = PairObjective(frames, plain.distortion).godambe(stage.theta)
     # A mirror or wrong stars, which interstar angles do not see.
     status = (
         check_noise(noise_px(likelihood, stage.theta), plain, stage.status)
         if stage.status.ok
         else stage.status
     )
-    settings = {"ignored_distortion": camera.distortion} if camera.distortion != "none" else {}
+    ignored = camera.distortion != plain.distortion
+    settings = {"ignored_distortion": camera.distortion} if ignored else {}
     return assemble(
         obs,
         plain,

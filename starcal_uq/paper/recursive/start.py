@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, undistorted
 from starcal_uq.core.errors import CalibrationError, check_known
 from starcal_uq.core.settings import PairCovariance, RecursiveMethod
 from starcal_uq.core.status import Status
@@ -65,7 +65,7 @@ def begin(
     start from zero. CalibrationError when the least-squares start fails.
     """
     p, q, reference = len(camera.theta), len(prior.deviation), prior.reference_px
-    origin, stage = np.concatenate([camera.theta[:3], np.zeros(p - 3)]), None
+    origin, stage = undistorted(camera.distortion, camera.theta), None
     if method == "samaan":
         first = frames.part(0, min(options.start_frames, frames.n_frames))
         stage = optics_stage(first, camera, Search("lm", _START_ITERATIONS))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import reading
 from starcal_uq.core.records import to_plain
@@ -113,9 +114,8 @@ class RecursiveCalibration:
         self.options.check(method)
         self.method = method
         keeps_distortion = method == "samaan" or self.options.parameters == "all"
-        self.nominal = (
-            camera if keeps_distortion else camera.replace(distortion="none", coefficients=())
-        )
+        bare = get_model(camera.distortion).bare
+        self.nominal = camera if keeps_distortion else camera.replace(distortion=bare)
         self._given_distortion = camera.distortion
         self._recursion: Recursion | None = None
         self._start_stage: Stage | None = None

@@ -160,12 +160,13 @@ def _template_command(results: Results) -> str:
 def _distortion(results: Results) -> AnyDict:
     """The formula of the distortion model, from its registry entry."""
     model = get_model(results.calibration.camera.distortion)
-    radial = [(c.name, c.order - 1) for c in model.coefficients if c.name.startswith("k")]
+    radial = [(c.name, c.order - 1) for c in model.lens if c.name.startswith("k")]
     forward = model.direction == "forward"
     return {
         "distortion_source": model.source,
         "radial_terms": radial,
-        "decentring": [c.name for c in model.coefficients if not c.name.startswith("k")],
+        "decentring": [c.name for c in model.lens if not c.name.startswith("k")],
+        "axes": model.axes,
         "from_point": "ideal" if forward else "distorted",
         "to_point": "distorted" if forward else "ideal",
     }
