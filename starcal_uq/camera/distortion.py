@@ -89,14 +89,14 @@ class DistortionModel:
         """Displacement by the lens, px, for coefficients k of which the first are the lens's."""
         return self.formula(u, v, k[: len(self.lens)])
 
-    def stretched(self, u: Any, v: Any, theta: Sequence[Any]) -> tuple[Any, Any]:
+    def stretched(self, u: Any, v: Any, theta: Any) -> tuple[Any, Any]:
         """Offset on the detector of the point (u, v) behind the lens, px, for parameters theta."""
         if not self.axes:
             return u, v
         stretch, skew = theta[3 + len(self.lens)], theta[4 + len(self.lens)]
         return u + skew * v, v + stretch * v
 
-    def unstretched(self, x: Any, y: Any, theta: Sequence[Any]) -> tuple[Any, Any]:
+    def unstretched(self, x: Any, y: Any, theta: Any) -> tuple[Any, Any]:
         """Inverse of `stretched`."""
         if not self.axes:
             return x, y

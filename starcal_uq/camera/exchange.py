@@ -231,7 +231,8 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
     ideal = camera.focal_px * seen[:, :2] / seen[:, 2:]
     # SIP has no linear terms: the axes of the detector are part of CD.
     ideal = np.column_stack(model.stretched(ideal[:, 0], ideal[:, 1], theta))
-    axes = np.stack(model.unstretched(*np.eye(2), theta))
+    along_x, along_y = np.eye(2)
+    axes = np.stack(model.unstretched(along_x, along_y, theta))
     scale = camera.corner_radius_px
     header = fits.Header()
     header.update(WCSAXES=2, IMAGEW=camera.width_px, IMAGEH=camera.height_px)

@@ -396,8 +396,8 @@ def _unprojected(
     root = backward_root(model_name, theta, pixel)
     outputs = backward_kernel(model_name, derivatives)(pixel.shape[1], theta, pixel, root)
     # The displacement acts on ideal points (forward) or on measured ones (inverse).
-    offset = pixel - (theta[:2] if theta.ndim == 2 else theta[:2, None])
-    point = root if root.ndim == 2 else np.stack(get_model(model_name).unstretched(*offset, theta))
+    x, y = pixel - (theta[:2] if theta.ndim == 2 else theta[:2, None])
+    point = root if root.ndim == 2 else np.stack(get_model(model_name).unstretched(x, y, theta))
     before = before_fold(model_name, theta, point)
     if not before.all():
         outputs[0][:, ~before] = np.nan

@@ -131,7 +131,7 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
     if model.axes:
         lower[model.of_lens.stop] = -0.99
     if n_parameters < p:
-        return Constraints(*(np.delete(bound, model.of_lens) for bound in (lower, upper)))
+        return Constraints(np.delete(lower, model.of_lens), np.delete(upper, model.of_lens))
     radius = camera.half_diagonal_px
     return Constraints(
         lower, upper, lambda theta: monotonic_expression(camera.distortion, theta, radius)
@@ -210,7 +210,8 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     began = perf_counter()
     model = get_model(camera.distortion)
     f = theta[2]
-    offset = np.stack(model.unstretched(*(frames.pixel - theta[:2, None]), theta))
+    x, y = frames.pixel - theta[:2, None]
+    offset = np.stack(model.unstretched(x, y, theta))
     bare = np.delete(theta, model.of_lens)
     rotations = sums_for(frames).attitudes(frames, model.bare, bare)
     if not np.isfinite(rotations).all():
