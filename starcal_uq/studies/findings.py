@@ -271,7 +271,7 @@ class Sweep:
     def held(self, along: str, by: str | None = None, at: AnyMapping | None = None) -> AnyDict:
         """Where the other axes are held."""
         for axis in filter(None, (along, by)):
-            self._check(axis)
+            self.check(axis)
         given = {axis: value for axis, value in (at or {}).items() if axis not in (along, by)}
         cells = self.ok & self._cells(given)
         named = (*self.drawn, along, by, *given)
@@ -300,7 +300,7 @@ class Sweep:
         """A statistic of a number at every value of an axis, over seeds and all axes that `at` does
         not hold.
         """
-        self._check(along)
+        self.check(along)
         others = [axis for axis in self.axes if axis != along]
         return self.over(numbers, statistic, others, self._cells(at or {})).ravel()
 
@@ -308,7 +308,7 @@ class Sweep:
         """Cells (C,) at values of axes."""
         cells = np.ones(len(self.ok), dtype=np.bool_)
         for axis, value in at.items():
-            self._check(axis)
+            self.check(axis)
             known = self.values[axis]
             if value not in known:
                 raise ValueError(
@@ -317,7 +317,8 @@ class Sweep:
             cells &= self._codes[self.axes.index(axis)] == known.index(value)
         return cells
 
-    def _check(self, axis: str) -> None:
+    def check(self, axis: str) -> None:
+        """ValueError for a name that is no swept axis."""
         if axis not in self.axes:
             raise ValueError(
                 f"{axis!r} was not swept: use one of {', '.join(self.axes) or 'none'}."

@@ -1,10 +1,9 @@
-"""Figures of coupling studies: what couples with what, what would decouple it, and at what cost."""
+"""Figures of coupling studies: small multiples along a swept axis, and maps over two."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -17,21 +16,17 @@ from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.figures.scales import round_levels, symbol, ticks_at_levels
 from starcal_uq.presentation.figures.sweeps import (
-    MARKERS,
-    NAMED,
+    Panel,
     colour_of,
     draw_bars,
-    draw_lines,
     held_title,
-    in_the_middle,
     legend,
-    logarithmic,
-    nothing,
     numeric,
     plain,
-    positions,
+    row_of_panels,
     scale,
     short,
+    small_multiples,
     some,
     target_line,
     target_words,
@@ -53,7 +48,6 @@ _MOST_PANELS = 3
 _MOST_CELLS = 80
 # Colours span at least this factor.
 _RELIEF = 2.0
-_CORRELATION_LEVELS = (-0.99, -0.97, -0.95, -0.9, -0.8, -0.5, 0.0, 0.5, 0.8, 0.9, 0.95, 0.97, 0.99)
 _CORRELATION_TICKS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999, 0.9999, 0.99999)
 # Variables that a map or a line may show: words, unit, and whether a small number is good news.
 _SHOWN = {
@@ -129,30 +123,25 @@ def plot_study_correlation(
     """
     sweep = study.sweep
     along, by = two_axes(sweep, along, by)
-    chosen = [tuple(pair) for pair in pairs] if pairs is not None else _main_pairs(sweep)
-    figure, panels = _row(len(chosen), 2.4, 3.9)
+    chosen = _main_pairs(sweep) if pairs is None else pairs
+    values = [_correlation(study, *pair) for pair in chosen]
+    titles = [
+        f"{symbol(first)} and {symbol(second)}{_sign_words(r[sweep.ok])}"
+        for (first, second), r in zip(chosen, values, strict=True)
+    ]
+    panels = [Panel(title, np.abs(r)) for title, r in zip(titles, values, strict=True)]
+    figure, axes, lines = small_multiples(sweep, panels, along, by, at, log=False, sharey=True)
     sampled = "posterior_correlation" in study.data
-    top = 0.0
-    for ax, (first, second) in zip(panels, chosen, strict=True):
-        lines = sweep.lines(_correlation(study, first, second), along, by, at)
-        style.dress(ax, grid=True)
-        draw_lines(ax, _sizes(lines))
-        if sampled and second not in AXES:
-            drawn = study.values("posterior_correlation", parameter=first, parameter_2=second)
-            draw_bars(ax, _sizes(sweep.lines(drawn, along, by, at)))
-        top = max(top, np.nanmax(np.abs([lines.median, lines.low, lines.high]), initial=0.0))
-        title = f"{symbol(first)} and {symbol(second)}{_sign_words(lines.median)}"
-        style.label(ax, title, axis_label(along))
-    style.label(panels[0], y="size of the correlation")
-    _correlation_axis(panels[0], top)
-    legend(figure, lines, sampled=sampled)
+    if sampled:
+        for ax, (first, second) in zip(axes, chosen, strict=True):
+            if second not in AXES:
+                r = study.values("posterior_correlation", parameter=first, parameter_2=second)
+                draw_bars(ax, sweep.lines(np.abs(r), along, by, at))
+    style.label(axes[0], y="size of the correlation")
+    top = np.nanmax(np.concatenate([[0.3], *[np.ravel(line.high) for line in lines]]))
+    _correlation_axis(axes[0], float(top))
+    legend(figure, lines[0], sampled=sampled)
     return figure
-
-
-def _row(n: int, beside_in: float, height_in: float) -> tuple[Figure, Any]:
-    """A figure with panels side by side that share their vertical axis."""
-    figure = style.new_figure(beside_in + 2.9 * n, height_in)
-    return figure, figure.subplots(1, n, sharey=True, squeeze=False)[0]
 
 
 def _correlation(study: Study, first: str, second: str) -> FloatArray:
@@ -170,31 +159,21 @@ def _correlation(study: Study, first: str, second: str) -> FloatArray:
 
 
 def _main_pairs(sweep: Sweep) -> list[tuple[str, str]]:
-    """The pairs to show where none was named: those that are coupled in most of the sweep, or the
-    strongest.
-    """
+    """The pairs that are coupled in most of the sweep, or the strongest."""
     shown = sorted(sweep.coupled or sweep.pairs[:_MOST_PANELS], key=lambda pair: -pair.mean_size)
     return [pair.names for pair in shown[:_MOST_PANELS]]
 
 
 def _sign_words(r: FloatArray) -> str:
     signs = np.sign(r[np.abs(np.nan_to_num(r)) > 0.05])
-    if not len(signs):
+    if not len(signs) or signs.min() != signs.max():
         return ""
-    return " (opposite)" if signs.max() < 0 else " (alike)" if signs.min() > 0 else ""
-
-
-def _sizes(lines: Lines) -> Lines:
-    """Absolute values, the range over seeds with them."""
-    low, high = np.sort(np.abs([lines.low, lines.high]), axis=0)
-    low[lines.low * lines.high < 0.0] = 0.0
-    return replace(lines, median=np.abs(lines.median), low=low, high=high)
+    return " (opposite)" if signs[0] < 0 else " (alike)"
 
 
 def _correlation_axis(ax: Axes, top: float) -> None:
     """From zero to above the largest correlation, on the scale of Fisher's z."""
-    top = min(max(top, 0.3), 0.999999)
-    limit = np.tanh(np.arctanh(top) * 1.06 + 0.05)
+    limit = np.tanh(np.arctanh(min(top, 0.999999)) * 1.06 + 0.05)
     ax.set_yscale("function", functions=(_to_z, np.tanh))
     ax.set_ylim(0.0, limit)
     ticks = _CORRELATION_TICKS if limit > 0.6 else (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -253,9 +232,7 @@ def plot_study_map(
     style.label(ax, capital(text), axis_label(x), axis_label(y))
     style.dress(ax)
     many = min(lines.median.shape) >= 6 and lines.median.size > _MOST_CELLS
-    if not np.isfinite(lines.median).any():
-        nothing(ax)
-    elif many and numeric(lines.values) and numeric(lines.by_values):
+    if many and numeric(lines.values) and numeric(lines.by_values):
         _contours(ax, lines, variable)
     else:
         _cells(ax, lines, variable)
@@ -287,33 +264,25 @@ def _written(variable: str) -> Callable[[float], str]:
 
 def _contours(ax: Axes, lines: Lines, variable: str) -> None:
     """Colours on true scales, with contours that carry their numbers."""
-    x, y = (floats(values) for values in (lines.values, lines.by_values))
-    z = np.ma.masked_invalid(lines.median)
+    x, y, z = floats(lines.values), floats(lines.by_values), np.ma.masked_invalid(lines.median)
     scale(ax.xaxis, lines.values)
     scale(ax.yaxis, lines.by_values)
     colours, norm, _ = _colours(lines.median, variable)
-    levels, _ = round_levels(z.compressed())
-    image = ax.pcolormesh(
-        x, y, z, cmap=colours, norm=norm, shading="nearest" if z.mask.any() else "gouraud"
-    )
+    shading: Literal["nearest", "gouraud"] = "nearest" if z.mask.any() else "gouraud"
+    image = ax.pcolormesh(x, y, z, cmap=colours, norm=norm, shading=shading)
     bar = style.colour_bar(ax, image, "")
-    low, high = z.min(), z.max()
-    if variable == "correlation":
-        levels = np.array(_CORRELATION_LEVELS)
-        shown = levels[(levels > low) & (levels < high)]
-    else:
-        least, most = np.ravel([image.norm.vmin, image.norm.vmax])
-        ticks_at_levels(bar, levels[(levels >= least) & (levels <= most)])
-        # Contours of little relief would be those of chance.
-        shown = levels[1:-1][:: max(1, len(levels) // 6)] if high > 1.3 * low else levels[:0]
-    if not len(shown):
-        in_the_middle(ax, " to ".join(map(_written(variable), (low, high))), "white")
+    levels, _ = round_levels(z.compressed())
+    levels = levels[(levels >= z.min()) & (levels <= z.max())]
+    # Contours of little relief would be those of chance.
+    if z.max() - z.min() < (0.1 if variable == "correlation" else 0.25 * z.max()):
+        ends = " to ".join(map(_written(variable), (z.min(), z.max())))
+        style.note(ax, ends, (0.5, 0.5), xycoords="axes fraction", ha="center")
         return
-    from matplotlib.patheffects import withStroke
-
-    drawn = ax.contour(x, y, z, levels=shown, colors="white", linewidths=1.0, linestyles="solid")
-    for text in ax.clabel(drawn, fmt=lambda value: f"{value:.3g}", fontsize=style.TICK_SIZE):
-        text.set_path_effects([withStroke(linewidth=2.0, foreground=style.INK)])
+    if variable != "correlation":
+        ticks_at_levels(bar, levels)
+    look: AnyDict = {"colors": "white", "linewidths": 1.0, "linestyles": "solid"}
+    drawn = ax.contour(x, y, z, levels=levels[:: max(1, len(levels) // 6)], **look)
+    ax.clabel(drawn, fmt=lambda value: f"{value:.3g}", fontsize=style.TICK_SIZE)
 
 
 def _colours(z: FloatArray, variable: str) -> tuple[str, Any, Any]:
@@ -344,24 +313,19 @@ def plot_study_maps(study: Study, x: str | None = None, y: str | None = None) ->
         sweep.coupled or sweep.pairs[:1],
         key=lambda pair: max((c.change for c in pair.costs), default=0.0),
     )
-    first, second = changing.names
+    inflation = np.nan_to_num(np.sqrt(study.data["variance_inflation"].values[sweep.ok]))
+    inflated = study.parameter_names[int(np.argmax(inflation.sum(axis=0)))]
     figure = style.new_figure(11.0, 2.2 + 0.72 * max(5, min(10, len(sweep.values[y]))))
-    inflated = _most_inflated(study)
-    for ax, variable, parameter, other in zip(
-        figure.subplots(2, 2).ravel(),
-        *(("correlation", "variance_inflation", "frame_error_arcsec", "common_rotation_arcsec"),),
-        *((first, inflated, None, None), (second, None, None, None)),
-        strict=True,
-    ):
+    shown = (
+        ("correlation", *changing.names),
+        ("variance_inflation", inflated, None),
+        ("frame_error_arcsec", None, None),
+        ("common_rotation_arcsec", None, None),
+    )
+    for ax, (variable, parameter, other) in zip(figure.subplots(2, 2).flat, shown, strict=True):
         plot_study_map(study, variable, parameter=parameter, parameter_2=other, x=x, y=y, ax=ax)
     held_title(figure, sweep.held(x, y))
     return figure
-
-
-def _most_inflated(study: Study) -> str:
-    """The parameter whose sigma the others inflate most, over the whole sweep."""
-    factors = np.where(study.sweep.ok[:, None], study.data["variance_inflation"].values, np.nan)
-    return study.parameter_names[int(np.argmax(np.nan_to_num(np.sqrt(factors)).sum(axis=0)))]
 
 
 def plot_weakest(
@@ -388,39 +352,32 @@ def plot_weakest(
     """
     sweep = study.sweep
     along, by = two_axes(sweep, along, by, names=True)
-    shares = study.data["weak_direction"].values ** 2
     variance = sweep.lines(study.data["weak_variance"].values, along, by, at)
-    rows = some(len(variance.median), _MOST_PANELS)
-    figure, panels = _row(len(rows), 2.2, 3.8)
-    places = np.arange(len(variance.values))
-    names = study.parameter_names
-    stack = np.array([sweep.lines(one, along, by, at).median for one in shares.T])
+    names, weights = study.parameter_names, study.data["weak_direction"].values
+    stack = np.array([sweep.lines(one**2, along, by, at).median for one in weights.T])
     total = np.nansum(stack, axis=0)
     parts = np.nan_to_num(stack / np.where(total > 0.0, total, np.nan))
+    rows = some(len(variance.median), _MOST_PANELS)
+    figure, panels = row_of_panels(len(rows), 3.8)
+    places = np.arange(len(variance.values))
+    small: AnyDict = {"ha": "center", "va": "bottom", "fontsize": style.TICK_SIZE - 0.5}
     for ax, row in zip(panels, rows, strict=True):
         style.dress(ax)
-        below = np.zeros(len(places))
-        look: AnyDict = {"edgecolor": "white", "linewidth": 0.8}
-        for name, height in zip(names, parts[:, row], strict=True):
-            ax.bar(places, height, 0.78, bottom=below, color=colour_of(name), **look)
-            below = below + height
-        for at_x, value in zip(places, variance.median[row], strict=True):
+        below = np.cumsum(parts[:, row], axis=0) - parts[:, row]
+        for name, height, bottom in zip(names, parts[:, row], below, strict=True):
+            ax.bar(places, height, 0.78, bottom=bottom, color=colour_of(name), edgecolor="white")
+        for place, value in zip(places, variance.median[row], strict=True):
             words = "–" if np.isnan(value) else f"×{significant(value)}"
-            size = style.TICK_SIZE - 0.5
-            style.note(ax, words, (at_x, 1.02), ha="center", va="bottom", fontsize=size)
+            style.note(ax, words, (place, 1.02), **small)
         ax.set_ylim(0.0, 1.12)
-        ax.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "25 %", "50 %", "75 %", "100 %"])
+        ax.yaxis.set_major_formatter(lambda value, _: percent(value) if value <= 1.0 else "")
         ticks(ax.xaxis, variance.values, places)
-        style.label(ax, _by_title(variance, row), axis_label(along))
+        title = "" if by is None else capital(said(by, variance.by_values[row]))
+        style.label(ax, title, axis_label(along))
     style.label(panels[0], y="share of the weakest direction")
     handles = [style.key(symbol(name), colour_of(name), linewidth=7.0) for name in names]
     style.legend_above(figure, handles)
     return figure
-
-
-def _by_title(lines: Lines, row: int) -> str:
-    """The value of the second axis, above a panel."""
-    return "" if lines.by is None else capital(said(lines.by, lines.by_values[row]))
 
 
 def plot_matrices(
@@ -443,46 +400,43 @@ def plot_matrices(
     """
     sweep = study.sweep
     along, by = two_axes(sweep, along, by, names=True)
-    names = study.parameter_names
-    r = study.data["correlation"].values
+    names, r = study.parameter_names, study.data["correlation"].values
     p = len(names)
     lines = [sweep.lines(one, along, by, at) for one in r.reshape(-1, p * p).T]
     grid = np.array([entry.median for entry in lines]).reshape(p, p, *lines[0].median.shape)
     columns, rows = some(grid.shape[3], 5), some(grid.shape[2], _MOST_PANELS)
     figure = style.new_figure(11.0, 0.9 + 1.9 * len(rows))
     panels = style.panels(figure, len(rows), len(columns), (0.95, 0.8, 0.58, 0.32), (0.12, 0.12))
-    for row, at_row in enumerate(rows):
-        for column, at_column in enumerate(columns):
-            ax = figure.add_subplot(panels[row, column])
-            image = _matrix(ax, grid[:, :, at_row, at_column], names, row == 0, column == 0)
-            if column == 0 and by is not None:
-                style.label(ax, y=value_words(lines[0].by_values[at_row]))
-            if row == len(rows) - 1:
-                style.label(ax, x=value_words(lines[0].values[at_column]))
-    figure.supxlabel(axis_label(along), fontsize=style.LABEL_SIZE, color=style.INK, y=0.01)
-    if by is not None:
-        figure.supylabel(axis_label(by), fontsize=style.LABEL_SIZE, color=style.INK, x=0.005)
+    axes = panels.subplots(sharex=True, sharey=True, squeeze=False)
+    for (row, column), ax in np.ndenumerate(axes):
+        image = _matrix(ax, grid[:, :, rows[row], columns[column]], names)
+        ax.tick_params(labeltop=row == 0, labelbottom=False, labelleft=column == 0)
+    for row, ax in zip(rows, axes[:, 0], strict=True):
+        style.label(ax, y="" if by is None else value_words(lines[0].by_values[row]))
+    for column, ax in zip(columns, axes[-1], strict=True):
+        style.label(ax, x=value_words(lines[0].values[column]))
+    look: AnyDict = {"fontsize": style.LABEL_SIZE, "color": style.INK}
+    figure.supxlabel(axis_label(along), y=0.01, **look)
+    figure.supylabel("" if by is None else axis_label(by), x=0.005, **look)
     bar = figure.colorbar(image, cax=figure.add_axes((0.945, 0.2, 0.012, 0.6)))
     style.dress_bar(bar, "correlation")
     return figure
 
 
-def _matrix(ax: Axes, matrix: FloatArray, names: Sequence[str], top: bool, left: bool) -> Any:
+def _matrix(ax: Axes, matrix: FloatArray, names: Sequence[str]) -> Any:
     ax.set_facecolor(style.LIGHT)
     # The diagonal says nothing.
     matrix = np.where(np.eye(len(names), dtype=np.bool_), np.nan, matrix)
     image = ax.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto")
-    ticks = np.arange(len(names))
     words = [symbol(name) for name in names]
-    ax.set_xticks(ticks, words if top else [], fontsize=style.TICK_SIZE)
-    ax.set_yticks(ticks, words if left else [], fontsize=style.TICK_SIZE)
-    ax.tick_params(top=False, labeltop=top, bottom=False, labelbottom=False, colors=style.INK)
+    ax.set_xticks(range(len(names)), words, fontsize=style.TICK_SIZE)
+    ax.set_yticks(range(len(names)), words, fontsize=style.TICK_SIZE)
+    ax.tick_params(colors=style.INK)
     style.squares(ax, len(names), len(names), 1.0)
-    if len(names) <= 5:
-        for (i, j), value in np.ndenumerate(matrix):
-            if np.isfinite(value):
-                colour = "white" if abs(value) > 0.62 else style.INK
-                style.in_cell(ax, correlation_text(value), i, j, fontsize=6.5, color=colour)
+    for (i, j), value in np.ndenumerate(matrix):
+        if np.isfinite(value) and len(names) <= 5:
+            colour = "white" if abs(value) > 0.62 else style.INK
+            style.in_cell(ax, correlation_text(value), i, j, fontsize=6.5, color=colour)
     return image
 
 
@@ -511,33 +465,20 @@ def plot_needed(
     sweep = study.sweep
     along, by = two_axes(sweep, along, by)
     target = study.definition.target_arcsec if target_arcsec is None else target_arcsec
-    n = 1 if target is None else 2
-    figure = style.new_figure(5.8 * n, 4.0)
-    panels = figure.subplots(1, n, squeeze=False)[0]
-    lines = sweep.lines(sweep.frame_error, along, by, at)
-    _line_panel(panels[0], lines)
-    title = "Error that differs from frame to frame"
-    style.label(panels[0], title, axis_label(along), "1 sigma per axis [arcsec]")
+    title = "Error that differs from frame to frame, 1 sigma per axis [arcsec]"
+    panels = [Panel(title, sweep.frame_error)]
     if target is not None:
-        low, high = panels[0].get_ylim()
-        panels[0].set_ylim(min(low, target / 1.5), max(high, target * 1.5))
-        plain(panels[0].yaxis)
-        target_line(panels[0], target)
+        panels.append(Panel(f"Frames for {target:g} arcsec", study.frames_for(target)))
+    figure, axes, lines = small_multiples(sweep, panels, along, by, at, wide=2.0)
+    if target is not None:
+        low, high = axes[0].get_ylim()
+        axes[0].set_ylim(min(low, target / 1.5), max(high, target * 1.5))
+        plain(axes[0].yaxis)
+        target_line(axes[0], target)
         ground = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
-        target_words(panels[0], target, f"target {target:g} arcsec", bbox=ground)
-        _line_panel(panels[1], sweep.lines(study.frames_for(target), along, by, at))
-        style.label(panels[1], f"Frames for {target:g} arcsec", axis_label(along), "frames")
-    legend(figure, lines)
+        target_words(axes[0], target, f"target {target:g} arcsec", bbox=ground)
+    legend(figure, lines[0])
     return figure
-
-
-def _line_panel(ax: Axes, lines: Lines, dashed: Lines | None = None) -> None:
-    """Lines on a logarithmic axis."""
-    style.dress(ax, grid=True)
-    draw_lines(ax, lines)
-    if dashed is not None:
-        draw_lines(ax, dashed, dashed=True)
-    logarithmic(ax, lines, *filter(None, [dashed]))
 
 
 def plot_inflation(
@@ -561,22 +502,15 @@ def plot_inflation(
     at : dict, optional
         Values at which other axes are held, their middle ones by default.
     """
-    sweep = study.sweep
-    along, by = two_axes(sweep, along, by)
-    names = study.parameter_names
-    columns = len(names) if len(names) <= 3 else -(-len(names) // 2)
-    rows = -(-len(names) // columns)
-    figure = style.new_figure(11.0, 0.8 + 2.75 * rows)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, name in zip(panels, names, strict=False):
+    along, by = two_axes(study.sweep, along, by)
+    panels = []
+    for name in study.parameter_names:
         numbers, text = numbers_of(study, "sigma", name)
         known, _ = numbers_of(study, "sigma_conditional", name)
-        lines = sweep.lines(numbers, along, by, at)
-        _line_panel(ax, lines, sweep.lines(known, along, by, at))
-        style.label(ax, capital(text), axis_label(along))
-    for ax in panels[len(names) :]:
-        ax.set_visible(False)
-    legend(figure, lines, dashed="all others known")
+        panels.append(Panel(capital(text), numbers, known))
+    columns = len(panels) if len(panels) <= 3 else -(-len(panels) // 2)
+    figure, _, lines = small_multiples(study.sweep, panels, along, by, at, columns=columns)
+    legend(figure, lines[0], dashed="all others known")
     return figure
 
 
@@ -590,7 +524,7 @@ def plot_simpler(
     """Attitude error that a simpler distortion model would leave, beside the error of the
     calibration itself.
 
-    Where a model's line lies below the grey one, that model is rich enough.
+    Where a full line lies below the dashed one of its colour, that model is rich enough.
 
     Parameters
     ----------
@@ -608,37 +542,18 @@ def plot_simpler(
     """
     models = list(map(str, study.data["simpler"].values)) if "simpler" in study.data else []
     bias = {model: model_bias(study, model) for model in models}
-    # A model that leaves out zeros alone was not tried.
-    bias = {model: left for model, left in bias.items() if np.any(np.nan_to_num(left) > 0.0)}
-    if not bias:
-        raise ValueError("no simpler distortion model was tried in this study.")
     sweep = study.sweep
+    # A model that leaves out zeros alone was not tried.
+    panels = [
+        Panel(f"Left by the model {model} [arcsec]", left, sweep.frame_error)
+        for model, left in bias.items()
+        if np.any(np.nan_to_num(left) > 0.0)
+    ]
+    if not panels:
+        raise ValueError("no simpler distortion model was tried in this study.")
     along, by = two_axes(sweep, along, by)
-    error = sweep.lines(sweep.frame_error, along, by, at)
-    curves = [sweep.lines(left, along, by, at) for left in bias.values()]
-    looks = [
-        (NAMED[n % 5], {"marker": MARKERS[n % 5], "markersize": 4.5}) for n in range(len(bias))
-    ]
-    rows = some(len(error.median), _MOST_PANELS)
-    figure, panels = _row(len(rows), 2.2, 3.9)
-    x = positions(error.values)
-    for ax, row in zip(panels, rows, strict=True):
-        style.dress(ax, grid=True)
-        style.band(ax, x, error.low[row], error.high[row], style.GREY, alpha=0.25)
-        ax.plot(x, error.median[row], color=style.GREY, linewidth=2.2)
-        for curve, (colour, look) in zip(curves, looks, strict=True):
-            ax.plot(x, curve.median[row], color=colour, **look)
-        scale(ax.xaxis, error.values)
-        style.label(ax, _by_title(error, row), axis_label(along))
-    logarithmic(panels[0], error, *curves)
-    style.label(panels[0], y="arcsec")
-    keys = [
-        style.key(f"left by the model {model}", colour, **look)
-        for model, (colour, look) in zip(bias, looks, strict=True)
-    ]
-    style.legend_above(
-        figure, [style.key("error of the calibration", style.GREY, linewidth=2.2), *keys]
-    )
+    figure, _, lines = small_multiples(sweep, panels, along, by, at, sharey=True)
+    legend(figure, lines[0], dashed="error of the calibration")
     return figure
 
 
@@ -662,27 +577,24 @@ def plot_coverage(study: Study, *, along: str | None = None) -> Figure:
         raise ValueError('coverage needs simulated cells: set mode = "simulate" in [study].')
     sweep = study.sweep
     along, _ = two_axes(sweep, along, None)
-    covered = study.data["covered_95"].values
-    others = [axis for axis in sweep.axes if axis != along]
-    figure = style.new_figure(8.6, 4.0)
-    ax = style.dress(figure.subplots(), grid=True)
+    ax = style.dress(style.new_figure(8.6, 4.0).subplots(), grid=True)
     places = np.arange(len(sweep.values[along]))
     names = study.parameter_names
-    lowest = 0.9
+    dots: AnyDict = {"marker": "o", "markersize": 6, "linestyle": "none"}
     for i, name in enumerate(names):
-        n, rate = (sweep.over(covered[:, i], what, others).ravel() for what in ("count", "mean"))
-        shift = 0.62 * ((i + 0.5) / len(names) - 0.5)
-        for at_x, part, size in zip(places + shift, rate, n, strict=True):
-            if np.isfinite(part):
-                low, high = binomial_interval(round(part * size), int(size))
-                ax.vlines(at_x, low, high, color=colour_of(name), linewidth=1.4)
-                ax.plot(at_x, part, marker="o", markersize=6, color=colour_of(name))
-                lowest = min(lowest, low)
+        covered = study.values("covered_95", parameter=name)
+        n, rate = (sweep.pooled(covered, along, statistic=what) for what in ("count", "mean"))
+        seen = np.isfinite(rate)
+        hits = np.round(rate[seen] * n[seen]).astype(int)
+        x = places[seen] + 0.62 * ((i + 0.5) / len(names) - 0.5)
+        ends = [binomial_interval(*pair) for pair in zip(hits, n[seen].astype(int), strict=True)]
+        ax.vlines(x, *np.transpose(ends), color=colour_of(name), linewidth=1.4)
+        ax.plot(x, rate[seen], color=colour_of(name), label=symbol(name), **dots)
     ax.axhline(0.95, color=style.INK, linewidth=0.9)
     ticks(ax.xaxis, sweep.values[along], places)
-    ax.set_ylim(max(0.0, lowest - 0.06), 1.015)
+    ax.set_ylim(max(0.0, min(0.9, ax.dataLim.y0) - 0.06), 1.015)
     ax.yaxis.set_major_formatter(lambda value, _: percent(value))
     style.label(ax, "", axis_label(along), "95 % intervals that hold the truth")
-    dots: AnyDict = {"marker": "o", "markersize": 6}
-    style.legend_above(figure, [style.key(symbol(name), colour_of(name), **dots) for name in names])
+    figure = style.figure_of(ax)
+    style.legend_above(figure, ax.get_legend_handles_labels()[0])
     return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,8 +31,8 @@ _PARAMETER_COLOURS = {
     "p1": style.GREEN,
     "p2": "#F0E442",
 }
-NAMED = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.VERMILLION)
-MARKERS = "osD^v"
+_NAMED = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.VERMILLION)
+_MARKERS = "osD^v"
 
 
 def two_axes(
@@ -49,8 +50,7 @@ def two_axes(
         raise ValueError("no cell of the study has numbers: see the status of its cells.")
     named = [axis for axis in (along, by) if axis is not None]
     for axis in named:
-        if axis not in sweep.axes:
-            raise ValueError(f"{axis!r} was not swept: use one of {', '.join(sweep.axes)}.")
+        sweep.check(axis)
     free = [axis for axis in sweep.axes if axis not in named]
     if along is None:
         along = next((axis for axis in free if numeric(sweep.values[axis]) is not names), free[0])
@@ -121,7 +121,7 @@ def _line_colours(lines: Lines) -> dict[int, Any]:
     if lines.by is None:
         return {rows[0]: style.BLUE}
     if not numeric(lines.by_values):
-        return {row: NAMED[i % len(NAMED)] for i, row in enumerate(rows)}
+        return {row: _NAMED[i % len(_NAMED)] for i, row in enumerate(rows)}
     import matplotlib
 
     ramp = matplotlib.colormaps["viridis"]
@@ -129,7 +129,7 @@ def _line_colours(lines: Lines) -> dict[int, Any]:
 
 
 def _marked(number: int) -> AnyDict:
-    return {"marker": MARKERS[number % len(MARKERS)], "markersize": 4.5}
+    return {"marker": _MARKERS[number % len(_MARKERS)], "markersize": 4.5}
 
 
 def draw_lines(ax: Axes, lines: Lines, *, dashed: bool = False) -> None:
@@ -200,20 +200,75 @@ def held_title(figure: Figure, held: AnyMapping) -> None:
         )
 
 
-def logarithmic(ax: Axes, *lines: Lines) -> None:
+def logarithmic(ax: Axes, lines: Sequence[Lines]) -> None:
     """A logarithmic axis in plain numbers over what is drawn, of at least a factor of two."""
-    values = np.concatenate(
-        [array.ravel() for entry in lines for array in (entry.median, entry.low, entry.high)]
-    )
+    values = np.concatenate([np.ravel((one.median, one.low, one.high)) for one in lines])
     values = values[np.isfinite(values) & (values > 0.0)]
     if not len(values):
-        nothing(ax)
+        middle: AnyDict = {"xycoords": "axes fraction", "ha": "center", "color": style.GREY}
+        style.note(ax, "no cell has this", (0.5, 0.5), **middle)
         return
     low, high = float(values.min()) / 1.15, float(values.max()) * 1.15
     wider = max(1.0, np.sqrt(2.25 * low / high))
     ax.set_ylim(low / wider, high * wider)
     ax.set_yscale("log")
     plain(ax.yaxis)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A number of every cell (C,) with its title, and another one to draw dashed."""
+
+    title: str
+    numbers: FloatArray
+    dashed: FloatArray | None = None
+
+
+def row_of_panels(n: int, height_in: float) -> tuple[Figure, Any]:
+    """A figure with panels side by side that share their vertical axis."""
+    figure = style.new_figure(2.3 + 2.9 * n, height_in)
+    return figure, figure.subplots(1, n, sharey=True, squeeze=False)[0]
+
+
+def small_multiples(
+    sweep: Sweep,
+    panels: Sequence[Panel],
+    along: str,
+    by: str | None,
+    at: AnyMapping | None,
+    *,
+    columns: int | None = None,
+    log: bool = True,
+    sharey: bool = False,
+    wide: float = 1.0,
+) -> tuple[Figure, list[Axes], list[Lines]]:
+    """A panel for each number along one axis, a line with its band for each value of another.
+
+    In rows of `columns` panels, all in one by default; `wide` is the width of one over the usual
+    one. Returns the figure, its panels, and the lines of each.
+    """
+    columns = len(panels) if columns is None else columns
+    rows = -(-len(panels) // columns)
+    figure = style.new_figure(2.4 + 2.9 * wide * columns, 0.8 + (3.1 if rows == 1 else 2.75) * rows)
+    axes = list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
+    drawn = []
+    for ax, panel in zip(axes, panels, strict=False):
+        style.dress(ax, grid=True)
+        lines = sweep.lines(panel.numbers, along, by, at)
+        draw_lines(ax, lines)
+        drawn.append([lines])
+        if panel.dashed is not None:
+            dashed = sweep.lines(panel.dashed, along, by, at)
+            draw_lines(ax, dashed, dashed=True)
+            drawn[-1].append(dashed)
+        style.label(ax, panel.title, axis_label(along))
+    for spare in axes[len(panels) :]:
+        spare.set_visible(False)
+    if log:
+        together = [lines for some in drawn for lines in some]
+        for ax, own in zip(axes, drawn, strict=False):
+            logarithmic(ax, together if sharey else own)
+    return figure, axes[: len(panels)], [lines[0] for lines in drawn]
 
 
 def plain(axis: Any, *, fine: bool = True) -> None:
@@ -248,22 +303,6 @@ def target_words(ax: Axes, value: float, words: str, **look: Any) -> None:
     """Words at the left end of the line of a target."""
     place = {"xycoords": ("axes fraction", "data"), "color": style.VERMILLION}
     style.note(ax, words, (0.02, value), (0, 4), **place, **look)
-
-
-def in_the_middle(ax: Axes, words: str, colour: str = style.GREY) -> None:
-    """Words in the place of what a panel cannot show."""
-    style.note(
-        *(ax, words, (0.5, 0.5)),
-        xycoords="axes fraction",
-        ha="center",
-        color=colour,
-        fontsize=style.LABEL_SIZE,
-    )
-
-
-def nothing(ax: Axes) -> None:
-    """No cell has a number of this panel."""
-    in_the_middle(ax, "no cell has this")
 
 
 def short(value: float) -> str:

@@ -80,9 +80,8 @@ _CAPTIONS = {
     "simpler": (
         "Would a simpler model do?",
         "Frame-dependent attitude error across the boresight that a simpler distortion model "
-        "would leave, beside that "
-        "of the calibration (grey). Where a line lies below the grey one, the simpler model is "
-        "rich enough.",
+        "would leave, beside that of the calibration (dashed). Where a full line lies below the "
+        "dashed one of its colour, the simpler model is rich enough.",
     ),
     "coverage": (
         "Coverage",
