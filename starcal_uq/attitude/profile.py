@@ -268,6 +268,11 @@ class TableColumns:
         """One column (K,) as numbers."""
         return _numbers(self.path, self.word, self.numbers, name, self.cells[name])
 
+    @property
+    def time_s(self) -> FloatArray:
+        """Times (K,), s; of UTC times the seconds since the first."""
+        return _times(self.path, self.word, self.numbers, self.cells)
+
 
 def read_columns(path: PathLike, content: str) -> TableColumns:
     """Read a table; AttitudeProfileError for one without rows, each of which should hold
@@ -284,7 +289,7 @@ def read_columns(path: PathLike, content: str) -> TableColumns:
             columns, numbers, word = _text(path, ecsv=ending == ".ecsv")
         if not len(numbers):
             raise AttitudeProfileError(
-                f"{path}: holds no attitudes; give a table with {content} per row."
+                f"{path}: holds no rows; give a table with {content} per row."
             )
         return TableColumns(path, columns, numbers, word)
 
@@ -294,8 +299,7 @@ def read_profile(path: PathLike, scalar: str | None) -> ProfileTable:
     table = read_columns(path, "a time and a quaternion")
     names = _components(table.path, table.cells, scalar)
     q = np.column_stack([table.numbers_of(name) for name in names])
-    time_s = _times(table.path, table.word, table.numbers, table.cells)
-    return ProfileTable(time_s, q, table.numbers, table.word)
+    return ProfileTable(table.time_s, q, table.numbers, table.word)
 
 
 def _components(path: Path, columns: AnyDict, scalar: str | None) -> tuple[str, ...]:

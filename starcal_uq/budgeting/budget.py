@@ -39,12 +39,14 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, PathLike
+from starcal_uq.propagation.thermal import thermal_error
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.thermal import TemperatureProfile
 
 _CONFIDENCE = 0.997
 # A row of the file that may hold what effects fill rows with.
@@ -62,6 +64,7 @@ def budget(
     file: BudgetFile | PathLike | None = None,
     confidence: float | None = None,
     misfit: Diagnosis | None = None,
+    temperature_profile: TemperatureProfile | PathLike | None = None,
     n_samples: int = N_SAMPLES,
     seed: int = 0,
 ) -> Budget:
@@ -84,6 +87,9 @@ def budget(
     misfit : Diagnosis, optional
         The tests of the model (`starcal_uq.diagnose`), for an attitude error that does not hold
         what they found.
+    temperature_profile : TemperatureProfile or path, optional
+        Temperatures of the optics over an orbit, from which the row *thermo-elastic of the optics*
+        is filled; those with which `attitude` was propagated by default.
     n_samples, seed : int
         Number and seed of the sampled totals.
 
@@ -91,11 +97,16 @@ def budget(
     ------
     BudgetError
         If the file is wrong, or the confidence is not between 0 and 1.
+    AttitudeProfileError, CalibrationError
+        If the temperature profile is wrong, or the calibration holds no effect of the temperature.
     """
     if attitude is None:
         from starcal_uq.propagation.propagate import propagate
 
         attitude = propagate(post, obs)
+    if temperature_profile is not None:
+        thermal = thermal_error(attitude.thermal_response, temperature_profile)
+        attitude = replace(attitude, thermal=thermal)
     stated = (
         file
         if isinstance(file, BudgetFile)
@@ -119,9 +130,14 @@ def budget(
     untested = () if attitude.misfit is not None else (UNTESTED,)
     effects, replaced = stated_instead(effect_rows(attitude, post), stated.contributors)
     known = (*alignment_rows(attitude), *effects)
+    filled = _from_file(stated, (*untested, *FROM_FILE), known)
+    # Effects stand beside the other rows of the calibration.
+    ours = {row.name for row in effects} - {entry.name for entry in FROM_FILE}
+    beside = tuple(row for row in filled if row.name in ours)
     rows = (
         *posterior_rows(attitude, post),
-        *_from_file(stated, (*untested, *FROM_FILE), known),
+        *beside,
+        *(row for row in filled if row.name not in ours),
     )
     found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
     settings: AnyDict = {
@@ -130,6 +146,8 @@ def budget(
         "file": stated.path,
         "alignment": attitude.alignment,
     }
+    if attitude.thermal is not None:
+        settings["temperature_profile"] = attitude.thermal.profile.name
     if stated.frames:
         settings["frames"] = {name: rotation.tolist() for name, rotation in stated.frames.items()}
     return Budget(

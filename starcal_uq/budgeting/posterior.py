@@ -26,7 +26,7 @@ from starcal_uq.budgeting.rows import (
     not_assessed,
 )
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import join_words, plural
+from starcal_uq.core.formatting import join_words, percent, plural, significant
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import FloatArray
 from starcal_uq.propagation.attitude_error import (
@@ -36,11 +36,13 @@ from starcal_uq.propagation.attitude_error import (
     choice,
 )
 from starcal_uq.propagation.onboard_error import with_cross
+from starcal_uq.propagation.thermal import TEMPERATURE
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.onboard_error import EffectError
+    from starcal_uq.propagation.thermal import ThermalError
 
 # What alignment takes up of an effect is a row of its own.
 _IN_COMMON = ", common rotation"
@@ -151,7 +153,12 @@ def effect_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributor, 
     """
     if attitude.aboard is None or attitude.aboard.parameters is None:
         return ()
-    rows = [row for share in attitude.effects for row in _rows_of(share, attitude)]
+    thermal = attitude.thermal
+    rows = []
+    for share in attitude.effects:
+        if share.name == TEMPERATURE and thermal is not None:
+            share = thermal.share(attitude.onboard)
+        rows += _rows_of(share, attitude)
     if post.effects is not None and "zenith" in post.effects.names:
         expected = OF_EFFECTS["zenith"]
         rows += [
@@ -172,52 +179,75 @@ def effect_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributor, 
 def _rows_of(share: EffectError, attitude: AttitudeError) -> list[Contributor]:
     """The rest of an effect, and what is in common; of frames by themselves nothing is."""
     expected = OF_EFFECTS[share.name]
+    thermal = attitude.thermal if share.name == TEMPERATURE else None
+    told = _conditions(attitude, thermal)
     constant = share.rest_constant_arcsec**2 > 0.5 * np.diag(share.rest_covariance_arcsec2)
-    kinds = ["ensemble" if one else expected.interpretation for one in constant]
-    rest = share.rest_mean_arcsec, share.rest_covariance_arcsec2
-    rows = _of_axes(expected, attitude, rest, kinds)
-    common = share.common_mean_arcsec, share.common_covariance_arcsec2
+    rest = _of_axes(expected, share.rest_mean_arcsec, share.rest_covariance_arcsec2, told)
+    for index, row in enumerate(rest):
+        if constant[index]:
+            rest[index] = replace(row, interpretation="ensemble")
+        elif thermal is not None and row.sigma_arcsec > _NOTHING_ARCSEC:
+            # A short peak of the temperature is beyond what the root mean square says.
+            peak = float(thermal.peak_arcsec(attitude.onboard)[index])
+            tail = (peak - abs(row.mean_arcsec)) / row.sigma_arcsec
+            words = f"{told}, largest error {significant(peak)} arcsec"
+            rest[index] = replace(row, conditions=words, tail_997=max(GAUSSIAN_997, tail))
+    common = []
     if share.name != "frame" and share.common_arcsec.max() > _NOTHING_ARCSEC:
         shared = replace(
             expected,
             name=expected.name + _IN_COMMON,
             ecss_class="bias",
+            interpretation="ensemble",
             # Alignment and mission may have different nights.
             absorbed_by_alignment="in part" if share.name == "epoch" else "yes",
         )
-        rows = _of_axes(shared, attitude, common, ["ensemble"] * len(AXES)) + rows
-    return rows
+        common = _of_axes(shared, share.common_mean_arcsec, share.common_covariance_arcsec2, told)
+    tested = attitude.misfit is not None
+    return [
+        replace(row, with_misfit_found_arcsec=row.sigma_arcsec if tested else math.nan)
+        for row in common + rest
+    ]
+
+
+def _conditions(attitude: AttitudeError, thermal: ThermalError | None) -> str:
+    """Frames, what the software uses, and the temperatures."""
+    uses = "the camera's parameters alone" if attitude.onboard == "model" else "the effect as well"
+    words = (
+        f"star geometry of {plural(attitude.n_frames, 'frame')} ({attitude.frames}); the software "
+        f"uses {uses}"
+    )
+    if thermal is None:
+        return words
+    outside = (
+        f", {percent(thermal.outside_share)} of the time outside of those of the calibration"
+        if thermal.outside.any()
+        else ""
+    )
+    return (
+        f"{words}; temperatures of {thermal.profile.name}{outside}, alignment at "
+        f"{thermal.aligned_c:.1f} degC"
+    )
 
 
 def _of_axes(
-    expected: Expected,
-    attitude: AttitudeError,
-    moments: tuple[FloatArray, FloatArray],
-    kinds: Sequence[str],
+    expected: Expected, mean: FloatArray, covariance: FloatArray, conditions: str
 ) -> list[Contributor]:
     """A row on three axes from means (3,) and covariance (3, 3), arcsec."""
-    mean, covariance = moments
     sigma = np.sqrt(np.diag(covariance))
-    uses = (
-        "the camera's parameters alone" if attitude.onboard == "model" else "what effects tell it"
-    )
+    correlations = axis_correlations(covariance, np.ones(3))
     return [
         replace(
             not_assessed(expected, axis),
             mean_arcsec=float(mean[index]),
             sigma_arcsec=float(sigma[index]),
-            interpretation=kinds[index],
-            axis_correlation=correlation,
-            conditions=f"star geometry of {plural(attitude.n_frames, 'frame')} "
-            f"({attitude.frames}); the software uses {uses}",
+            axis_correlation=correlations[index],
+            conditions=conditions,
             provenance="effect of the calibration, propagated with the posterior",
             source="posterior",
             if_model_holds_arcsec=float(sigma[index]),
-            with_misfit_found_arcsec=math.nan if attitude.misfit is None else float(sigma[index]),
         )
-        for index, (axis, correlation) in enumerate(
-            zip(AXES, axis_correlations(covariance, np.ones(3)), strict=True)
-        )
+        for index, axis in enumerate(AXES)
     ]
 
 

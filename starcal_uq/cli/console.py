@@ -151,11 +151,17 @@ def show_coupling(coupling: Coupling) -> None:
 
 def show_attitude(error: AttitudeError) -> None:
     """Attitude error by contributor and axis, 1 sigma, and what follows."""
-    from starcal_uq.presentation.words.propagation import attitude_table, onboard_table
+    from starcal_uq.presentation.words.propagation import (
+        attitude_table,
+        onboard_table,
+        thermal_table,
+    )
 
     print_table(attitude_table(error))
     if error.variants:
         print_table(onboard_table(error))
+    if error.thermal is not None:
+        print_table(thermal_table(error.thermal))
 
 
 def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = None) -> None:

@@ -18,6 +18,7 @@ from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
 from starcal_uq.core.manifest import refuse_others
 from starcal_uq.core.settings import KEYS
+from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -44,6 +45,7 @@ def budget_command(
     out: list[Path] | None = None,
     template: Path | None = None,
     confidence: float | None = None,
+    temperature_profile: Path | None = None,
     seed: int = 0,
     force: bool = False,
 ) -> Answer:
@@ -68,10 +70,15 @@ def budget_command(
         )
         return Answer({"run": run, "files": [], "template": template, "budget": None})
     # Without a question of its own, the call shows what is there.
-    if opened.has("budget") and file is None and confidence is None and not force:
+    asked: AnyDict = {
+        "file": file,
+        "confidence": confidence,
+        "temperature_profile": temperature_profile,
+    }
+    if opened.has("budget") and not force and all(value is None for value in asked.values()):
         found = opened.error_budget
     else:
-        found = opened.budget(file=file, confidence=confidence, seed=seed, force=force)
+        found = opened.budget(**asked, seed=seed, force=force)
     for path in out or []:
         write_page(found, path)
     show_budget(found)

@@ -129,7 +129,11 @@ def _study(result: Any) -> AnyDict:
 def _attitude(result: Any) -> AnyDict:
     from starcal_uq.propagation.onboard_error import side_by_side
 
-    return {"contributors": result.to_dataframe(), "aboard": side_by_side(result.variants)}
+    return {
+        "contributors": result.to_dataframe(),
+        "aboard": side_by_side(result.variants),
+        "thermal": [] if result.thermal is None else result.thermal.to_dataframe(),
+    }
 
 
 def _table_as(key: str) -> Callable[[Any], AnyDict]:

@@ -43,6 +43,7 @@ from starcal_uq.core.settings import OnboardModel
 from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.toml import read_section
+from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.files import READ
 
 if TYPE_CHECKING:
@@ -97,6 +98,7 @@ def run_command(
     alignment: str = "random",
     alignment_frames: int | None = None,
     onboard: OnboardModel = "model",
+    temperature_profile: Path | None = None,
     budget: Path | None = None,
     force: bool = False,
 ) -> Answer:
@@ -110,6 +112,9 @@ def run_command(
     if budget is not None:
         # A mistake in it should not show after the work.
         sc.budgeting.load_budget_file(budget)
+    if temperature_profile is not None:
+        sc.propagation.load_temperature_profile(temperature_profile)
+        _refuse_profile(estimation.effects)
     if sampling.priors is not None:
         read_section(sampling.priors, "priors", PriorError, alone=False)
     *given, last = inputs
@@ -131,7 +136,7 @@ def run_command(
         raise typer.BadParameter(
             "a table of stars needs the nominal camera (TOML) after it; only images do without."
         )
-    aligning = {
+    aligning: AnyDict = {
         "alignment": alignment,
         "alignment_frames": alignment_frames,
         "onboard": onboard,
@@ -151,7 +156,8 @@ def run_command(
     }
     files = {f"input {number}": path for number, path in enumerate(inputs)}
     files |= {} if camera is None else {"camera": camera}
-    command = command_of("run", settings | aligning | {"budget": budget}, files)
+    settings |= aligning | {"budget": budget, "temperature_profile": temperature_profile}
+    command = command_of("run", settings, files)
     with run.making(command, force=force, words=typed_words(sys.argv[1:])), Ahead() as ahead:
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
             # Priors may determine what the data leave open.
@@ -159,8 +165,28 @@ def run_command(
             _calibrate(run, inputs, camera, from_images, estimation, undetermined, sky, images)
         show_calibration(run.calibration, run.truth)
         warn_air(run.observations, run.calibration)
+        if temperature_profile is not None and not _follows_temperature(run):
+            note(
+                f"The data ask for no effect of the temperature: {temperature_profile} is left out."
+            )
+            temperature_profile = None
+        aligning["temperature_profile"] = temperature_profile
         _after_calibration(run, ahead, sampling, draws, budget, **aligning)
     return _conclude(run)
+
+
+def _refuse_profile(effects: str | None) -> None:
+    """Refuse a temperature profile where the effects that are asked for follow no temperature."""
+    if effects is not None and not {"auto", "temperature"} & set(effects.split(",")):
+        raise typer.BadParameter(
+            f"--temperature-profile needs the effect temperature, which --effects {effects} leaves "
+            "out: add it, or leave the profile out."
+        )
+
+
+def _follows_temperature(run: Run) -> bool:
+    effects = run.calibration.effects
+    return effects is not None and "temperature" in effects.names
 
 
 def _calibrate(

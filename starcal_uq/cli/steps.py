@@ -238,6 +238,7 @@ def propagate_command(
     alignment: str = "random",
     alignment_frames: int | None = None,
     onboard: settings.OnboardModel = "model",
+    temperature_profile: Path | None = None,
     draws: int = 300,
     seed: int = 0,
     force: bool = False,
@@ -269,6 +270,7 @@ def propagate_command(
         alignment=alignment,
         alignment_frames=alignment_frames,
         onboard=onboard,
+        temperature_profile=temperature_profile,
         force=force,
     )
     show_attitude(error)

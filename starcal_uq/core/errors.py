@@ -110,7 +110,7 @@ class ObservationError(StarcalError):
 
 
 class AttitudeProfileError(StarcalError):
-    """An attitude profile is unreadable, or its times or quaternions cannot be used."""
+    """A profile over time is unreadable, or its times, quaternions or temperatures cannot be used."""
 
 
 class CatalogueError(StarcalError):

@@ -66,6 +66,7 @@ from starcal_uq.presentation.figures.propagation import (
     plot_error_series,
     plot_field_map,
     plot_spectrum,
+    plot_thermal,
 )
 from starcal_uq.presentation.figures.studies import (
     plot_coverage,
@@ -104,6 +105,7 @@ from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
 from starcal_uq.propagation.field import FieldMap
 from starcal_uq.propagation.spectrum import ErrorSpectrum
+from starcal_uq.propagation.thermal import ThermalError
 from starcal_uq.sky.catalogue import StarCatalogue
 from starcal_uq.studies.result import Study
 
@@ -272,6 +274,12 @@ VIEWS: Mapping[type, View] = {
         _draws,
         spectrum=plot_spectrum,
         time_series=plot_error_series,
+    ),
+    ThermalError: _view(
+        "Attitude error over a temperature profile",
+        propagation.thermal_text,
+        propagation.thermal_table,
+        profile=plot_thermal,
     ),
     Results: View(run_text, run_html),
     Study: _view(

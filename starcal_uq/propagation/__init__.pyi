@@ -8,3 +8,6 @@ from .field import FieldMap as FieldMap
 from .field import field_map as field_map
 from .spectrum import ErrorSpectrum as ErrorSpectrum
 from .spectrum import error_spectrum as error_spectrum
+from .thermal import TemperatureProfile as TemperatureProfile
+from .thermal import ThermalError as ThermalError
+from .thermal import load_temperature_profile as load_temperature_profile

@@ -30,6 +30,7 @@ from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, PathLike, floa
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
 from starcal_uq.propagation.onboard_error import EffectError, OnboardError, with_cross
+from starcal_uq.propagation.thermal import ThermalError, ThermalResponse
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -210,6 +211,10 @@ class AttitudeError(Shown):
     variants : tuple of OnboardError
         The calibration's part with every onboard model; empty without effects. That of `onboard`
         stands in the other fields as well.
+    thermal_response : ThermalResponse or None
+        How attitudes follow the temperature of the optics; None without such an effect.
+    thermal : ThermalError or None
+        The error over a temperature profile; None where none was given.
     effects_per_frame_arcsec : (K, 3) array or None
         Root mean square of what effects of every frame by itself do to each frame; None without
         such, and when read from a file.
@@ -251,6 +256,8 @@ class AttitudeError(Shown):
     onboard: OnboardModel = "model"
     variants: tuple[OnboardError, ...] = ()
     effects_per_frame_arcsec: FloatArray | None = None
+    thermal_response: ThermalResponse | None = None
+    thermal: ThermalError | None = None
 
     @property
     def aboard(self) -> OnboardError | None:
@@ -468,7 +475,9 @@ class AttitudeError(Shown):
             }
         table = table.assign(alignment=self.alignment, **columns)
         if self.variants:
-            aboard = json.dumps(to_plain(_Aboard(self.onboard, self.variants)))
+            aboard = json.dumps(
+                to_plain(_Aboard(self.onboard, self.variants, self.thermal_response))
+            )
             table = table.assign(onboard=[aboard] + [""] * (len(table) - 1))
             for own in self.variants:
                 figures = np.full((len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
@@ -543,6 +552,7 @@ class _Aboard:
 
     onboard: OnboardModel
     variants: tuple[OnboardError, ...]
+    thermal_response: ThermalResponse | None = None
 
 
 def choice(error: AttitudeError) -> tuple[Finding, ...]:

@@ -39,7 +39,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.settings import OnboardModel, bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, PathLike
 from starcal_uq.observations.splits import frame_sample
 from starcal_uq.propagation.alignment import alignment_frames as _alignment_frames
 from starcal_uq.propagation.alignment import alignment_weights
@@ -50,6 +50,7 @@ from starcal_uq.propagation.attitude_error import (
 from starcal_uq.propagation.geometry import FrameGeometry
 from starcal_uq.propagation.onboard import Aboard, Turns
 from starcal_uq.propagation.onboard_error import PARAMETERS, EffectError, OnboardError
+from starcal_uq.propagation.thermal import TemperatureProfile, ThermalResponse, thermal_error
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -79,6 +80,7 @@ def propagate(
     alignment_frames: int | None = None,
     onboard: OnboardModel = "model",
     calibrated: Observations | None = None,
+    temperature_profile: TemperatureProfile | PathLike | None = None,
 ) -> AttitudeError:
     """Attitude error of single frames: centroid noise, calibration as common rotation and rest, and
     their interaction.
@@ -109,6 +111,8 @@ def propagate(
     calibrated : Observations, optional
         The table of the calibration, for frames of a mission, where effects change with what a
         table states; `obs` by default. What the mission does not state is drawn from it.
+    temperature_profile : TemperatureProfile or path, optional
+        Temperatures of the optics over an orbit, for `AttitudeError.thermal`.
 
     Raises
     ------
@@ -121,6 +125,9 @@ def propagate(
         of these, or effects are those of another table than `calibrated`.
     DegenerateFrameError
         When a frame does not determine an attitude.
+    AttitudeProfileError, CalibrationError
+        When the temperature profile is wrong, or the calibration holds no effect of the
+        temperature.
     """
     draws = post.thin(n_draws, seed)[:, :-1]
     count = len(draws)
@@ -146,6 +153,7 @@ def propagate(
     whole = first.with_sampled(sampled)
     sigmas = whole.sigmas
     interaction = sampled.interaction
+    warmth = ThermalResponse.of(post, aboard.calibrated, frames.response, together)
     half_widths = [_noise_half_widths(nea, seed)]
     half_widths += [
         *_calibration_half_widths(
@@ -193,6 +201,10 @@ def propagate(
         variants=_variants(aboard, split, sampled, frames),
         effects_per_frame_arcsec=(
             np.sqrt(_diagonal(_total(turns.own))) * ARCSEC if turns.own else None
+        ),
+        thermal_response=warmth,
+        thermal=(
+            None if temperature_profile is None else thermal_error(warmth, temperature_profile)
         ),
     )
 

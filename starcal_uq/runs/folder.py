@@ -135,6 +135,8 @@ class RunFolder:
         Direction uncertainty over the field (NPZ).
     spectrum : Path
         Spectrum of the frame-dependent error along an attitude profile (NPZ).
+    thermal : Path
+        Attitude error over a temperature profile (CSV).
     budget : Path
         Error budget (CSV).
     diagnosis : Path
@@ -169,6 +171,7 @@ class RunFolder:
     alignment = _File("alignment_frames.parquet", "propagate")
     field_map = _File("field_map.npz", "propagate")
     spectrum = _File("error_spectrum.npz", "propagate", attitudes="PROFILE")
+    thermal = _File("thermal.csv", "propagate", temperature_profile="FILE")
     budget = _File("budget.csv", "budget")
     diagnosis = _File("diagnosis.json", "diagnose")
     rejected = _File("rejected.csv", "calibrate", screening=True)

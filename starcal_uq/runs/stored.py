@@ -77,9 +77,6 @@ class StoredRun:
     posterior: cached_property[Posterior] = _of_file(
         "posterior", "inference.posterior", "Posterior"
     )
-    attitude: cached_property[AttitudeError] = _of_file(
-        "attitude", "propagation.attitude_error", "AttitudeError"
-    )
     field_map: cached_property[FieldMap] = _of_file("field_map", "propagation.field", "FieldMap")
     spectrum: cached_property[ErrorSpectrum] = _of_file(
         "spectrum", "propagation.spectrum", "ErrorSpectrum"
@@ -123,6 +120,18 @@ class StoredRun:
     def name(self) -> str:
         """Name of the folder."""
         return self.path.resolve().name
+
+    @cached_property
+    def attitude(self) -> AttitudeError:
+        """The attitude error, over a temperature profile where one was given."""
+        from starcal_uq.propagation.attitude_error import AttitudeError
+        from starcal_uq.propagation.thermal import read_again, thermal_error
+
+        error = AttitudeError.load(self.folder.require("attitude"))
+        if not self.has("thermal"):
+            return error
+        profile = read_again(self.folder.require("thermal"))
+        return replace(error, thermal=thermal_error(error.thermal_response, profile))
 
     @cached_property
     def calibration(self) -> Calibration:

@@ -195,7 +195,7 @@ def broken(frame: pd.DataFrame, change: str) -> pd.DataFrame:
         ),
         ("time", r"column time_s or time_utc is missing"),
         ("short", r"holds 1 attitude; give at least two"),
-        ("empty", r"holds no attitudes"),
+        ("empty", r"holds no rows"),
     ],
 )
 def test_bad_files_are_refused_in_one_sentence(tmp_path: Path, change: str, message: str) -> None:

@@ -30,7 +30,7 @@ def test_a_file_is_read_with_one_error_or_three(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        (HEADER, "holds no attitudes"),
+        (HEADER, "holds no rows"),
         (HEADER.replace("qw", "q") + ROW, "column qw is missing"),
         (HEADER + ROW + "5,6,0.6,0,0,0.7,1\n", "line 3: the quaternion has the length 0.92"),
         (HEADER + ROW + "4,3,0.6,0,0,0.8,1\n", r"line 3 \(frames 4 and 3\): .* earlier row; keep"),

@@ -12,7 +12,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.settings import EffectName
 from starcal_uq.presentation.words.effects import MEANINGS
-from tests.helpers.effects import breathing, sheet, table
+from tests.helpers.effects import breathing, moving, sheet, table
 from tests.helpers.outside import campaign
 
 
@@ -107,3 +107,78 @@ def test_the_remedy_that_a_misfit_prints_first_leads_to_a_usable_answer(cli, tmp
     section = report.partition('id="effects"')[2].partition('id="misfit"')[0]
     assert "Every frame has a scale and two shears" in section and "not taken up" in section
     assert command not in verdict["commands"]
+
+
+@pytest.fixture
+def warmed(tmp_path):
+    """A run whose calibration follows the temperature, and a profile of an orbit beside it."""
+    rng = np.random.default_rng(8)
+    warmth = rng.uniform(-1.0, 1.0, 12)
+    c = campaign(rng, n_frames=12, displaced=moving(0.5, warmth))
+    obs = table(c, temperature_c=-25.0 + 15.0 * warmth[c.columns["frame"]])
+    obs.save(tmp_path / "obs.csv")
+    sheet(c).save(tmp_path / "camera.toml")
+    run = sc.Run(tmp_path / "run")
+    run.calibrate(obs, sheet(c), effects="temperature")
+    run.sample(seed=0, n_ensembles=2, n_walkers=16, n_steps=20)
+    (tmp_path / "orbit.csv").write_text("time_s,temperature_c\n0,-40\n60,-10\n90,5\n", "utf-8")
+    return tmp_path
+
+
+def test_a_temperature_profile_goes_from_the_command_line_into_the_budget(cli, warmed) -> None:
+    words = ("propagate", "run", "--draws", 50)
+    status, out, err = cli(*words, "--temperature-profile", "orbit.csv", "--json")
+    assert status == 0, err
+    attitude = json.loads(out)["attitude"]
+    assert attitude["onboard"] == "model"
+    parts = {row["part"] for row in attitude["aboard"]}
+    assert {"rest", "temperature, rest", "camera parameters, rest"} <= parts
+    assert [row["temperature_c"] for row in attitude["thermal"]][::4] == [-40.0, -10.0, 5.0]
+    # The budget of the run takes it from the folder.
+    stored = sc.Run("run")
+    assert stored.attitude.thermal.profile.name == "orbit.csv"
+    made = stored.budget()
+    row = next(each for each in made.rows if each.name == "thermo-elastic of the optics")
+    assert row.sigma_arcsec == stored.attitude.thermal.model.rest_covariance_arcsec2[0, 0] ** 0.5
+    assert "temperatures of orbit.csv, " in row.conditions
+    assert "of the time outside of those of the calibration" in row.conditions
+    # Another profile may be given to the budget alone.
+    Path("mild.csv").write_text("time_s,temperature_c\n0,-26\n60,-24\n", "utf-8")
+    status, out, err = cli(
+        *("budget", "run", "--temperature-profile", "mild.csv", "--force", "--json")
+    )
+    assert status == 0, err
+    rows = json.loads(out)["budget"]["contributors"]
+    mild = next(each for each in rows if each["name"] == row.name)
+    assert mild["sigma_arcsec"] < 0.2 * row.sigma_arcsec
+    # Without a profile the folder holds none, and the row is that of the calibration's range.
+    assert cli(*words, "--force")[0] == 0
+    assert not Path("run/thermal.csv").exists()
+    plain = next(each for each in sc.Run("run").budget().rows if each.name == row.name)
+    assert "orbit.csv" not in plain.conditions
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            "propagate run --temperature-profile bad.csv --force",
+            "bad.csv, line 3: temperature_c is",
+        ),
+        (
+            "run obs.csv camera.toml -o other --effects field --temperature-profile orbit.csv",
+            "--temperature-profile needs the effect temperature, which --effects field leaves out",
+        ),
+        ("budget plain --temperature-profile orbit.csv", "holds no effect 'temperature', so that"),
+    ],
+)
+def test_a_profile_that_cannot_act_is_one_sentence(cli, warmed, words, sentence) -> None:
+    Path("bad.csv").write_text("time_s,temperature_c\n0,1\n1,warm\n", "utf-8")
+    if "plain" in words:
+        plain = sc.Run("plain")
+        plain.calibrate(sc.load_observations("obs.csv"), sc.Camera.load("camera.toml"))
+        plain.sample(seed=0, n_ensembles=2, n_walkers=16, n_steps=20)
+        plain.propagate(n_draws=20)
+    status, _, err = cli(*words.split())
+    assert status == 2
+    assert sentence in err.splitlines()[-1]

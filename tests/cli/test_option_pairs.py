@@ -59,6 +59,7 @@ VALUES = {
     "--alignment": ("observed", "rich.csv"),
     "--alignment-frames": ("20",),
     "--onboard": ("effects",),
+    "--temperature-profile": ("orbit.csv",),
     "--budget": ("budget.toml",),
     "--json": (None,),
 }
@@ -117,6 +118,7 @@ def tables(tmp_path):
     SITE.save(tmp_path / "site.toml")
     (tmp_path / "priors.toml").write_text("[priors]\nfocal_fraction = 0.05\n", encoding="utf-8")
     (tmp_path / "budget.toml").write_text("", encoding="utf-8")
+    (tmp_path / "orbit.csv").write_text("time_s,temperature_c\n0,5\n60,25\n", encoding="utf-8")
     return tmp_path
 
 

@@ -33,9 +33,11 @@ from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
 from starcal_uq.propagation.field import FieldMap
 from starcal_uq.propagation.spectrum import ErrorSpectrum
+from starcal_uq.propagation.thermal import ThermalError
 from tests.helpers.gaussian_camera import gaussian_posterior
 from tests.helpers.profiles import slew
 from tests.helpers.scenes import camera, nominal, observations
+from tests.propagation.test_thermal import orbit, response
 
 WINGS = ("propagation", "diagnostics", "comparison", "planning", "budgeting")
 FIGURES = {
@@ -45,6 +47,7 @@ FIGURES = {
     FieldMap: ["maps"],
     DistortionCurve: ["curve"],
     ErrorSpectrum: ["spectrum", "time_series"],
+    ThermalError: ["profile"],
     Misfit: ["p_values"],
     Jackknife: ["ratios"],
     StarTest: [],
@@ -129,6 +132,7 @@ def results() -> dict[type, Any]:
             camera(), stars, n_frames=(5, 10), n_campaigns=2, n_geometries=100, workers=0
         ),
         *(budget, budget.outcomes[0]),
+        response()[0].over(orbit()),
     ]
     return {type(result): result for result in made}
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.distortion import DistortionCurve
     from starcal_uq.propagation.field import FieldMap
     from starcal_uq.propagation.spectrum import ErrorSpectrum
+    from starcal_uq.propagation.thermal import ThermalError
 
 
 def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
@@ -245,6 +246,8 @@ def _key(ax: Axes, scale: float, largest: float) -> None:
     )
 
 
+# A longer profile is drawn in minutes.
+_MINUTES = 10.0
 _COLOURS = (style.BLUE, style.VERMILLION, style.GREEN)
 _DASHES = ("-", "--", "-")
 _BINS_PER_DECADE = 10
@@ -278,6 +281,46 @@ def plot_spectrum(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
     style.legend_on_top(ax, columnspacing=1.4)
     style.label(ax, "", "frequency [Hz]", "power spectral density [arcsec²/Hz]")
     return ax
+
+
+def plot_thermal(error: ThermalError) -> Figure:
+    """Temperature of the optics over time, and the attitude error that it causes: across the
+    boresight and about it, with one camera for all temperatures and with effects aboard.
+    """
+    figure = style.new_figure(7.2, 4.4)
+    above = style.dress(style.place(figure, 0.95, 3.1, 6.05, 1.0), grid=True)
+    below = style.dress(style.place(figure, 0.95, 0.5, 6.05, 2.0), grid=True)
+    time, unit = error.profile.time_s, "s"
+    if np.ptp(time) > _MINUTES * 60.0:
+        time, unit = time / 60.0, "min"
+    style.band(above, time[[0, -1]], error.lowest_c, error.highest_c, style.SKY, alpha=0.35)
+    above.plot(time, error.profile.temperature_c, color=style.INK, lw=1.4)
+    above.axhline(error.aligned_c, color=style.VERMILLION, lw=1.0, ls=":")
+    words = (
+        style.key("temperature", style.INK),
+        style.key("seen by the calibration", style.SKY, lw=6.0, alpha=0.35),
+        style.key("at alignment", style.VERMILLION, ls=":"),
+    )
+    style.legend_on_top(above, handles=words, columnspacing=1.4)
+    style.label(above, "", "", "temperature\n[°C]")
+    for sizes, look, aboard in (
+        (error.model_arcsec, "-", "model"),
+        (error.effects_arcsec, "--", "effects"),
+    ):
+        across = np.sqrt(np.mean(sizes[:, :2] ** 2, axis=1))
+        for values, colour, axis in (
+            (across, style.BLUE, "across the boresight"),
+            (sizes[:, 2], style.ORANGE, "roll"),
+        ):
+            below.plot(time, values, look, color=colour, lw=1.4, label=f"{axis}, {aboard} aboard")
+    for ax in (above, below):
+        ax.set_xlim(time[0], time[-1])
+        style.label_distance(ax, x_in=0.24, y_in=0.4)
+    above.tick_params(axis="x", labelbottom=False)
+    below.set_ylim(bottom=0.0)
+    style.legend_on_top(below, columnspacing=1.4, ncols=2)
+    style.label(below, "", f"time [{unit}]", "1 sigma after\nalignment [arcsec]")
+    return figure
 
 
 def plot_error_series(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:

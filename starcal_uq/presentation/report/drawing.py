@@ -21,6 +21,7 @@ from starcal_uq.presentation.figures.propagation import (
     plot_distortion_curve,
     plot_field_map,
     plot_glance,
+    plot_thermal,
 )
 from starcal_uq.presentation.figures.style import figure_of, label, new_axes, svg_bytes
 from starcal_uq.presentation.report.results import Results
@@ -36,7 +37,7 @@ AFTER_SAMPLING = (
     "price_of_coupling",
     "distortion_curve",
 )
-AFTER_PROPAGATION = ("field_map",)
+AFTER_PROPAGATION = ("field_map", "thermal")
 AFTER_DIAGNOSIS = ("glance", "misfit", "attitude")
 AFTER_BUDGET = ("budget",)
 # The frames of a run from images stand among the figures by this name: a piece of a page, not a
@@ -96,6 +97,8 @@ def _figure(results: Results, name: str) -> Any:
         return figure_of(plot_couplings(results.coupling))
     if name == "attitude" and results.attitude is not None:
         return figure_of(plot_attitude(results.attitude))
+    if name == "thermal" and results.attitude is not None and results.attitude.thermal is not None:
+        return plot_thermal(results.attitude.thermal)
     if name == "field_map" and results.field_map is not None:
         return plot_field_map(results.field_map)
     if name == "distortion_curve" and results.distortion_curve is not None:

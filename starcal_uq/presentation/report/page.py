@@ -23,6 +23,8 @@ from starcal_uq.presentation.words.propagation import (
     onboard_sentence,
     onboard_table,
     one_number_sentence,
+    thermal_table,
+    thermal_text,
 )
 
 _MARKS = {Level.PASS: "✓", Level.WARN: "!", Level.FAIL: "✗"}
@@ -64,6 +66,7 @@ def context(results: Results) -> AnyDict:
     trust = verdict.of(Question.TRUSTWORTHY)
     usable, unusable = summary.uses(results)
     provenance = (post or cal).provenance
+    thermal = None if results.attitude is None else results.attitude.thermal
     return {
         "title": (results.truth or cal.nominal).name or results.name,
         "run_name": results.name,
@@ -106,6 +109,8 @@ def context(results: Results) -> AnyDict:
         "onboard_table": None
         if results.attitude is None or not results.attitude.variants
         else onboard_table(results.attitude),
+        "thermal_table": None if thermal is None else thermal_table(thermal),
+        "thermal_sentence": "" if thermal is None else thermal_text(thermal),
         "onboard_sentence": "" if results.attitude is None else onboard_sentence(results.attitude),
         "one_number_sentence": ""
         if results.attitude is None

@@ -37,6 +37,7 @@ from starcal_uq.propagation.distortion import DistortionCurve
 from starcal_uq.propagation.field import FieldMap
 from starcal_uq.propagation.onboard_error import with_cross
 from starcal_uq.propagation.spectrum import ErrorSpectrum
+from starcal_uq.propagation.thermal import ThermalError
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.verdict.remedies import Place
@@ -162,7 +163,8 @@ def attitude_text(error: AttitudeError) -> str:
     misfit adds.
     """
     parts = (agreement_text(error.agreement), one_number_sentence(error), alignment_sentence(error))
-    return " ".join(filter(None, (*parts, onboard_sentence(error), misfit_sentence(error))))
+    warmth = "" if error.thermal is None else thermal_text(error.thermal)
+    return " ".join(filter(None, (*parts, onboard_sentence(error), warmth, misfit_sentence(error))))
 
 
 def attitude_table(error: AttitudeError) -> TextTable:
@@ -215,6 +217,46 @@ def onboard_table(error: AttitudeError) -> TextTable:
         f"Calibration's part with effects, arcsec, 1 sigma, {IF_MODEL_HOLDS}",
         "llrrrr",
     )
+
+
+def thermal_text(error: ThermalError) -> str:
+    """Temperatures, alignment, and what is left across the boresight with each onboard model."""
+    peaks = error.peak_arcsec("model"), error.peak_arcsec("effects")
+    sizes = [
+        f"{significant(float(with_cross(own.rest_arcsec)[3]))} arcsec rms (largest "
+        f"{significant(float(with_cross(peak)[3]))})"
+        for own, peak in zip((error.model, error.effects), peaks, strict=True)
+    ]
+    words = (
+        f"Over {error.profile.name}, {fixed(error.profile.temperature_c.min(), 1)} to "
+        f"{fixed(error.profile.temperature_c.max(), 1)} °C with alignment at "
+        f"{fixed(error.aligned_c, 1)} °C, "
+        f"the temperature of the optics causes {sizes[0]} across the boresight where the software "
+        "uses one camera for all temperatures, and "
+        f"{sizes[1]} where it follows the temperature."
+    )
+    if not error.outside.any():
+        return words
+    return (
+        f"{words} {percent(error.outside_share)} of the time are outside of the calibration's "
+        f"{fixed(error.lowest_c, 1)} to {fixed(error.highest_c, 1)} °C, where the error assumes "
+        "that the camera keeps changing in proportion."
+    )
+
+
+def thermal_table(error: ThermalError) -> TextTable:
+    """Root mean square and peak over the profile by what the software aboard uses."""
+    rows = tuple(
+        (name if own == "model" else "", own, *map(significant, with_cross(values).tolist()))
+        for name, *both in (
+            ("common rotation", error.model.common_arcsec, error.effects.common_arcsec),
+            ("rest, rms over the profile", error.model.rest_arcsec, error.effects.rest_arcsec),
+            ("rest, largest", error.peak_arcsec("model"), error.peak_arcsec("effects")),
+        )
+        for own, values in zip(("model", "effects"), both, strict=True)
+    )
+    title = f"Temperature of the optics over {error.profile.name}, arcsec, 1 sigma"
+    return TextTable(("part", "aboard", *TOTAL_AXES), rows, title, "llrrrr")
 
 
 def coupling_text(coupling: Coupling) -> str:

@@ -17,6 +17,7 @@ from starcal_uq.runs.stored import StoredRun, writing
 if TYPE_CHECKING:
     from starcal_uq.budgeting.file import BudgetFile
     from starcal_uq.budgeting.result import Budget
+    from starcal_uq.propagation.thermal import TemperatureProfile
 
 
 @bounded
@@ -27,6 +28,7 @@ def budget(
     *,
     file: BudgetFile | PathLike | None = None,
     confidence: float | None = None,
+    temperature_profile: TemperatureProfile | PathLike | None = None,
     seed: int = 0,
     force: bool = False,
 ) -> Budget:
@@ -38,7 +40,7 @@ def budget(
 
     Parameters
     ----------
-    file, confidence, seed
+    file, confidence, temperature_profile, seed
         As for `starcal_uq.budget`.
     force : bool
         Whether a budget that was made with another file goes. It is kept as ``budget-1.csv``,
@@ -62,9 +64,13 @@ def budget(
         attitude,
         file=stated,
         confidence=confidence,
+        temperature_profile=temperature_profile,
         seed=seed,
     )
-    with run._step("budget", seed, {"file": file, "confidence": confidence}) as files:
+    settings = {"file": file, "confidence": confidence}
+    if temperature_profile is not None:
+        settings["temperature_profile"] = made.provenance.settings["temperature_profile"]
+    with run._step("budget", seed, settings) as files:
         made.save(files.budget)
         if not force and run.has("budget") and not _of_one_file(made, run.error_budget):
             shutil.copyfile(

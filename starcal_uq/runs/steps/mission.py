@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.field import FieldMap
     from starcal_uq.propagation.spectrum import ErrorSpectrum
+    from starcal_uq.propagation.thermal import TemperatureProfile
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,7 @@ def propagate(
     alignment: str | PathLike = "random",
     alignment_frames: int | None = None,
     onboard: OnboardModel = "model",
+    temperature_profile: TemperatureProfile | PathLike | None = None,
     force: bool = False,
 ) -> tuple[AttitudeError, FieldMap, ErrorSpectrum | None]:
     """Carry the posterior through QUEST on the observed frames or a mission's, and over the
@@ -116,6 +118,8 @@ def propagate(
         Number of frames of the random sky; 100 by default.
     onboard : {"model", "effects"}
         What the mission's software uses: parameters of the camera alone, or effects as well.
+    temperature_profile : TemperatureProfile or path, optional
+        Temperatures of the optics over an orbit; the error over it is written as well.
     force : bool
         Whether to replace the attitude error of before.
     """
@@ -146,6 +150,7 @@ def propagate(
         alignment_frames=alignment_frames,
         onboard=onboard,
         calibrated=run.observations,
+        temperature_profile=temperature_profile,
     )
     fields = field_map(posterior, run.observations)
     spectrum = None
@@ -168,6 +173,8 @@ def propagate(
         "alignment_frames": alignment_frames,
         "onboard": onboard,
     }
+    if error.thermal is not None:
+        settings["temperature_profile"] = error.thermal.profile.name
     with run._step("propagate", seed, settings) as files:
         save_results(
             files,
@@ -177,6 +184,7 @@ def propagate(
             attitude=error,
             field_map=fields,
             spectrum=spectrum,
+            thermal=error.thermal,
         )
     # The file of the attitude error holds less than the result, and a report shows what is in
     # the file.
