@@ -214,10 +214,11 @@ def _of_partitions(
     progress: Progress | None,
 ) -> Calibration:
     """The calibration of all partitions, from that of a sample of their frames."""
-    sample = obs.sample()
+    sample, composed = obs.sample(), settings.composed
+    plain = settings.changed(likelihood=replace(composed, terms=()), effects="none")
     # What is compiled is compiled here, before other processes ask for it.
     with paths.using(paths.chosen(obs.n_stars)):
-        start = calibrate(sample, camera, settings, model=camera.distortion)
+        start = calibrate(sample, camera, plain, model=camera.distortion)
     with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
         return calibrate_partitions(
             obs,
@@ -226,6 +227,7 @@ def _of_partitions(
             processes,
             max_iterations=settings.max_iterations,
             duplicates=settings.duplicates,
+            effects=None if composed.effects is None else composed.effects.names,
             progress=progress,
         )
 

@@ -60,7 +60,6 @@ RULES = (
     Rule("star_errors", (True,), "method", (None, "efficient")),
     Rule("effects", (), "method", (None, "efficient")),
     Rule("effects", (), "star_errors", (None,)),
-    Rule("effects", (), "partitioned", (None,)),
     Rule("relative_attitudes", (), "mount", (None,)),
     Rule("mount_sigma_arcsec", (), "mount", ("fixed",)),
     *(

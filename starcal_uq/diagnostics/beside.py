@@ -52,7 +52,8 @@ def with_effects_of(
     """
     assert cal.effects is not None
     seen = None if obs.n_frames == whole.n_frames else obs
-    known = effects_of(whole, cal.camera, seen=seen, zeniths=cal.effects.zeniths)
+    held = cal.effects
+    known = effects_of(whole, cal.camera, seen=seen, zeniths=held.zeniths, extent=held.extent)
     effects = [known[name] for name in cal.effects.names if name in known]
     frames = StarFrames.from_observations(obs, axes=True)
     ratio = {effect.name: cal.effects.ratio(cal.sigma)[effect.name] for effect in effects}
@@ -79,18 +80,7 @@ def normals_beside(obs: Observations, cal: Calibration) -> FrameNormals:
     as the calibration has them.
     """
     exact = with_effects_of(obs, cal, quaternion_to_rotation(cal.quaternions), obs)
-    state, _ = exact.profile(cal.theta, exact.rotations)
-    _, found = exact.conditioned(state, state.e[None])
-    shared = exact.shifts(state, replace(found, frame=0.0 * found.frame))
-    e = exact.project_out(state, state.e[None]) - shared
-    columns = np.concatenate([e, exact.slopes(cal.theta, state)])
-    gram = products_by_frame(exact.frames, columns, columns)
-    cross = products_by_frame(exact.frames, exact.columns.frame, columns)
-    solved = exact.solved
-    left = solved.frame_root[:, :, None] * (np.swapaxes(solved.frame_vectors, 1, 2) @ cross)
-    gram -= np.swapaxes(left, 1, 2) @ left
-    dof = 2 * exact.frames.sizes - 3
-    return FrameNormals.of(cal.theta, gram, state.log_determinant, state.rotations, dof)
+    return FrameNormals.beside(exact, cal.theta)
 
 
 def by_frame(frames: StarFrames, columns: FloatArray) -> tuple[FloatArray, IntArray]:

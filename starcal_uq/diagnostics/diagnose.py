@@ -253,7 +253,9 @@ def diagnose(
     models = rivals(cal.camera.distortion) if models is None else models
     obs, whole = weighed(obs, cal), cal
     if obs.n_frames < whole.n_frames and whole.partitions is not None:
-        cal = calibrate(obs, whole.nominal, model=whole.nominal.distortion, duplicates="keep")
+        effects = whole.effects.names if whole.effects is not None else ()
+        model = whole.nominal.distortion
+        cal = calibrate(obs, whole.nominal, model=model, effects=effects, duplicates="keep")
     found = jackknife_of_all(whole) or _jackknife(obs, cal)
     step(1, 4)
     predictive = predictive_check(obs, whole, post, seed=seed)

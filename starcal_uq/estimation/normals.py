@@ -7,7 +7,8 @@ order, without another fit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,8 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.residual_map import FrameScatter
+from starcal_uq.likelihood.effect_sums import EffectLikelihood
+from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.sums import frame_normals
@@ -81,6 +84,37 @@ class FrameNormals:
         gram, attitudes = frame_normals(frames, model, theta, start)
         own = attitudes.log_determinant, attitudes.rotations, 2 * frames.sizes - 3
         return cls.of(theta, gram, *own, scale)
+
+    @classmethod
+    def beside(
+        cls, exact: EffectLikelihood, theta: FloatArray, scale: FloatArray | None = None
+    ) -> FrameNormals:
+        """Normal equations at theta (p,) beside effects.
+
+        Those of frames are marginalised in each; those of the run and of stars, which frames share,
+        are at their best.
+        """
+        state, _ = exact.profile(theta, exact.rotations)
+        _, found = exact.conditioned(state, state.e[None])
+        shared = exact.shifts(state, replace(found, frame=0.0 * found.frame))
+        e = exact.project_out(state, state.e[None]) - shared
+        columns = np.concatenate([e, exact.slopes(theta, state)])
+        gram = products_by_frame(exact.frames, columns, columns)
+        cross = products_by_frame(exact.frames, exact.columns.frame, columns)
+        solved = exact.solved
+        left = solved.frame_root[:, :, None] * (np.swapaxes(solved.frame_vectors, 1, 2) @ cross)
+        gram -= np.swapaxes(left, 1, 2) @ left
+        dof = 2 * exact.frames.sizes - 3
+        return cls.of(theta, gram, state.log_determinant, state.rotations, dof, scale)
+
+    @classmethod
+    def joined(cls, parts: Sequence[FrameNormals]) -> FrameNormals:
+        """Those of all frames of several, in the same units."""
+        own = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("matrices", "slopes", "squares", "log_determinant", "rotations", "dof")
+        }
+        return replace(parts[0], **own)
 
     @classmethod
     def of(

@@ -29,7 +29,9 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, IntArray, Progress
 from starcal_uq.estimation.assemble import check_noise
 from starcal_uq.estimation.duplicates import repeated
+from starcal_uq.estimation.effects import Around, with_effects_of
 from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.estimation.partitioned_effects import Beside, FileStars
 from starcal_uq.estimation.residual_map import (
     OUTLIER_SIGMA,
     FrameScatter,
@@ -144,14 +146,20 @@ def _residuals(
     theta: FloatArray,
     scale: float,
     n_stars: int,
+    beside: Beside | None,
     part: Partition,
 ) -> _Residuals:
-    obs = reader.load(part)
+    rests = [] if beside is None else beside.rests(part)
+    obs = reader.load(part) if beside is None else beside.cleared(rests)
     likelihood = MarginalLikelihood(obs, camera.distortion)
     whole, e = likelihood.frames, np.empty((2, obs.n_stars))
     normal, attitudes = settled_sums(
         whole, camera.distortion, theta, likelihood.start_rotations(theta), e
     )
+    if rests:
+        frames = FrameNormals.joined([rest.normals(theta) for _, rest in rests])
+        slopes, matrix = frames.slopes.sum(axis=0), frames.matrix
+        normal = replace(normal, gradient=-slopes, matrix=matrix)
     stated = obs.sigma_or_one
     size = np.max(np.abs(e), axis=0) / scale
     worst = int(np.argmax(size))
@@ -188,12 +196,21 @@ def _added_residuals(parts: Sequence[_Residuals]) -> _Residuals:
 
 
 def _scatter(
-    reader: PartitionReader, model: str, theta: FloatArray, whole: Normal, part: Partition
+    reader: PartitionReader,
+    model: str,
+    theta: FloatArray,
+    whole: Normal,
+    beside: Beside | None,
+    part: Partition,
 ) -> FrameScatter:
-    likelihood = MarginalLikelihood(reader.load(part), model)
-    frames, scale = likelihood.frames, 1.0 / np.sqrt(np.diag(whole.matrix))
-    near = frame_sums(frames, model, theta, likelihood.start_rotations(theta))[1].at(theta)
+    scale = 1.0 / np.sqrt(np.diag(whole.matrix))
     scaled = whole.matrix * np.outer(scale, scale), -whole.gradient * scale
+    if beside is not None:
+        own = [rest.normals(theta, scale) for _, rest in beside.rests(part)]
+        return FrameNormals.joined(own).scatter(scaled)
+    likelihood = MarginalLikelihood(reader.load(part), model)
+    frames = likelihood.frames
+    near = frame_sums(frames, model, theta, likelihood.start_rotations(theta))[1].at(theta)
     return FrameNormals.around(frames, model, theta, near, scale).scatter(scaled)
 
 
@@ -229,12 +246,14 @@ def calibrate_partitions(
     *,
     max_iterations: int,
     duplicates: str,
+    effects: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
     """Refine a calibration of a sample of frames on all partitions.
 
     `start`: calibration of the sample by the ``efficient`` method; its estimate from interstar
-    angles stays. `cluster`: processes that read the partitions.
+    angles stays. `cluster`: processes that read the partitions. `effects`: those beyond the camera;
+    those that the data ask for where it is empty, none where it is None.
     `duplicates`: what to do with frames that hold the same pixels as another. `progress`: called
     with (partitions done, partitions) in every pass. CalibrationError when there is no estimate.
     RepeatedFramesError when frames hold the same pixels and are refused. ObservationError for bad
@@ -294,16 +313,10 @@ def calibrate_partitions(
     # As in `assemble`: the rotation-volume term moves the maximum by about 0.01 sigma of a small
     # table.
     theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
-    camera = start.nominal.with_theta(theta)
-    scale = sigma * float(np.sqrt(dof / (2.0 * n_stars)))
-    rest = total(partial(_residuals, reader, camera, theta, scale, n_stars), _added_residuals)
-    scatter = total(partial(_scatter, reader, model, theta, rest.normal.normal), sum_of)
     likelihood = MarginalLikelihood(sample, model)
     state, _ = likelihood.profile(theta)
-    residuals = likelihood.frames.in_pixels(state.e).T
-    status = check_noise(float(np.sqrt(np.mean(residuals**2))), camera, status)
     record = provenance(None, start.provenance.settings, joined_hash(seen.hashes))
-    partitions = {
+    about = {
         "folder": str(obs.folder),
         "n_files": len(obs.parts),
         "n_stars": n_stars,
@@ -314,7 +327,7 @@ def calibrate_partitions(
         # By which another folder that has some of the files is known.
         "data_sha256": sorted(seen.hashes),
     }
-    return start.moved(
+    cal = start.moved(
         theta,
         sigma,
         dof,
@@ -322,17 +335,35 @@ def calibrate_partitions(
         covariance=best.covariance,
         stages=(*start.stages[:-1], sampled, stage),
         quaternions=rotation_to_quaternion(state.rotations),
-        residuals_px=residuals,
-        chi2=float(np.sum(rest.sums.chi2)),
+        residuals_px=likelihood.frames.in_pixels(state.e).T,
+        chi2=best.sum_of_squares,
         information=best.information,
+        compressed=compressed,
+        provenance=record.adding(partitions=about, kernels=kernels),
+        fingerprints=None,
+    )
+    beside = None
+    if effects is not None:
+        n = dof + len(first)
+        stars = FileStars(obs, sample, Around.of(cal), n, effects, total)
+        cal = with_effects_of(stars, cal, effects)
+        if cal.effects is not None and cal.effects.names:
+            held = replace(cal.effects, node_grams=cal.effects.node_grams[:0])
+            beside = Beside(stars.files, held, cal.theta, cal.sigma)
+    camera, theta, sigma = cal.camera, cal.theta, cal.sigma
+    scale = sigma * float(np.sqrt(dof / (2.0 * n_stars)))
+    looking = partial(_residuals, reader, camera, theta, scale, n_stars, beside)
+    rest = total(looking, _added_residuals)
+    scatter = total(partial(_scatter, reader, model, theta, rest.normal.normal, beside), sum_of)
+    size = float(np.sqrt(np.mean(cal.residuals_px**2)))
+    richer = _stepped(camera, rest.richer, sigma**2)
+    return replace(
+        cal,
+        status=check_noise(size, camera, cal.status),
+        chi2=float(np.sum(rest.sums.chi2)) if beside is None else cal.chi2,
         rotation_per_theta=rest.response / n_frames,
         attitude_noise=rest.inverse / n_frames * sigma**2,
-        compressed=compressed,
-        provenance=record.adding(partitions=partitions, kernels=kernels),
-        fingerprints=None,
-        partitions=replace(
-            rest.sums, richer=_stepped(camera, rest.richer, sigma**2), scatter=scatter
-        ),
+        partitions=replace(rest.sums, richer=richer, scatter=scatter),
     )
 
 

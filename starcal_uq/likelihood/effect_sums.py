@@ -94,11 +94,6 @@ class Columns:
         """Columns (m, 2, n) of the run, attitudes projected out."""
         return self.attitudes.removed_from(self.raw) if len(self.raw) else self.raw
 
-    @cached_property
-    def run_turns(self) -> FloatArray:
-        """Turns (m, 3, K) of the frames that were in them, rad."""
-        return self.attitudes.coefficients(self.raw) * self.turning[:, None, None]
-
     def cross(self, x: FloatArray) -> Cross:
         """Products with columns x (q, 2, n) whose attitudes are projected out."""
         size = 2 * self.frames.n_stars
@@ -381,6 +376,15 @@ class Solved:
         cross[:, place] -= self.own @ mean
         return replace(self, cross=cross, outer=outer)
 
+    def with_known(self, m: int) -> Solved:
+        """The same with m coefficients of the run that are known."""
+        k, c, _ = self.frame_run.shape
+        none = np.zeros((m, len(self.outer)))
+        frame_run = np.zeros((k, c, m))
+        return replace(
+            self, frame_run=frame_run, own=np.zeros((m, m)), cross=none, run_root=np.zeros(m)
+        )
+
     @cached_property
     def run_factor(self) -> FloatArray:
         """Cholesky factor (m, m) of ``1 + rho N`` of the run."""
@@ -437,7 +441,8 @@ class EffectLikelihood(MarginalLikelihood):
 
     Coefficients are linear over fractions of a pixel, and their columns and normal equations are
     those at the estimate. What they are expected to be, `mean` (m,) of those of the run, is taken
-    off the images in `frames`; all others here are differences from that.
+    off the images in `frames`; all others here are differences from that. Where those of the run are
+    `given`, from more frames than these, there is no difference.
 
     `frames`: data, with any weights and axes of the noise. `ratio`: square of every effect's scale
     in units of `sigma` squared. `theta` (p,): estimate, px units. `rotations` (K, 3, 3): attitudes
@@ -453,23 +458,29 @@ class EffectLikelihood(MarginalLikelihood):
         theta: FloatArray,
         rotations: FloatArray,
         sigma: float = 1.0,
+        given: FloatArray | None = None,
     ) -> None:
         super().__init__(frames, model_name)
         state, _ = self.profile(theta, rotations)
         self.effects = tuple(effect for effect in effects if effect.name in ratio)
         run = [effect for effect in self.effects if effect.grouping == "run"]
-        self.mean, self.pull = expected(run, ratio), pull_of(run)
-        if self.mean.any():
+        self.mean, self.pull = expected(run, ratio) if given is None else given, pull_of(run)
+        if self.mean.any() or given is not None:
             seen = Columns.of(self.effects, self, state, theta, slice(None))
             shift = self.project_out(state, np.tensordot(self.mean, seen.raw, 1)[None])[0]
             shift = frames.in_pixels(shift)
             self.frames = replace(frames, pixel=np.ascontiguousarray(frames.pixel - shift))
             state, _ = self.profile(theta, state.rotations)
         self.use_rotations(state.rotations)
-        sums = EffectSums(self.effects, theta, sigma)
+        # What frames share may be known: products of its columns are not needed then.
+        free = [e for e in self.effects if given is None or e.grouping != "run"]
+        sums = EffectSums(free, theta, sigma)
         nothing = np.zeros((0, 2, frames.n_stars))
         self.columns = sums.add(self, state, nothing, slice(None))
         self.solved = sums.solved(ratio)
+        if given is not None:
+            self.columns = replace(self.columns, raw=seen.raw, turning=seen.turning)
+            self.solved = self.solved.with_known(len(given))
         self._frame_root = np.sqrt(sums.ratios(ratio, "frame"))
 
     def conditioned(self, state: Profile, columns: FloatArray) -> tuple[FloatArray, Cross]:
@@ -497,7 +508,9 @@ class EffectLikelihood(MarginalLikelihood):
 
     def turns(self, state: Profile, found: Cross) -> FloatArray:
         """Rotation vectors (q, 3, K) of the frames that such shifts cause, rad."""
-        own = np.einsum("mq,mik->qik", found.run, self.columns.run_turns)
+        columns = self.columns
+        raw = np.tensordot((found.run * columns.turning[:, None]).T, columns.raw, 1)
+        own = columns.attitudes.coefficients(raw)
         own += np.einsum("kcq,cik->qik", found.frame, self.columns.frame_turns)
         if self.columns.n_stars:
             own += self.attitude_response(state, self._of_stars(found))

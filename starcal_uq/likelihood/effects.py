@@ -22,11 +22,13 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import (
     TIME_DEGREE,
     Covariates,
+    Extent,
     Shape,
     View,
     axes_shape,
     frame_shapes,
     magnitude_shape,
+    nights_of,
     over_time,
     phase_shape,
     seconds_utc,
@@ -45,8 +47,6 @@ _ORDER, _SMOOTHNESS = 8, 1.5
 _GRID = 24
 # Fewer stars than this that are seen twice do not tell their errors from noise.
 _FEWEST_STARS = 5
-# Hours without a frame that separate two nights.
-_NIGHT_HOURS = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +75,15 @@ def effects_of(
     *,
     seen: Observations | None = None,
     zeniths: Zeniths | None = None,
+    extent: Extent | None = None,
 ) -> dict[str, Effect]:
     """Every effect that a table allows, by name; its scale is px at the corner of the field.
 
     `camera`: the estimate. `seen`: other frames that the same effects are wanted on. `zeniths`:
-    those of the frames, for the effect of air.
+    those of the frames, for the effect of air. `extent`: that of all frames, of which the table is
+    a part; stars, which parts share, have no effect then.
     """
-    known = Covariates.of(obs, seen)
+    known = Covariates.of(obs, seen, extent)
     corner = corner_unit(camera)
     fixed = place_effects(camera)
     found = [
@@ -95,7 +97,7 @@ def effects_of(
         found.append(
             _run("time", over_time(known.clock, known.called), np.outer(corner, decay).ravel())
         )
-    nights = None if seen is not None else _nights(obs)
+    nights = None if seen is not None else _nights(obs, extent)
     if nights is not None:
         found.append(_run("epoch", _moving("epoch", nights), np.tile(corner, len(nights))))
     found.append(fixed["phase"])
@@ -103,7 +105,7 @@ def effects_of(
         found.append(zenith_effect(obs if seen is None else seen, zeniths))
     if known.magnitude is not None:
         found.append(_run("magnitude", magnitude_shape(known.magnitude, camera)))
-    if seen is None:
+    if seen is None and extent is None:
         model = StarModel(obs, float(camera.focal_px))
         if model.n_recurring >= _FEWEST_STARS or np.any(model.stated2 > 0.0):
             shape = Shape("directions of the stars", "star", 2, lambda view: view.uv[None][:0])
@@ -153,14 +155,13 @@ def _moving(against: str, weights: FloatArray) -> Shape:
     return Shape(f"change of x0, y0 and f with {against}", against, 3 * len(weights), columns)
 
 
-def _nights(obs: Observations) -> FloatArray | None:
+def _nights(obs: Observations, extent: Extent | None) -> FloatArray | None:
     """Membership (E, N) of the stars in nights; None where there is one."""
     seconds = None if obs.time_utc is None else seconds_utc(obs.time_utc)
-    if seconds is None:
+    nights = nights_of(seconds) if extent is None else extent.nights_s
+    if seconds is None or len(nights) < 2:
         return None
-    moments, member = np.unique(seconds, return_inverse=True)
-    night = np.concatenate([[0], np.cumsum(np.diff(moments) > 3600.0 * _NIGHT_HOURS)])
-    return None if night[-1] == 0 else np.eye(int(night[-1]) + 1)[:, night[member]]
+    return np.eye(len(nights))[:, np.searchsorted(nights[1:, 0], seconds, side="right")]
 
 
 def field_effect(camera: Camera) -> Effect:

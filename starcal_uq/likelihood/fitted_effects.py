@@ -11,6 +11,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.likelihood.compressed import CompressedLikelihood
 from starcal_uq.likelihood.effects import Effect, effects_of
+from starcal_uq.likelihood.shapes import Extent
 from starcal_uq.likelihood.zenith import Zeniths
 
 if TYPE_CHECKING:
@@ -124,6 +125,7 @@ class Effects(Shown):
     frame_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     stars: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     star_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    extent: Extent | None = None  # Of all frames, where their residuals are those of a sample
 
     SHAPES: ClassVar[Shapes] = {
         "coefficients": ("m",),
@@ -165,7 +167,7 @@ class Effects(Shown):
 
         LookupError for one that the table does not allow.
         """
-        known = effects_of(obs, camera, zeniths=self.zeniths)
+        known = effects_of(obs, camera, zeniths=self.zeniths, extent=self.extent)
         return [known[n] for n in self.names if n != "zenith" or self.zeniths is not None]
 
     def to_dataframe(self) -> pd.DataFrame:

@@ -8,10 +8,10 @@ scale and their overlap do not matter here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from starcal_uq.camera.distortion import (
     shared_names,
 )
 from starcal_uq.core.constants import LIGHT_SPEED_KM_S
-from starcal_uq.core.types import FloatArray, IntArray, StrArray, floats
+from starcal_uq.core.types import FloatArray, IntArray, Shapes, StrArray, floats
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ _RADIAL_DEGREE, _TWIST_DEGREE = 6, 3
 TIME_DEGREE = 3
 _STARS_PER_CELL = 25.0
 MAX_CELLS = 8
+# Hours without a frame that separate two nights.
+_NIGHT_HOURS = 4.0
 # Coordinates of shapes that keep their place in the field, and those of the directions of one
 # frame.
 IN_FIELD = ("radius", "azimuth", "field", "field cells")
@@ -124,6 +126,77 @@ def shapes(
     return (*found, _cells(obs, camera, max_cells))
 
 
+def nights_of(seconds: FloatArray | None) -> FloatArray:
+    """First and last moment (E, 2) of every night in which there are frames."""
+    if seconds is None or not len(seconds):
+        return np.zeros((0, 2))
+    moments = np.unique(seconds)
+    first = np.flatnonzero(np.diff(moments) > 3600.0 * _NIGHT_HOURS) + 1
+    return np.stack([moments[[0, *first]], moments[[*(first - 1), -1]]], axis=1)
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Covariates of all stars of a table, which its parts are standardised by."""
+
+    # `temperature_c`, `magnitude` (3,): number of stars that state it, mean and standard deviation
+    temperature_c: FloatArray
+    magnitude: FloatArray
+    nights_s: FloatArray  # (E, 2): first and last moment of every night, seconds since 1970
+
+    SHAPES: ClassVar[Shapes] = {
+        "temperature_c": (3,),
+        "magnitude": (3,),
+        "nights_s": ("e", 2),
+    }
+
+    @classmethod
+    def of(cls, obs: Observations) -> Extent:
+        """That of a table."""
+        seconds = None if obs.time_utc is None else seconds_utc(obs.time_utc)
+        return cls(_moments(obs.temperature_c), _moments(obs.mag), nights_of(seconds))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Extent]) -> Extent:
+        """That of all parts."""
+        nights = np.concatenate([part.nights_s for part in parts])
+        nights = nights[np.argsort(nights[:, 0])]
+        ends = np.maximum.accumulate(nights[:, 1])
+        first = np.flatnonzero(nights[1:, 0] - ends[:-1] > 3600.0 * _NIGHT_HOURS) + 1
+        if len(nights):
+            nights = np.stack([nights[[0, *first], 0], ends[[*(first - 1), -1]]], axis=1)
+        temperature = _joined_moments([part.temperature_c for part in parts])
+        return cls(temperature, _joined_moments([part.magnitude for part in parts]), nights)
+
+    @property
+    def warmth(self) -> tuple[float, float]:
+        """Mean and standard deviation of the temperature, degC; NaN where there is none."""
+        return float(self.temperature_c[1]), float(self.temperature_c[2])
+
+    @property
+    def time_s(self) -> tuple[float, float]:
+        """First and last moment, seconds since 1970; NaN where there are no times."""
+        if not len(self.nights_s):
+            return np.nan, np.nan
+        return float(self.nights_s[0, 0]), float(self.nights_s[-1, 1])
+
+
+def _moments(values: FloatArray | None) -> FloatArray:
+    known = np.zeros(0) if values is None else values[np.isfinite(values)]
+    if not len(known):
+        return np.array([0.0, np.nan, np.nan])
+    return np.array([len(known), known.mean(), known.std()])
+
+
+def _joined_moments(parts: Sequence[FloatArray]) -> FloatArray:
+    counts, means, spreads = np.array([part for part in parts if part[0] > 0.0]).reshape(-1, 3).T
+    if not len(counts):
+        return np.array([0.0, np.nan, np.nan])
+    mean = float(np.average(means, weights=counts))
+    square = float(np.average(spreads**2 + (means - mean) ** 2, weights=counts))
+    return np.array([counts.sum(), mean, np.sqrt(square)])
+
+
 @dataclass(frozen=True)
 class Covariates:
     """What shapes may change with, of every star (N,), standardised; None where nothing varies.
@@ -138,14 +211,20 @@ class Covariates:
     magnitude: FloatArray | None
 
     @classmethod
-    def of(cls, obs: Observations, seen: Observations | None = None) -> Covariates:
+    def of(
+        cls,
+        obs: Observations,
+        seen: Observations | None = None,
+        extent: Extent | None = None,
+    ) -> Covariates:
         """Those of a table, or of other frames on which its shapes are wanted.
 
         What these do not state is drawn from the table: the time of a frame and its temperature
-        together, the magnitude of a star by itself.
+        together, the magnitude of a star by itself. `extent`: that of all frames, of which the table
+        is a part; the order of the frames is no clock then.
         """
         seen = obs if seen is None else seen
-        clock, called = run_clock(obs)
+        clock, called = run_clock(obs) if extent is None else (_clock_in(obs, extent), "time")
         like: Any = slice(None)
         star = like
         if seen is not obs:
@@ -154,11 +233,14 @@ class Covariates:
             like = obs.frame_starts[frame]
             clock = None if clock is None else clock[like]
             star = _drawn(rng, obs.n_stars, seen.n_stars)
+        warmth, magnitude = (
+            (None, None) if extent is None else (extent.temperature_c[1:], extent.magnitude[1:])
+        )
         return cls(
             clock,
             called,
-            _standardised(obs.temperature_c, seen.temperature_c, like),
-            _standardised(obs.mag, seen.mag, star),
+            _standardised(obs.temperature_c, seen.temperature_c, like, warmth),
+            _standardised(obs.mag, seen.mag, star, magnitude),
         )
 
 
@@ -198,6 +280,15 @@ def run_clock(obs: Observations) -> tuple[FloatArray | None, str]:
     return clock, called
 
 
+def _clock_in(obs: Observations, extent: Extent) -> FloatArray | None:
+    """The clock of a part of a table; None where no frame of it states a time."""
+    seconds = None if obs.time_utc is None else seconds_utc(obs.time_utc)
+    first, last = extent.time_s
+    if seconds is None or not last > first:
+        return None
+    return 2.0 * (seconds - first) / (last - first) - 1.0
+
+
 def seconds_utc(times: StrArray) -> FloatArray | None:
     """Seconds since 1970 of times (N,); None where one of them cannot be read."""
     unique, inverse = np.unique(times, return_inverse=True)
@@ -228,17 +319,23 @@ def _drawn(rng: np.random.Generator, n: int, size: int) -> IntArray:
 
 
 def _standardised(
-    table: FloatArray | None, seen: FloatArray | None, rows: Any
+    table: FloatArray | None,
+    seen: FloatArray | None,
+    rows: Any,
+    moments: FloatArray | None = None,
 ) -> FloatArray | None:
-    """A quantity of the stars seen by mean and spread of the table's, and within its range; zero
-    where unknown.
+    """A quantity of the stars seen by mean and spread of the table's, or by these moments (2,), and
+    within its range; zero where unknown.
 
     Where it is not stated, it is taken from these rows of the table. None where nothing varies.
     """
-    if table is None or not (spread := float(np.nanstd(table))) > _LEAST_SPREAD:
+    if table is None:
+        return None
+    mean, spread = (np.nanmean(table), np.nanstd(table)) if moments is None else moments
+    if not float(spread) > _LEAST_SPREAD:
         return None
     values = table[rows] if seen is None else np.clip(seen, np.nanmin(table), np.nanmax(table))
-    z: FloatArray = np.nan_to_num((values - np.nanmean(table)) / spread)
+    z: FloatArray = np.nan_to_num((values - mean) / spread)
     return z
 
 

@@ -89,6 +89,10 @@ class Zeniths:
         """Zeniths of the frames (K, 3), ICRS axes."""
         return np.asarray(np.einsum("kj,kjx->kx", self._by_frame(self.places), self.axes))
 
+    def seen_in(self, obs: Observations) -> Zeniths:
+        """The same place below the frames of a table."""
+        return replace(self, frame_ids=obs.frame_ids, axes=frame_axes(obs)[0])
+
     def _by_frame(self, places: FloatArray) -> FloatArray:
         return np.broadcast_to(places, (len(self.axes), 3))
 

@@ -63,13 +63,14 @@ class PartitionReader:
     Every centroid must lie on the detector of the camera. `columns` are names in the files of
     columns that are called otherwise, `meta` entries that are declared for all partitions, and
     every table goes through the picklable function `prepare`, such as one that makes directions
-    apparent.
+    apparent. `also` are columns that are read beyond those that every estimate is made of.
     """
 
     camera: Camera | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     meta: AnyDict = field(default_factory=dict)
     prepare: Callable[[Observations], Observations] | None = None
+    also: tuple[str, ...] = ()
 
     def load(
         self, part: Partition, *, check: bool = False, frames: IntArray | None = None
@@ -77,7 +78,9 @@ class PartitionReader:
         """The table of a partition with the columns that estimates are made of; of some `frames`,
         with all columns.
         """
-        only = STREAMED if self.prepare is None else (*STREAMED, "time_utc")
+        only = (*STREAMED, *self.also)
+        if self.prepare is not None and "time_utc" not in only:
+            only = (*only, "time_utc")
         columns, meta = read_table(
             part.path,
             self.camera,

@@ -84,7 +84,10 @@ class Aboard:
 
     @property
     def _is_of_posterior(self) -> bool:
-        return self.post.provenance.data_sha256 in (None, self.calibrated.data_hash)
+        made_of = self.post.provenance
+        # Of partitions, the sample that their calibration keeps stands for all.
+        known = None, self.calibrated.data_hash
+        return made_of.data_sha256 in known or made_of.partitions.get("sample_sha256") in known[1:]
 
     @cached_property
     def _run(self) -> dict[str, IntArray]:
@@ -174,7 +177,7 @@ class Aboard:
         if found is None:
             return Turns(geometry.response, {})
         camera = self.post.camera
-        here = effects_of(self.calibrated, camera, seen=frames)
+        here = effects_of(self.calibrated, camera, seen=frames, extent=found.extent)
         frame = [effect for effect in self._effects if effect.grouping == "frame"]
         shapes = [here[name].columns for name in self._run] + [e.columns for e in frame]
 

@@ -22,6 +22,7 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.presentation.report.words import data_sentence
+from tests.helpers.effects import breathing, bump, moving, sheet, table, together
 from tests.helpers.outside import campaign
 
 
@@ -39,7 +40,12 @@ def divided(obs: sc.Observations, folder: Path, edges: list[int]) -> Partitioned
     return sc.observations.open_partitions(folder)
 
 
-def assert_equal(a: sc.Calibration, b: sc.Calibration, bound: float) -> None:
+ATTITUDES = ("rotation_per_theta", "attitude_noise")
+
+
+def assert_equal(
+    a: sc.Calibration, b: sc.Calibration, bound: float, as_near: tuple[str, ...] = ATTITUDES
+) -> None:
     """Estimates within `bound` sigma, and everything that is made of all stars as near."""
     assert np.max(np.abs(a.theta - b.theta) / b.sigmas) < bound
     assert a.dof == b.dof and a.n_stars == b.n_stars and a.n_frames == b.n_frames
@@ -52,8 +58,8 @@ def assert_equal(a: sc.Calibration, b: sc.Calibration, bound: float) -> None:
         + np.random.default_rng(1).standard_normal((20, len(b.theta))) @ b.compressed.whitening.T
     )
     likelihoods = [cal.compressed.log_likelihood(points, b.sigma) for cal in (a, b)]
-    assert np.max(np.abs(likelihoods[0] - likelihoods[1])) < 1e-6
-    for name in ("rotation_per_theta", "attitude_noise"):
+    assert np.max(np.abs(likelihoods[0] - likelihoods[1])) < max(1e-6, 100.0 * bound)
+    for name in as_near:
         one, other = getattr(a, name), getattr(b, name)
         assert np.max(np.abs(one - other)) < 10 * bound * np.max(np.abs(other))
 
@@ -371,3 +377,74 @@ def test_memory_and_time_grow_with_the_partition_and_the_stars(tmp_path: Path) -
         memory.append(float(words[1]))
     assert np.log10(seconds[1] / seconds[0]) < 1.05
     assert memory[1] < 1.2 * memory[0]
+
+
+@pytest.fixture(scope="module")
+def moved(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[sc.Observations, sc.Camera, PartitionedObservations]:
+    """A campaign of three nights whose field is bent, whose frames breathe and warm up."""
+    rng, n = np.random.default_rng(3), 90
+    warm = rng.uniform(-10.0, 20.0, n)
+    shifts = together(bump(0.3), breathing(rng, n, 0.1), moving(0.02, warm - 5.0))
+    made = campaign(rng, n_frames=n, displaced=shifts)
+    times = np.array([f"2026-01-0{1 + k // 30}T0{1 + k % 8}:00:{k % 60:02d}" for k in range(n)])
+    frame = np.searchsorted(np.unique(made.columns["frame"]), made.columns["frame"])
+    obs = table(made, temperature_c=warm[frame], time_utc=times[frame])
+    folder = tmp_path_factory.mktemp("moved") / "frames"
+    return obs, sheet(made), divided(obs, folder, [0, 25, 26, 71, 90])
+
+
+# The search for many scales, most of which the data hardly tell, ends where rounding leads it.
+@pytest.mark.parametrize(
+    ("effects", "bound"),
+    [
+        ("auto", 1e-7),
+        ("field", 1e-7),
+        ("temperature,time,epoch,magnitude,phase,axes,frame", 1e-3),
+    ],
+)
+def test_effects_of_partitions_are_those_of_the_table(moved, effects: str, bound: float) -> None:
+    obs, camera, parts = moved
+    one = sc.calibrate(obs, camera, effects=effects)
+    many = sc.calibrate(parts, camera, effects=effects)
+    assert one.effects is not None and many.effects is not None
+    assert many.effects.names == one.effects.names
+    # Attitudes of a table are those of its images as they are; here, less what effects shift.
+    assert_equal(many, one, bound, as_near=())
+    noise = np.diag(one.attitude_noise)
+    np.testing.assert_allclose(np.diag(many.attitude_noise), noise, rtol=1e-4)
+    for own, other in zip(many.effects.fitted, one.effects.fitted, strict=True):
+        assert own.gain_nat == pytest.approx(other.gain_nat, abs=100.0 * bound)
+        assert own.scale_px == pytest.approx(other.scale_px, rel=100.0 * bound)
+    unit = np.sqrt(np.diag(one.effects.covariance))
+    assert (
+        np.max(np.abs(many.effects.coefficients - one.effects.coefficients) / unit) < 10.0 * bound
+    )
+    # Nodes are those of the same mixture.
+    points = one.theta + np.random.default_rng(1).standard_normal((20, 5)) * one.sigmas
+    noise = np.full(20, one.sigma)
+    apart = one.log_likelihood(points, noise) - many.log_likelihood(points, noise)
+    assert np.max(np.abs(apart)) < 100.0 * bound
+    # All frames are the sample; their images differ by the square of what effects shift.
+    assert np.max(np.abs(many.residuals_px - one.residuals_px)) < 1e-4
+    frames, own = jackknife_of_all(many), jackknife_frames(obs, one)
+    assert frames is not None
+    np.testing.assert_allclose(frames.ratio, own.ratio, rtol=2e-3)
+    # Control: without its effects the table is another one.
+    assert np.max(np.abs(sc.calibrate(obs, camera).theta - many.theta) / many.sigmas) > 0.5
+
+
+def test_effects_that_partitions_cannot_have_are_refused(moved, tmp_path: Path) -> None:
+    obs, camera, parts = moved
+    with pytest.raises(CalibrationError, match="effect 'star' needs all stars"):
+        sc.calibrate(parts, camera, effects="star")
+    shutil.copytree(parts.folder, tmp_path / "frames")
+    lacking = obs.select(obs.frame >= 71)
+    columns = {name: v for name, v in lacking.columns.items() if name != "temperature_c"}
+    last = tmp_path / "frames" / "part3.parquet"
+    sc.Observations(**columns, meta=lacking.meta).save(last, force=True)
+    some = sc.observations.open_partitions(tmp_path / "frames")
+    with pytest.raises(ObservationError, match=r"part3\.parquet: column temperature_c"):
+        sc.calibrate(some, camera, effects="temperature")
+    assert sc.calibrate(some, camera, effects="field").effects.names == ("field",)
