@@ -404,7 +404,9 @@ def moved(
         ("temperature,time,epoch,magnitude,phase,axes,frame", 1e-3),
     ],
 )
-def test_effects_of_partitions_are_those_of_the_table(moved, effects: str, bound: float) -> None:
+def test_effects_of_partitions_are_those_of_the_table(
+    moved, effects: str, bound: float, tmp_path: Path
+) -> None:
     obs, camera, parts = moved
     one = sc.calibrate(obs, camera, effects=effects)
     many = sc.calibrate(parts, camera, effects=effects)
@@ -431,6 +433,10 @@ def test_effects_of_partitions_are_those_of_the_table(moved, effects: str, bound
     frames, own = jackknife_of_all(many), jackknife_frames(obs, one)
     assert frames is not None
     np.testing.assert_allclose(frames.ratio, own.ratio, rtol=2e-3)
+    many.save(tmp_path / "cal.json")
+    again = sc.Calibration.load(tmp_path / "cal.json").effects
+    assert again is not None and again.extent is not None
+    np.testing.assert_array_equal(again.extent.nights_s, many.effects.extent.nights_s)
     # Control: without its effects the table is another one.
     assert np.max(np.abs(sc.calibrate(obs, camera).theta - many.theta) / many.sigmas) > 0.5
 
