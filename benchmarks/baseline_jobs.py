@@ -103,9 +103,9 @@ show("camera", camera)
 for name, options in {{
     "plain": {{}},
     "k1": {{"model": "k1"}},
-    "robust": {{"likelihood": "student_t"}},
-    "noise": {{"noise": "model"}},
-    "stars": {{"star_errors": True}},
+    "robust": {{"effects": "tails"}},
+    "noise": {{"effects": "noise"}},
+    "stars": {{"effects": "star"}},
     "three_stage": {{"method": "three_stage"}},
 }}.items():
     cal = sc.calibrate(obs, camera, **options)
@@ -189,8 +189,8 @@ JOBS = (
         (
             "new example -o .",
             f"run stars.ecsv camera.toml -o first --seed {{seed}} {SAMPLER}",
-            "run stars.ecsv camera.toml -o run --site site.toml --noise model --screen --seed {seed}",
-            f"run stars.ecsv camera.toml -o json --site site.toml --robust --seed {{seed}} {SAMPLER} --json",
+            "run stars.ecsv camera.toml -o run --site site.toml --effects noise --screen --seed {seed}",
+            f"run stars.ecsv camera.toml -o json --site site.toml --effects tails --seed {{seed}} {SAMPLER} --json",
             "calibrate stars.ecsv camera.toml -o screened --site site.toml --screen",
             "report run --notebook --force",
         ),
@@ -200,7 +200,7 @@ JOBS = (
         (
             "new example -o example",
             f"run esa_tetra3_observations.csv {ESA} -o run --directions catalogue --site example/site.toml"
-            " --time 2019-07-29T20:47:26 --noise model --seed {seed}",
+            " --time 2019-07-29T20:47:26 --effects noise --seed {seed}",
             f"calibrate esa_tetra3_observations.csv {ESA} -o apparent --directions apparent"
             " --column ra_deg=ra_apparent_deg --column dec_deg=dec_apparent_deg --only-frames 0-5 --model k1",
         ),
@@ -288,9 +288,9 @@ JOBS = (
             "propagate run --seed {seed} --draws 60",
             "diagnose run --seed {seed}",
             "report run",
-            "calibrate parts camera.toml -o noise --workers 0 --noise model",
-            "calibrate parts camera.toml -o robust --workers 0 --robust",
-            "calibrate parts camera.toml -o stars --workers 0 --star-errors",
+            "calibrate parts camera.toml -o noise --workers 0 --effects noise",
+            "calibrate parts camera.toml -o robust --workers 0 --effects tails",
+            "calibrate parts camera.toml -o stars --workers 0 --effects star",
         ),
     ),
     *(
@@ -300,10 +300,10 @@ JOBS = (
                 f"STARCAL_UQ_KERNELS={path}",
                 *STARS,
                 "calibrate stars.ecsv camera.toml -o common",
-                "calibrate stars.ecsv camera.toml -o noise --noise model",
-                "calibrate stars.ecsv camera.toml -o robust --robust",
-                "calibrate stars.ecsv camera.toml -o stars --star-errors",
-                "calibrate stars.ecsv camera.toml -o star_noise --star-errors --noise model",
+                "calibrate stars.ecsv camera.toml -o noise --effects noise",
+                "calibrate stars.ecsv camera.toml -o robust --effects tails",
+                "calibrate stars.ecsv camera.toml -o stars --effects star",
+                "calibrate stars.ecsv camera.toml -o star_noise --effects star,noise",
                 "calibrate stars.ecsv camera.toml -o three --method three_stage",
                 "calibrate stars.ecsv camera.toml -o inverse --model inverse",
                 *(
@@ -368,7 +368,7 @@ JOBS = (
             "calibrate repeated.csv camera.toml -o dropped --in-space --duplicates drop --json",
             "calibrate stars.csv camera.toml -o run --directions catalogue",
             "calibrate stars.csv camera.toml -o run --model brown9",
-            "calibrate stars.csv camera.toml -o run --method samaan --robust",
+            "calibrate stars.csv camera.toml -o run --method samaan --effects tails",
             "calibrate camera.toml stars.csv -o run",
             "calibrate stars.csv camera.toml -o three --only-frames 0-2 --model brown_tangential --json",
             "sample nowhere",

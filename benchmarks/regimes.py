@@ -214,11 +214,11 @@ def frame_scatter(rng: np.random.Generator, n_frames: int) -> Outcome:
     return Outcome(figures={"Ratio seen nine times in ten": least}, shares=alarms | small)
 
 
-def recurring(name: str, *, star_errors: bool = False, runs: int = 150, **options: Any) -> Regime:
+def recurring(name: str, *, effects: str = "none", runs: int = 150, **options: Any) -> Regime:
     """Frames that see the same stars again and again; without other models and starts, which take
     most of the time.
     """
-    chosen: dict[str, Any] = {"calibrate": {"star_errors": True}} if star_errors else {}
+    chosen: dict[str, Any] = {"calibrate": {"effects": effects}}
     return Regime(name, partial(plain, options=options, models=(), n_starts=0, **chosen), runs)
 
 
@@ -247,10 +247,10 @@ def by_frame(radius: np.ndarray, mag: np.ndarray, frame: np.ndarray) -> np.ndarr
 STARING: dict[str, Any] = {"n_frames": 40, "pointings": 1, "drift_px": 3.3}
 
 
-def uneven(name: str, *, noise: str = "common", runs: int = 100, **options: Any) -> Regime:
+def uneven(name: str, *, effects: str = "none", runs: int = 100, **options: Any) -> Regime:
     """Noise that varies over 40 frames, calibrated with one noise or with the fitted model."""
-    steps = {"calibrate": {"noise": noise}, "models": (), "n_starts": 0}
-    words = name if noise == "common" else f"{name}, with `--noise model`"
+    steps = {"calibrate": {"effects": effects}, "models": (), "n_starts": 0}
+    words = name if effects == "none" else f"{name}, with `--effects noise`"
     return Regime(words, partial(plain, options={"n_frames": 40} | options, **steps), runs)
 
 
@@ -339,18 +339,20 @@ REGIMES: list[Regime] = [
     recurring("40 stars: errors of 0.01 px of their own", star_sigma_px=0.01, **PATCH),
     recurring("40 stars: errors of 0.03 px of their own", star_sigma_px=0.03, **PATCH),
     recurring(
-        "40 stars: 0.03 px, with `--star-errors`", star_errors=True, star_sigma_px=0.03, **PATCH
+        "40 stars: 0.03 px, with `--effects star`", effects="star", star_sigma_px=0.03, **PATCH
     ),
-    recurring("40 stars: no errors, with `--star-errors`", star_errors=True, **PATCH),
+    recurring("40 stars: no errors, with `--effects star`", effects="star", **PATCH),
     recurring("15 stars in 20 frames: errors of 0.03 px of their own", **FEW),
-    recurring("15 stars: the same, with `--star-errors`", star_errors=True, **FEW),
+    recurring("15 stars: the same, with `--effects star`", effects="star", **FEW),
     uneven("noise three times larger at the edge", runs=200, sigma_px=worse_outside),
-    uneven("noise three times larger at the edge", runs=200, noise="model", sigma_px=worse_outside),
+    uneven(
+        "noise three times larger at the edge", runs=200, effects="noise", sigma_px=worse_outside
+    ),
     uneven("noise larger for faint stars", sigma_px=worse_for_faint),
-    uneven("noise larger for faint stars", noise="model", sigma_px=worse_for_faint),
+    uneven("noise larger for faint stars", effects="noise", sigma_px=worse_for_faint),
     uneven("noise of its own in every frame", sigma_px=by_frame),
-    uneven("noise of its own in every frame", noise="model", sigma_px=by_frame),
-    uneven("clean: 40 frames", noise="model"),
+    uneven("noise of its own in every frame", effects="noise", sigma_px=by_frame),
+    uneven("clean: 40 frames", effects="noise"),
     Regime("every frame twice, 20 frames", partial(twice, duplicates="refuse"), 100),
     Regime(
         "every frame twice, kept (`--duplicates keep`: as before)",
@@ -370,9 +372,7 @@ REGIMES: list[Regime] = [
     ),
     air("no air: 60 frames of 40 stars", 60, **PATCH),
     air("no air: 40 stars with errors of 0.03 px", 60, star_sigma_px=0.03, **PATCH),
-    air(
-        "no air: the same, with `--star-errors`", 60, star_sigma_px=0.03, star_errors=True, **PATCH
-    ),
+    air("no air: the same, with `--effects star`", 60, star_sigma_px=0.03, effects="star", **PATCH),
     air("no air: 15 stars in 20 frames, with errors of 0.03 px", 60, **FEW),
     air(
         "no air: one field, drifting by 3.3 px a frame, star errors of 0.03 px",

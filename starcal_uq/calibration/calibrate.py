@@ -17,19 +17,19 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import RecursiveMethod, bounded
 from starcal_uq.core.tasks import one_thread, processors
 from starcal_uq.core.types import Progress
-from starcal_uq.estimation.assemble import raise_unless_good, with_star_errors
+from starcal_uq.estimation.assemble import raise_unless_good
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.effects import with_effects, without_effects
-from starcal_uq.estimation.fit import fit_composed
+from starcal_uq.estimation.fit import fit_weighed
 from starcal_uq.estimation.partitioned import calibrate_partitions
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.robust import with_tail_weights
 from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
 from starcal_uq.estimation.ties import with_ties
+from starcal_uq.estimation.weighing import with_weighing
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood import paths
-from starcal_uq.likelihood.composed import Likelihood
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 
@@ -119,33 +119,29 @@ def calibrate(
         distortion monotonic. The refinement always uses the first; the recursive methods use none.
     max_iterations : int
         Limit for each stage.
-    likelihood : {"marginal", "student_t"} or starcal_uq.likelihood.Likelihood
-        Likelihood that the refinement maximises, composed or by name: Gaussian noise, or a Student
-        t per star for tables with wrong identifications. With ``student_t`` the stages see only
+    effects : {"none", "auto"} or sequence of str
+        Effects beyond the camera, by name or joined by commas; ``auto`` takes up those that the
+        data ask for, beside any that are named (`Calibration.effects`). Scales of ``axes``,
+        ``field``, ``frame``, ``zenith``, ``temperature``, ``time``, ``epoch``, ``star``, ``phase``
+        and ``magnitude`` are estimated by restricted likelihood and marginalised in estimate,
+        covariance and `compressed`. Two effects decide how much the stars count:
+
+        ``noise``: a variance that is fitted as a function of radius, magnitude, frame and axis, as
+        far as the residuals ask for it (`Calibration.noise_model`). Everything that takes the
+        result then weighs the stars by it, and `sigma` is a factor on it.
+
+        ``tails``: a Student t per star, for tables with wrong identifications. The stages see only
         stars whose angles agree with those of their frame, the refinement sees all that can be in
         the field, `covariance` is the sandwich one, `information` the observed one, `sigma` the
         scale of the t, `chi2` is summed with the stars' weights, and `compressed` is the Gaussian
-        likelihood of the reweighted stars.
+        likelihood of the reweighted stars, which keep these weights where there are further
+        effects. With ``noise`` it is the scale of the t that varies.
+
+        Effects need the ``efficient`` method.
     dof : float or "free", optional
-        Degrees of freedom of ``student_t``, 2 to 200, by default 4; "free" estimates them, with the
-        gamma prior of Juarez & Steel (2010) on what exceeds 2.
-    noise : {"common", "model"}
-        One noise for all stars (or one factor on what they state), or a variance that is fitted as
-        a function of radius, magnitude, frame and axis, as far as the residuals ask for it:
-        `Calibration.noise_model`. Everything that takes the result then weighs the stars by it, and
-        `sigma` is a factor on it. With ``student_t`` it is the scale of the t that varies. It needs
-        the ``efficient`` method.
-    star_errors : bool
-        Take into account that a star's direction errs alike in every frame (catalogue, blend,
-        colour): the size of such errors is estimated, beyond what the column ``direction_mas`` of
-        the table states, and they are marginalised in estimate, covariance and `compressed`. With
-        ``student_t`` the stars keep the weights of their tails. It needs the ``efficient`` method.
-    effects : {"none", "auto"} or sequence of str
-        Effects beyond the camera, by name or joined by commas: ``axes``, ``field``, ``frame``,
-        ``zenith``, ``temperature``, ``time``, ``epoch``, ``star``, ``phase``, ``magnitude``. Their scales
-        are estimated by restricted likelihood and marginalised in estimate, covariance and `compressed`;
-        ``auto`` takes up those that the data ask for (`Calibration.effects`). With ``student_t``
-        the stars keep the weights of their tails. It needs the ``efficient`` method.
+        Degrees of freedom of ``tails``, 2 to 200; "free" estimates them, with the gamma prior of
+        Juarez & Steel (2010) on what exceeds 2. By default they are estimated, but no less than 4:
+        fewer take in stars a thousand sigma away, at the price of intervals that are a third wider.
     relative_attitudes : RelativeAttitudes or path, optional
         Rotations of the camera between frames that were measured without stars, with their errors
         (`starcal_uq.attitude.load_relative_attitudes` describes the file): they tie the attitudes,
@@ -214,8 +210,7 @@ def _of_partitions(
     progress: Progress | None,
 ) -> Calibration:
     """The calibration of all partitions, from that of a sample of their frames."""
-    sample, composed = obs.sample(), settings.composed
-    plain = settings.changed(likelihood=replace(composed, terms=()), effects="none")
+    sample, plain = obs.sample(), settings.changed(effects="none")
     # What is compiled is compiled here, before other processes ask for it.
     with paths.using(paths.chosen(obs.n_stars)):
         start = calibrate(sample, camera, plain, model=camera.distortion)
@@ -227,7 +222,7 @@ def _of_partitions(
             processes,
             max_iterations=settings.max_iterations,
             duplicates=settings.duplicates,
-            effects=None if composed.effects is None else composed.effects.names,
+            effects=settings.names,
             progress=progress,
         )
 
@@ -235,57 +230,58 @@ def _of_partitions(
 def _of_table(
     obs: Observations, camera: Camera, settings: EstimationSettings, sheet: str, throw: bool
 ) -> Calibration:
-    """The calibration of a table with the model that it determines, and the terms of the
-    likelihood; `sheet` is the model of the camera's sheet.
+    """The calibration of a table with the model that it determines, and with its effects; `sheet`
+    is the model of the camera's sheet.
     """
-    composed = settings.composed
-    if obs.stated_px is not None and composed.noise == "common":
+    if obs.stated_px is not None and not settings.noise:
         # Weights of another calibration's noise model are what this table states.
         obs = replace(obs, stated_px=None, noise_axes=None)
     calibration = fit_determined(
         obs,
         camera,
-        lambda start: _tied(obs, fit_composed(obs, start, settings), composed),
+        lambda start: _tied(obs, fit_weighed(obs, start, settings), settings),
         sheet=sheet,
         asked=settings.model is not None,
         throw=throw,
     )
-    if not (composed.terms and calibration.status.ok):
-        return calibration
-    found = _with_terms(obs, obs, calibration, composed)
-    if not (found.effects and found.effects.names and settings.weighs):
+    if calibration.status.ok and settings.shifting:
+        calibration = _with_all(obs, calibration, settings)
+    return with_weighing(obs, calibration, settings.noise, settings.tails)
+
+
+def _with_all(obs: Observations, cal: Calibration, settings: EstimationSettings) -> Calibration:
+    """The calibration with effects that shift stars; others are found again beside these."""
+    found = _with_shifts(obs, obs, cal, settings)
+    if not (found.effects and found.effects.fitted and (settings.noise or settings.tails)):
         return found
     # Noise and tails of a camera without its effects hold these, too.
-    again = fit_composed(without_effects(obs, found), calibration.nominal, settings)
+    again = fit_weighed(without_effects(obs, found), cal.nominal, settings)
     if not again.status.ok:
         return found
     # It is still an estimate from the table as it is.
-    made_of = calibration.provenance.data_sha256
+    made_of = cal.provenance.data_sha256
     again = replace(again, provenance=again.provenance.adding(data_sha256=made_of))
-    return _with_terms(obs, without_effects(obs, found), again, composed)
+    return _with_shifts(obs, without_effects(obs, found), again, settings)
 
 
-def _with_terms(
-    obs: Observations, seen: Observations, calibration: Calibration, composed: Likelihood
+def _with_shifts(
+    obs: Observations, seen: Observations, calibration: Calibration, settings: EstimationSettings
 ) -> Calibration:
-    """The calibration with the terms of its likelihood; tails weigh the stars as they are `seen`."""
-    if composed.tails is not None:
+    """The calibration with effects that shift stars; tails weigh these as they are `seen`."""
+    if settings.tails:
         calibration = with_tail_weights(weighed(seen, calibration), calibration)
-    obs = weighed(obs, calibration)
-    if composed.effects is not None:
-        return with_effects(obs, calibration, composed.effects.names)
-    return with_star_errors(obs, calibration)
+    return with_effects(weighed(obs, calibration), calibration, settings.shifting)
 
 
-def _tied(obs: Observations, calibration: Calibration, composed: Likelihood) -> Calibration:
+def _tied(obs: Observations, calibration: Calibration, settings: EstimationSettings) -> Calibration:
     """The calibration with known rotations between its frames, which may tell what the stars leave
     open.
     """
-    if composed.ties is None or not (calibration.status.ok or calibration.undetermined):
+    if settings.ties is None or not (calibration.status.ok or calibration.undetermined):
         return calibration
-    if composed.tails is not None:
+    if settings.tails:
         calibration = with_tail_weights(weighed(obs, calibration), calibration)
-    return with_ties(weighed(obs, calibration), calibration, composed.ties)
+    return with_ties(weighed(obs, calibration), calibration, settings.ties)
 
 
 def _enough(workers: int | None, obs: PartitionedObservations) -> int | None:

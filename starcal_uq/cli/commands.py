@@ -20,6 +20,7 @@ from starcal_uq.cli import steps as cli_steps
 from starcal_uq.cli import study as cli_study
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.settings import unfolded
+from starcal_uq.core.conflicts import EARLIER
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import wanted
 from starcal_uq.core.types import AnyDict
@@ -113,6 +114,9 @@ def usage_sentence(error: Exception) -> str:
         return f"{name} {_problem(parameter, problems[0]['input']) if problems else error.message}"
     if isinstance(error, typer.BadParameter):
         return str(error.message)
+    option, context = getattr(error, "option_name", ""), getattr(error, "ctx", None)
+    if option in EARLIER and context is not None and context.command.name in ("calibrate", "run"):
+        return f"{option} is no option any more: give --effects {EARLIER[option]} in its place."
     words = getattr(error, "format_message", None)
     message = words() if callable(words) else str(error)
     return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."

@@ -153,14 +153,14 @@ def parse_dof(text: str | None) -> float | Literal["free"] | None:
 
 def check_effects(text: str | None) -> None:
     """Refuse what is neither ``auto`` nor ``none`` nor names of effects with commas."""
-    from starcal_uq.likelihood.composed import EffectTerms
+    from starcal_uq.core.settings import effect_names
 
     if text is None:
         return
     if not _is_name(text):
         raise typer.BadParameter(f"{shown(text)} is no list of effects, such as field,frame.")
     try:
-        EffectTerms.parsed(text)
+        effect_names(text)
     except StarcalError as error:
         raise typer.BadParameter(str(error)) from None
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 
 from starcal_uq.core.conflicts import words_of
 from starcal_uq.core.provenance import NAME
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, Near, Remedy
+from starcal_uq.core.settings import joined_effects
 
 # Commands whose options have the names of the settings of a calibration.
 _CALIBRATING = ("calibrate", "run")
@@ -27,7 +29,26 @@ def as_given(remedy: Remedy) -> str:
     if not made or remedy.files != (OBS, CAMERA) or remedy.arguments.get("out") != RUN:
         return remedy.command or remedy.call
     asked = {name: value for name, value in remedy.arguments.items() if name != "out"}
-    return shlex.join([NAME, *sys.argv[1:], *words_of(asked)])
+    words = sys.argv[1:]
+    if "effects" in asked:
+        # An option that is given twice would hold the last list alone.
+        words, given = _without_effects(words)
+        asked["effects"] = joined_effects(*given, asked["effects"])
+    return shlex.join([NAME, *words, *words_of(asked)])
+
+
+def _without_effects(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """A command line without its lists of effects, and these."""
+    kept: list[str] = []
+    given: list[str] = []
+    rest = iter(words)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        if name == "--effects":
+            given.append(value if equals else next(rest, "none"))
+        else:
+            kept.append(word)
+    return kept, given
 
 
 def _words(remedy: Remedy) -> list[str]:

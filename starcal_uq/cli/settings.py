@@ -37,10 +37,6 @@ class EstimationSettings:
     method: settings.Method = "efficient"
     solver: settings.Solver = "lm"
     screen: bool = False
-    robust: bool = False
-
-    star_errors: bool = False
-    noise: settings.NoiseKind = "common"
     effects: str | None = None
     start: str | None = None
     pixel_um: float | None = None
@@ -52,14 +48,13 @@ class EstimationSettings:
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
         own = vars(self) | {"screening": self.screen}
-        for name in ("screen", "robust", "start", "pixel_um"):
+        for name in ("screen", "start", "pixel_um"):
             del own[name]
         own["effects"] = None if self.effects == "none" else self.effects
         # No workers (0) are a choice, and no absence of one.
-        options = {
+        return {
             name: value for name, value in own.items() if value is not None and value is not False
         }
-        return options | {"likelihood": "student_t"} if self.robust else options
 
     def started(self, camera: Camera) -> Camera:
         """The nominal camera with the pitch and the start that were asked for."""
@@ -206,7 +201,7 @@ def refuse_conflicts(settings: AnyDict) -> None:
     rule = conflict(settings)
     if rule is None:
         return
-    given, other = typed(rule.name, settings[rule.name]), settings.get(rule.other)
+    given, other = typed(rule.name, rule.value(settings)), settings.get(rule.other)
     if rule.other == "partitioned":
         words = f"needs a folder of partitions: leave {given} out." if True in rule.allowed else ""
         raise typer.BadParameter(

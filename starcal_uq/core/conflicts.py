@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.settings import WEIGHING, effect_names, joined_effects
 
 # Options as they are typed, each with its values in the order given; None where it stands alone.
 Options: TypeAlias = dict[str, tuple[str | None, ...]]
@@ -30,7 +31,8 @@ class Rule:
     other : str
         The other option; "partitioned" stands for observations that are a folder of files.
     allowed : tuple
-        Values of the other one with which it makes sense; None stands for its default.
+        Values of the other one with which it makes sense, of effects their kind
+        (`kind_of_effects`); None stands for its default.
     """
 
     name: str
@@ -38,13 +40,22 @@ class Rule:
     other: str
     allowed: tuple[object, ...]
 
+    def value(self, settings: Mapping[str, object]) -> object:
+        """The option's value; of effects the first that the rule is about."""
+        value: Any = settings.get(self.name)
+        if self.name == "effects" and self.values:
+            return next((name for name in effect_names(value) if name in self.values), None)
+        return value
+
     def broken(self, settings: Mapping[str, object]) -> bool:
         """Whether settings, by the names of their options, are against it; what they lack is not
         given.
         """
-        value = settings.get(self.name)
+        value = self.value(settings)
         concerned = value in self.values if self.values else is_given(value)
         other = settings.get(self.other)
+        if self.other == "effects":
+            other = kind_of_effects(other)
         return concerned and (other if is_given(other) else None) not in self.allowed
 
 
@@ -53,13 +64,20 @@ def is_given(value: object) -> bool:
     return value not in (None, False, "none")
 
 
-# "likelihood" and "dof" are those of the estimate; "sampled" and "sampled_dof" those of the draws.
+def kind_of_effects(effects: Any) -> str | None:
+    """Effects by what draws have to know of them: ``shifts``, where some move stars; ``tails``
+    alone; None where there are none of these.
+    """
+    names = effect_names(effects)
+    if set(names) - set(WEIGHING):
+        return "shifts"
+    return "tails" if "tails" in names else None
+
+
+# "sampled" and "sampled_dof" are likelihood and degrees of freedom of the draws.
 RULES = (
-    Rule("likelihood", ("student_t",), "method", (None, "efficient")),
-    Rule("noise", ("model",), "method", (None, "efficient")),
-    Rule("star_errors", (True,), "method", (None, "efficient")),
     Rule("effects", (), "method", (None, "efficient")),
-    Rule("effects", (), "star_errors", (None,)),
+    Rule("effects", WEIGHING, "partitioned", (None,)),
     Rule("relative_attitudes", (), "mount", (None,)),
     Rule("mount_sigma_arcsec", (), "mount", ("fixed",)),
     *(
@@ -67,26 +85,20 @@ RULES = (
         for name in ("relative_attitudes", "mount")
         for other in (
             ("method", (None, "efficient")),
-            ("star_errors", (None,)),
-            ("effects", (None,)),
+            ("effects", (None, "tails")),
             ("partitioned", (None,)),
         )
     ),
-    Rule("dof", (), "likelihood", ("student_t",)),
     Rule("recursion", (), "method", _RECURSIVE),
     Rule("method", _IN_MEMORY, "partitioned", (None,)),
-    Rule("likelihood", ("student_t",), "partitioned", (None,)),
-    Rule("noise", ("model",), "partitioned", (None,)),
-    Rule("star_errors", (True,), "partitioned", (None,)),
     Rule("duplicates", ("drop",), "partitioned", (None,)),
     Rule("screening", (True,), "partitioned", (None,)),
     Rule("frames", (), "partitioned", (None,)),
     Rule("scheduler", (), "partitioned", (True,)),
     Rule("workers", (), "partitioned", (True,)),
     Rule("sampled_dof", (), "sampled", ("student_t",)),
-    Rule("sampled", ("marginal",), "likelihood", (None, "marginal")),
-    Rule("sampled", (*_COMPOSITE, "student_t"), "star_errors", (None,)),
-    Rule("sampled", (*_COMPOSITE, "student_t"), "effects", (None,)),
+    Rule("sampled", ("marginal",), "effects", (None, "shifts")),
+    Rule("sampled", (*_COMPOSITE, "student_t"), "effects", (None, "tails")),
     Rule("sampled", (*_COMPOSITE, "student_t"), "partitioned", (None,)),
     Rule("evaluation", ("exact",), "partitioned", (None,)),
     Rule("sampled", _COMPOSITE, "method", (None, "efficient", *_IN_MEMORY)),
@@ -101,13 +113,13 @@ RULES = (
 # their values.
 _TYPED = {"--likelihood": "sampled", "--dof": "sampled_dof", "--only-frames": "frames"}
 _FLAGS: dict[str, tuple[str, object]] = {
-    "--robust": ("likelihood", "student_t"),
     "--screen": ("screening", True),
-    "--star-errors": ("star_errors", True),
     "--in-space": ("in_space", True),
     "--force": ("force", True),
     "--json": ("json", True),
 }
+# Words by which earlier versions were asked for effects, as their run folders hold them.
+EARLIER = {"--robust": "tails", "--star-errors": "star", "--noise": "noise"}
 
 
 def parsed(words: Sequence[str]) -> tuple[list[str], Options]:
@@ -120,17 +132,19 @@ def parsed(words: Sequence[str]) -> tuple[list[str], Options]:
             places.append(word)
             continue
         name, equals, value = word.partition("=")
-        given = value if equals else None if name in _FLAGS else next(rest, None)
+        alone = name in _FLAGS or name in ("--robust", "--star-errors")
+        given = value if equals else None if alone else next(rest, None)
         options[name] = (*options.get(name, ()), given)
     return places, options
 
 
 def sampled_by_default(settings: Mapping[str, object]) -> object:
-    """The likelihood of the draws: that of the estimate, unless star errors or effects give its
-    stars known weights.
+    """The likelihood of the draws: that of the estimate, unless effects that shift stars or known
+    rotations give them known weights.
     """
-    known = settings.get("star_errors") or is_given(settings.get("effects"))
-    return None if known else settings.get("likelihood")
+    tied = is_given(settings.get("mount")) or is_given(settings.get("relative_attitudes"))
+    tails = kind_of_effects(settings.get("effects")) == "tails" and not tied
+    return "student_t" if tails else None
 
 
 def arguments_of(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:
@@ -139,7 +153,13 @@ def arguments_of(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     for option, values in options.items():
+        if option in EARLIER:
+            if values != ("common",):
+                found["effects"] = joined_effects(found.get("effects"), EARLIER[option])
+            continue
         value: Any = values[0] if len(values) == 1 else tuple(values)
+        if option == "--effects":
+            value = joined_effects(found.get("effects"), values[-1])
         name = _TYPED.get(option, option[2:].replace("-", "_"))
         name, value = _FLAGS.get(option, (name, value))
         found[name] = value
@@ -186,7 +206,7 @@ def refuse_conflicts(**settings: object) -> None:
     rule = conflict(settings)
     if rule is None:
         return
-    value = settings[rule.name]
+    value = rule.value(settings)
     given = f"{rule.name}={value!r}" if isinstance(value, str | int | float) else rule.name
     if rule.other == "partitioned" and True in rule.allowed:
         needed = (
@@ -199,6 +219,11 @@ def refuse_conflicts(**settings: object) -> None:
             f"{given} and partitioned observations exclude each other: leave it out, or "
             "calibrate the frames of "
             "`obs.sample()` with it."
+        )
+    if rule.other == "effects":
+        raise CalibrationError(
+            f"{given} and effects={settings.get('effects')!r} exclude each other: leave one of "
+            "them out."
         )
     wanted = " or ".join(repr(allowed) for allowed in rule.allowed if allowed is not None)
     raise CalibrationError(

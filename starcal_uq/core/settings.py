@@ -10,14 +10,14 @@ from __future__ import annotations
 import inspect
 import os
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar, get_args
 
-from starcal_uq.core.errors import SettingError
+from starcal_uq.core.errors import CalibrationError, SettingError
 from starcal_uq.core.files import shown
 
 P = ParamSpec("P")
@@ -40,7 +40,6 @@ ModelName = Literal[
     "brown_tangential+axes",
     "inverse+axes",
 ]
-NoiseKind = Literal["common", "model"]
 MountKind = Literal["free", "fixed"]
 EffectName = Literal[
     "axes",
@@ -53,7 +52,11 @@ EffectName = Literal[
     "star",
     "phase",
     "magnitude",
+    "noise",
+    "tails",
 ]
+# Effects that decide how much stars count, and shift none.
+WEIGHING = ("noise", "tails")
 OnboardModel = Literal["model", "effects"]
 MergedNoise = Literal["auto", "common", "own"]
 Duplicates = Literal["refuse", "drop", "keep"]
@@ -94,6 +97,30 @@ ExportFormat = Literal[
     "latex",
     "markdown",
 ]
+
+
+def effect_names(effects: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Names in a list of effects as it is typed, ``auto`` among them; empty for ``none``.
+
+    CalibrationError for a name that is unknown.
+    """
+    names = effects.split(",") if isinstance(effects, str) else list(effects or ())
+    names = [name.strip() for name in names]
+    if names == ["none"]:
+        return ()
+    known = ("auto", *get_args(EffectName))
+    for name in names:
+        if name not in known:
+            raise CalibrationError(
+                f"effect {name!r} is unknown: use none alone, or some of {', '.join(known)}."
+            )
+    return tuple(dict.fromkeys(names))
+
+
+def joined_effects(*lists: str | Sequence[str] | None) -> str:
+    """Lists of effects as one, as it is typed."""
+    names = dict.fromkeys(name for effects in lists for name in effect_names(effects))
+    return ",".join(names) or "none"
 
 
 @dataclass(frozen=True)

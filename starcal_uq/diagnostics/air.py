@@ -40,10 +40,12 @@ from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.noise_model import fit_noise
 from starcal_uq.estimation.weights import weighed
+from starcal_uq.likelihood.effect_sums import EffectLikelihood
+from starcal_uq.likelihood.effects import star_effect
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.shapes import View, focal_drift, frame_shapes, lens_shapes
-from starcal_uq.likelihood.star_errors import StarErrors, StarLikelihood, star_numbers
+from starcal_uq.likelihood.star_errors import StarModel, star_numbers
 from starcal_uq.likelihood.zenith import frame_axes
 from starcal_uq.maths.linear import principal
 from starcal_uq.observations.splits import one_of_each
@@ -155,7 +157,8 @@ def air_test(
         return found
     weighted = obs.weighted(model.sigma_px(obs), model.axes)
     if errors is not None:
-        errors = errors[0], errors[1] * _rms(obs.sigma_px) / _rms(weighted.sigma_px)
+        own = errors.sigma * _rms(obs.sigma_px) / _rms(weighted.sigma_px)
+        errors = errors._replace(sigma=own)
     again = _Air(weighted, cal, seed, errors)
     found = again.test(seed)
     if found is None or np.isnan(found.f_px):
@@ -169,22 +172,23 @@ def _rms(sigma_px: FloatArray | None) -> float:
     return 1.0 if sigma_px is None else float(np.sqrt(np.mean(sigma_px**2)))
 
 
-def _star_noise(
-    obs: Observations, cal: Calibration, found: StarTest
-) -> tuple[StarErrors, float] | None:
-    """Direction errors of the stars and the noise of their images: those fitted, or those that
-    recurring stars show.
-    """
-    if cal.star_errors is not None:
-        return cal.star_errors, cal.sigma
+class _StarNoise(NamedTuple):
+    """Direction errors of the stars per axis, px, the noise of their images, and how many recur."""
+
+    tau_px: float
+    sigma: float
+    n_recurring: int
+
+
+def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> _StarNoise | None:
+    """Direction errors that recurring stars show."""
     # Effects hold what stars bring along, where the data ask for that.
     if not found.tau_px > 0.0 or has_effects(cal):
         return None
     # The estimate's noise holds both.
     of_stars = found.tau_px**2 * float(np.mean(obs.sigma_or_one**-2.0))
     own = float(np.sqrt(max(cal.sigma**2 - of_stars, 0.1 * cal.sigma**2)))
-    numbers = found.n_stars, found.n_recurring
-    return StarErrors(found.tau_px, found.tau_px_std, 0.0, float(cal.theta[2]), *numbers), own
+    return _StarNoise(found.tau_px, own, found.n_recurring)
 
 
 class Remainder:
@@ -203,7 +207,7 @@ class Remainder:
         obs: Observations,
         cal: Calibration,
         seed: int,
-        errors: tuple[StarErrors, float] | None = None,
+        errors: _StarNoise | None = None,
         most: int = _FRAMES,
     ) -> None:
         chosen = one_of_each(
@@ -218,7 +222,11 @@ class Remainder:
         self.focal_px = cal.camera.focal_px
         self.likelihood = MarginalLikelihood(self.obs, model, axes=True)
         if errors is not None:
-            self.likelihood = StarLikelihood(self.obs, model, cal.theta, rotations, *errors)
+            stars = star_effect(StarModel(self.obs, float(cal.theta[2])))
+            ratio = {stars.name: (errors.tau_px / errors.sigma) ** 2}
+            at = (cal.theta, rotations, errors.sigma)
+            frames = self.likelihood.frames
+            self.likelihood = EffectLikelihood(frames, model, [stars], ratio, *at)
         elif has_effects(cal):
             self.likelihood = with_effects_of(self.obs, cal, rotations, obs)
         self.state, _ = self.likelihood.profile(cal.theta, rotations)
@@ -231,7 +239,7 @@ class Remainder:
         self.dof = max(self.likelihood.dof - len(cal.theta), 1)
         # Errors of few stars are known less well than the noise of their images.
         self.least_dof = (
-            self.dof if errors is None else max(2 * errors[0].n_recurring - 3 - len(cal.theta), 1)
+            self.dof if errors is None else max(2 * errors.n_recurring - 3 - len(cal.theta), 1)
         )
 
     @cached_property
@@ -307,7 +315,7 @@ class _Air:
         obs: Observations,
         cal: Calibration,
         seed: int,
-        errors: tuple[StarErrors, float] | None,
+        errors: _StarNoise | None,
     ) -> None:
         rest = Remainder(obs, cal, seed, errors, _FRAMES if obs.timed else _FRAMES_APIECE)
         # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is
@@ -353,7 +361,11 @@ class _Air:
         rest, theta = self._alone, self._cal.theta
         shifts, taken = self._taken(self.seen_px)
         left = shifts[0] - np.tensordot(taken, rest.likelihood.derivatives(theta, rest.state), 1)
-        x, y = rest.likelihood.frames.in_pixels(left)
+        likelihood = rest.likelihood
+        if has_effects(self._cal) and isinstance(likelihood, EffectLikelihood):
+            # Effects have taken their part of it off the images already.
+            left = likelihood.conditioned(rest.state, left[None])[0][0]
+        x, y = likelihood.frames.in_pixels(left)
         clean = replace(rest.clean, x_px=rest.clean.x_px - x, y_px=rest.clean.y_px - y)
         return fit_noise(clean, self._cal.camera, rounds=1)[0]
 

@@ -33,8 +33,8 @@ _ABSORBED = 1e-8
 
 
 def has_effects(cal: Calibration) -> bool:
-    """Whether a calibration has taken up effects."""
-    return cal.effects is not None and bool(cal.effects.names)
+    """Whether a calibration holds effects that shift stars."""
+    return cal.effects is not None and bool(cal.effects.fitted)
 
 
 def effects_beside(obs: Observations, cal: Calibration) -> list[Effect]:
@@ -48,13 +48,13 @@ def with_effects_of(
     """Exact likelihood with the effects of a calibration, for frames of the table `whole` at these
     attitudes (K, 3, 3).
 
-    Frames that are not all of the table lack effects of nights and stars.
+    Frames that are not all of the table lack effects of nights.
     """
     assert cal.effects is not None
     seen = None if obs.n_frames == whole.n_frames else obs
     held = cal.effects
     known = effects_of(whole, cal.camera, seen=seen, zeniths=held.zeniths, extent=held.extent)
-    effects = [known[name] for name in cal.effects.names if name in known]
+    effects = [known[own.name] for own in held.fitted if own.name in known]
     frames = StarFrames.from_observations(obs, axes=True)
     ratio = {effect.name: cal.effects.ratio(cal.sigma)[effect.name] for effect in effects}
     at = (cal.theta, rotations, cal.sigma)

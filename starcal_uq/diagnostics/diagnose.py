@@ -23,7 +23,7 @@ from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import AnyDict, FloatArray, Progress
+from starcal_uq.core.types import FloatArray, Progress
 from starcal_uq.diagnostics.air import AirTest, air_test
 from starcal_uq.diagnostics.beside import has_effects, without_effects
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
@@ -203,7 +203,7 @@ def diagnose_apart(
 
 def _effects_that_help(obs: Observations, cal: Calibration, misfit: Misfit) -> tuple[str, ...]:
     """Effects that the data would take up, where tests find structure beside none."""
-    allowed = cal.method == "efficient" and cal.partitions is None and cal.star_errors is None
+    allowed = cal.method == "efficient" and cal.partitions is None
     if cal.effects is not None or not allowed or not misfit.found(ALPHA):
         return ()
     try:
@@ -309,9 +309,8 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     same = better = failed = 0
     largest = 0.0
     best: tuple[float, tuple[float, ...]] = (np.inf, ())
-    # Errors of the stars and effects weigh an estimate that was found without them: that is what a
-    # start leads to.
-    weighed_again = cal.star_errors is not None or has_effects(cal)
+    # Effects weigh an estimate that was found without them: that is what a start leads to.
+    weighed_again = has_effects(cal)
     reached = cal.stages[-2] if weighed_again else None
     reference, lowest = (
         (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
@@ -368,13 +367,13 @@ def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatA
     method = cal.method if cal.method in METHODS else "efficient"
     likelihood = cal.provenance.likelihood
     if likelihood != "marginal" or method not in ("efficient", "three_stage"):
-        options: AnyDict = {} if likelihood == "marginal" else {"likelihood": likelihood}
+        effects = "none" if likelihood == "marginal" else "tails"
         other = calibrate(
-            obs, start, model=start.distortion, method=method, duplicates="keep", **options
+            obs, start, model=start.distortion, method=method, duplicates="keep", effects=effects
         )
         return other.theta, other.chi2
     found = fit(obs, start, method=method)
-    if cal.star_errors is not None or has_effects(cal):
+    if has_effects(cal):
         return found.theta, found.chi2
     # The last, small step of a calibration, which is the same for all that end in its optimum.
     step = (

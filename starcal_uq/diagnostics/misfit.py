@@ -57,8 +57,6 @@ from starcal_uq.likelihood.shapes import (
     frame_shapes,
     shapes,
 )
-from starcal_uq.likelihood.star_errors import StarModel
-from starcal_uq.likelihood.terms import TermSums
 from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import scaled_inverse, without_first
 from starcal_uq.observations.frames import StarFrames
@@ -400,14 +398,13 @@ class _Sums(Fit):
     """Sums over all stars from which every test follows; the table is visited once, some frames at
     a time.
 
-    Where stars bring errors along, or there are effects, `gram` is weighted by them. `plain` is of
-    the parameters and the residuals that are left after each star's offset, which are independent:
-    frame by frame, and for unequal noise. Beside effects it is that part of `gram`, and noise is
-    that of residuals for which they are free.
+    Where there are effects, `gram` is weighted by them. `plain` is of the parameters and the
+    residuals; beside effects it is that part of `gram`, and noise is that of residuals for which
+    they are free.
     """
 
     def __init__(self, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> None:
-        likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=cal.star_errors is None)
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
         p, theta = len(cal.theta), cal.theta
         super().__init__(families, p, likelihood.dof - p)
         self.names, self.n_stars = cal.parameter_names, obs.n_stars
@@ -420,10 +417,7 @@ class _Sums(Fit):
         # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their
         # normal matrices.
         self.frames: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-        rotations, stars = quaternion_to_rotation(cal.quaternions), None
-        if cal.star_errors is not None:
-            model = StarModel(obs, cal.star_errors.focal_px)
-            stars = TermSums(model.term(cal.star_errors.tau_px))
+        rotations = quaternion_to_rotation(cal.quaternions)
         effects, sums = effects_beside(obs, cal), None
         if effects:
             held = {effect.name for effect in effects}
@@ -438,16 +432,6 @@ class _Sums(Fit):
                 if "frame" not in held:
                     self.block_rank += int(by_frame(part.frames, own)[1].sum())
                 continue
-            if stars is not None:
-                stars.add(
-                    part,
-                    state,
-                    np.concatenate([fitted, part.project_out(state, columns.all())]),
-                    rows,
-                )
-                fitted[p] = cal.residuals_px[rows].T * (
-                    1.0 if part.frames.weight is None else part.frames.weight
-                )
             flat = fitted.reshape(p + 1, -1)
             self.plain += flat @ flat.T
             self._add_blocks(part, state, view, fitted, columns)
@@ -456,8 +440,6 @@ class _Sums(Fit):
             matrices = products_by_frame(part.frames, h, h)
             squares = part.frames.sum(np.sum(e**2, axis=0))
             self.frames.append((squares, np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
-        if stars is not None:
-            self.gram -= stars.eliminated(stars.term.ratio(cal.sigma)).correction()
         if sums is not None:
             self._with_effects(sums, obs, cal)
 

@@ -31,7 +31,6 @@ from starcal_uq.estimation.fit import refit
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.inference.arviz import psis
-from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.observations.splits import one_of_each
 
@@ -203,8 +202,6 @@ def compare_models(
     """
     obs = weighed(obs, cal)
     obs = without_effects(obs, cal)
-    if cal.star_errors is not None:
-        cal = _without_star_errors(obs, cal)
     own = cal.camera.distortion
     names = tuple(dict.fromkeys((own, *(rivals(own) if models is None else models))))
     fits, failed = {}, {}
@@ -301,16 +298,6 @@ def of_all_stars(found: ModelComparison, obs: Observations, cal: Calibration) ->
     return replace(
         found, scores=tuple(scores), share=obs.n_frames / cal.n_frames if sampled else 1.0
     )
-
-
-def _without_star_errors(obs: Observations, cal: Calibration) -> Calibration:
-    """The estimate that knows of no errors of the stars, as those of the other models: moves are
-    then the models'.
-    """
-    theta = cal.stages[-2].theta
-    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-    state, _ = likelihood.profile(theta, quaternion_to_rotation(cal.quaternions))
-    return replace(cal, theta=theta, quaternions=rotation_to_quaternion(state.rotations))
 
 
 def _normals(obs: Observations, cal: Calibration, name: str) -> FrameNormals:

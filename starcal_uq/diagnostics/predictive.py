@@ -21,7 +21,6 @@ from starcal_uq.diagnostics.beside import has_effects, with_effects_of
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.effect_sums import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
-from starcal_uq.likelihood.star_errors import StarLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
 from starcal_uq.observations.splits import frame_sample
 
@@ -125,18 +124,14 @@ def predictive_check(
     limit = max(1, min(obs.n_frames, _MAX_STARS * obs.n_frames // obs.n_stars))
     used = weighed(obs, cal)
     some, places = frame_sample(used, limit, seed)
-    part = MarginalLikelihood(some, cal.camera.distortion, axes=cal.star_errors is None)
+    part = MarginalLikelihood(some, cal.camera.distortion, axes=True)
     frames = part.frames
-    shared: StarLikelihood | EffectLikelihood | None = None
+    shared: EffectLikelihood | None = None
     state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[places]))
     e, h = state.e, part.slopes(cal.theta, state)
-    # Residuals after each star's offset and after effects, as they follow the parameters; replicates
+    # Residuals after effects, as they follow the parameters; replicates
     # go the same way.
-    if cal.star_errors is not None:
-        shared = StarLikelihood(
-            some, part.model_name, cal.theta, state.rotations, cal.star_errors, cal.sigma
-        )
-    elif has_effects(cal):
+    if has_effects(cal):
         shared = with_effects_of(some, cal, state.rotations, used)
         # Its images are less what effects are expected to do.
         state, _ = shared.profile(cal.theta, shared.rotations)

@@ -189,8 +189,6 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
 
 def _included(cal: Calibration) -> tuple[float, float]:
     """Error of the stars that a calibration has marginalised, and its standard error, px."""
-    if cal.star_errors is not None:
-        return cal.star_errors.tau_px, cal.star_errors.tau_px_std
     fitted = () if cal.effects is None else cal.effects.fitted
     own = next((effect for effect in fitted if effect.name == "star"), None)
     if own is None:

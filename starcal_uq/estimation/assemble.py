@@ -5,20 +5,13 @@ likelihood at it.
 from __future__ import annotations
 
 from dataclasses import replace
-from time import perf_counter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import (
-    exp_rotation,
-    quaternion_to_rotation,
-    rotation_to_quaternion,
-)
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import undistorted
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.formatting import plural
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.result import Calibration, KeptFrames, check_camera
@@ -31,10 +24,9 @@ from starcal_uq.estimation.undetermined import (
     remedy_of,
     undetermined,
 )
-from starcal_uq.likelihood.compressed import compress, optimum, settled, unit_covariance
+from starcal_uq.likelihood.compressed import compress, settled, unit_covariance
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
 from starcal_uq.likelihood.solvers import is_singular
-from starcal_uq.likelihood.star_errors import StarLikelihood, StarModel
 from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
 
 if TYPE_CHECKING:
@@ -157,75 +149,6 @@ def failed(
     status = Status.SINGULAR if names else status
     return CalibrationError(
         f"the calibration failed ({status.name})", status, names, reason=remedy_of(status, names)
-    )
-
-
-def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
-    """The calibration with errors that stars bring along estimated and marginalised, and the
-    estimate that they weight.
-
-    CalibrationError when no star is seen twice and none states its error, or for more stars and
-    frames than fit into memory.
-    """
-    began = perf_counter()
-    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
-    model = StarModel(obs, float(cal.theta[2]))
-    if model.n_recurring < _FEWEST_STARS and not np.any(model.stated2 > 0.0):
-        raise CalibrationError(
-            f"errors of the stars cannot be told from noise: {plural(model.n_recurring, 'star')} "
-            "of "
-            f"{len(model.images)} seen in more than one frame, and the table states no "
-            "direction_mas; leave "
-            "star_errors out."
-        )
-    errors, sigma, spread = model.estimate(likelihood, cal.theta, cal.sigmas, cal.sigma)
-    theta, covariance = cal.theta, cal.covariance
-    factors = cal.width_factors
-    trajectory, cost = [theta], []
-    rotations = likelihood.rotations_at(theta)
-    for _ in range(2):
-        term = model.term(errors.tau_px)
-        compressed = compress(likelihood, theta, covariance, rotations, term, sigma)
-        compressed = replace(compressed, dof=likelihood.dof)
-        cost.append(float(compressed.gram[0, 0]))
-        found = optimum(compressed)
-        theta, covariance, sigma = found.theta, found.covariance, found.sigma
-        rotations = likelihood.rotations_at(theta)
-        trajectory.append(theta)
-    cost.append(found.sum_of_squares)
-    stage = Stage(
-        "stars", np.array(trajectory), np.array(cost), Status.CONVERGED, 2, perf_counter() - began
-    )
-    compressed = found.compressed
-    theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
-    exact = StarLikelihood(obs, likelihood.model_name, theta, rotations, errors, sigma)
-    state, _ = exact.profile(theta, rotations)
-    rest, offsets = exact.conditioned(state, state.e[None])
-    shifts = state.e[None] - exact.term.shifts(exact, state, offsets)
-    turned = exact.attitude_response(state, shifts)[0].T
-    weight = likelihood.frames.weight
-    # The stars of a frame err each by themselves: to its attitude that is more noise, which a stare
-    # does not average.
-    own = errors.total_px**2 * (1.0 if weight is None else float(np.mean(weight**2)))
-    return cal.moved(
-        theta,
-        sigma,
-        cal.dof,
-        cal.status,
-        sigma_std=sigma / float(np.sqrt(2.0 * found.dof)),
-        covariance=covariance * np.outer(factors, factors),
-        stages=(*cal.stages, stage),
-        quaternions=rotation_to_quaternion(exp_rotation(turned) @ state.rotations),
-        residuals_px=likelihood.frames.in_pixels(rest[0]).T,
-        chi2=found.sum_of_squares,
-        information=found.information,
-        attitude_noise=np.mean(state.inverse, axis=2) * (sigma**2 + own),
-        # The interstar angles err with the same stars.
-        pair_covariance=cal.pair_covariance + spread,
-        compressed=compressed,
-        provenance=cal.provenance.with_settings(star_errors=True),
-        star_errors=errors,
     )
 
 

@@ -45,7 +45,13 @@ from starcal_uq.likelihood.compressed import (
     optimum,
     unit_covariance,
 )
-from starcal_uq.likelihood.effect_sums import Cross, EffectLikelihood, EffectSums, pull_of
+from starcal_uq.likelihood.effect_sums import (
+    Cross,
+    EffectLikelihood,
+    EffectSums,
+    pull_of,
+    stars_of,
+)
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
@@ -163,7 +169,9 @@ def _of_run(effects: Sequence[Effect]) -> list[Effect]:
     return [effect for effect in effects if effect.grouping == "run"]
 
 
-def with_effects(obs: Observations, cal: Calibration, wanted: Sequence[str] = ()) -> Calibration:
+def with_effects(
+    obs: Observations, cal: Calibration, wanted: Sequence[str] = ("auto",)
+) -> Calibration:
     """The calibration with effects estimated and marginalised.
 
     Parameters
@@ -171,7 +179,7 @@ def with_effects(obs: Observations, cal: Calibration, wanted: Sequence[str] = ()
     obs, cal
         The table, with the weights of the calibration, and the estimate by its marginal likelihood.
     wanted : sequence of str
-        The effects; those that the data ask for where it is empty.
+        The effects; with ``auto`` also those that the data ask for beside them.
 
     Raises
     ------
@@ -186,23 +194,23 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
     """As `with_effects`, of all stars; the calibration has attitudes and residuals of `stars.obs`."""
     began = perf_counter()
     model = _Linearised(stars, cal)
-    zeniths = model.zeniths() if not wanted or "zenith" in wanted else None
+    selecting, asked = "auto" in wanted, tuple(name for name in wanted if name != "auto")
+    zeniths = model.zeniths() if selecting or "zenith" in asked else None
     known = stars.effects(zeniths)
-    names = tuple(wanted) or tuple(known)
-    for name in names:
+    names = tuple(known) if selecting else asked
+    for name in asked:
         if name not in known:
             raise CalibrationError(_impossible(name, known))
     restricted = model.restricted(names, zeniths)
     refused: list[tuple[str, float]] = []
-    if not wanted:
-        logs, steps, refused = selected(restricted, names)
-    else:
-        logs, steps = forced(restricted, names)
-    least = penalty(len(names))
+    logs, steps = forced(restricted, asked)
+    least = penalty(len(names) - len(asked))
+    if selecting:
+        logs, steps, refused = selected(restricted, names, logs, steps)
     if not logs:
         return replace(
             cal,
-            effects=Effects((), True, tuple(refused), least),
+            effects=Effects((), selecting, tuple(refused), least),
             provenance=cal.provenance.with_settings(effects=[]),
         )
     if zeniths is not None and "zenith" in logs:
@@ -217,10 +225,10 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
     sigma, theta = found.sigma, found.theta
     covariance, weights = _mixed(found, grams, nodes)
     theta = theta - 0.5 * found.compressed.whitening @ found.compressed.log_determinant_slope
-    obs, extent = stars.obs, stars.extent
+    obs, extent, of_stars = stars.obs, stars.extent, stars_of(effects)
     held = Effects(
         (),
-        not wanted,
+        selecting,
         tuple(refused),
         least,
         *joint,
@@ -231,6 +239,8 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
         places=tuple((e.name, len(e.prior)) for e in _of_run(effects)),
         zeniths=zeniths if "zenith" in logs else None,
         extent=extent,
+        asked=asked,
+        stated_px=0.0 if of_stars is None else float(np.sqrt(np.mean(of_stars.stated2))),
     )
     ratio = {
         name: sigma**-2.0 if name in restricted.known else float(np.exp(2.0 * value))
@@ -332,6 +342,8 @@ class Rest:
 def _impossible(name: str, known: Mapping[str, Effect]) -> str:
     """Why a table does not allow an effect, and which it allows."""
     lacking = "needs what does not vary in this table"
+    if name == "star":
+        lacking = "needs stars that are seen in several frames, or a column direction_mas"
     if name == "zenith":
         lacking = (
             "needs directions in which refraction may be missing, and stars that were above one "

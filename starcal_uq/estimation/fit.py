@@ -46,6 +46,7 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.likelihood.solvers import is_singular
+from starcal_uq.likelihood.student import DEFAULT_DOF, parse_dof
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import one_of_each
@@ -64,22 +65,21 @@ _LEADING = Search(tolerance=1e-4, last="unseen")
 _LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.006
 
 
-def fit_composed(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
-    """Calibrate with a nominal camera by the noise and the tails of a composed likelihood.
+def fit_weighed(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
+    """Calibrate with a nominal camera, with the effects ``noise`` and ``tails`` of the settings.
 
     Weights that the table has from another result's noise model are what its stars state.
     CalibrationError when there is no estimate.
     """
-    fitted = _gaussian_fit if settings.composed.tails is None else _robust_fit
-    if settings.composed.noise == "common":
+    fitted = _robust_fit if settings.tails else _gaussian_fit
+    if not settings.noise:
         return fitted(obs, camera, settings)
     obs = obs.unweighted
     calibration = fitted(obs, camera, settings)
     if not calibration.status.ok:
         return calibration
     model, weighted = _with_noise_model(obs, camera, calibration, settings)
-    record = weighted.provenance.with_settings(noise="model")
-    return replace(weighted, provenance=record.adding(noise_model=model.record()))
+    return replace(weighted, provenance=weighted.provenance.adding(noise_model=model.record()))
 
 
 def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
@@ -234,7 +234,7 @@ def _with_noise_model(
     nothing.
     """
     max_iterations = settings.max_iterations
-    if settings.composed.tails is not None:
+    if settings.tails:
         model = _noise_of_tails(obs, calibration, max_iterations)
         if model.varies:
             weighted = obs.weighted(model.sigma_px(obs), model.axes)
@@ -277,9 +277,8 @@ def _noise_of_tails(obs: Observations, cal: Calibration, max_iterations: int) ->
 
 def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings) -> Calibration:
     search = Search(settings.solver, settings.max_iterations)
-    tails = settings.composed.tails
-    assert tails is not None
-    nu, frames = tails.dof, StarFrames.from_observations(obs, axes=True)
+    nu = None if settings.dof is None else parse_dof(settings.dof, CalibrationError)
+    frames = StarFrames.from_observations(obs, axes=True)
     check_count(MarginalLikelihood(frames, camera.distortion), camera)
     model = camera.distortion
 
@@ -310,6 +309,9 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
         ) from None
     pair_theta = start.stages[-1].theta
     found = refine(frames, model, pair_theta, start.rotations, nu, search.max_iterations)
+    if settings.dof is None and found.nu < DEFAULT_DOF:
+        nu, near = DEFAULT_DOF, found.stage.theta
+        found = refine(frames, model, near, found.state.rotations, nu, search.max_iterations)
     theta, sigma, state, information = (
         found.stage.theta,
         found.sigma,

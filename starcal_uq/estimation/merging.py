@@ -288,15 +288,10 @@ def check_mergeable(
                 "form: calibrate it with the marginal likelihood, or calibrate all observations "
                 "together."
             )
-        if cal.star_errors is not None:
+        if cal.effects is not None and cal.effects.fitted:
+            held = ", ".join(effect.name for effect in cal.effects.fitted)
             raise CalibrationError(
-                f"{name}: holds errors of its stars, which other runs of the same stars share: "
-                "calibrate all "
-                "observations together, or calibrate it without star errors."
-            )
-        if cal.effects is not None and cal.effects.names:
-            raise CalibrationError(
-                f"{name}: holds effects ({', '.join(cal.effects.names)}), whose scales and "
+                f"{name}: holds effects ({held}), whose scales and "
                 "coefficients the frames of all runs share: calibrate all observations together, "
                 "or calibrate each run with effects 'none'."
             )

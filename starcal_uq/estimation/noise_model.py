@@ -246,7 +246,9 @@ def fit_noise_of_tails(
         if not found.model.varies or _settled(found, last, sigma_px**2, before**2):
             break
     if found is None:
-        raise CalibrationError("how the noise varies cannot be fitted: leave noise='model' out.")
+        raise CalibrationError(
+            "how the noise varies cannot be fitted: leave the effect 'noise' out."
+        )
     return found.model
 
 

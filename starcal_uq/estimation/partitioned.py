@@ -246,14 +246,14 @@ def calibrate_partitions(
     *,
     max_iterations: int,
     duplicates: str,
-    effects: Sequence[str] | None = None,
+    effects: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Calibration:
     """Refine a calibration of a sample of frames on all partitions.
 
     `start`: calibration of the sample by the ``efficient`` method; its estimate from interstar
-    angles stays. `cluster`: processes that read the partitions. `effects`: those beyond the camera;
-    those that the data ask for where it is empty, none where it is None.
+    angles stays. `cluster`: processes that read the partitions. `effects`: those that shift
+    stars; with ``auto`` also those that the data ask for.
     `duplicates`: what to do with frames that hold the same pixels as another. `progress`: called
     with (partitions done, partitions) in every pass. CalibrationError when there is no estimate.
     RepeatedFramesError when frames hold the same pixels and are refused. ObservationError for bad
@@ -343,11 +343,11 @@ def calibrate_partitions(
         fingerprints=None,
     )
     beside = None
-    if effects is not None:
+    if effects:
         n = dof + len(first)
         stars = FileStars(obs, sample, Around.of(cal), n, effects, total)
         cal = with_effects_of(stars, cal, effects)
-        if cal.effects is not None and cal.effects.names:
+        if cal.effects is not None and cal.effects.fitted:
             held = replace(cal.effects, node_grams=cal.effects.node_grams[:0])
             beside = Beside(stars.files, held, cal.theta, cal.sigma)
     camera, theta, sigma = cal.camera, cal.theta, cal.sigma

@@ -106,7 +106,8 @@ class FileStars:
                 "the effect 'star' needs all stars in memory, and these observations are "
                 "partitions: leave it out, or calibrate the frames of `obs.sample()` with it."
             )
-        names = sorted({_COVARIATES[name] for name in wanted or _COVARIATES if name in _COVARIATES})
+        asked = _COVARIATES if "auto" in wanted else wanted
+        names = sorted({_COVARIATES[name] for name in asked if name in _COVARIATES})
         names = [name for name in names if name in obs.columns]
         _check_columns(parts, names)
         reader = replace(parts.reader, also=tuple(names))

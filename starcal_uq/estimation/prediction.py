@@ -55,7 +55,7 @@ def predicted(
 ) -> PredictedCamera:
     """The camera of an estimate with effects; `Calibration.at` describes the others."""
     camera, names = estimate.camera, () if effects is None else effects.names
-    if effects is None or not names:
+    if effects is None or not effects.fitted:
         if temperature_c is None and time_utc is None and not new_night:
             return estimate
         raise CalibrationError(

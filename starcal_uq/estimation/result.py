@@ -30,8 +30,7 @@ from starcal_uq.estimation.residual_map import PartitionSums
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.undetermined import remedy_of
 from starcal_uq.likelihood.compressed import CompressedLikelihood
-from starcal_uq.likelihood.fitted_effects import Effects
-from starcal_uq.likelihood.star_errors import StarErrors
+from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
 from starcal_uq.likelihood.ties import FittedTies
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, is_positive
@@ -91,7 +90,6 @@ _DOCUMENT = (
         "stages",
         "compressed",
         "fingerprints",
-        "star_errors",
         "partitions",
         "undetermined",
         "effects",
@@ -213,9 +211,6 @@ class Calibration(Shown, Traced):
     fingerprints : Fingerprints or None
         What identifies the frames, so that a measurement is not counted twice; None for a stream,
         and for a calibration by a version before this one.
-    star_errors : StarErrors or None
-        Direction errors of the stars, where they were asked for: `covariance`, `information` and
-        `compressed` hold them, and residuals and attitudes are those after each star's own offset.
     partitions : PartitionSums or None
         Of a calibration of partitioned observations, sums over all of their residuals: `frame_ids`,
         `quaternions`, `residuals_px`, `pair_theta` and `pair_covariance` are those of a sample of
@@ -256,7 +251,6 @@ class Calibration(Shown, Traced):
     compressed: CompressedLikelihood
     provenance: Provenance
     fingerprints: Fingerprints | None = None
-    star_errors: StarErrors | None = None
     partitions: PartitionSums | None = None
     undetermined: tuple[str, ...] = ()
     effects: Effects | None = None
@@ -358,7 +352,7 @@ class Calibration(Shown, Traced):
 
     @property
     def noise_model(self) -> NoiseModel | None:
-        """How the noise varies, of a calibration with ``noise="model"``; None otherwise."""
+        """How the noise varies, of a calibration with the effect ``noise``; None otherwise."""
         from starcal_uq.likelihood.noise_model import noise_model_of
 
         return noise_model_of(self)
@@ -476,7 +470,7 @@ class Calibration(Shown, Traced):
         """Log likelihood (n,) of the whole data set at theta (n, p), px units, and sigma (n,), the
         scales of effects integrated.
         """
-        if self.effects is None or not self.effects.names:
+        if self.effects is None or not self.effects.fitted:
             return self.compressed.log_likelihood(theta, sigma)
         return self.effects.mixed(self.compressed, theta, sigma)
 
@@ -609,11 +603,31 @@ class Calibration(Shown, Traced):
                     "again if it is being "
                     f"written, or {remedy}."
                 )
+            stars = document.pop("star_errors", None)
             found = from_plain(cls, document, arrays)
+            if stars is not None:
+                found = replace(found, effects=_of_stars(stars, found.compressed))
             # What the data leave open has no information.
             if not is_positive(found.information, strictly=not found.undetermined):
                 raise ValueError("its information matrix is not positive definite")
             return found
+
+
+def _of_stars(stars: AnyDict, compressed: CompressedLikelihood) -> Effects:
+    """Errors of the stars of an earlier version, which had a record of their own, as an effect."""
+    tau, nothing = float(stars["tau_px"]), np.nan
+    factor = float(np.exp(1.96 * stars["tau_px_std"] / max(tau, 1e-12)))
+    own = FittedEffect("star", tau, tau / factor, tau * factor, nothing, nothing, nothing, "")
+    return Effects(
+        (own,),
+        False,
+        (),
+        0.0,
+        cross=np.zeros((len(compressed.theta_hat), 0)),
+        node_grams=compressed.gram[None],
+        node_log_weights=np.zeros(1),
+        stated_px=float(stars["stated_px"]),
+    )
 
 
 def _at(nominal: Camera, theta: FloatArray, sigma: float, dof: int, status: Status) -> AnyDict:

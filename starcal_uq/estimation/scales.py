@@ -130,14 +130,16 @@ def parameters_at(solved: Solved, p: int) -> tuple[FloatArray, FloatArray]:
 
 
 def selected(
-    restricted: Restricted, candidates: Sequence[str]
+    restricted: Restricted,
+    candidates: Sequence[str],
+    logs: dict[str, float],
+    steps: list[Step],
 ) -> tuple[dict[str, float], list[Step], list[tuple[str, float]]]:
-    """Logs of the scales of the effects that the data ask for, how they were taken up, and what the
-    others would gain.
+    """Logs of the scales of the effects that the data ask for beside those of `logs`, how they were
+    taken up, and what the others would gain.
     """
-    logs: dict[str, float] = {}
-    steps: list[Step] = []
-    least = penalty(len(candidates))
+    asked = tuple(logs)
+    least = penalty(len(candidates) - len(asked))
     now, solved, sigma = restricted.at(logs)
     while True:
         tried = {n: restricted.alone(logs, n) for n in candidates if n not in logs}
@@ -152,7 +154,8 @@ def selected(
             gain, name = (air, "zenith") if air > max(least, gain - least) else (gain, name)
         before = parameters_at(solved, restricted.p)
         logs = restricted.together({**logs, name: tried[name][0]})
-        logs = {n: v for n, v in logs.items() if n == name or v > _RANGE[0] + 0.1}
+        stay = (name, *asked)
+        logs = {n: v for n, v in logs.items() if n in stay or v > _RANGE[0] + 0.1}
         steps = [step for step in steps if step.name in logs]
         now, solved, sigma = restricted.at(logs)
         after = parameters_at(solved, restricted.p)
@@ -224,6 +227,8 @@ def _spread(density: Callable[[FloatArray], float], centre: FloatArray) -> Float
 def forced(restricted: Restricted, names: Sequence[str]) -> tuple[dict[str, float], list[Step]]:
     """Logs of the scales of effects that were asked for, and what each gains beside the others."""
     logs: dict[str, float] = {}
+    if not names:
+        return logs, []
     for name in names:
         logs[name] = restricted.alone(logs, name)[0]
     logs = restricted.together(logs)

@@ -10,16 +10,18 @@ from typing import Any, Protocol, TypedDict, get_args
 from starcal_uq.attitude.relative import RelativeAttitudes, load_relative_attitudes
 from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.settings import Duplicates, Method, MountKind, NoiseKind, Solver
-from starcal_uq.core.types import PathLike
-from starcal_uq.likelihood.composed import (
-    EffectTerms,
-    FixedMount,
-    Likelihood,
-    StarDirections,
-    StudentTails,
+from starcal_uq.core.settings import (
+    WEIGHING,
+    Duplicates,
+    Method,
+    MountKind,
+    Solver,
+    effect_names,
+    joined_effects,
 )
+from starcal_uq.core.types import PathLike
 from starcal_uq.likelihood.student import parse_dof
+from starcal_uq.likelihood.ties import FixedMount
 
 METHODS = get_args(Method)
 ITERATIONS = 200
@@ -27,10 +29,10 @@ ITERATIONS = 200
 _WORDS = {
     "method": METHODS,
     "solver": get_args(Solver),
-    "likelihood": ("marginal", "student_t"),
-    "noise": get_args(NoiseKind),
     "mount": get_args(MountKind),
 }
+# Keywords of earlier versions, and the effects that they are now.
+_EARLIER = {"likelihood": "tails", "noise": "noise", "star_errors": "star"}
 
 
 class MethodOptions(Protocol):
@@ -47,11 +49,8 @@ class EstimationOptions(TypedDict, total=False):
     method: str
     solver: str
     max_iterations: int
-    likelihood: str | Likelihood
+    effects: str | Sequence[str] | None
     dof: float | str | None
-    noise: str
-    star_errors: bool
-    effects: str | Sequence[str]
     relative_attitudes: RelativeAttitudes | PathLike | None
     mount: str
     mount_sigma_arcsec: float | None
@@ -63,9 +62,6 @@ class EstimationOptions(TypedDict, total=False):
 class EstimationSettings:
     """How a calibration is made; `calibrate` describes the fields, which are its keywords.
 
-    `likelihood` is a composed one, or its name, to which `dof`, `noise`, `star_errors`,
-    `effects`, `relative_attitudes` and `mount` add parts.
-
     Raises
     ------
     CalibrationError
@@ -76,11 +72,8 @@ class EstimationSettings:
     method: str = "efficient"
     solver: str = "lm"
     max_iterations: int = ITERATIONS
-    likelihood: str | Likelihood = "marginal"
+    effects: str | Sequence[str] | None = "none"
     dof: float | str | None = None
-    noise: str = "common"
-    star_errors: bool = False
-    effects: str | Sequence[str] = "none"
     relative_attitudes: RelativeAttitudes | PathLike | None = None
     mount: str = "free"
     mount_sigma_arcsec: float | None = None
@@ -95,39 +88,23 @@ class EstimationSettings:
                     f"{name} {value!r} is unknown: use one of {', '.join(words)}."
                 )
         parse_dof(self.dof, CalibrationError)
+        if self.dof is not None and not self.tails:
+            raise CalibrationError(
+                f"dof={self.dof!r} belongs to effects='tails': add this effect, or leave dof out."
+            )
         self.refuse_conflicts()
 
     def refuse_conflicts(self, **others: object) -> None:
         """Refuse settings that exclude each other or some others, such as ``partitioned=True``."""
-        refuse_conflicts(
-            **{
-                **{field.name: getattr(self, field.name) for field in fields(self)},
-                "likelihood": self.composed.name,
-                "noise": self.composed.noise,
-                "star_errors": self.composed.star_errors,
-                "effects": self.composed.effects,
-                "mount": None if self.mount == "free" else self.mount,
-                "relative_attitudes": None if self.mount == "fixed" else self.composed.ties,
-                **others,
-            }
-        )
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        own["effects"] = joined_effects(self.effects)
+        own["mount"] = None if self.mount == "free" else self.mount
+        own["relative_attitudes"] = None if self.mount == "fixed" else self.ties
+        refuse_conflicts(**own | others)
 
     @cached_property
-    def composed(self) -> Likelihood:
-        """The likelihood of its parts."""
-        if isinstance(self.likelihood, Likelihood):
-            return self.likelihood
-        tails = None
-        if self.likelihood == "student_t":
-            tails = StudentTails(parse_dof(self.dof, CalibrationError))
-        noise: NoiseKind = "model" if self.noise == "model" else "common"
-        effects = EffectTerms.parsed(self.effects)
-        terms = (StarDirections(),) if self.star_errors else ()
-        terms = terms if effects is None else (*terms, effects)
-        return Likelihood(noise, tails, terms, self._ties)
-
-    @property
-    def _ties(self) -> RelativeAttitudes | FixedMount | None:
+    def ties(self) -> RelativeAttitudes | FixedMount | None:
+        """What ties the attitudes of different frames."""
         if self.mount == "fixed":
             return FixedMount(self.mount_sigma_arcsec or 0.0)
         known = self.relative_attitudes
@@ -135,14 +112,34 @@ class EstimationSettings:
             return known
         return load_relative_attitudes(known)
 
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names in the list of effects, ``auto`` among them."""
+        return effect_names(self.effects)
+
     @property
-    def weighs(self) -> bool:
-        """Whether residuals decide how much stars count: by tails, or a model of the noise."""
-        return self.composed.tails is not None or self.composed.noise == "model"
+    def shifting(self) -> tuple[str, ...]:
+        """The same of effects that shift stars."""
+        return tuple(name for name in self.names if name not in WEIGHING)
+
+    @property
+    def noise(self) -> bool:
+        """Whether the noise is to vary from star to star."""
+        return "noise" in self.names
+
+    @property
+    def tails(self) -> bool:
+        """Whether residuals are to have the tails of a Student t."""
+        return "tails" in self.names
 
     def changed(self, **options: Any) -> EstimationSettings:
         """The settings with some of their fields changed.
 
         TypeError for a name that is not one of them.
         """
+        for name in options:
+            if name in _EARLIER:
+                raise TypeError(
+                    f"{name} is no setting any more: use effects={_EARLIER[name]!r} in its place."
+                )
         return replace(self, **options)

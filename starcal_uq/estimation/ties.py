@@ -19,10 +19,9 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.stages import Search, Stage
 from starcal_uq.estimation.undetermined import coma_record, undetermined
-from starcal_uq.likelihood.composed import FixedMount
 from starcal_uq.likelihood.compressed import settled, unit_covariance
 from starcal_uq.likelihood.sums import Attitudes, frame_sums
-from starcal_uq.likelihood.ties import FittedTies, TiedLikelihood, Ties
+from starcal_uq.likelihood.ties import FittedTies, FixedMount, TiedLikelihood, Ties
 from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
 
 if TYPE_CHECKING:

@@ -20,7 +20,6 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.compressed import compress
 from starcal_uq.likelihood.effect_sums import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.star_errors import StarLikelihood
 from starcal_uq.likelihood.ties import TiedLikelihood, Ties
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import frame_sample
@@ -45,19 +44,12 @@ class ExactMarginal:
         self, obs: Observations | StarFrames, cal: Calibration, rotations: FloatArray | None = None
     ) -> None:
         model, theta = cal.camera.distortion, cal.theta
-        if cal.star_errors is not None and not isinstance(obs, StarFrames):
-            start = quaternion_to_rotation(cal.quaternions)
-            self._one: MarginalLikelihood = StarLikelihood(
-                obs, model, theta, start, cal.star_errors, cal.sigma
-            )
-            self._one.use_rotations(self._one.rotations_at(theta))
-            return
         if cal.ties is not None and not isinstance(obs, StarFrames):
             ties = Ties.of(obs.frame_ids, cal.ties.known)
-            self._one = TiedLikelihood(obs, model, ties, cal.ties.sigma)
+            self._one: MarginalLikelihood = TiedLikelihood(obs, model, ties, cal.ties.sigma)
             self._one.use_rotations(quaternion_to_rotation(cal.quaternions))
             return
-        if cal.effects and cal.effects.names and not isinstance(obs, StarFrames):
+        if cal.effects and cal.effects.fitted and not isinstance(obs, StarFrames):
             effects = cal.effects.of(obs, cal.camera)
             frames = StarFrames.from_observations(obs, axes=True)
             at = (theta, quaternion_to_rotation(cal.quaternions), cal.sigma)
@@ -97,7 +89,7 @@ class FrameSample:
         )
         frames = StarFrames.from_observations(some, axes=True)
         frame = np.repeat(np.arange(some.n_frames), frames.sizes)
-        plain = replace(cal, star_errors=None, effects=None, ties=None)
+        plain = replace(cal, effects=None, ties=None)
         self._batches = []
         for first in range(min(BATCHES, some.n_frames)):
             batch = frames.select(frame % BATCHES == first)

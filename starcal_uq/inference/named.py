@@ -165,7 +165,7 @@ def _named_source(
         )
     if likelihood == "marginal":
         return _marginal(obs, cal)
-    if cal.effects and cal.effects.names:
+    if cal.effects and cal.effects.fitted:
         raise SamplingError(
             f"the calibration holds effects, which the likelihood {likelihood!r} does not know: "
             "sample with likelihood='marginal', or calibrate with effects='none'."
@@ -175,12 +175,6 @@ def _named_source(
             "the calibration holds known rotations between frames, which the likelihood "
             f"{likelihood!r} does not know: sample with likelihood='marginal', or calibrate "
             "without relative_attitudes and mount."
-        )
-    if cal.star_errors is not None:
-        raise SamplingError(
-            f"the calibration holds errors of the stars, which the likelihood {likelihood!r} "
-            "does not know: sample "
-            "with likelihood='marginal', or calibrate without star_errors."
         )
     if obs is None:
         raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
@@ -233,8 +227,9 @@ def _marginal(obs: Observations | None, cal: Calibration) -> Source:
             exact = sample.log_likelihood
         else:
             exact = _scales_integrated(cal, ExactMarginal(obs, cal).log_likelihood)
+            of_stars = cal.effects is not None and cal.effects.star_px > 0.0
             # Stars that bring errors along make frames depend on each other.
-            if obs.n_frames > _MANY * SAMPLED_FRAMES and cal.star_errors is None:
+            if obs.n_frames > _MANY * SAMPLED_FRAMES and not of_stars:
                 sample = FrameSample(obs, cal)
     at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
     return Source("marginal", *at, exact=exact, fast=cal.log_likelihood, sample=sample)
@@ -244,7 +239,7 @@ def _scales_integrated(cal: Calibration, exact: LogLikelihood) -> LogLikelihood:
     """An exact likelihood at the best scales of effects with what integrating over the scales
     changes.
     """
-    if not (cal.effects and cal.effects.names):
+    if not (cal.effects and cal.effects.fitted):
         return exact
 
     def integrated(theta: FloatArray, sigma: FloatArray) -> FloatArray:

@@ -393,7 +393,7 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
         camera=cal.camera,
         provenance=run.provenance,
         dof_draws=None if extra is None else extra.reshape(-1),
-        star_error_px=_star_error_px(cal),
+        star_error_px=0.0 if cal.effects is None else cal.effects.star_px,
         effects=_effects(cal, draws.reshape(-1, len(shown))[:, :-1]),
     )
     derived = derived_quantities(posterior)
@@ -403,19 +403,12 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
     return replace(posterior, diagnostics=replace(diagnostics, checks=checks, derived=derived))
 
 
-def _star_error_px(cal: Calibration) -> float:
-    """Direction error of a star per axis, px; zero where the calibration holds none."""
-    if cal.star_errors is not None:
-        return cal.star_errors.total_px
-    return 0.0 if cal.effects is None else cal.effects.scale("star")
-
-
 def _effects(cal: Calibration, theta: FloatArray) -> Effects | None:
     """The effects of a calibration beside draws (n, p) of the parameters, which their coefficients
     follow as far as the data tie these together.
     """
     effects = cal.effects
-    if effects is None or not effects.names:
+    if effects is None or not effects.fitted:
         return None
     # The draws hold the scales already, and no camera that flies needs the zeniths.
     effects = replace(

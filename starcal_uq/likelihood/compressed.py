@@ -24,7 +24,6 @@ from starcal_uq.likelihood import arrays
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood, Profile
 from starcal_uq.likelihood.paths import sums_for
 from starcal_uq.likelihood.sums import Attitudes, NormalSums, settled_sums
-from starcal_uq.likelihood.terms import Term, TermSums
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 
@@ -171,8 +170,6 @@ def compress(
     theta_hat: FloatArray,
     covariance: FloatArray,
     rotations: FloatArray | None = None,
-    term: Term | None = None,
-    sigma: float = 1.0,
 ) -> CompressedLikelihood:
     """Compress a likelihood around an estimate.
 
@@ -181,7 +178,6 @@ def compress(
     `covariance` (p, p): covariance there; sets the whitened coordinates. `rotations` (K, 3, 3):
     attitudes to start from; otherwise those where the likelihood's own searches start, or
         QUEST's.
-    `term`: linear in the pixels, marginalised; `sigma` is the noise that its prior is relative to.
     """
     whitening, theta = scaled_cholesky(covariance), np.asarray(theta_hat, dtype=np.float64)
     frames, model_name = likelihood.frames, likelihood.model_name
@@ -189,12 +185,7 @@ def compress(
         known = likelihood.sums(theta, tolerance=TURN_RAD)
     else:
         known = settled_sums(frames, model_name, theta, rotations)
-    if term is None:
-        return gram_sums(frames, model_name, theta, whitening, known).likelihood(theta, whitening)
-    of_term = TermSums(term)
-    sums = expanded(likelihood, theta, whitening, known, of_term.add)
-    taken = of_term.eliminated(term.ratio(sigma)).correction()
-    return dataclasses.replace(sums, gram=sums.gram - taken).likelihood(theta, whitening)
+    return gram_sums(frames, model_name, theta, whitening, known).likelihood(theta, whitening)
 
 
 def expanded(

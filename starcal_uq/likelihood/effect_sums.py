@@ -297,7 +297,7 @@ class EffectSums:
             outer, inner = total.outer.star, total.inner.star
             cross = np.concatenate([inner[:, :m], outer], axis=1) - also @ flat
             variance = ratio["star"] + self.stars.stated2 / self._sigma**2
-            eliminated = Eliminated(self.of_stars, np.repeat(variance, 2), also=also)
+            eliminated = Eliminated(self.of_stars, np.repeat(variance, 2), also)
             found = eliminated.coefficients(cross)
             taken = taken + 0.5 * (cross.T @ found + found.T @ cross)
             log_determinant += eliminated.log_determinant

@@ -105,12 +105,17 @@ def effects_of(
         found.append(zenith_effect(obs if seen is None else seen, zeniths))
     if known.magnitude is not None:
         found.append(_run("magnitude", magnitude_shape(known.magnitude, camera)))
-    if seen is None and extent is None:
-        model = StarModel(obs, float(camera.focal_px))
-        if model.n_recurring >= _FEWEST_STARS or np.any(model.stated2 > 0.0):
-            shape = Shape("directions of the stars", "star", 2, lambda view: view.uv[None][:0])
-            found.append(Effect("star", "star", shape, np.ones(2), model))
+    if extent is None:
+        stars = StarModel(obs if seen is None else seen, float(camera.focal_px))
+        if seen is not None or stars.n_recurring >= _FEWEST_STARS or np.any(stars.stated2 > 0.0):
+            found.append(star_effect(stars))
     return {effect.name: effect for effect in found}
+
+
+def star_effect(stars: StarModel) -> Effect:
+    """Errors of the stars' directions, px at the boresight, beyond what their catalogue states."""
+    shape = Shape("directions of the stars", "star", 2, lambda view: view.uv[None][:0])
+    return Effect("star", "star", shape, np.ones(2), stars)
 
 
 def zenith_effect(obs: Observations, zeniths: Zeniths) -> Effect:

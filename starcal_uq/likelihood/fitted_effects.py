@@ -31,7 +31,8 @@ class FittedEffect:
         Name in the list of effects.
     scale_px, low_px, high_px : float
         Standard deviation of its coefficients, px at the corner of the field, and its 95 %
-        interval; 1 for `zenith`, whose coefficients have a known prior.
+        interval; 1 for `zenith`, whose coefficients have a known prior. Of `noise` the standard
+        deviation over the stars of their noise, px; NaN for what an effect lacks.
     size_px : float
         Root mean square per axis over the stars of the shifts that it explains, px; attitudes and
         parameters removed.
@@ -42,6 +43,8 @@ class FittedEffect:
         Largest change of a parameter when it was taken up, in its standard deviations.
     moved_name : str
         That parameter.
+    dof : float or None
+        Degrees of freedom of `tails`.
     """
 
     name: str
@@ -52,6 +55,14 @@ class FittedEffect:
     gain_nat: float
     moved_sigma: float
     moved_name: str
+    dof: float | None = None
+
+    @classmethod
+    def weighing(
+        cls, name: str, gain_nat: float, scale_px: float = np.nan, dof: float | None = None
+    ) -> FittedEffect:
+        """An effect that decides how much stars count, and shifts none."""
+        return cls(name, scale_px, np.nan, np.nan, np.nan, gain_nat, np.nan, "", dof)
 
 
 @dataclass(frozen=True)
@@ -97,8 +108,8 @@ class Effects(Shown):
     scales.
     """
 
-    fitted: tuple[FittedEffect, ...]
-    selected: bool  # Whether the data chose them; otherwise they were asked for
+    fitted: tuple[FittedEffect, ...]  # Those that shift stars
+    selected: bool  # Whether the data were to choose, beside those that were asked for
     # Candidates that were not taken up, and what the next one would have gained, nat
     refused: tuple[tuple[str, float], ...]
     penalty_nat: float  # Gain that an effect has to exceed
@@ -126,6 +137,10 @@ class Effects(Shown):
     stars: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     star_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     extent: Extent | None = None  # Of all frames, where their residuals are those of a sample
+    weighing: tuple[FittedEffect, ...] = ()  # Noise that varies, and tails
+    asked: tuple[str, ...] = ()  # Names of those that were asked for
+    # Root mean square of the direction errors that the catalogue of the effect `star` states, px
+    stated_px: float = 0.0
 
     SHAPES: ClassVar[Shapes] = {
         "coefficients": ("m",),
@@ -141,12 +156,19 @@ class Effects(Shown):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the effects."""
-        return tuple(effect.name for effect in self.fitted)
+        """Names of all effects: of those that weigh stars, then of those that shift them."""
+        return tuple(effect.name for effect in (*self.weighing, *self.fitted))
 
     def scale(self, name: str) -> float:
         """Scale of an effect, px at the corner; zero of one that is not there."""
         return next((e.scale_px for e in self.fitted if e.name == name), 0.0)
+
+    @property
+    def star_px(self) -> float:
+        """Direction error of a star per axis with what its catalogue states, px at the boresight;
+        zero where the effect `star` is not there.
+        """
+        return float(np.hypot(self.scale("star"), self.stated_px))
 
     def ratio(self, sigma: float) -> dict[str, float]:
         """Squares of the scales in units of `sigma` squared, by name."""
@@ -168,13 +190,15 @@ class Effects(Shown):
         LookupError for one that the table does not allow.
         """
         known = effects_of(obs, camera, zeniths=self.zeniths, extent=self.extent)
-        return [known[n] for n in self.names if n != "zenith" or self.zeniths is not None]
+        names = [effect.name for effect in self.fitted]
+        return [known[n] for n in names if n != "zenith" or self.zeniths is not None]
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per effect, those not taken up with their gain alone."""
         import pandas as pd
 
-        fitted = [vars(effect) | {"taken": True} for effect in self.fitted]
+        held = (*self.weighing, *self.fitted)
+        fitted = [vars(effect) | {"taken": True} for effect in held]
         refused = [{"name": n, "gain_nat": gain, "taken": False} for n, gain in self.refused]
         columns = [*(each.name for each in fields(FittedEffect)), "taken"]
         return pd.DataFrame([*fitted, *refused], columns=columns)

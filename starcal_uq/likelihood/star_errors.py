@@ -1,14 +1,12 @@
 """Errors that a star brings along: its direction is off by the same in every frame that shows it.
 
 A star s whose tabulated direction errs by u_s (px at the boresight, along two axes on the sky)
-shifts its images by ``Z u`` with Z the pixels per direction, turned with every frame: a term whose
-groups are the stars. With u_s of variance ``tau^2`` per axis, and what the catalogue states on top,
-its prior scale is ``sqrt(tau^2 + stated^2)``.
+shifts its images by ``Z u`` with Z the pixels per direction, turned with every frame. Its variance
+per axis is ``tau^2`` and what the catalogue states on top.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +14,7 @@ import numpy as np
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
-from starcal_uq.likelihood.terms import Term, TermLikelihood, TermSums
-from starcal_uq.observations.frames import StarFrames
+from starcal_uq.likelihood.terms import Term
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -28,8 +25,6 @@ _SAME_PX = 0.3
 # Stars of one name are one star within this: aberration and proper motion move a direction from
 # frame to frame.
 _SAME_NAME_PX, _SAME_NAME_RAD = 5.0, 6e-4
-# Range of log(tau^2 / sigma^2).
-_LOG_RATIO = (-14.0, 9.0)
 
 
 def star_numbers(obs: Observations, focal_px: float) -> IntArray:
@@ -119,14 +114,12 @@ def star_term(
     numbers: IntArray,
     directions: FloatArray,
     focal_px: float,
-    scale_px: FloatArray | float = 1.0,
     rigid: bool = False,
 ) -> Term:
     """Offsets of the stars along two axes on the sky, px at the boresight.
 
     `numbers` (N,): star of every image, from 0.
     `directions` (3, N): catalogue directions.
-    `scale_px` (S,): their standard deviation before any data.
     `rigid`: take the turn of the columns alone, of size one: shifts are then in units of the noise.
     """
     axes, n_stars = sky_axes(directions, numbers), int(numbers.max()) + 1
@@ -135,34 +128,7 @@ def star_term(
         z = offset_columns(part, state, axes[:, :, rows], focal_px)
         return _turn(z) if rigid else z
 
-    scale = np.broadcast_to(np.reshape(scale_px, (-1, 1)), (n_stars, 2))
-    return Term("stars' errors", "star_errors", numbers, scale, columns)
-
-
-@dataclass(frozen=True)
-class StarErrors:
-    """Direction errors of stars that the covariance of a calibration holds."""
-
-    # `tau_px`, `tau_px_std`: error of a star per axis beyond what its catalogue states, estimated
-    # by restricted maximum likelihood, and its standard error; px at the boresight.
-    tau_px: float
-    tau_px_std: float
-    # Root mean square of what the catalogue states, px; zero where the table states nothing
-    stated_px: float
-    focal_px: float  # Focal length that turns directions into these px
-    # `n_stars`, `n_recurring`: distinct stars, and those seen in more than one frame.
-    n_stars: int
-    n_recurring: int
-
-    @property
-    def tau_arcsec(self) -> float:
-        """`tau_px` as an angle."""
-        return self.tau_px / self.focal_px * ARCSEC
-
-    @property
-    def total_px(self) -> float:
-        """Error of a star per axis with what its catalogue states, px."""
-        return float(np.hypot(self.tau_px, self.stated_px))
+    return Term(numbers, n_stars, columns)
 
 
 class StarModel:
@@ -186,107 +152,6 @@ class StarModel:
         """Stars with more than one image."""
         return int(np.count_nonzero(self.images > 1))
 
-    def term(self, tau_px: float = 0.0) -> Term:
-        """The stars' errors, of `tau_px` per axis beyond what their catalogue states."""
-        scale = np.sqrt(tau_px**2 + self.stated2)
-        return star_term(self.numbers, self.directions, self.focal_px, scale)
-
-    def ratio(self, tau2: float, sigma: float) -> FloatArray:
-        """Variance of each star's offset along its two axes, (2 S,), in units of sigma^2."""
-        return np.repeat((tau2 + self.stated2) / sigma**2, 2)
-
-    def estimate(
-        self, likelihood: MarginalLikelihood, theta: FloatArray, scale: FloatArray, sigma: float
-    ) -> tuple[StarErrors, float, FloatArray]:
-        """Estimate tau by restricted maximum likelihood, linearised at theta (p,); `scale` (p,)
-        makes parameters alike.
-
-        Attitudes, parameters and sigma are integrated or profiled out; `sigma` is a first value.
-        Returns the errors, the noise of the images themselves, and what the errors add to the
-        covariance (p, p) of the estimate that takes images as independent, px units.
-        """
-        from scipy.optimize import minimize_scalar
-
-        p, sums = len(theta), TermSums(self.term())
-        gram = sums.add_linearised(likelihood, theta, scale, likelihood.rotations_at(theta))
-        dof = likelihood.dof - p
-
-        def restricted(log_ratio: float, noise: float) -> tuple[float, float]:
-            """Minus the restricted log likelihood, and the noise there."""
-            solved = sums.eliminated(self.ratio(float(np.exp(log_ratio)) * noise**2, noise))
-            left = gram - solved.correction()
-            rest = left[p, p] - left[:p, p] @ np.linalg.solve(left[:p, :p], left[:p, p])
-            value = dof * np.log(rest) + np.linalg.slogdet(left[:p, :p])[1] + solved.log_determinant
-            return float(0.5 * value), float(np.sqrt(rest / dof))
-
-        def cost(log_ratio: float) -> float:
-            return restricted(log_ratio, sigma)[0]
-
-        # What is stated is known in px: its share of the noise settles in a second round.
-        for _ in range(2 if np.any(self.stated2 > 0.0) else 1):
-            bounds = self._range(sums, gram, dof)
-            best = float(
-                minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02}).x
-            )
-            sigma = restricted(best, sigma)[1]
-        step = 0.2
-        curvature = (cost(best + step) + cost(best - step) - 2.0 * cost(best)) / step**2
-        tau = float(np.exp(0.5 * best) * sigma)
-        # The standard error of log ratio is twice that of log tau; near none at all the likelihood
-        # has no curvature.
-        relative = 0.5 / np.sqrt(curvature) if curvature > 0.25 else 1.0
-        inverse = np.linalg.inv(gram[:p, :p])
-        pull = np.sqrt(self.ratio(tau**2, 1.0))[:, None] * sums.cross[:, :p] @ inverse
-        errors = StarErrors(
-            tau_px=tau,
-            tau_px_std=float(tau * relative),
-            stated_px=float(np.sqrt(np.mean(self.stated2))),
-            focal_px=self.focal_px,
-            n_stars=len(self.images),
-            n_recurring=self.n_recurring,
-        )
-        return errors, sigma, pull.T @ pull * np.outer(scale, scale)
-
-    def _range(self, sums: TermSums, gram: FloatArray, dof: int) -> tuple[float, float]:
-        """Where to look for log(tau^2 / sigma^2): around what likeness within stars says (see
-        `diagnostics.stars`).
-        """
-        low, high = _LOG_RATIO
-        if np.any(self.stated2 > 0.0):
-            return low, high
-        p = len(gram) - 1
-        step = np.linalg.solve(gram[:p, :p], gram[:p, p])
-        pull = sums.cross[:, p] - sums.cross[:, :p] @ step
-        total = float(gram[p, p] - gram[:p, p] @ step)
-        g = sums.matrix
-        first, second = float(g.trace()), float(g.multiply(g).sum())
-        curvature = second - first**2 / dof
-        likeness = (float(pull @ pull) / total * dof - first) / curvature
-        error = np.sqrt(2.0 / curvature)
-        if likeness < 3.0 * error:
-            return low, min(float(np.log(6.0 * error)), high)
-        # The noise of the images themselves is below that of all together: the ratio may be several
-        # times larger.
-        return max(float(np.log(likeness)) - 2.0, low), high
-
-
-class StarLikelihood(TermLikelihood):
-    """Exact likelihood with the stars' errors marginalised at a given scale, in units of sigma.
-
-    Arguments are those of `TermLikelihood`; with `axes`, noise of x and y is what a noise model
-    found.
-    """
-
-    def __init__(
-        self,
-        obs: Observations,
-        model_name: str,
-        theta: FloatArray,
-        rotations: FloatArray,
-        errors: StarErrors,
-        sigma: float,
-        axes: bool = False,
-    ) -> None:
-        term = StarModel(obs, errors.focal_px).term(errors.tau_px)
-        frames = StarFrames.from_observations(obs, axes)
-        super().__init__(frames, model_name, term, theta, rotations, sigma)
+    def term(self) -> Term:
+        """The stars' errors, px at the boresight."""
+        return star_term(self.numbers, self.directions, self.focal_px)

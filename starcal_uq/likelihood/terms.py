@@ -1,17 +1,13 @@
-"""Terms of the residuals that are linear in the pixels and have a prior, and their elimination.
+"""Offsets of stars, linear in the pixels, and their elimination.
 
-A term shifts the images of a group of stars, such as those of one star, of one frame or of the
-whole run, by ``Z u`` with the same few coefficients u, which have variances `prior_scale` squared.
-In units of the noise the data then have the covariance
-
-    V = I + Z Lambda Z^T,   Lambda = prior_scale^2 / sigma^2.
-
-After the attitudes are projected out (P), products with W = V^-1 - V^-1 A (A^T V^-1 A)^-1 A^T V^-1
-need one system:
+A term shifts the images of every star by ``Z u`` with the same two coefficients u, which have a
+variance. In units of the noise the data then have the covariance ``V = I + Z Lambda Z^T``. After the
+attitudes are projected out (P), products with W = V^-1 - V^-1 A (A^T V^-1 A)^-1 A^T V^-1 need one
+system:
 
     x^T W y = x^T (I-P) y - c_x^T G^-1 c_y,   c_x = Z^T (I-P) x,   G = Lambda^-1 + Z^T (I-P) Z.
 
-G couples groups that were seen together. Z^T Z is block-diagonal over groups and P over frames, so
+G couples stars that were seen together. Z^T Z is block-diagonal over stars and P over frames, so
 that either side can be eliminated; the smaller one is left over, and is solved as a sparse or a
 dense matrix. Residuals and columns are whitened: any weights and axes of the noise are in them.
 """
@@ -28,7 +24,6 @@ import numpy as np
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
-from starcal_uq.observations.frames import StarFrames
 
 # A variance, in units of the noise, that is none.
 _NO_RATIO = 1e-10
@@ -42,31 +37,13 @@ _STARS_AT_ONCE = 20_000
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """Shifts of the images that groups of stars share, linear in c coefficients of each of G
-    groups.
-    """
+    """Shifts of the images of stars by two coefficients of each."""
 
-    # `name`, `option`: its errors in words, and the setting that asks for them.
-    name: str
-    option: str
-    groups: IntArray  # (N,): group of every image, from 0
-    # (G, c): standard deviation of the coefficients before any data; infinite where they are free
-    prior_scale: FloatArray
-    # Whitened shifts (c, 2, n) of the images of some rows by coefficients of one, of the model of
+    groups: IntArray  # (N,): star of every image, from 0
+    n_groups: int
+    # Whitened shifts (2, 2, n) of the images of some rows by coefficients of one, of the model of
     # their frames.
     columns: Callable[[MarginalLikelihood, Profile, slice], FloatArray]
-
-    def ratio(self, sigma: float) -> FloatArray:
-        """Variances (G c,) of the coefficients in units of `sigma` squared."""
-        return np.asarray((self.prior_scale / sigma) ** 2).ravel()
-
-    def shifts(
-        self, part: MarginalLikelihood, state: Profile, coefficients: FloatArray
-    ) -> FloatArray:
-        """Whitened shifts (q, 2, N) of all images by coefficients (G c, q)."""
-        z = self.columns(part, state, slice(None))
-        by_image = coefficients.reshape(*self.prior_scale.shape, -1)[self.groups]
-        return np.asarray(np.einsum("niq,ixn->qxn", by_image, z, optimize=True))
 
 
 def add_by_group(total: FloatArray, values: FloatArray, groups: IntArray) -> None:
@@ -85,8 +62,7 @@ class TermSums:
     """Sums over all images from which products with the covariance of a term follow."""
 
     def __init__(self, term: Term) -> None:
-        self.term = term
-        self.n_groups, self.size = term.prior_scale.shape
+        self.term, self.n_groups, self.size = term, term.n_groups, 2
         self.own = np.zeros((self.n_groups, self.size, self.size))
         self._cross: FloatArray | None = None
         self._blocks: list[tuple[FloatArray, IntArray, IntArray]] = []
@@ -174,10 +150,6 @@ class TermSums:
         """The same less the square of a coupling, sparse."""
         return (block_diagonal(self.own) - coupling @ coupling.T).tocsr()
 
-    def eliminated(self, ratio: FloatArray) -> Eliminated:
-        """Eliminate coefficients of variances `ratio` (G c,), in units of sigma^2."""
-        return Eliminated(self, ratio)
-
 
 def block_diagonal(blocks: FloatArray) -> Any:
     """A block-diagonal matrix of blocks (G, c, c), sparse."""
@@ -225,14 +197,14 @@ class Eliminated:
         self,
         sums: TermSums,
         ratio: FloatArray,
+        also: Any,
         by_group: bool | None = None,
-        also: Any = None,
     ) -> None:
         from scipy.sparse import diags_array, eye_array, hstack
 
         self._sums, self.ratio = sums, np.maximum(ratio, _NO_RATIO)
         precision = 1.0 / self.ratio
-        b = sums.coupling if also is None else hstack([sums.coupling, also]).tocsr()
+        b = hstack([sums.coupling, also]).tocsr()
         self._coupling = b
         self._by_group = b.shape[0] <= b.shape[1] if by_group is None else by_group
         log_own = 0.0
@@ -243,10 +215,9 @@ class Eliminated:
             self._inverse: FloatArray = np.asarray(np.linalg.inv(own), dtype=np.float64)
             log_own = float(np.sum(np.log(np.linalg.det(own))))
             left = eye_array(b.shape[1]) - b.T @ self._own_solve(b)
-        self._solve, log_factor = factor(left, sums.term.name, sums.term.option)
-        # log |I + Lambda Z^T (I-P) Z|; of free coefficients, that of their own matrix.
-        finite = self.ratio[np.isfinite(self.ratio)]
-        self.log_determinant = log_factor + log_own + float(np.sum(np.log(finite)))
+        self._solve, log_factor = factor(left, "errors of the stars", "the effect 'star'")
+        # log |I + Lambda Z^T (I-P) Z|
+        self.log_determinant = log_factor + log_own + float(np.sum(np.log(self.ratio)))
 
     def _own_solve(self, values: Any) -> Any:
         return block_diagonal(self._inverse) @ values
@@ -265,71 +236,3 @@ class Eliminated:
         precision = (1.0 / self.ratio).reshape(-1, sums.size, 1) * np.eye(sums.size)
         inverse = np.linalg.inv(sums.own + precision)
         return np.asarray(np.diagonal(inverse, axis1=1, axis2=2)).ravel()
-
-    def correction(self) -> FloatArray:
-        """What the term takes off the Gram matrix (q, q) of the columns that were added."""
-        cross = self._sums.cross
-        taken = cross.T @ self.coefficients(cross)
-        return np.asarray(0.5 * (taken + taken.T))
-
-
-class TermLikelihood(MarginalLikelihood):
-    """Exact likelihood with a term marginalised, its prior in units of sigma.
-
-    Coefficients are linear over fractions of a pixel; they are the best ones of the estimate's
-    system, and the cost that they and the attitudes leave is that of these residuals. Beyond the
-    attitudes' volume, determinants do not depend on theta enough to matter (1e-3 nat).
-
-    `frames`: data, with any weights and axes of the noise.
-    `theta` (p,): estimate, px units.
-    `rotations` (K, 3, 3): attitudes there.
-    `sigma`: noise that the prior is relative to.
-    """
-
-    def __init__(
-        self,
-        frames: StarFrames,
-        model_name: str,
-        term: Term,
-        theta: FloatArray,
-        rotations: FloatArray,
-        sigma: float,
-    ) -> None:
-        super().__init__(frames, model_name)
-        state, _ = self.profile(theta, rotations)
-        self.use_rotations(state.rotations)
-        sums = TermSums(term)
-        sums.add(self, state, np.zeros((1, 2, self.frames.n_stars)), slice(None))
-        self.term, self._eliminated = term, sums.eliminated(term.ratio(sigma))
-
-    def conditioned(self, state: Profile, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Columns (q, 2, N) less what attitudes and coefficients take of them, and those
-        coefficients (G c, q).
-        """
-        projected = self.project_out(state, columns)
-        z, q = self.term.columns(self, state, slice(None)), len(columns)
-        cross = np.zeros((*self.term.prior_scale.shape, q))
-        add_by_group(cross, np.einsum("ixn,qxn->iqn", z, projected), self.term.groups)
-        found = self._eliminated.coefficients(cross.reshape(-1, q))
-        return projected - self.project_out(state, self.term.shifts(self, state, found)), found
-
-    def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
-        rest, coefficients = self.conditioned(state, columns)
-        scaled = coefficients / np.sqrt(self._eliminated.ratio)[:, None]
-        return np.concatenate([rest.reshape(len(columns), -1), scaled.T], axis=1)
-
-    def random_shifts(self, state: Profile, rng: np.random.Generator) -> FloatArray:
-        """Whitened shifts (1, 2, N) of all images by random coefficients, in units of sigma."""
-        drawn = np.sqrt(self._eliminated.ratio) * rng.standard_normal(len(self._eliminated.ratio))
-        return self.term.shifts(self, state, drawn[:, None])
-
-    def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
-        state, cost = self.profile(theta, self._rotations)
-        if not np.isfinite(cost):
-            return -np.inf
-        left = self.whitened(state, state.e[None])
-        return float(
-            -0.5 * np.sum(left**2) / sigma**2
-            - self.dof * np.log(sigma)
-            - 0.5 * np.sum(state.log_determinant)
-        )

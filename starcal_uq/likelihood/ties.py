@@ -41,6 +41,26 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 
+@dataclass(frozen=True)
+class FixedMount:
+    """A camera that the Earth turns, and nothing else.
+
+    Attributes
+    ----------
+    sigma_arcsec : float
+        How far the mount moves from frame to frame about each axis, standard deviation, arcsec.
+    """
+
+    sigma_arcsec: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.sigma_arcsec < float("inf"):
+            raise CalibrationError(
+                f"mount_sigma_arcsec is {self.sigma_arcsec!r}: state how far the mount moves from "
+                "frame to frame, such as 1.0."
+            )
+
+
 @dataclass(frozen=True, eq=False)
 class FittedTies:
     """Known rotations between frames that a calibration holds.

@@ -216,10 +216,10 @@ def _drop_shared(
                 "one of the runs out."
             )
         rest = table.select_frames(np.delete(table.frame_ids, repeating))
-        noise = cal.provenance.settings.get("noise", "common")
+        effects = "none" if cal.noise_model is None else "noise"
         model = cal.nominal.distortion
         again = calibrate(
-            rest, cal.nominal, model=model, method=cal.method, noise=noise, duplicates="keep"
+            rest, cal.nominal, model=model, method=cal.method, effects=effects, duplicates="keep"
         )
         tables[i], calibrations[i] = rest, again
         earlier.append(fingerprints_of(again, rest))

@@ -79,13 +79,14 @@ class SimulatedCells(Cells):
         rng = np.random.default_rng(random)
         obs = observe(geometry, noise, settings, rng)
         likelihood = settings["likelihood"]
+        tails = ["tails"] if likelihood == "student_t" else []
+        stars = ["star"] if settings["direction_mas"] > 0.0 else []
         cal = calibrate(
             obs,
             camera.data_sheet(),
             model=camera.distortion,
             method=settings["method"],
-            likelihood="student_t" if likelihood == "student_t" else "marginal",
-            star_errors=settings["direction_mas"] > 0.0,
+            effects=[*tails, *stars],
         )
         stated, found = self._foretold(key, geometry, noise, cell, camera)
         prior = self._prior(cell, camera, cal, obs.sigma_px is not None, rng)

@@ -1,4 +1,4 @@
-"""Parts of a likelihood together: tails with noise that varies, and tails with errors of the stars.
+"""Effects that weigh stars, and others: tails with noise that varies, and tails with errors of the stars.
 
 The sensor and its wrong identifications are made with NumPy alone.
 """
@@ -10,7 +10,6 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.estimation.weights import weighed
-from starcal_uq.likelihood import Likelihood, StarDirections, StudentTails
 from tests.helpers.outside import campaign
 
 DRAWS = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 100, "n_burn": 30, "seed": 3}
@@ -49,33 +48,31 @@ def starred(seed):
 
 def test_tails_and_noise_that_varies_go_together():
     _, obs, camera = uneven(1)
-    cal = sc.calibrate(obs, camera, likelihood="student_t", noise="model")
-    alone = sc.calibrate(obs, camera, likelihood="student_t")
+    cal = sc.calibrate(obs, camera, effects="tails,noise")
+    alone = sc.calibrate(obs, camera, effects="tails")
     assert "radius" in cal.noise_model.terms and cal.noise_model.frame_dof is None
     assert np.all(cal.sigmas[2:] < 0.93 * alone.sigmas[2:]) and cal.sigma_name == "sigma_scale"
-    composed = Likelihood("model", StudentTails())
-    again = sc.calibrate(obs, camera, likelihood=composed)
-    assert np.array_equal(again.theta, cal.theta)
-    assert again.provenance["settings"] == cal.provenance["settings"]
+    assert cal.effects.names == ("noise", "tails")
+    assert all(effect.gain_nat > 20.0 for effect in cal.effects.weighing)
     assert cal.sampled_likelihood == "student_t"
     # The control: without tails the wrong stars spoil the fit.
     with pytest.raises(sc.errors.CalibrationError, match="do not fit the others"):
-        sc.calibrate(obs, camera, noise="model")
+        sc.calibrate(obs, camera, effects="noise")
 
 
 def test_even_noise_with_tails_stays_even():
     _, obs, camera = uneven(2, sigma_px=0.05)
-    cal = sc.calibrate(obs, camera, likelihood="student_t", noise="model")
-    alone = sc.calibrate(obs, camera, likelihood="student_t")
+    cal = sc.calibrate(obs, camera, effects="tails,noise")
+    alone = sc.calibrate(obs, camera, effects="tails")
     assert not cal.noise_model.varies and np.array_equal(cal.theta, alone.theta)
 
 
 def test_tails_and_errors_of_the_stars_go_together():
     c, obs, camera = starred(1)
-    cal = sc.calibrate(obs, camera, likelihood="student_t", star_errors=True)
-    composed = Likelihood(tails=StudentTails(), terms=(StarDirections(),))
-    assert np.array_equal(sc.calibrate(obs, camera, likelihood=composed).theta, cal.theta)
-    assert abs(cal.star_errors.tau_px - 0.1) < 3.0 * cal.star_errors.tau_px_std
+    cal = sc.calibrate(obs, camera, effects="tails,star")
+    assert cal.effects.names == ("tails", "star")
+    (star,) = cal.effects.fitted
+    assert star.low_px < 0.1 < star.high_px < 0.15
     assert np.all(np.abs(cal.theta - c.theta) < 3.0 * cal.sigmas)
     assert np.all(cal.tail_factors >= 1.0) and cal.residuals_px.shape == (obs.n_stars, 2)
     # Weights are the same whenever they are taken, and wrong stars have hardly any.
@@ -86,23 +83,21 @@ def test_tails_and_errors_of_the_stars_go_together():
     post = sc.sample(obs, cal, **DRAWS)
     assert np.allclose(np.std(post.draws[:, :5], axis=0), cal.sigmas, rtol=0.3)
     # The control: without tails the wrong stars are errors of the stars or noise.
-    gaussian = sc.calibrate(obs, camera, star_errors=True, throw=False)
+    gaussian = sc.calibrate(obs, camera, effects="star", throw=False)
     assert gaussian.sigmas[2] > 5.0 * cal.sigmas[2]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("made", "options"), [(uneven, {"noise": "model"}), (starred, {"star_errors": True})]
-)
-def test_intervals_of_parts_together_hold(made, options):
+@pytest.mark.parametrize(("made", "effect"), [(uneven, "noise"), (starred, "star")])
+def test_intervals_of_parts_together_hold(made, effect):
     """Of 24 campaigns; the control has the tails alone."""
     z, plain = [], []
     for seed in range(24):
         c, obs, camera = made(100 + seed)
-        for kept, parts in ((z, options), (plain, {})):
-            cal = sc.calibrate(obs, camera, likelihood="student_t", **parts)
+        for kept, parts in ((z, [effect]), (plain, [])):
+            cal = sc.calibrate(obs, camera, effects=["tails", *parts])
             kept.append((cal.theta - c.theta) / cal.sigmas)
     coverage, control = (np.mean(np.abs(np.array(kept)) < 1.96) for kept in (z, plain))
     assert coverage > 0.88, coverage
-    if "star_errors" in options:
+    if effect == "star":
         assert control < 0.87, control

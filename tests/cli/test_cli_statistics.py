@@ -154,7 +154,7 @@ def test_unknown_likelihood_is_named(cli, inputs):
 
 def test_robust_refinement(cli, inputs, tmp_path):
     status, _, _ = cli(
-        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--robust"
+        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--effects", "tails"
     )
     assert status == 0
     cal = sc.Calibration.load(tmp_path / "run" / "calibration.json")

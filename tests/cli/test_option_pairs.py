@@ -26,10 +26,7 @@ VALUES = {
     "--method": ("three_stage", "least_squares", "samaan", "griffith"),
     "--solver": ("minpack", "ipopt"),
     "--screen": (None,),
-    "--robust": (None,),
-    "--star-errors": (None,),
-    "--noise": ("model",),
-    "--effects": ("auto", "none", "field,frame", "star"),
+    "--effects": ("auto", "none", "field,frame", "star", "noise", "tails", "auto,noise,tails"),
     "--start": ("x0_px=500",),
     "--max-iterations": ("500",),
     "--duplicates": ("drop", "keep"),
@@ -205,20 +202,20 @@ def test_some_pairs_of_options_work_or_are_refused_in_words(asked):
     # Neither is everything refused, nor nothing.
     assert 20 < np.sum(begun) < 100
     # Controls: these are known.
-    assert asked("plain.csv", [("--robust", None), ("--model", "k1")])
-    assert asked("plain.csv", [("--robust", None), ("--noise", "model")])
-    assert asked("plain.csv", [("--robust", None), ("--star-errors", None)])
-    assert asked("plain.csv", [("--effects", "auto"), ("--noise", "model")])
-    assert asked("plain.csv", [("--effects", "field"), ("--robust", None)])
+    assert asked("plain.csv", [("--effects", "tails"), ("--model", "k1")])
+    assert asked("plain.csv", [("--effects", "tails,noise"), ("--likelihood", "student_t")])
+    assert asked("plain.csv", [("--effects", "tails,star"), ("--likelihood", "marginal")])
+    assert asked("plain.csv", [("--effects", "auto,noise")])
+    assert asked("plain.csv", [("--effects", "noise"), ("--likelihood", "pairs")])
     assert asked("plain.csv", [("--effects", "auto"), ("--screen", None)])
     assert asked("parts", [("--effects", "none")])
-    assert asked("plain.csv", [("--effects", "none"), ("--star-errors", None)])
     assert not asked("parts", [("--effects", "auto")])
-    assert not asked("plain.csv", [("--effects", "frame"), ("--star-errors", None)])
+    assert not asked("plain.csv", [("--effects", "none,frame")])
     assert not asked("plain.csv", [("--effects", "auto"), ("--method", "samaan")])
-    assert not asked("plain.csv", [("--robust", None), ("--method", "three_stage")])
-    assert not asked("plain.csv", [("--star-errors", None), ("--method", "samaan")])
-    assert not asked("parts", [("--star-errors", None)])
+    assert not asked("plain.csv", [("--effects", "tails"), ("--method", "three_stage")])
+    assert not asked("plain.csv", [("--effects", "tails"), ("--likelihood", "marginal")])
+    assert not asked("plain.csv", [("--effects", "star"), ("--likelihood", "student_t")])
+    assert not asked("parts", [("--effects", "star")])
 
 
 @pytest.mark.slow

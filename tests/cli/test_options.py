@@ -253,3 +253,34 @@ def test_the_least_and_oddest_numbers_that_are_accepted_work_or_are_refused(
                 assert "nan" not in " ".join(lines), (option, value, err)
                 tried += 1
     assert tried > 40
+
+
+@pytest.mark.parametrize(
+    ("words", "effect"),
+    [(("--robust",), "tails"), (("--noise", "model"), "noise"), (("--star-errors",), "star")],
+)
+def test_switches_of_earlier_versions_name_the_effect_in_their_place(cli, words, effect):
+    for command in ("calibrate", "run"):
+        status, _, err = cli(command, "obs.csv", "camera.toml", "-o", "run", *words)
+        assert status == 2
+        assert f"{words[0]} is no option any more: give --effects {effect} in its place." in err
+    # Control: other commands have never had them.
+    assert "no option any more" not in cli("report", "run", *words)[2]
+
+
+def test_a_remedy_adds_its_effect_to_the_list_that_was_given(monkeypatch):
+    from starcal_uq.cli.remedies import as_given
+    from starcal_uq.core.remedy import calibrated
+
+    (remedy,) = calibrated(effects="tails")
+    for given, wanted in (
+        (
+            ["--effects", "field,noise", "--seed", "3"],
+            "--seed 3 --force --effects field,noise,tails",
+        ),
+        (["--effects=tails"], "--force --effects tails"),
+        (["--effects", "none"], "--force --effects tails"),
+    ):
+        words = ["starcal-uq", "calibrate", "obs.csv", "camera.toml", *given]
+        monkeypatch.setattr("sys.argv", words)
+        assert as_given(remedy) == f"starcal-uq calibrate obs.csv camera.toml {wanted}"

@@ -267,7 +267,7 @@ EXAMPLES = {
         ]
         + [
             observed.noise(s.uneven, dataclasses.replace(cal, sigma=99.0))
-            for cal in (sc.calibrate(s.uneven, s.sheet, noise="model"),)
+            for cal in (sc.calibrate(s.uneven, s.sheet, effects="noise"),)
         ]
     ),
     "diagnostics.verdict.observed.partitions": lambda s: [
@@ -352,7 +352,7 @@ ARGUMENTS = {
     "evaluation='exact'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
     "likelihood='marginal'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
     "likelihood='pairs'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
-    "likelihood='student_t'": "sc.calibrate(obs, camera, {})",
+    "likelihood='student_t'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
     "method='efficient'": "sc.calibrate(obs, camera, {})",
     "method='griffith'": "sc.calibrate(obs, camera, {})",
     "method='three_stage'": "sc.calibrate(obs, camera, {})",
@@ -451,7 +451,7 @@ def execute(small, cli, tmp_path):
         folder = tmp_path / f"files{len(list(tmp_path.iterdir()))}"
         shutil.copytree(small.folder, folder)
         words = [*shlex.split(command), *shlex.split(more)]
-        ground = "GROUND_" if "SITE" in words else "PATCH_" if "--star-errors" in words else ""
+        ground = "GROUND_" if "SITE" in words else "PATCH_" if "star" in words else ""
         files = {
             "OBS": f"{ground}OBS.csv",
             "CAMERA": f"{ground}CAMERA.toml",
@@ -498,7 +498,7 @@ def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
             execute(command, more, parse=words[0] == "validate")
         else:
             assert tried.startswith("sc."), tried
-            stars = {"obs": small.patch, "camera": small.sheet} if "star_errors" in tried else {}
+            stars = {"obs": small.patch, "camera": small.sheet} if "'star'" in tried else {}
             eval(tried, names | stars)
 
 

@@ -90,11 +90,11 @@ def test_errors_of_stars_that_no_catalogue_has_are_no_way_out():
         c = campaign(rng, n_frames=6, stars_per_frame=25, patch_stars=30, star_sigma_px=size)
         obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
         cal = sc.calibrate(
-            obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), star_errors=True
+            obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), effects="star"
         )
         levels[size] = stars(sc.diagnostics.star_test(obs, cal))
     assert levels[0.1].level is Level.PASS
-    assert levels[5.0].level is Level.FAIL and "--star-errors" in levels[5.0].advice
+    assert levels[5.0].level is Level.FAIL and "--effects star" in levels[5.0].advice
 
 
 def test_a_calibration_alone_is_no_verdict_and_names_the_command_that_makes_one(call, tmp_path):

@@ -126,7 +126,7 @@ def smear(uv):
     return np.array([0.12 * rng.standard_normal(uv.shape[1]), np.zeros(uv.shape[1])])
 
 
-def outside(seed, *, air=None, star_errors=False, noise="common", meta=None, **options):
+def outside(seed, *, air=None, effects="none", meta=None, **options):
     """Frames without times from the simulator of another make, calibrated; `air` is where the
     zenith is.
     """
@@ -147,19 +147,19 @@ def outside(seed, *, air=None, star_errors=False, noise="common", meta=None, **o
     return (
         c,
         obs,
-        sc.calibrate(obs, camera, star_errors=star_errors, noise=noise, duplicates="keep"),
+        sc.calibrate(obs, camera, effects=effects, duplicates="keep"),
     )
 
 
-@pytest.mark.parametrize("star_errors", [False, True])
-def test_errors_of_stars_are_not_refraction(star_errors):
+@pytest.mark.parametrize("effects", ["none", "star"])
+def test_errors_of_stars_are_not_refraction(effects):
     for seed in range(4):
-        _, obs, cal = outside(seed, star_errors=star_errors, **PATCH)
+        _, obs, cal = outside(seed, effects=effects, **PATCH)
         found = air_test(obs, cal)
         assert not found.is_air and not found.like_others
         assert found.p_value > 1e-3
     # The control: refraction beside the errors of the stars.
-    c, obs, cal = outside(0, air="one", star_errors=star_errors, **PATCH)
+    c, obs, cal = outside(0, air="one", effects=effects, **PATCH)
     found = air_test(obs, cal)
     assert found.is_air
     assert abs(cal.theta[2] + found.f_px - c.theta[2]) < 4.0 * cal.sigmas[2] < 0.5 * found.f_px

@@ -5,7 +5,9 @@ say.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -184,28 +186,50 @@ def test_what_a_run_was_made_with_is_no_remedy():
         Level.WARN,
         remedies=NOISE + ROBUST,
     )
-    words = ("run", "obs.csv", "camera.toml", "--noise")
+    words = ("run", "obs.csv", "camera.toml")
     plain = ("--method", "least_squares")
-    found = Place("r", (*words, "model", *plain)).exact(asked)
-    # Plain least squares has neither Student-t tails nor a noise model.
+    found = Place("r", (*words, "--effects", "noise", *plain)).exact(asked)
+    # Plain least squares has neither tails nor noise that varies.
     assert (
         found.remedy == ""
-        and "made with --noise model already" in found.advice
-        and "--robust" in found.advice
+        and "made with --effects noise already" in found.advice
+        and "--effects tails" in found.advice
     )
-    alone = Place("r", ("run", "obs.csv", "camera.toml", "--robust", *plain)).exact(asked)
-    assert alone.remedy == "" and alone.advice.endswith("the run was made with --robust already.")
-    tried = (Tried({"noise": "model"}, 1, 0),)
-    fresh = Place("r", ("run", "obs.csv", "camera.toml"), tried=tried).exact(asked)
-    assert fresh.remedy == "starcal-uq run obs.csv camera.toml --robust -o r --force"
-    # Another value of the option takes its place; no option at all is something else.
-    first, *rest = Place("r", (*words, "common")).exact(asked).ways
-    assert (
-        first[0] == "starcal-uq run obs.csv camera.toml --noise model -o r --force"
-        and len(rest) == 2
+    alone = Place("r", (*words, "--effects", "tails", *plain)).exact(asked)
+    assert alone.remedy == "" and alone.advice.endswith(
+        "the run was made with --effects tails already."
     )
+    tried = (Tried({"effects": "auto,noise"}, 1, 0),)
+    fresh = Place("r", words, tried=tried).exact(asked)
+    assert fresh.remedy == "starcal-uq run obs.csv camera.toml --effects auto,tails -o r --force"
+    # Effects are added to those that are given, or that `run` looks for by itself; no option at all
+    # is something else.
+    for given, wanted in (
+        (("--effects", "none"), "noise"),
+        (("--effects", "field"), "field,noise"),
+        (("--effects", "field,tails"), "field,tails,noise"),
+        ((), "auto,noise"),
+        (("--likelihood", "pairs"), "noise"),
+    ):
+        first, *_ = Place("r", (*words, *given)).exact(asked).ways
+        found = dict(itertools.pairwise(shlex.split(first[0])))
+        assert found["--effects"] == wanted and first[0].count("--effects") == 1
     whole = dataclasses.replace(asked, remedies=calibrated("command"))
-    assert Place("r", (*words, "model")).exact(whole).remedy.endswith("--noise model -o r --force")
+    made = Place("r", (*words, "--effects", "noise")).exact(whole)
+    assert made.remedy.endswith("--effects noise -o r --force")
+
+
+def test_runs_of_earlier_versions_are_made_again_with_their_switches_as_effects():
+    check = Check(Code.OUTLIERS, level=Level.WARN, remedies=calibrated("command", effects="tails"))
+    words = ("run", "obs.csv", "camera.toml", "--noise", "model", "--star-errors", "--screen")
+    made = Place("r", words).exact(check)
+    assert made.remedy == (
+        "starcal-uq run obs.csv camera.toml --effects noise,star,tails --screen -o r --force"
+    )
+    again = Place("r", (*words, "--robust")).exact(check)
+    assert again.remedy == "" and "made with --effects tails already" in again.advice
+    even = Place("r", ("run", "obs.csv", "camera.toml", "--noise", "common")).exact(check)
+    assert "--noise" not in even.remedy and "--effects auto,tails" in even.remedy
 
 
 def test_remedies_name_the_files_of_the_run():
@@ -214,11 +238,11 @@ def test_remedies_name_the_files_of_the_run():
     """
     check = Check(Code.OUTLIERS, level=Level.WARN, remedies=SCREEN)
     made = Place(
-        "/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--noise", "model")
+        "/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--effects", "noise")
     ).exact(check)
     assert tuple(words for words, _ in made.ways) == (
         (
-            "starcal-uq run /data/obs.csv /data/camera.toml --noise model --screen -o '/a b/run' "
+            "starcal-uq run /data/obs.csv /data/camera.toml --effects noise --screen -o '/a b/run' "
             "--force"
         ),
         "sc.calibration.screen(obs, camera)",

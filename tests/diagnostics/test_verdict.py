@@ -406,7 +406,7 @@ def test_wrong_stars_of_a_robust_estimate_are_no_pattern(run):
     obs = dataclasses.replace(
         run.obs, dec_deg=run.obs.dec_deg + 0.8 * wrong * rng.choice([-1.0, 1.0], run.obs.n_stars)
     )
-    cal = sc.calibrate(obs, sc.paper.paper_start(), likelihood="student_t")
+    cal = sc.calibrate(obs, sc.paper.paper_start(), effects="tails")
     assert outcome("Pattern in the residuals", obs, cal).level is Level.PASS
     assert outcome("Outliers", obs, cal).level is not Level.PASS
     # A pattern of the others is found, and their mean is one with the wrong stars where no tails
@@ -422,7 +422,7 @@ def test_wrong_stars_of_a_robust_estimate_are_no_pattern(run):
         obs, dec_deg=run.obs.dec_deg + 0.8 * (wrong & ~first | first & (np.cumsum(first) == 3))
     )
     obs = obs.select(~first | (np.cumsum(first) <= 3))
-    cal = sc.calibrate(obs, sc.paper.paper_start(), likelihood="student_t")
+    cal = sc.calibrate(obs, sc.paper.paper_start(), effects="tails")
     assert of_heard(obs, cal)[0].n_frames < obs.n_frames
     tests, control = (
         sc.diagnostics.misfit_tests(obs, c) for c in (cal, dataclasses.replace(cal, provenance={}))

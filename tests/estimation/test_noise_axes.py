@@ -69,11 +69,11 @@ def test_attitude_noise_is_that_of_the_axes(covariance):
     obs, camera = given(c)
     true = np.sqrt(np.mean(attitude_errors(c, c.theta) ** 2, axis=0))
     by_noise = {}
-    for noise in ("common", "model"):
-        cal = sc.calibrate(obs, camera, noise=noise)
+    for effects in ("none", "noise"):
+        cal = sc.calibrate(obs, camera, effects=effects)
         found = misfit_tests(obs, cal)
-        by_noise[noise] = cal, found, sc.propagate(sc.sample(obs, cal, **SHORT), obs).nea_arcsec
-    cal, found, stated = by_noise["model"]
+        by_noise[effects] = cal, found, sc.propagate(sc.sample(obs, cal, **SHORT), obs).nea_arcsec
+    cal, found, stated = by_noise["noise"]
     # 60 frames tell a standard deviation to 9 %.
     assert np.all(np.abs(np.log(stated / true)) < 0.25)
     model = cal.noise_model
@@ -84,11 +84,11 @@ def test_attitude_noise_is_that_of_the_axes(covariance):
     assert np.linalg.det(model.axes) == pytest.approx(1.0)
     assert even_noise(found).level is Level.PASS
     # One noise for both axes is found to be wrong, and so is its attitude noise.
-    common, found, stated = by_noise["common"]
+    common, found, stated = by_noise["none"]
     check = even_noise(found)
     assert (
         check.level is Level.WARN
-        and "--noise model" in check.remedy
+        and "--effects noise" in check.remedy
         and "along x as along y" in check.sentence
     )
     assert np.max(np.abs(np.log(stated / true))) > 0.25
@@ -98,16 +98,16 @@ def test_attitude_noise_is_that_of_the_axes(covariance):
 
 def test_even_noise_has_no_axes():
     obs, camera = given(observed(EVEN, 1))
-    cal, common = (sc.calibrate(obs, camera, noise=noise) for noise in ("model", "common"))
+    cal, common = (sc.calibrate(obs, camera, effects=effects) for effects in ("noise", "none"))
     assert cal.noise_model.axes is None and np.array_equal(cal.theta, common.theta)
 
 
 def test_axes_go_with_compressed_likelihoods_and_plans():
     c = observed(SMEARED, 2, n_frames=40)
     obs, camera = given(c)
-    whole = sc.calibrate(obs, camera, noise="model")
+    whole = sc.calibrate(obs, camera, effects="noise")
     halves = [
-        sc.calibrate(obs.select_frames(ids), camera, noise="model")
+        sc.calibrate(obs.select_frames(ids), camera, effects="noise")
         for ids in (np.arange(20), np.arange(20, 40))
     ]
     merged = merge(halves)
@@ -128,7 +128,7 @@ def test_axes_go_with_compressed_likelihoods_and_plans():
 
 def test_a_model_of_an_earlier_version_has_no_axes():
     obs, camera = given(observed(EVEN, 3))
-    record = sc.calibrate(obs, camera, noise="model").noise_model.record()
+    record = sc.calibrate(obs, camera, effects="noise").noise_model.record()
     older = {name: value for name, value in record.items() if not name.startswith("axis_")}
     assert from_plain(NoiseModel, older).axes is None
 
@@ -136,7 +136,7 @@ def test_a_model_of_an_earlier_version_has_no_axes():
 def test_shapes_are_whitened_as_their_residuals_are():
     """Sums over cells of the field are those of their columns."""
     obs, camera = given(observed(TURNED, 4))
-    cal = sc.calibrate(obs, camera, noise="model")
+    cal = sc.calibrate(obs, camera, effects="noise")
     part = MarginalLikelihood(weighed(obs, cal), "brown", axes=True)
     state, _ = part.profile(cal.theta)
     view = View.of(part, state, cal.theta, slice(None))
@@ -156,15 +156,15 @@ def test_shapes_are_whitened_as_their_residuals_are():
 @pytest.mark.slow
 def test_misfit_tests_keep_their_size_with_fitted_axes():
     """Shapes along one axis alone meet the noise of that axis alone."""
-    least = {"model": [], "common": []}
+    least = {"noise": [], "none": []}
     for seed in range(40):
         obs, camera = given(observed(SMEARED, seed))
-        for noise, found in least.items():
-            tests = misfit_tests(obs, sc.calibrate(obs, camera, noise=noise)).tests
+        for effects, found in least.items():
+            tests = misfit_tests(obs, sc.calibrate(obs, camera, effects=effects)).tests
             found.append([test.p_value for test in tests if not test.is_of_noise])
-    rejected = {noise: np.mean(np.array(found) < 0.05) for noise, found in least.items()}
-    assert rejected["model"] < 0.09
-    assert rejected["common"] > rejected["model"]
+    rejected = {effects: np.mean(np.array(found) < 0.05) for effects, found in least.items()}
+    assert rejected["noise"] < 0.09
+    assert rejected["none"] > rejected["noise"]
 
 
 @pytest.mark.slow
@@ -174,7 +174,7 @@ def test_intervals_with_fitted_axes_hold(covariance):
     for seed in range(60):
         c = observed(covariance, seed)
         obs, camera = given(c)
-        cal = sc.calibrate(obs, camera, noise="model")
+        cal = sc.calibrate(obs, camera, effects="noise")
         low, high = cal.interval(0.95).T
         inside.append((low < c.theta) & (c.theta < high))
         # The control: intervals as narrow for the estimate that weighs both axes alike.

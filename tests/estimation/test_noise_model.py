@@ -41,7 +41,7 @@ def scene(sigma, seed=3, **options):
 
 def test_the_noise_of_every_star_is_found():
     c, obs, camera = scene(all_at_once)
-    cal = sc.calibrate(obs, camera, noise="model")
+    cal = sc.calibrate(obs, camera, effects="noise")
     model = cal.noise_model
     assert {"radius", "magnitude"} <= set(model.terms) and model.frame_dof is not None
     radius = np.hypot(*(obs.xy - c.theta[:2]).T) / (
@@ -58,13 +58,13 @@ def test_the_noise_of_every_star_is_found():
     stated = sc.Observations(
         **c.columns | {"sigma_px": 0.5 * all_at_once(radius, obs.mag, obs.frame)}
     )
-    again = sc.calibrate(stated, camera, noise="model")
+    again = sc.calibrate(stated, camera, effects="noise")
     assert not again.noise_model.varies and again.sigma == pytest.approx(2.0, rel=0.1)
 
 
 def test_even_noise_is_left_as_it_is():
     _, obs, camera = scene(even)
-    common, fitted = sc.calibrate(obs, camera), sc.calibrate(obs, camera, noise="model")
+    common, fitted = sc.calibrate(obs, camera), sc.calibrate(obs, camera, effects="noise")
     assert not fitted.noise_model.varies
     assert np.array_equal(common.theta, fitted.theta) and np.array_equal(
         common.covariance, fitted.covariance
@@ -75,7 +75,7 @@ def test_even_noise_is_left_as_it_is():
 def test_every_reader_of_a_run_sees_the_same_weights_and_the_data_stay_what_they_are(tmp_path):
     _, obs, camera = scene(worse_outside, n_frames=20)
     run = sc.Run(tmp_path / "run")
-    cal = run.calibrate(obs, camera, noise="model")
+    cal = run.calibrate(obs, camera, effects="noise")
     read = sc.Run(tmp_path / "run")
     assert np.array_equal(read.observations.sigma_px, cal.noise_model.sigma_px(obs))
     assert np.array_equal(run.observations.sigma_px, read.observations.sigma_px)
@@ -87,7 +87,7 @@ def test_every_reader_of_a_run_sees_the_same_weights_and_the_data_stay_what_they
     )
     assert read.observations.unweighted.sigma_px is None
     # Calibrated again from what the run gives: the same data, the same model.
-    again = sc.calibrate(read.observations, camera, noise="model")
+    again = sc.calibrate(read.observations, camera, effects="noise")
     assert np.array_equal(again.theta, cal.theta)
     draws = {"n_ensembles": 2, "n_walkers": 14, "n_steps": 8, "seed": 1}
     post = sc.sample(obs, cal, **draws)
@@ -115,11 +115,16 @@ def test_screening_measures_stars_by_the_noise_where_they_are():
 def test_settings_that_do_not_go_together_are_refused_in_a_sentence():
     _, obs, camera = scene(even, n_frames=6)
     for options, words in (
-        ({"noise": "uneven"}, "noise 'uneven' is unknown"),
-        ({"noise": "model", "method": "three_stage"}, "method='efficient'"),
+        ({"effects": "uneven"}, "effect 'uneven' is unknown"),
+        ({"effects": "noise", "method": "three_stage"}, "method='efficient'"),
     ):
         with pytest.raises(sc.errors.CalibrationError, match=words):
             sc.calibrate(obs, camera, **options)
+    # Keywords of earlier versions name the effect in their place.
+    earlier = {"noise": "model", "likelihood": "student_t", "star_errors": True}
+    for (name, value), effect in zip(earlier.items(), ("noise", "tails", "star"), strict=True):
+        with pytest.raises(TypeError, match=f"use effects='{effect}'"):
+            sc.calibrate(obs, camera, **{name: value})
 
 
 def test_the_check_says_that_sigma_is_wrong_and_by_how_much():
@@ -127,12 +132,12 @@ def test_the_check_says_that_sigma_is_wrong_and_by_how_much():
     cal = sc.calibrate(obs, camera)
     found = misfit_tests(obs, cal)
     check = even_noise(found)
-    assert check.level is Level.WARN and "noise='model'" in check.remedy
+    assert check.level is Level.WARN and "effects='noise'" in check.remedy
     k2 = cal.parameter_names.index("k2")
     assert (
         found.uneven.ratios[k2] > 1.3 and "k2" in check.sentence and "at its edge" in check.sentence
     )
-    fitted = sc.calibrate(obs, camera, noise="model")
+    fitted = sc.calibrate(obs, camera, effects="noise")
     assert even_noise(misfit_tests(obs, fitted)).level is Level.PASS
     _, obs, camera = scene(even)
     assert even_noise(misfit_tests(obs, sc.calibrate(obs, camera))).level is Level.PASS

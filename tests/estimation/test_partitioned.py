@@ -272,8 +272,8 @@ def test_what_partitions_cannot_do_is_said(small) -> None:
     obs, camera, parts = small
     for options in (
         {"method": "three_stage"},
-        {"likelihood": "student_t"},
-        {"noise": "model"},
+        {"effects": "tails"},
+        {"effects": "noise"},
         {"duplicates": "drop"},
     ):
         with pytest.raises(CalibrationError, match="partitioned observations"):

@@ -97,9 +97,7 @@ def test_student_t_leaves_the_minimum_that_interstar_angles_stray_into(name):
     # Angles alone end hundreds of pixels away, in "sensor 14" at a noise six times the true one,
     # without a word.
     c = observed(name, 1)
-    cal = sc.calibrate(
-        sc.Observations(**c.columns), sheet(c, name), likelihood="student_t", model="brown"
-    )
+    cal = sc.calibrate(sc.Observations(**c.columns), sheet(c, name), effects="tails", model="brown")
     assert squared_error(cal, c.theta) < UNLIKELY
     assert cal.sigma < SENSORS[name][5]
 
@@ -117,7 +115,7 @@ def merged(c, sheet):
 
 
 def with_errors_of_stars(c, sheet):
-    return sc.calibrate(sc.Observations(**c.columns), sheet, star_errors=True)
+    return sc.calibrate(sc.Observations(**c.columns), sheet, effects="star")
 
 
 @pytest.mark.parametrize(
@@ -311,27 +309,23 @@ LEFT_OPEN = {
 }
 
 
-@pytest.mark.parametrize(
-    "likelihood", ["marginal", pytest.param("student_t", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("effects", ["none", pytest.param("tails", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", LEFT_OPEN)
-def test_what_the_data_leave_open_is_named_and_what_would_determine_it(name, likelihood):
+def test_what_the_data_leave_open_is_named_and_what_would_determine_it(name, effects):
     place, options, model, words = LEFT_OPEN[name]
     # The Student t ends elsewhere along what is open, where other parameters are open as well.
-    words = words if likelihood == "marginal" else "the data do not .* are needed"
+    words = words if effects == "none" else "the data do not .* are needed"
     obs, sheet, _ = drawn(place, **options)
     with pytest.raises(CalibrationError, match=words) as caught:
-        sc.calibrate(obs, sheet, model=model, likelihood=likelihood)
+        sc.calibrate(obs, sheet, model=model, effects=effects)
     assert caught.value.status is Status.SINGULAR
 
 
 @pytest.mark.parametrize("place", [anywhere, on_a_line, in_a_corner])
-@pytest.mark.parametrize(
-    "likelihood", ["marginal", pytest.param("student_t", marks=pytest.mark.slow)]
-)
-def test_stars_in_odd_places_that_determine_everything(place, likelihood):
+@pytest.mark.parametrize("effects", ["none", pytest.param("tails", marks=pytest.mark.slow)])
+def test_stars_in_odd_places_that_determine_everything(place, effects):
     obs, sheet, theta = drawn(place)
-    cal = sc.calibrate(obs, sheet, likelihood=likelihood)
+    cal = sc.calibrate(obs, sheet, effects=effects)
     assert not cal.undetermined
     assert squared_error(cal, theta) < UNLIKELY
 

@@ -62,7 +62,6 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "rotation_per_theta": np.arange(15.0).reshape(3, 5) * 1e-4,
         "attitude_noise": np.eye(3) * 1e-12,
         "provenance": Provenance(data_sha256="0" * 64),
-        "star_errors": None,
         "effects": None,
         "noise_model": None,
         "inflation": None,

@@ -691,10 +691,9 @@ def test_degrees_of_freedom_are_the_callers_or_the_calibrations() -> None:
 def test_a_stream_of_samaans_has_no_likelihood_to_sample() -> None:
     cal = SimpleNamespace(
         provenance=Provenance(settings={"stream": True, "method": "samaan"}),
-        star_errors=1,
-        effects=None,
+        effects=SimpleNamespace(fitted=("star",)),
     )
     with pytest.raises(SamplingError, match="a stream leaves only the quadratic likelihood"):
         named._named_source("pairs", None, cal, None)
-    with pytest.raises(SamplingError, match="holds errors of the stars"):
+    with pytest.raises(SamplingError, match="holds effects"):
         named._named_source("pairs", observations(n_frames=3), cal, None)

@@ -233,10 +233,8 @@ def test_what_is_refused():
     with pytest.raises(CalibrationError, match="no frame yet"):
         sc.calibrate([], sc.paper.paper_start(), method="griffith")
     for method in ("least_squares", "samaan", "griffith"):
-        with pytest.raises(
-            CalibrationError, match="likelihood='student_t' needs method='efficient'"
-        ):
-            sc.calibrate(obs, sc.paper.paper_start(), method=method, likelihood="student_t")
+        with pytest.raises(CalibrationError, match="effects='tails' needs method='efficient'"):
+            sc.calibrate(obs, sc.paper.paper_start(), method=method, effects="tails")
         three = obs.select(np.isin(np.arange(obs.n_stars), [0, 1, 2]))
         with pytest.raises(CalibrationError, match="3 stars in 1 frames"):
             sc.calibrate(three, sc.paper.paper_start(), method=method)

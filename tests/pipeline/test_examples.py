@@ -47,10 +47,10 @@ def test_refraction_moves_the_focal_length_as_it_does_in_a_separate_fit() -> Non
     """
     esa = sc.example_data("esa")
     seen = sc.sky.make_apparent(esa.observations, site=esa.site)
-    cal = sc.calibrate(seen, esa.camera, noise="model")
+    cal = sc.calibrate(seen, esa.camera, effects="noise")
     assert abs(cal.theta[2] - 5116.54) < 2.0 * np.hypot(0.28, 0.19)
     untold = sc.sky.make_apparent(esa.observations)
-    without = sc.calibrate(untold, esa.camera, noise="model")
+    without = sc.calibrate(untold, esa.camera, effects="noise")
     assert 1.5 < cal.theta[2] - without.theta[2] < 3.0
     # The stars, weighed with the noise that was fitted, tell the latitude; as the table states
     # them, they do not.

@@ -42,6 +42,7 @@ from starcal_uq.calibration.screening.tails import (
 )
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.findings import Finding
+from starcal_uq.core.settings import WEIGHING, effect_names, joined_effects
 from starcal_uq.core.status import Note, Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
@@ -97,7 +98,6 @@ def screen(
     control: str = "table",
     max_rounds: int = 10,
     throw: bool = True,
-    noise: str = "common",
     duplicates: str = "refuse",
     **options: Any,
 ) -> Screening:
@@ -121,14 +121,12 @@ def screen(
         Limit on the rounds of calibrating and testing.
     throw : bool
         Whether to raise an error where the calibration does not converge.
-    noise : {"common", "model"}
-        As for `calibrate`. With ``model``, stars are screened a second time, with the noise that
-        the model fitted to those kept at first gives each of them.
     duplicates : {"refuse", "drop", "keep"}
         As for `calibrate`; asked once, of the rows that are kept. With ``drop``, the result is of
         the other frames.
     **options
-        Passed on to `calibrate`, such as ``solver``.
+        Passed on to `calibrate`, such as ``solver``. With the effect ``noise``, stars are screened
+        a second time, with the noise that the model fitted to those kept at first gives each.
 
     Returns
     -------
@@ -145,7 +143,8 @@ def screen(
     """
     check_duplicates(duplicates)
     options["duplicates"] = "keep"
-    if noise != "common":
+    names = effect_names(options.get("effects"))
+    if "noise" in names:
         settings = {
             "significance": significance,
             "control": control,
@@ -153,7 +152,7 @@ def screen(
             "throw": throw,
         }
         settings["duplicates"] = duplicates
-        return _with_noise_model(obs.unweighted, camera, settings, options | {"noise": noise})
+        return _with_noise_model(obs.unweighted, camera, settings, options, names)
     frames = StarFrames.from_observations(obs)
     rates = _rates(frames, significance, control, max_rounds)
     use, start = pre_screen(camera, frames)
@@ -295,20 +294,26 @@ def _with_tails(options: AnyDict, tails: Tails) -> AnyDict:
     """Options of the last calibration: Student's tails where the stars have them and nothing else
     was asked for.
     """
-    free = options.get("likelihood") is None and not options.get("star_errors")
+    free = not {"tails", "star"} & set(effect_names(options.get("effects")))
     suits = free and options.get("method", "efficient") == "efficient"
-    return options | {"likelihood": "student_t"} if suits and tails.heavy else options
+    if not (suits and tails.heavy):
+        return options
+    return options | {"effects": joined_effects(options.get("effects"), "tails")}
 
 
 def _with_noise_model(
-    obs: Observations, camera: Camera, settings: AnyDict, options: AnyDict
+    obs: Observations,
+    camera: Camera,
+    settings: AnyDict,
+    options: AnyDict,
+    effects: tuple[str, ...],
 ) -> Screening:
     """Screen with one noise, fit how it varies, screen with that; what is kept gets a model of its
     own.
     """
     # The noise model is what explains tails.
-    plain = {name: value for name, value in options.items() if name not in ("noise", "duplicates")}
-    plain |= {"likelihood": "marginal"}
+    plain = {name: value for name, value in options.items() if name != "duplicates"}
+    plain["effects"] = [name for name in effects if name not in WEIGHING]
     first = screen(obs, camera, **settings, **plain)
     model = calibrate(first.observations, camera, throw=settings["throw"], **options).noise_model
     if model is not None and model.varies:

@@ -302,7 +302,7 @@ def jackknife(found: Jackknife, moving: Remedies = ()) -> Check:
     )
 
 
-STAR_REMEDY = calibrated(star_errors=True)
+STAR_REMEDY = calibrated(effects="star")
 
 
 def stars(found: StarTest) -> Check:

@@ -59,8 +59,8 @@ MIN_FRAMES = 5
 _SMALL_SIGMA = 1.0
 # Remedies that several checks give.
 SCREEN = calibrated(screening=True)
-ROBUST = calibrated("command", likelihood="student_t")
-NOISE = calibrated(noise="model")
+ROBUST = calibrated("command", effects="tails")
+NOISE = calibrated(effects="noise")
 EFFECTS = calibrated(effects="auto")
 # Effects that bend directions where they keep their place in the field.
 _OF_THE_FIELD = {"axes", "field"}
@@ -320,7 +320,7 @@ def screening(obs: Observations) -> Check | None:
         if "blamed" in record
         else str(record["blame"]),
     }
-    remedies = calibrated("command", noise="model")
+    remedies = calibrated("command", effects="noise")
     return Check(Code.SCREENING, facts, Level.WARN, remedies=remedies)
 
 

@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from typing import Any
+from typing import Any, get_args
 
 from starcal_uq.core.conflicts import (
     arguments_of,
@@ -23,6 +23,7 @@ from starcal_uq.core.conflicts import (
 )
 from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, SITE, SOME_IMAGES, UTC, Near, Remedies, Remedy
+from starcal_uq.core.settings import WEIGHING, EffectName, effect_names, joined_effects
 from starcal_uq.core.status import Advice, Check, Code, Level, Order
 from starcal_uq.core.types import AnyDict
 
@@ -55,10 +56,11 @@ _CAUSES = {
 }
 # Actions whose options these are.
 _CALIBRATING = ("calibrate", "run")
+_OF_NOISE = {"star", *WEIGHING}
 _OF_OPTIONS = {
     INPUT: {"site", "in_space", "directions", "time", "frames", "screening"},
-    LENS: {"model", "effects"},
-    NOISE: {"noise", "likelihood", "star_errors"},
+    LENS: {"model", "auto"} | set(get_args(EffectName)) - _OF_NOISE,
+    NOISE: _OF_NOISE,
 }
 # Options that a new one makes meaningless: a place on the ground and one in space, directions made
 # and declared.
@@ -107,7 +109,8 @@ def cause_of(check: Check) -> str:
     if check.code in _CAUSES:
         return _CAUSES[check.code]
     steps = [step for one in check.remedies for step in one.steps or (one,)]
-    asked = {name for step in steps if step.action in _CALIBRATING for name in step.arguments}
+    made = [step.arguments for step in steps if step.action in _CALIBRATING]
+    asked = {name for given in made for name in (*given, *effect_names(given.get("effects")))}
     return next((cause for cause, options in _OF_OPTIONS.items() if options & asked), NUMERICS)
 
 
@@ -123,15 +126,17 @@ def by_cause(checks: Sequence[Check]) -> dict[str, list[Check]]:
     return {cause: found[cause] for cause in present}
 
 
-def changed(given: AnyDict, asked: AnyDict) -> AnyDict:
+def changed(given: AnyDict, asked: AnyDict, effects: str = "none") -> AnyDict:
     """The options that are given, with those that are asked for in the place of what they
-    replace.
+    replace; effects are added to those that are given, or else to `effects`.
     """
     ended = {name for one in asked for name in _ENDS.get(one, ())}
     left = {name: value for name, value in given.items() if name not in ended}
     if "site" in asked and "directions" in left:
         # Directions are made apparent at a site, and must not be declared so.
         left["directions"] = "catalogue"
+    if "effects" in asked:
+        asked = asked | {"effects": joined_effects(given.get("effects", effects), asked["effects"])}
     return left | asked
 
 
@@ -152,6 +157,14 @@ class Place:
         """Files and options of the command that made the run."""
         places, options = parsed(self.words)
         return tuple(places[1:]), arguments_of(options)
+
+    @property
+    def effects(self) -> str:
+        """Effects of a run that none were typed for: `run` looks for them where it may."""
+        _, given = self.made
+        selecting = {"sampled": None, **given, "effects": "auto", "partitioned": self.partitioned}
+        alone = self.words[:1] != ("run",) or conflict(selecting)
+        return "none" if alone else "auto"
 
     def exact(self, check: Check) -> Check:
         """A check whose commands name the files of this run; those that cannot help it are left
@@ -177,9 +190,10 @@ class Place:
         if asked.get("site") == SITE:
             return Finding(Refusal.SITE_UNKNOWN)
         _, given = self.made
-        if all(given.get(name) == value for name, value in asked.items()):
+        options = changed(given, asked, self.effects)
+        here = {"effects": self.effects} | given
+        if all(here.get(name) == options[name] for name in asked):
             return Finding(Refusal.MADE_WITH, {"asked": asked})
-        options = changed(given, asked)
         if any(options == one.options for one in self.tried):
             return Finding(Refusal.TRIED, {"asked": asked})
         settings = {"sampled": sampled_by_default(options)} | options
@@ -208,7 +222,8 @@ class Place:
             # the run.
             files, given = self.made
             out = self.run if self.words[0] == "run" else f"{self.run}-2"
-            steps = (Remedy("run", files, changed(given, asked) | {"out": out, "force": True}),)
+            options = changed(given, asked, self.effects)
+            steps = (Remedy("run", files, options | {"out": out, "force": True}),)
         elif OBS in remedy.files and self.observations:
             files = (f"{self.run}/observations.parquet", f"{self.run}/camera.toml")
             steps = (Remedy("run", files, {"out": f"{self.run}-2", **asked, "force": True}),)

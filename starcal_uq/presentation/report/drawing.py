@@ -81,7 +81,7 @@ def _figure(results: Results, name: str) -> Any:
         return plot_residuals(cal, obs)
     if name == "residual_profiles":
         return plot_residual_profiles(cal, obs)
-    if name == "effects" and cal.effects is not None and cal.effects.names:
+    if name == "effects" and cal.effects is not None and cal.effects.fitted:
         return plot_effects(cal, obs)
     if name == "convergence":
         return plot_convergence(cal, truth)

@@ -39,7 +39,7 @@ _ORDERS = {
     ),
     Advice.CHECK_THE_DIRECTIONS: ("Check the times, and what the directions were declared to be."),
     Advice.WITHOUT_STAR_ERRORS: (
-        "Leave --star-errors out (star_errors=False), and see which checks then fail."
+        "Leave star out of the list of effects, and see which checks then fail."
     ),
     Advice.COUNT_THE_PATTERN: (
         "Count the pattern as an error of the directions, as the attitude error with the misfit "

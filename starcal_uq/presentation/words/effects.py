@@ -19,6 +19,8 @@ MEANINGS = {
     "star": "A star's direction errs alike in every frame: catalogue, blend, colour.",
     "phase": "Centroids err with where within a pixel the star is.",
     "magnitude": "Images shift, and the scale changes, with the brightness of the star.",
+    "noise": "The noise varies with radius, magnitude, frame or axis.",
+    "tails": "Residuals have the tails of a Student t, so that wrong stars hardly count.",
 }
 
 
@@ -26,9 +28,9 @@ def effects_table(effects: Effects, *, path: bool = False) -> TextTable | None:
     """One row per effect of the calibration, in the order in which they were taken up; None without
     any. With `path` those that were not taken up follow, with what they would gain.
     """
-    if not effects.fitted:
+    if not effects.names:
         return None
-    rows = tuple(map(_row, effects.fitted))
+    rows = (*map(_weighing_row, effects.weighing), *map(_row, effects.fitted))
     if path:
         rows += tuple(
             (name, "", "", "", fixed(gain, 1), "not taken up") for name, gain in effects.refused
@@ -36,6 +38,13 @@ def effects_table(effects: Effects, *, path: bool = False) -> TextTable | None:
     heads = ("effect", "scale", "95 % interval", "shift rms", "gain [nat]", "moved most")
     title = "Effects beyond the camera [px; scale: 1 sigma at the corner]"
     return TextTable(heads, rows, title, "lrrrrl")
+
+
+def _weighing_row(effect: FittedEffect) -> tuple[str, ...]:
+    """Of noise, how far it varies from star to star; of tails, their degrees of freedom."""
+    scale = significant(effect.scale_px if effect.dof is None else effect.dof)
+    scale += "" if effect.dof is None else " dof"
+    return effect.name, scale, "", "", fixed(effect.gain_nat, 1), ""
 
 
 def _row(effect: FittedEffect) -> tuple[str, ...]:
@@ -54,16 +63,19 @@ def _row(effect: FittedEffect) -> tuple[str, ...]:
 
 def effects_text(effects: Effects) -> str:
     """Which effects the calibration holds, and which were not taken up, with their gains."""
-    held = join_words(effects.names)
+    # An earlier version did not keep what was asked for beside a selection.
+    asked = effects.names if not effects.selected else effects.asked
+    held = join_words([name for name in effects.names if name not in asked])
+    given = f"Effects that were asked for: {join_words(asked)}"
     seen = "" if effects.air is None else f" {air_words(effects.air)}"
     if not effects.selected:
-        return f"Effects that were asked for: {held}; none were chosen by the data.{seen}"
+        return f"{given}; none were chosen by the data.{seen}"
     least = f"an effect has to gain {fixed(effects.penalty_nat, 1)} nat"
     gains = ", ".join(f"{name} {fixed(gain, 1)}" for name, gain in effects.refused)
     first = (
         f"Effects that the data ask for: {held}."
         if held
-        else "The data ask for no effect beyond the camera."
+        else f"The data ask for no {'further ' if asked else ''}effect beyond the camera."
     )
-    first += seen
+    first = f"{given}. {first}{seen}" if asked else first + seen
     return f"{first} Not taken up ({least}): {gains}." if gains else first

@@ -1,0 +1,71 @@
+"""Effects that decide how much stars count: noise that varies, and tails, with what they gain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray
+from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.result import Calibration
+    from starcal_uq.observations.table import Observations
+
+# Range of the log of a scale about that of the median.
+_LOG_SCALE = 5.0
+
+
+def log_density(squares: FloatArray, nu: float | None) -> float:
+    """Log likelihood of squared residuals (N,) of two axes at their best scale, but for a constant.
+
+    `nu`: degrees of freedom of a Student t; None for a Gaussian.
+    """
+    n = len(squares)
+    if nu is None:
+        return -n * (1.0 + float(np.log(np.mean(squares) / 2.0)))
+    from scipy.optimize import minimize_scalar
+
+    middle = float(np.log(np.median(squares)))
+
+    def cost(log_scale: float) -> float:
+        far = np.log1p(squares * np.exp(-log_scale) / nu)
+        return n * log_scale + 0.5 * (nu + 2.0) * float(np.sum(far))
+
+    bounds = (middle - _LOG_SCALE, middle + _LOG_SCALE)
+    return -float(minimize_scalar(cost, bounds=bounds, method="bounded").fun)
+
+
+def with_weighing(obs: Observations, cal: Calibration, noise: bool, tails: bool) -> Calibration:
+    """The calibration with ``noise`` and ``tails`` among its effects, where these were asked for.
+
+    What they gain is told by the residuals at the estimate, for as many stars as there are degrees
+    of freedom. `obs`: the table, with the noise that its stars state.
+    """
+    found: list[FittedEffect] = []
+    stated = obs.unweighted.sigma_or_one
+    model, nu = cal.noise_model, float(cal.provenance.student_t["dof"]) if tails else None
+    sigma_px = stated if model is None else model.sigma_px(obs)
+    squares = np.sum(cal.residuals_px**2, axis=1)
+    # Stars that cannot be in the field have no residual.
+    seen = np.isfinite(squares)
+    stated, sigma_px, squares = stated[seen], sigma_px[seen], squares[seen]
+    share = 0.5 * cal.dof / len(squares)
+    here = log_density(squares / sigma_px**2, nu)
+    if noise:
+        shrunk = 2.0 * float(np.sum(np.log(sigma_px / stated)))
+        gain = here - shrunk - log_density(squares / stated**2, nu)
+        spread = float(np.std(sigma_px)) * cal.sigma
+        found.append(FittedEffect.weighing("noise", share * gain, scale_px=spread))
+    if nu is not None:
+        gain = here - log_density(squares / sigma_px**2, None)
+        found.append(FittedEffect.weighing("tails", share * gain, dof=nu))
+    if not found:
+        return cal
+    held = Effects((), False, (), 0.0) if cal.effects is None else cal.effects
+    asked = (*(effect.name for effect in found), *held.asked)
+    held = replace(held, weighing=tuple(found), asked=asked)
+    record = cal.provenance.with_settings(effects=list(held.names))
+    return replace(cal, effects=held, provenance=record)
