@@ -76,8 +76,8 @@ post = sc.sample(obs, cal, seed=1)""",
         """\
 esa = sc.example_data("esa")
 table = sc.sky.make_apparent(esa.observations)
-held = "zenith,field,phase,magnitude"
-lens = sc.calibrate(table, esa.camera, noise="model", effects=held)""",
+held = "noise,zenith,field,phase,magnitude"
+lens = sc.calibrate(table, esa.camera, effects=held)""",
         {
             "Calibration.effects": (
                 "What does each effect do?",

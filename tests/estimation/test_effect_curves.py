@@ -125,7 +125,7 @@ def test_each_effect_has_a_panel(moved, breathed) -> None:
 def test_the_zenith_stands_beside_that_of_the_site() -> None:
     esa = sc.example_data("esa")
     obs = sc.sky.make_apparent(esa.observations)
-    cal = sc.calibrate(obs, esa.camera, effects="zenith", noise="model")
+    cal = sc.calibrate(obs, esa.camera, effects="zenith,noise")
     truth = sc.sky.refraction.site_among_stars(esa.site, obs.time_utc[obs.frame_starts[:-1]])[0]
     sky = found_zeniths(cal, truth)
     assert sky is not None
