@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.planes import PINHOLE, Plane
 from starcal_uq.core.formatting import join_words, plural
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.consensus import focal_lengths, ideal_frames
@@ -116,7 +118,8 @@ def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFo
     `seed`: seed of the draws that the split is held against.
     """
     numbers, frames = frames_with_focals(obs, seed)
-    return focals_of(numbers, ideal_frames(camera, frames), camera.focal_px, seed=seed)
+    plane = get_model(camera.distortion).plane
+    return focals_of(numbers, ideal_frames(camera, frames), camera.focal_px, plane, seed=seed)
 
 
 def frames_with_focals(obs: Observations, seed: int = 0) -> tuple[IntArray, StarFrames]:
@@ -129,7 +132,7 @@ def frames_with_focals(obs: Observations, seed: int = 0) -> tuple[IntArray, Star
 
 
 def focals_of(
-    numbers: IntArray, ideal: StarFrames, start_px: float, *, seed: int = 0
+    numbers: IntArray, ideal: StarFrames, start_px: float, plane: Plane = PINHOLE, *, seed: int = 0
 ) -> FrameFocals:
     """The same of frames with these numbers (K,) by their ideal points, from a focal length in
     px.
@@ -140,10 +143,10 @@ def focals_of(
     if not len(numbers):
         return none
     theta = np.array([0.0, 0.0, start_px])
-    log_scale = np.log(start_px / focal_lengths(ideal, start_px, by_frame=True))
+    log_scale = np.log(start_px / focal_lengths(ideal, start_px, plane, by_frame=True))
     for _ in range(_STEPS):
         pixel = np.ascontiguousarray(ideal.pixel * ideal.spread(np.exp(log_scale)))
-        likelihood = MarginalLikelihood(replace(ideal, pixel=pixel), "none")
+        likelihood = MarginalLikelihood(replace(ideal, pixel=pixel), plane.bare)
         state, cost = likelihood.profile(theta)
         if not np.isfinite(cost):
             return none

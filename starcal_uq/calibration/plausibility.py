@@ -21,6 +21,8 @@ import numpy as np
 from starcal_uq.attitude.rotations import unit_vectors
 from starcal_uq.calibration.cameras import focals_of, frames_with_focals
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.planes import Plane
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, Remedy
@@ -73,6 +75,7 @@ class _Table:
     centre: FloatArray
     detector: IntArray
     focal_px: float
+    plane: Plane
 
     @property
     def frames(self) -> StarFrames:
@@ -86,7 +89,7 @@ class _Table:
 
     @property
     def field_rad(self) -> float:
-        return float(2.0 * np.arctan(0.5 * np.hypot(*self.detector) / self.focal_px))
+        return 2.0 * self.plane.angle(0.5 * float(np.hypot(*self.detector)) / self.focal_px)
 
 
 # Tables without a slip, each with a clause that names slip and remedy.
@@ -191,7 +194,7 @@ def find_reason(
     # Distortion bends attitudes and focal lengths less than slips and other cameras do.
     numbers, frames = frames_with_focals(obs)
     pinhole = replace(frames, pixel=frames.pixel - table.centre[:, None])
-    focals = focals_of(numbers, pinhole, table.focal_px)
+    focals = focals_of(numbers, pinhole, table.focal_px, table.plane)
     if focals.n_groups > 1:
         return focals.words(camera)
     if plain.share < 1.0 - _FEW_WRONG and plain.scatter_px > _NOISY * table.tolerance_px:
@@ -216,6 +219,7 @@ def _sample(obs: Observations, camera: Camera) -> _Table:
         centre=camera.theta[:2],
         detector=np.array([camera.width_px, camera.height_px]),
         focal_px=camera.focal_px,
+        plane=get_model(camera.distortion).plane,
     )
 
 
@@ -235,9 +239,9 @@ def _fit(table: _Table, wider: float = 1.0) -> _Fit:
     length that their angles ask for.
     """
     frames, tolerance_px = table.frames, wider * table.tolerance_px
-    start_px = 0.5 * float(table.detector.max()) / np.tan(0.5 * _FIELD_RAD)
-    focal_px = float(focal_lengths(frames, start_px)[0])
-    b = directions(frames.pixel, focal_px)
+    start_px = 0.5 * float(table.detector.max()) / table.plane.radius(0.5 * _FIELD_RAD)
+    focal_px = float(focal_lengths(frames, start_px, table.plane)[0])
+    b = directions(frames.pixel, focal_px, table.plane)
     best = consensus(b, frames.r, frames.starts, tolerance_px / focal_px)
     offset_px = np.where(np.isfinite(best.offset_rad), best.offset_rad, np.inf) * focal_px
     cost = float(np.mean(np.minimum((offset_px / tolerance_px) ** 2, 1.0)))

@@ -140,13 +140,13 @@ class Camera(Shown):
 
     @property
     def fov_deg(self) -> tuple[float, float]:
-        """Full horizontal and vertical field of an ideal pinhole centred on the detector,
+        """Full horizontal and vertical field of the ideal projection centred on the detector,
         degrees.
         """
-        f = self.focal_px
+        angle, f = get_model(self.distortion).plane.angle, self.focal_px
         return (
-            math.degrees(2.0 * math.atan(self.width_px / (2.0 * f))),
-            math.degrees(2.0 * math.atan(self.height_px / (2.0 * f))),
+            math.degrees(2.0 * angle(self.width_px / (2.0 * f))),
+            math.degrees(2.0 * angle(self.height_px / (2.0 * f))),
         )
 
     @property
@@ -319,6 +319,7 @@ class Camera(Shown):
                 held.width_px,
                 held.height_px,
                 held.pixel_um,
+                fisheye=held.fisheye,
                 name=held.name,
             )
         except CameraError as error:
@@ -334,21 +335,23 @@ class Camera(Shown):
         """
         header = _HEADER if self.pixel_um is not None else _HEADER.replace(_LENGTHS, _PIXELS)
         model = get_model(self.distortion)
-        header += (_AXES_HEADER if model.axes else "") + _DIRECTION[model.direction] + "\n"
+        header += _AXES_HEADER if model.axes else ""
+        header += _DIRECTION[model.direction].format(model.plane.name) + "\n"
         write_section(path, "camera", self.to_dict(), header, force)
 
     def to_opencv(self) -> tuple[FloatArray, FloatArray]:
         """The same camera for OpenCV, whose pixel origin is ours.
 
         OpenCV distorts normalised coordinates: k1_cv = k1 f^2, k2_cv = k2 f^4, k3_cv = k3 f^6, p_cv
-        = p f.
+        = p f; its thin-prism terms s1 and s3 are our s1 f and s2 f. The coefficients of `f_theta`,
+        `equidistant` and `fisheye` are those of ``cv2.fisheye``.
 
         Returns
         -------
         camera_matrix : array, shape (3, 3)
             Pixels.
-        dist_coeffs : array, shape (5,)
-            k1, k2, p1, p2, k3, dimensionless.
+        dist_coeffs : array, shape (5,), (12,) with a thin prism, or (4,) of a fisheye
+            Dimensionless, in OpenCV's order.
 
         Raises
         ------
@@ -367,6 +370,7 @@ class Camera(Shown):
         pixel_um: float | None,
         *,
         distortion: str | None = None,
+        fisheye: bool = False,
         name: str = "",
     ) -> Camera:
         """A camera from OpenCV's matrix and coefficients.
@@ -376,20 +380,23 @@ class Camera(Shown):
         camera_matrix
             Shape (3, 3), pixels.
         dist_coeffs
-            k1, k2[, p1, p2[, k3]], any shape; None or empty for none. Further coefficients must be
-            zero.
+            k1, k2[, p1, p2[, k3, ...]], or of a fisheye k1, k2, k3, k4; any shape; None or empty
+            for none. Coefficients without a counterpart must be zero.
         width_px, height_px, pixel_um
             The detector, of which OpenCV keeps no record; the pitch may be None.
         distortion
-            Distortion model to use; by default the smallest of brown, brown3 and brown_tangential
-            that holds the coefficients, with ``+axes`` for fx != fy or skew.
+            Distortion model to use; by default the smallest of brown, brown3, brown_tangential and
+            thin_prism, or of equidistant and fisheye, that holds the coefficients, with ``+axes``
+            for fx != fy or skew.
+        fisheye
+            Whether the coefficients are those of ``cv2.fisheye``.
 
         Raises
         ------
         CameraError
             For fx != fy, skew, or coefficients that the distortion model cannot hold.
         """
-        model, theta = from_opencv(camera_matrix, dist_coeffs, distortion)
+        model, theta = from_opencv(camera_matrix, dist_coeffs, distortion, fisheye)
         return cls(
             width_px=width_px,
             height_px=height_px,
@@ -430,7 +437,7 @@ _HEADER = """\
 # -0.5 ... width_px - 0.5 along x and -0.5 ... height_px - 0.5 along y.
 # width_px, height_px, x0_px, y0_px: pixels. pixel_um: micrometres. focal_mm: millimetres.
 # x0_px, y0_px: principal point. Distortion coefficients act on offsets in pixels from it:
-# k1 px^-2, k2 px^-4, k3 px^-6, p1 and p2 px^-1.
+# k1 px^-2, k2 px^-4, k3 px^-6, k4 px^-8, p1, p2, s1 and s2 px^-1.
 """
 _AXES_HEADER = """\
 # stretch: scale along y over that along x, less one. skew: shift along x with the offset along y.
@@ -440,8 +447,8 @@ _AXES_HEADER = """\
 _LENGTHS = "pixel_um: micrometres. focal_mm: millimetres."
 _PIXELS = "focal_px: pixels; where the pitch is known, pixel_um and focal_mm."
 _DIRECTION = {
-    "forward": "# distortion maps ideal (pinhole) points to distorted (measured) points.\n",
-    "inverse": "# distortion maps distorted (measured) points to ideal (pinhole) points.\n",
+    "forward": "# distortion maps ideal ({}) points to distorted (measured) points.\n",
+    "inverse": "# distortion maps distorted (measured) points to ideal ({}) points.\n",
 }
 
 _WORDS = {
@@ -476,6 +483,8 @@ class _CameraSection(Section):
     def unknown(self, key: str) -> str:
         own = [c.name for c in get_model(self.distortion).coefficients]
         models = [n for n in model_names() if key in {c.name for c in get_model(n).lens}]
+        plane = get_model(self.distortion).plane
+        models = [n for n in models if get_model(n).plane is plane] or models
         if key in PARAMETERS and not models:
             models = [with_axes(self.distortion)]
         if key == "focal_mm":

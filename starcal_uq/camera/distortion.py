@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal
 
+from starcal_uq.camera.planes import EQUIDISTANT, PINHOLE, Plane
 from starcal_uq.core.errors import DistortionError
 from starcal_uq.core.types import FloatArray
 
@@ -54,6 +55,10 @@ class DistortionModel:
         point.
     source : str
         Source of the formula.
+    plane : Plane
+        The ideal projection, which gives the points that are displaced.
+    compared : bool
+        Whether the misfit tests and comparisons of models have its terms.
     axes : bool
         Whether stretch and skew of the detector's axes follow the coefficients of the lens.
     """
@@ -63,6 +68,8 @@ class DistortionModel:
     direction: Literal["forward", "inverse"]
     formula: Displacement
     source: str
+    plane: Plane = PINHOLE
+    compared: bool = True
     axes: bool = False
 
     @property
@@ -82,8 +89,10 @@ class DistortionModel:
 
     @property
     def bare(self) -> str:
-        """Name of the model without distortion whose axes are free where these are."""
-        return "none" + (AXES_SUFFIX if self.axes else "")
+        """Name of the model of this projection without distortion; its axes are free where these
+        are.
+        """
+        return self.plane.bare + (AXES_SUFFIX if self.axes else "")
 
     def displacement(self, u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
         """Displacement by the lens, px, for coefficients k of which the first are the lens's."""
@@ -127,12 +136,22 @@ def _brown_tangential(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
     )
 
 
+def _thin_prism(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
+    k1, k2, s1, s2 = k
+    du, dv = _radial(u, v, (k1, k2))
+    r2 = u * u + v * v
+    return du + s1 * r2, dv + s2 * r2
+
+
 _K1 = Coefficient("k1", "px^-2", 1e-10, "1e-10 px^-2", "radial distortion, cubic term", 3)
 _K2 = Coefficient("k2", "px^-4", 1e-15, "1e-15 px^-4", "radial distortion, quintic term", 5)
 _K3 = Coefficient("k3", "px^-6", 1e-20, "1e-20 px^-6", "radial distortion, seventh-order term", 7)
+_K4 = Coefficient("k4", "px^-8", 1e-25, "1e-25 px^-8", "radial distortion, ninth-order term", 9)
 _P1 = Coefficient("p1", "px^-1", 1e-7, "1e-7 px^-1", "decentring distortion along y", 2)
 _P2 = Coefficient("p2", "px^-1", 1e-7, "1e-7 px^-1", "decentring distortion along x", 2)
 
+_S1 = Coefficient("s1", "px^-1", 1e-7, "1e-7 px^-1", "thin prism along x", 2)
+_S2 = Coefficient("s2", "px^-1", 1e-7, "1e-7 px^-1", "thin prism along y", 2)
 _AXES = (
     Coefficient("stretch", "1", 1e-6, "1e-6", "scale along y over that along x, less one", 1),
     Coefficient("skew", "1", 1e-6, "1e-6", "shift along x with the offset along y", 1),
@@ -141,6 +160,7 @@ _AXES = (
 AXES_SUFFIX = "+axes"
 
 _EQ14 = "Ye & Yang 2017, eq. 14 (ideal to distorted), in pixels"
+_KANNALA = "Kannala & Brandt 2006, as OpenCV's fisheye, in pixels"
 _MODELS = {
     model.name: model
     for model in (
@@ -164,6 +184,24 @@ _MODELS = {
             _radial,
             "Ye & Yang 2017, eq. 6 (distorted to ideal), in pixels",
         ),
+        DistortionModel(
+            "thin_prism",
+            (_K1, _K2, _S1, _S2),
+            "forward",
+            _thin_prism,
+            "Weng, Cohen & Herniou 1992, without decentring",
+            compared=False,
+        ),
+        DistortionModel("f_theta", (), "forward", _none, "equidistant projection", EQUIDISTANT),
+        DistortionModel(
+            "equidistant",
+            (_K1, _K2),
+            "forward",
+            _radial,
+            _KANNALA + ", first two terms",
+            EQUIDISTANT,
+        ),
+        DistortionModel("fisheye", (_K1, _K2, _K3, _K4), "forward", _radial, _KANNALA, EQUIDISTANT),
     )
 }
 
@@ -209,7 +247,8 @@ def like(name: str, other: str) -> str:
 def shared_names(one: str, other: str) -> tuple[str, ...]:
     """Names of the coefficients that mean the same in both models."""
     a, b = get_model(one), get_model(other)
-    common = set(b.coefficients) - (set(b.lens) if a.direction != b.direction else set())
+    same = a.direction == b.direction and a.plane is b.plane
+    common = set(b.coefficients) - (set() if same else set(b.lens))
     return tuple(c.name for c in a.coefficients if c in common)
 
 
@@ -218,7 +257,8 @@ def is_special_case(small: str, large: str) -> bool:
     zero; without distortion, both directions are one.
     """
     a, b = get_model(small), get_model(large)
-    return set(a.coefficients) <= set(b.coefficients) and (a.direction == b.direction or not a.lens)
+    same = a.plane is b.plane and (a.direction == b.direction or not a.lens)
+    return same and set(a.coefficients) <= set(b.coefficients)
 
 
 def simpler_models(name: str) -> tuple[str, ...]:
@@ -234,9 +274,14 @@ def simpler_models(name: str) -> tuple[str, ...]:
 
 
 def rivals(name: str) -> tuple[str, ...]:
-    """Models to compare with one: those from ideal to distorted points, with its axes."""
-    forward = (base for base in model_names() if get_model(base).direction == "forward")
-    return tuple(like(base, name) for base in forward)
+    """Models to compare with one: those of its projection from ideal to distorted points, with its
+    axes.
+    """
+    models = (get_model(like(base, name)) for base in model_names())
+    plane = get_model(name).plane
+    return tuple(
+        m.name for m in models if m.compared and m.direction == "forward" and m.plane is plane
+    )
 
 
 def next_richer(name: str) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, shared_names, with_axes
 from starcal_uq.camera.formats import TEXT_FORMATS, Pinhole, write_pinhole
+from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CameraError
 from starcal_uq.core.extras import extra
@@ -33,6 +34,8 @@ _MOST_ORDERS = 9
 _CLOSE_PX = 1e-4
 # Rounding, px: differences below it are none.
 _EXACT_PX = 1e-6
+# A field up to 80 degrees from the axis can be written as one of a pinhole.
+_LEAST_COSINE = np.cos(np.radians(80.0))
 
 
 @dataclass(frozen=True)
@@ -115,16 +118,20 @@ def nearest(camera: Camera, distortion: str, without: tuple[str, ...] = ()) -> t
     )
 
 
-def _held(camera: Camera, kept: tuple[str, ...]) -> tuple[Camera, float]:
+def _held(camera: Camera, kept: tuple[str, ...], fisheye: bool = False) -> tuple[Camera, float]:
     """The camera itself if a format keeps its coefficients, or the nearest one that it can hold."""
     model = get_model(camera.distortion)
+    if model.plane is not PINHOLE and fisheye and ("skew" in kept or not camera.axes[1]):
+        return camera, 0.0
     used = {
         c.name
         for c, value in zip(model.coefficients, camera.coefficients, strict=True)
         if value != 0.0
     }
-    if not used or (model.direction == "forward" and used <= set(kept)):
+    own = model.direction == "forward" and model.plane is PINHOLE and used <= set(kept)
+    if own or (not used and model.plane is PINHOLE):
         return camera, 0.0
+    _in_front(camera)
     wanted = "brown_tangential"
     if model.radial:
         wanted = "brown3" if "k3" in kept else "brown"
@@ -132,6 +139,17 @@ def _held(camera: Camera, kept: tuple[str, ...]) -> tuple[Camera, float]:
     if model.axes and set(axes) & set(kept):
         return nearest(camera, with_axes(wanted), tuple(name for name in axes if name not in kept))
     return nearest(camera, wanted)
+
+
+def _in_front(camera: Camera) -> FloatArray:
+    """Directions of a grid of pixels; CameraError where a pinhole does not reach one of them."""
+    seen = unproject(camera, _grid(camera, _POINTS))
+    if np.min(seen[:, 2]) < _LEAST_COSINE:
+        raise CameraError(
+            "the field of this camera is too wide for a pinhole, and so for this format: export "
+            "to opencv, ros or kalibr, which have a fisheye."
+        )
+    return seen
 
 
 def _said(error: float, what: str) -> str:
@@ -144,20 +162,23 @@ def _said(error: float, what: str) -> str:
 
 
 def _pinhole_file(to: str, camera: Camera, path: Path) -> tuple[float, str]:
-    held, error = _held(camera, TEXT_FORMATS[to].kept)
+    form = TEXT_FORMATS[to]
+    held, error = _held(camera, form.kept, form.fisheye is not None)
     # OpenCV has terms for a camera without distortion, of whatever model.
-    bare = held if any(held.coefficients) else held.replace(distortion="none", coefficients=())
+    plane = get_model(held.distortion).plane
+    bare = held if any(held.coefficients) else held.replace(distortion=plane.bare, coefficients=())
     size = held.width_px, held.height_px
-    plain = Pinhole(*size, *bare.to_opencv(), held.pixel_um, held.name)
+    fisheye = plane is not PINHOLE
+    plain = Pinhole(*size, *bare.to_opencv(), held.pixel_um, held.name, fisheye)
     path.write_text(write_pinhole(plain, to), encoding="utf-8")
-    title, skew = TEXT_FORMATS[to].title, plain.matrix[0, 1]
+    stretch, skew = held.axes
     if not skew:
-        return error, _said(error, title)
+        return error, _said(error, form.title)
     # The functions of OpenCV, which are also those of ROS, read fx, fy, cx and cy alone.
-    ideal = unproject(held, _grid(held, 2))
-    error = float(np.max(np.abs(skew * ideal[:, 1] / ideal[:, 2])))
+    behind = (_grid(held, 2)[:, 1] - held.y0_px) / (1.0 + stretch)
+    error = float(np.max(np.abs(skew * behind)))
     return error, (
-        f"{title}: the same camera, with the skew in the camera matrix; functions of OpenCV leave "
+        f"{form.title}: the same camera, with the skew in the camera matrix; functions of OpenCV leave "
         f"it out, which is up to {error:.2g} px over the detector."
     )
 
@@ -187,11 +208,10 @@ def _tetra3(camera: Camera, path: Path) -> tuple[float, str]:
     """
     from scipy.optimize import least_squares
 
-    pixels = _grid(camera, _POINTS)
+    pixels, seen = _grid(camera, _POINTS), _in_front(camera)
     offsets = pixels - camera.centre_px
     half = camera.width_px / 2.0
     fraction = np.sum((offsets / half) ** 2, axis=1, keepdims=True)
-    seen = unproject(camera, pixels)
 
     def off(p: FloatArray) -> FloatArray:
         focal, k, x, y = p
@@ -224,8 +244,7 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
     with extra("images", "FITS headers"):
         from astropy.io import fits
 
-    pixels = _grid(camera, _POINTS)
-    seen = unproject(camera, pixels)
+    pixels, seen = _grid(camera, _POINTS), _in_front(camera)
     measured = pixels - [camera.x0_px, camera.y0_px]
     model, theta = get_model(camera.distortion), camera.theta
     ideal = camera.focal_px * seen[:, :2] / seen[:, 2:]

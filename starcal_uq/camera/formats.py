@@ -1,8 +1,8 @@
 """Camera files of OpenCV, ROS, Kalibr and mrcal: the same optics, each in its own words.
 
-All four hold a pinhole with OpenCV's dimensionless k1, k2, p1, p2, k3, and a pixel origin at the
-centre of the first pixel. None has a place for the pixel pitch, which a comment keeps: ``#
-pixel_um: 6.9``.
+All four hold a pinhole with OpenCV's dimensionless k1, k2, p1, p2, k3, and all but mrcal its fisheye;
+their pixel origin is the centre of the first pixel. None has a place for the pixel pitch, which a
+comment keeps: ``# pixel_um: 6.9``.
 
 Sources: OpenCV, "FileStorage" and "Camera Calibration and 3D Reconstruction"; ROS,
 sensor_msgs/CameraInfo as camera_calibration_parsers writes it; Kalibr, "YAML formats"; mrcal,
@@ -26,8 +26,8 @@ _PITCH = re.compile(r"^\s*# pixel_um: (\S+)\s*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Pinhole:
-    """What such a file holds: size and matrix (3, 3) in px, and k1, k2, p1, p2, k3 (5,),
-    dimensionless.
+    """What such a file holds: size and matrix (3, 3) in px, and dimensionless coefficients: (5,) or
+    (12,) of a pinhole, (4,) of a fisheye, in OpenCV's order.
 
     `pixel_um` is the pixel pitch, micrometres, where it is stated.
     """
@@ -38,27 +38,31 @@ class Pinhole:
     dist_coeffs: FloatArray
     pixel_um: float | None = None
     name: str = ""
+    fisheye: bool = False
 
 
 @dataclass(frozen=True)
 class TextFormat:
     """How a program writes a camera: its name, the ending of its files, what they keep of k1, k2,
-    p1, p2, k3, stretch and skew, and their text.
+    p1, p2, k3, s1, s2, stretch and skew, their text, and their words for a pinhole and a fisheye;
+    None where there is no fisheye.
     """
 
     title: str
     ending: str
     kept: tuple[str, ...]
     text: str
+    pinhole: str = ""
+    fisheye: str | None = None
 
 
 _ALL = ("k1", "k2", "p1", "p2", "k3")
-_MATRIX = ("stretch", "skew")
+_PRISM, _MATRIX = ("s1", "s2"), ("stretch", "skew")
 TEXT_FORMATS = {
     "opencv": TextFormat(
         "OpenCV",
         ".yaml",
-        (*_ALL, *_MATRIX),
+        (*_ALL, *_PRISM, *_MATRIX),
         """\
 %YAML:1.0
 ---
@@ -72,10 +76,11 @@ camera_matrix: !!opencv-matrix
    data: [ {fx}, {skew}, {x0}, 0.0, {fy}, {y0}, 0.0, 0.0, 1.0 ]
 distortion_coefficients: !!opencv-matrix
    rows: 1
-   cols: 5
+   cols: {n}
    dt: d
    data: [ {terms} ]
-""",
+{lens}""",
+        fisheye="fisheye_model: 1\n",
     ),
     "ros": TextFormat(
         "ROS camera_info",
@@ -89,10 +94,10 @@ camera_matrix:
   rows: 3
   cols: 3
   data: [{fx}, {skew}, {x0}, 0.0, {fy}, {y0}, 0.0, 0.0, 1.0]
-distortion_model: plumb_bob
+distortion_model: {lens}
 distortion_coefficients:
   rows: 1
-  cols: 5
+  cols: {n}
   data: [{terms}]
 rectification_matrix:
   rows: 3
@@ -103,6 +108,8 @@ projection_matrix:
   cols: 4
   data: [{fx}, {skew}, {x0}, 0.0, 0.0, {fy}, {y0}, 0.0, 0.0, 0.0, 1.0, 0.0]
 """,
+        "plumb_bob",
+        "equidistant",
     ),
     "kalibr": TextFormat(
         "Kalibr",
@@ -112,21 +119,23 @@ projection_matrix:
 {pitch}cam0:
   camera_model: pinhole
   intrinsics: [{fx}, {fy}, {x0}, {y0}]
-  distortion_model: radtan
+  distortion_model: {lens}
   distortion_coeffs: [{terms}]
   resolution: [{width}, {height}]
   rostopic: /cam0/image_raw
 """,
+        "radtan",
+        "equidistant",
     ),
     "mrcal": TextFormat(
         "mrcal",
         ".cameramodel",
-        (*_ALL, "stretch"),
+        (*_ALL, *_PRISM, "stretch"),
         """\
 {pitch}{{
-    'lensmodel': 'LENSMODEL_OPENCV5',
+    'lensmodel': 'LENSMODEL_OPENCV{n}',
 
-    # fx, fy, cx, cy, k1, k2, p1, p2, k3
+    # fx, fy, cx, cy, and the coefficients of OpenCV
     'intrinsics': [{fx}, {fy}, {x0}, {y0}, {terms}],
 
     'extrinsics': [0, 0, 0, 0, 0, 0],
@@ -142,8 +151,9 @@ def write_pinhole(camera: Pinhole, to: str) -> str:
     """Content of a file in one of the `TEXT_FORMATS`."""
     form = TEXT_FORMATS[to]
     matrix = camera.matrix.tolist()
-    coefficients = zip(_ALL, camera.dist_coeffs.tolist(), strict=True)
-    terms = [value for name, value in coefficients if name in form.kept]
+    terms = camera.dist_coeffs.tolist()
+    if len(terms) == len(_ALL):
+        terms = [value for name, value in zip(_ALL, terms, strict=True) if name in form.kept]
     return form.text.format(
         pitch="" if camera.pixel_um is None else f"# pixel_um: {camera.pixel_um!r}\n",
         # A name is free text; these files get what cannot end a line or a quotation.
@@ -155,6 +165,8 @@ def write_pinhole(camera: Pinhole, to: str) -> str:
         skew=matrix[0][1],
         x0=matrix[0][2],
         y0=matrix[1][2],
+        lens=form.fisheye if camera.fisheye else form.pinhole,
+        n=len(terms),
         terms=", ".join(map(repr, terms)),
     )
 
@@ -167,26 +179,22 @@ def read_pinhole(text: str) -> Pinhole:
         raise ValueError(
             "it has none of camera_matrix (OpenCV, ROS), cam0 (Kalibr) and lensmodel (mrcal)"
         )
-    width, height, name, intrinsics, coefficients = read(content)
+    width, height, name, intrinsics, coefficients, fisheye = read(content)
     numbers = [*intrinsics, *coefficients]
     if not all(
         isinstance(value, (int, float)) and not isinstance(value, bool) for value in numbers
     ):
         raise ValueError("a value of the optics is no number")
     fx, fy, x0, y0, *skew = intrinsics
-    if any(coefficients[5:]):
-        raise ValueError(
-            "it has rational, thin-prism or tilt terms, which have no counterpart here"
-        )
-    found = np.zeros(5)
-    found[: min(5, len(coefficients))] = coefficients[:5]
+    found = np.array(coefficients, dtype=np.float64)
     matrix = np.array(
         [[fx, *(skew or [0.0]), x0], [0.0, fy, y0], [0.0, 0.0, 1.0]], dtype=np.float64
     )
-    return Pinhole(width, height, matrix, found, float(pitch[1]) if pitch else None, name)
+    pixel_um = float(pitch[1]) if pitch else None
+    return Pinhole(width, height, matrix, found, pixel_um, name, fisheye)
 
 
-_Read = tuple[int, int, str, Sequence[float], Sequence[float]]
+_Read = tuple[int, int, str, Sequence[float], Sequence[float], bool]
 
 
 def _content(text: str) -> Mapping[str, Any]:
@@ -206,10 +214,12 @@ def _content(text: str) -> Mapping[str, Any]:
 
 def _opencv(content: Mapping[str, Any]) -> _Read:
     """OpenCV's sample programs and ROS use the same keys."""
-    kind = content.get("distortion_model", "plumb_bob")
-    if kind not in ("plumb_bob", "rational_polynomial"):
+    usual = "equidistant" if content.get("fisheye_model") else "plumb_bob"
+    kind = content.get("distortion_model", usual)
+    if kind not in ("plumb_bob", "rational_polynomial", "equidistant"):
         raise ValueError(
-            f"its distortion model is {kind!r}, and only plumb_bob has a counterpart here"
+            f"its distortion model is {kind!r}, and only plumb_bob and equidistant have a "
+            "counterpart here"
         )
     matrix = [float(value) for value in content["camera_matrix"]["data"]]
     if len(matrix) != 9 or matrix[3]:
@@ -220,18 +230,20 @@ def _opencv(content: Mapping[str, Any]) -> _Read:
         str(content.get("camera_name", "")),
         (matrix[0], matrix[4], matrix[2], matrix[5], matrix[1]),
         list(content["distortion_coefficients"]["data"]),
+        kind == "equidistant",
     )
 
 
 def _kalibr(content: Mapping[str, Any]) -> _Read:
     camera = content["cam0"]
     model, lens = camera.get("camera_model"), camera.get("distortion_model")
-    if model != "pinhole" or lens not in ("radtan", "none"):
+    if model != "pinhole" or lens not in ("radtan", "none", "equidistant"):
         raise ValueError(
-            f"its cam0 is {model} with {lens}, and only pinhole with radtan has a counterpart here"
+            f"its cam0 is {model} with {lens}, and only pinhole with radtan or equidistant has a "
+            "counterpart here"
         )
-    width, height = camera["resolution"]
-    return int(width), int(height), "", camera["intrinsics"], camera.get("distortion_coeffs", [])
+    (width, height), terms = camera["resolution"], camera.get("distortion_coeffs", [])
+    return int(width), int(height), "", camera["intrinsics"], terms, lens == "equidistant"
 
 
 def _mrcal(content: Mapping[str, Any]) -> _Read:
@@ -241,10 +253,12 @@ def _mrcal(content: Mapping[str, Any]) -> _Read:
         "LENSMODEL_OPENCV4",
         "LENSMODEL_OPENCV5",
         "LENSMODEL_OPENCV8",
+        "LENSMODEL_OPENCV12",
     ):
         raise ValueError(f"its lens is {lens!r}, and only OpenCV's have a counterpart here")
     width, height = content["imagersize"]
-    return int(width), int(height), "", content["intrinsics"][:4], content["intrinsics"][4:]
+    intrinsics = content["intrinsics"]
+    return int(width), int(height), "", intrinsics[:4], intrinsics[4:], False
 
 
 # By the key that none of the others has.

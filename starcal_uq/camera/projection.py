@@ -1,11 +1,11 @@
 """The camera model: one symbolic formula, and the vectorised kernels generated from it.
 
-A direction ``b`` in the camera frame falls on the ideal point ``(u, v) = f (b_x, b_y) / b_z``
-relative to the principal point; a distortion model of the registry moves it (``forward``) or moves
-the point behind the lens back (``inverse``). The axes of the detector stretch that point, where
-they are free. The direction in which a model is not explicit is found by Newton's method, and its
-derivatives by taking further Newton steps symbolically from the root: one step carries exact first
-derivatives, two carry exact second derivatives.
+A direction ``b`` in the camera frame falls on an ideal point relative to the principal point, of a
+pinhole ``(u, v) = f (b_x, b_y) / b_z`` (`starcal_uq.camera.planes`); a distortion model of the
+registry moves it (``forward``) or moves the point behind the lens back (``inverse``). The axes of
+the detector stretch that point, where they are free. The direction in which a model is not explicit
+is found by Newton's method, and its derivatives by taking further Newton steps symbolically from the
+root: one step carries exact first derivatives, two carry exact second derivatives.
 
 Arrays inside have the star axis last (structure of arrays), the layout in which sums over stars are
 matrix products.
@@ -23,6 +23,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.kernels import Kernel, build_kernel
+from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.core.errors import DistortionError
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
 
@@ -63,8 +64,8 @@ def _displaced(model_name: str, point: Any, theta: Any) -> Any:
     return ca.vertcat(point[0] + du, point[1] + dv)
 
 
-def _elements(theta: Any) -> list[Any]:
-    return [theta[i] for i in range(theta.numel())]
+def _elements(symbols: Any) -> list[Any]:
+    return [symbols[i] for i in range(symbols.numel())]
 
 
 def _behind_lens(model_name: str, offset: Any, theta: Any) -> Any:
@@ -108,9 +109,8 @@ def forward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
     """Pixel position of the direction ``exp([phi]x) b`` (casadi.SX, 2)."""
     import casadi as ca
 
-    direction = _rotated(s.b, s.phi)
-    ideal = s.theta[2] * direction[:2] / direction[2]
     model = get_model(model_name)
+    ideal = ca.vertcat(*model.plane.onto(_elements(_rotated(s.b, s.phi)), s.theta[2]))
     if model.direction == "forward":
         point = _displaced(model_name, ideal, s.theta)
     else:
@@ -131,7 +131,8 @@ def backward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
             point, _ = _newton_step(model_name, point, offset, s.theta)
     else:
         point = _displaced(model_name, offset, s.theta)
-    direction = ca.vertcat(point[0], point[1], s.theta[2])
+    plane = get_model(model_name).plane
+    direction = ca.vertcat(*plane.back(point[0], point[1], s.theta[2]))
     return direction / ca.sqrt(ca.sumsqr(direction))
 
 
@@ -399,6 +400,9 @@ def _unprojected(
     x, y = pixel - (theta[:2] if theta.ndim == 2 else theta[:2, None])
     point = root if root.ndim == 2 else np.stack(get_model(model_name).unstretched(x, y, theta))
     before = before_fold(model_name, theta, point)
+    plane = get_model(model_name).plane
+    if plane is not PINHOLE:
+        before &= ~(np.hypot(*point) > plane.limit_rad * theta[2])
     if not before.all():
         outputs[0][:, ~before] = np.nan
     return outputs
@@ -443,7 +447,8 @@ def project(camera: Camera, b_cam: FloatArray) -> FloatArray:
     Returns
     -------
     (N, 2) array
-        Pixels; NaN for a direction at or behind the image plane's horizon (b_z <= 0).
+        Pixels; NaN for a direction beyond what the projection of the model can reach: of a pinhole
+        at or behind the image plane's horizon (b_z <= 0).
 
     Raises
     ------
@@ -453,13 +458,16 @@ def project(camera: Camera, b_cam: FloatArray) -> FloatArray:
     b = floats(b_cam).reshape(-1, 3).T
     theta = camera.theta
     xy = np.full((2, b.shape[1]), np.nan)
-    front = b[2] > 0.0
+    plane = get_model(camera.distortion).plane
+    front = b[2] > np.cos(plane.limit_rad) * np.linalg.norm(b, axis=0)
+    if plane is PINHOLE:
+        front = b[2] > 0.0
     if not front.any():
         return xy.T
     seen = np.ascontiguousarray(b[:, front])
     root = forward_root(camera.distortion, theta, seen)
     if get_model(camera.distortion).direction == "forward":
-        radius = float(np.max(np.hypot(seen[0] / seen[2], seen[1] / seen[2]))) * theta[2]
+        radius = float(np.max(np.hypot(*plane.onto(seen, theta[2]))))
         fold = (
             fold_radius_px(camera.distortion, theta, radius) if np.any(theta[3:]) else float("inf")
         )
@@ -507,6 +515,12 @@ def unproject(camera: Camera, xy_px: FloatArray) -> FloatArray:
 
 def _no_inverse(camera: Camera) -> DistortionError:
     fold = fold_radius_px(camera.distortion, camera.theta, 4.0 * camera.corner_radius_px)
+    if fold == float("inf"):
+        limit_deg = np.degrees(get_model(camera.distortion).plane.limit_rad)
+        return DistortionError(
+            f"pixels lie more than {limit_deg:.0f} degrees from the optical axis, which the model "
+            f"{camera.distortion!r} does not reach: use a longer focal length."
+        )
     return DistortionError(
         f"the distortion {camera.distortion!r} folds over {fold:.0f} px from the principal point "
         "and cannot be "

@@ -33,12 +33,20 @@ ModelName = Literal[
     "brown3",
     "brown_tangential",
     "inverse",
+    "thin_prism",
+    "f_theta",
+    "equidistant",
+    "fisheye",
     "none+axes",
     "k1+axes",
     "brown+axes",
     "brown3+axes",
     "brown_tangential+axes",
     "inverse+axes",
+    "thin_prism+axes",
+    "f_theta+axes",
+    "equidistant+axes",
+    "fisheye+axes",
 ]
 MountKind = Literal["free", "fixed"]
 EffectName = Literal[

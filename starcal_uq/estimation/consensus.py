@@ -15,7 +15,8 @@ import numpy as np
 
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import undistorted
+from starcal_uq.camera.distortion import get_model, undistorted
+from starcal_uq.camera.planes import PINHOLE, Plane
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.observations.frames import StarFrames
@@ -160,21 +161,25 @@ def ideal_frames(camera: Camera, frames: StarFrames) -> StarFrames:
 
     The displacement is one of pixels, so that ideal points are the same for every focal length.
     """
-    b = measured_directions(camera, frames)
-    point = camera.focal_px * b[:2] / b[2]
+    b, plane = measured_directions(camera, frames), get_model(camera.distortion).plane
+    point = np.stack(plane.onto(b, camera.focal_px))
     if not np.isfinite(point).all():
         point = frames.pixel - camera.theta[:2, None]
     return replace(frames, pixel=point)
 
 
-def directions(point: FloatArray, focal_px: FloatArray | float) -> FloatArray:
+def directions(
+    point: FloatArray, focal_px: FloatArray | float, plane: Plane = PINHOLE
+) -> FloatArray:
     """Unit vectors (3, N) of ideal points (2, N), for one focal length or one of each star."""
-    b = np.vstack([point, np.broadcast_to(focal_px, point.shape[1:])])
+    b = np.stack(plane.back(*point, np.broadcast_to(focal_px, point.shape[1:])))
     unit: FloatArray = b / np.linalg.norm(b, axis=0)
     return unit
 
 
-def focal_lengths(ideal: StarFrames, start_px: float, *, by_frame: bool = False) -> FloatArray:
+def focal_lengths(
+    ideal: StarFrames, start_px: float, plane: Plane = PINHOLE, *, by_frame: bool = False
+) -> FloatArray:
     """Focal length, px, that the angles between ideal points ask for, wrong identifications or not:
     one of all frames (1,), or one of each (K,).
 
@@ -186,7 +191,7 @@ def focal_lengths(ideal: StarFrames, start_px: float, *, by_frame: bool = False)
     catalogue = _angle(ideal.r, first, second)
     focal_px = np.full(len(first), start_px)
     for _ in range(3):
-        b = directions(ideal.pixel, ideal.spread(focal_px) if by_frame else focal_px)
+        b = directions(ideal.pixel, ideal.spread(focal_px) if by_frame else focal_px, plane)
         focal_px *= _factors(_angle(b, first, second), catalogue)
     return focal_px
 
@@ -244,9 +249,9 @@ def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
     """
     if not np.isfinite(measured_directions(camera, frames)).all():
         camera = camera.with_theta(undistorted(camera.distortion, camera.theta))
-    ideal = ideal_frames(camera, frames)
-    camera = camera.replace(focal_px=float(focal_lengths(ideal, camera.focal_px)[0]))
-    b = directions(ideal.pixel, camera.focal_px)
+    ideal, plane = ideal_frames(camera, frames), get_model(camera.distortion).plane
+    camera = camera.replace(focal_px=float(focal_lengths(ideal, camera.focal_px, plane)[0]))
+    b = directions(ideal.pixel, camera.focal_px, plane)
     wide_rad = _WIDE_FRACTION * max(camera.width_px, camera.height_px) / camera.focal_px
     wide = consensus(b, frames.r, frames.starts, wide_rad)
     if not wide.agree.any():

@@ -209,7 +209,6 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     """
     began = perf_counter()
     model = get_model(camera.distortion)
-    f = theta[2]
     x, y = frames.pixel - theta[:2, None]
     offset = np.stack(model.unstretched(x, y, theta))
     bare = np.delete(theta, model.of_lens)
@@ -217,7 +216,7 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     if not np.isfinite(rotations).all():
         raise DegenerateFrameError(np.flatnonzero(np.isnan(rotations[:, 0, 0])))
     b = frames.rotated(rotations)
-    ideal = f * b[:2] / b[2]
+    ideal = np.stack(model.plane.onto(b, theta[2]))
     # Every model is linear in its coefficients; forward models act on ideal points, inverse ones on
     # measured points.
     forward = model.direction == "forward"

@@ -12,7 +12,9 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import unproject
+from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.types import FloatArray, IntArray, StrArray, floats
 from starcal_uq.identification.brightness import instrumental_mag
 from starcal_uq.identification.match import CameraState, Match, match_frame, start_state
@@ -297,7 +299,12 @@ def flipped(camera: Camera) -> Camera:
 
 
 def field_geometry(camera: Camera) -> FieldGeometry:
-    """The camera as the search sees it."""
+    """The camera as the search sees it; IdentificationError for one that is no pinhole."""
+    if get_model(camera.distortion).plane is not PINHOLE:
+        raise IdentificationError(
+            f"the search looks for stars of a pinhole camera, and {camera.distortion!r} is none: "
+            "identify them with another program, and calibrate from the table of its stars."
+        )
     return FieldGeometry(
         camera.focal_px, camera.width_px, camera.height_px, camera.corner_radius_px
     )

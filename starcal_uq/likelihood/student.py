@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
@@ -124,7 +125,9 @@ class StudentLikelihood:
         offset = frames.pixel - theta[:2, None]
         far = _OUT_OF_FIELD * float(np.max(np.hypot(offset[0], offset[1])))
         # Decided once: a star that came and went with theta would make the likelihood jump.
-        self._seen = frames.rotated(rotations)[2] > 1.0 / np.hypot(1.0, far / theta[2])
+        plane = get_model(model_name).plane
+        edge_rad = min(plane.angle(far / theta[2]), plane.limit_rad)
+        self._seen = frames.rotated(rotations)[2] > np.cos(edge_rad)
         if usable is not None:
             self._seen &= usable
         self._origin, self._rotations, self._turns = (

@@ -22,6 +22,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, undistorted
+from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import DistortionError, PlanningError
 from starcal_uq.core.types import FloatArray
@@ -95,7 +96,9 @@ def open_range(
     as neither folds on the detector.
     """
     model = get_model(camera.distortion)
+    # The range is one around the pinhole; a lens that is known for a fisheye is stated.
     stated = calibrated or not model.lens or any(camera.coefficients[: len(model.lens)])
+    stated = stated or model.plane is not PINHOLE
     if given is None:
         if stated:
             return None

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import DistortionModel, get_model
+from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import unproject, unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
@@ -185,6 +186,8 @@ def distortion_curve(
     excess = np.abs(curves - mean)[:, positive] / sd[positive]
     multiplier = float(np.quantile(excess.max(axis=1), level))
     f = float(post.mean[2])
+    # The scale of a pinhole falls towards the edge, that of an f-theta lens does not.
+    bent = radius if model.plane is PINHOLE else 0.0 * radius
     return DistortionCurve(
         radius_px=radius,
         azimuth_deg=azimuth,
@@ -194,7 +197,7 @@ def distortion_curve(
         upper_px=upper,
         lower_simultaneous_px=mean - multiplier * sd,
         upper_simultaneous_px=mean + multiplier * sd,
-        arcsec_per_px=f / (f * f + radius * radius) * ARCSEC,
+        arcsec_per_px=ARCSEC * f / (f * f + bent * bent),
         level=level,
         multiplier=multiplier,
         model=model.name,
@@ -227,7 +230,7 @@ def _radial(
     theta = np.repeat(thetas, len(offsets), axis=0)
     xy = _on_detector(model, np.tile(offsets, (count, 1)), theta.T) + theta[:, :2]
     b = unproject_theta(model.name, theta.T, xy)
-    ideal = (theta[:, 2:3] * b[:, :2] / b[:, 2:]).reshape(count, directions, -1, 2)
+    ideal = np.column_stack(model.plane.onto(b.T, theta[:, 2])).reshape(count, directions, -1, 2)
     displacement = offsets.reshape(directions, -1, 2) - ideal
     radial: FloatArray = np.sum(displacement * outward[:, None], axis=3)
     return radial

@@ -11,6 +11,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CatalogueError, SettingError, StarcalError, require
 from starcal_uq.core.settings import bounded, check_memory
@@ -239,8 +240,9 @@ class Window:
         b = unproject(camera, np.array([(x, y) for x in (low, high[0]) for y in (low, high[1])]))
         # A little wider than the farthest corner; the exact cut is made in pixels.
         self.min_cosine = float(np.cos(1.02 * np.max(np.arccos(b[:, 2]))))
-        if self.min_cosine > 0.0:
-            ideal_px = camera.focal_px * np.sqrt(1.0 / self.min_cosine**2 - 1.0)
+        plane = get_model(camera.distortion).plane
+        if (edge_rad := float(np.arccos(self.min_cosine))) < plane.limit_rad:
+            ideal_px = camera.focal_px * plane.radius(edge_rad)
             if fold_radius_px(camera.distortion, camera.theta, ideal_px) <= ideal_px:
                 self.min_cosine = float(np.min(b[:, 2]))
 

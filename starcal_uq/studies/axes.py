@@ -137,9 +137,9 @@ def camera_of(base: Camera, settings: AnyMapping) -> Camera:
             camera, camera.pixel_um / settings["pixel_um"], camera.width_px, camera.height_px
         )
     if "fov_deg" in settings:
-        camera = camera.replace(
-            focal_px=camera.width_px / (2.0 * math.tan(0.5 * math.radians(settings["fov_deg"])))
-        )
+        half_rad = 0.5 * math.radians(settings["fov_deg"])
+        plane = get_model(settings.get("distortion", camera.distortion)).plane
+        camera = camera.replace(focal_px=camera.width_px / (2.0 * plane.radius(half_rad)))
     if "focal_mm" in settings:
         camera = camera.replace(focal_mm=settings["focal_mm"])
     if "x0_offset_px" in settings:

@@ -108,8 +108,8 @@ def test_replace_carries_coefficients_by_name():
     assert PAPER.replace(distortion="none").coefficients == ()
     with pytest.raises(CameraError, match="no attribute 'focal'"):
         PAPER.replace(focal=3.0)
-    with pytest.raises(CameraError, match="'fisheye' is unknown"):
-        PAPER.replace(distortion="fisheye")
+    with pytest.raises(CameraError, match="'unheard' is unknown"):
+        PAPER.replace(distortion="unheard")
 
 
 def test_is_frozen_and_comparable():
@@ -145,7 +145,7 @@ def test_numpy_values_become_plain():
         ({"y0_px": "left"}, "y0_px is 'left'; give a number"),
         ({"coefficients": (1e-10,)}, r"1 coefficients for distortion 'brown'; give 2 \(k1, k2\)"),
         ({"coefficients": (1e-10, math.inf)}, "k2 is inf"),
-        ({"distortion": "fisheye"}, "'fisheye' is unknown: use one of none, k1, brown"),
+        ({"distortion": "unheard"}, "'unheard' is unknown: use one of none, k1, brown"),
     ],
 )
 def test_bad_values_are_refused(changes, message):
@@ -227,8 +227,8 @@ def test_file_by_hand(tmp_path):
         ),
         (file_text(k1=math.nan), "key k1 is nan; write the coefficient, a number from -1 to 1."),
         (
-            file_text(distortion="fisheye"),
-            "key distortion: distortion model 'fisheye' is unknown: use one of none, k1",
+            file_text(distortion="unheard"),
+            "key distortion: distortion model 'unheard' is unknown: use one of none, k1",
         ),
         (
             file_text(distortion=3),
@@ -331,7 +331,7 @@ def matrix(fx=5000.0, fy=5000.0, skew=0.0):
         (matrix(), [0.1, 0, 1e-4, 0, 0.2], {}, "'brown_tangential' cannot hold k3"),
         (matrix(), [0.1, 0.2], {"distortion": "k1"}, "'k1' cannot hold k2"),
         (matrix(), [0.1], {"distortion": "inverse"}, "'inverse' cannot hold"),
-        (matrix(), [0.1], {"distortion": "fisheye"}, "unknown"),
+        (matrix(), [0.1], {"distortion": "unheard"}, "unknown"),
     ],
 )
 def test_from_opencv_refuses_what_it_cannot_hold(camera_matrix, dist, options, message):

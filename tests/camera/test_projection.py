@@ -40,7 +40,16 @@ def test_round_trip_over_and_beyond_the_detector(model):
 
 @pytest.mark.parametrize(
     "model",
-    ["none", "k1", "brown", "brown3", "brown_tangential", "none+axes", "brown_tangential+axes"],
+    [
+        "none",
+        "k1",
+        "brown",
+        "brown3",
+        "brown_tangential",
+        "thin_prism",
+        "none+axes",
+        "thin_prism+axes",
+    ],
 )
 def test_forward_models_agree_with_opencv(model):
     """With fx != fy too; OpenCV has no skew."""
@@ -281,5 +290,5 @@ def test_a_direction_behind_the_camera_has_no_image():
 
 
 def test_unknown_model_is_named():
-    with pytest.raises(DistortionError, match="fisheye"):
-        get_model("fisheye")
+    with pytest.raises(DistortionError, match="unheard"):
+        get_model("unheard")

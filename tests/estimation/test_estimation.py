@@ -11,14 +11,13 @@ import pytest
 from scipy import stats
 
 import starcal_uq as sc
-from starcal_uq.camera.distortion import model_names
 from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.status import Status
 from tests.helpers.same import assert_same
-from tests.helpers.scenes import camera, nominal, observations, with_sigmas
+from tests.helpers.scenes import USUAL, camera, nominal, observations, with_sigmas
 
 
-@pytest.mark.parametrize("model", model_names())
+@pytest.mark.parametrize("model", (*USUAL, "thin_prism+axes", "fisheye"))
 @pytest.mark.parametrize("solver", ["lm", "minpack", "ipopt"])
 def test_every_solver_on_every_model(model, solver):
     truth, obs = camera(model), observations(model, max_mag=6.5)

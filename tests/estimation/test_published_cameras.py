@@ -139,3 +139,20 @@ def test_the_aspect_of_dawn_is_a_parameter_of_its_camera() -> None:
     assert abs(skew) < 3.0 * cal.sigmas[6]
     assert map_error_px(c, cal, shift) < 0.5 * SIGMA_PX
     assert cal.sigma == pytest.approx(SIGMA_PX, rel=0.05)
+
+
+def test_the_thin_prism_of_yan_is_a_parameter_of_its_camera() -> None:
+    focal_px, s1, s2 = 0.5 * SIDE_PX / np.tan(np.radians(10.0)), 2.3e-7, 4.5e-7
+    shift = prism(s1, s2)
+    c = observed(6, focal_px, shift, n_frames=60, stars=25)
+    cal = sc.calibrate(table(c), sheet(c), model="thin_prism")
+    z = (cal.theta[5:7] - (s1, s2)) / cal.sigmas[5:7]
+    error = map_error_px(c, cal, shift)
+    plain = map_error_px(c, sc.calibrate(table(c), sheet(c)), shift)
+    print("s1, s2", cal.theta[5:7], "+-", cal.sigmas[5:7], f"{error:.4f} px, brown {plain:.4f} px")
+    assert np.max(np.abs(z)) < 3.0
+    assert np.all(cal.sigmas[5:7] < 0.3 * np.array([s1, s2]))
+    assert error < 0.5 * SIGMA_PX
+    assert cal.sigma == pytest.approx(SIGMA_PX, rel=0.05)
+    # Control: without the prism the camera is worse.
+    assert plain > 1.5 * error

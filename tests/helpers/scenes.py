@@ -9,7 +9,6 @@ from functools import lru_cache
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import model_names
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_camera
 from starcal_uq.simulation.frames import simulate
@@ -23,10 +22,17 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "brown_tangential": (2e-9, -3.5e-15, 2e-7, -3e-7),
     "inverse": (-2e-9, 3.5e-15),
 }
+USUAL = tuple(COEFFICIENTS)
+COEFFICIENTS |= {
+    "thin_prism": (2e-9, -3.5e-15, 2e-7, -3e-7),
+    "f_theta": (),
+    "equidistant": (2e-9, -3.5e-15),
+    "fisheye": (2e-9, -3.5e-15, 3e-21, -1e-27),
+}
 AXES = (6.4e-4, -3e-4)
 COEFFICIENTS |= {name + "+axes": (*values, *AXES) for name, values in COEFFICIENTS.items()}
-# Every lens with square pixels, and the kinds of formula with free axes.
-MODELS = (*model_names(), "none+axes", "brown_tangential+axes", "inverse+axes")
+# Every kind of formula, with square pixels or free axes.
+MODELS = (*USUAL, "none+axes", "thin_prism+axes", "inverse+axes", "fisheye", "equidistant+axes")
 
 
 def camera(model: str = "brown", **changes: object) -> Camera:

@@ -9,9 +9,10 @@ import pytest
 from scipy import integrate, stats
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import model_names, parameter_names
+from starcal_uq.camera.distortion import parameter_names
 from starcal_uq.core.errors import PriorError
 from starcal_uq.inference.priors import Priors
+from tests.helpers.scenes import USUAL
 
 CAMERA = Camera(1024, 1024, 12.0, 72.0, 511.5, 511.5)
 
@@ -53,7 +54,7 @@ def test_draws_have_the_stated_moments() -> None:
     assert np.allclose(draws.std(axis=0), sd, rtol=0.02)
 
 
-@pytest.mark.parametrize("model", model_names())
+@pytest.mark.parametrize("model", USUAL)
 def test_distortion_prior_is_a_displacement_at_the_corner(model: str) -> None:
     priors = Priors.default(CAMERA.replace(distortion=model)).replace(distortion_corner_px=10.0)
     radius = priors.corner_radius_px

@@ -9,7 +9,6 @@ import pytest
 from scipy.optimize import least_squares, minimize
 
 from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.camera.distortion import model_names
 from starcal_uq.camera.projection import project
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.likelihood import compressed as module
@@ -25,7 +24,7 @@ from starcal_uq.likelihood.compressed import (
 )
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
-from tests.helpers.scenes import camera, observations, with_sigmas
+from tests.helpers.scenes import USUAL, camera, observations, with_sigmas
 
 
 def _information_scale(matrix):
@@ -120,7 +119,7 @@ def test_information_is_the_schur_complement_of_the_attitudes():
     assert np.max(np.abs(difference)) < 1e-8
 
 
-@pytest.mark.parametrize("model", model_names())
+@pytest.mark.parametrize("model", USUAL)
 def test_compressed_equals_exact_within_three_sigma(model):
     obs = observations(model, n_frames=200, max_mag=6.5)
     _compare(obs, model, 2e-3)
@@ -167,7 +166,7 @@ def _compare(obs, model, bound):
         assert np.max(np.abs(worse)) > 3 * np.max(np.abs(difference))
 
 
-@pytest.mark.parametrize("model", model_names())
+@pytest.mark.parametrize("model", USUAL)
 def test_slope_of_the_determinant_is_that_along_the_parameters(model):
     """The attitude columns change with the camera and with the attitudes that follow it."""
     import dataclasses

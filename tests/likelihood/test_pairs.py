@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcal_uq.camera.distortion import model_names
 from starcal_uq.likelihood import arrays
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
-from tests.helpers.scenes import camera, observations
+from tests.helpers.scenes import USUAL, camera, observations
 
 
 def _offset(cam, size):
@@ -21,7 +20,7 @@ def _offset(cam, size):
     )
 
 
-@pytest.mark.parametrize("model", model_names())
+@pytest.mark.parametrize("model", USUAL)
 @pytest.mark.parametrize("size", [0.0, 0.2, 12.0])
 def test_equals_the_explicit_sum_over_pairs(model, size):
     objective = PairObjective(StarFrames.from_observations(observations(model)), model)

@@ -13,13 +13,12 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.calibration.calibrate import METHODS
-from starcal_uq.camera.distortion import model_names
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.paper.recursive.start import RecursionOptions
 from starcal_uq.paper.recursive.stream import RecursiveCalibration
 from tests.helpers.same import assert_same
-from tests.helpers.scenes import camera, nominal, observations, with_sigmas
+from tests.helpers.scenes import USUAL, camera, nominal, observations, with_sigmas
 
 ALL = RecursionOptions(parameters="all")
 BASELINES = [("least_squares", None), ("samaan", None), ("griffith", None), ("griffith", ALL)]
@@ -35,7 +34,7 @@ def one_by_one(obs):
     return [obs.select_frames([k]) for k in obs.frame_ids]
 
 
-@pytest.mark.parametrize("model", model_names())
+@pytest.mark.parametrize("model", USUAL)
 @pytest.mark.parametrize("stated", [False, True])
 @pytest.mark.parametrize(("method", "options"), BASELINES)
 def test_every_method_on_every_model(model, stated, method, options):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.camera.distortion import model_names
 from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.status import Status
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -24,7 +23,7 @@ from starcal_uq.paper.recursive.innovations import PairNormals, frame_normals
 from starcal_uq.paper.recursive.start import RecursionOptions
 from starcal_uq.paper.recursive.stream import RecursiveCalibration
 from tests.helpers.same import assert_same
-from tests.helpers.scenes import camera, nominal, observations, with_sigmas
+from tests.helpers.scenes import USUAL, camera, nominal, observations, with_sigmas
 
 SCALES = {
     "f": 1.0,
@@ -62,7 +61,7 @@ def relative(a, b):
     return np.max(np.abs(a - b) / np.outer(unit, unit))
 
 
-@pytest.mark.parametrize("model", model_names())
+@pytest.mark.parametrize("model", USUAL)
 @pytest.mark.parametrize("stated", [False, True])
 def test_innovations_are_generalised_least_squares_over_explicit_pairs(model, stated):
     obs = with_sigmas(observations(model)) if stated else observations(model)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import next_richer
+from starcal_uq.camera.distortion import get_model, next_richer
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import (
@@ -234,7 +234,8 @@ def _of_aberration(cal: Calibration) -> Finding:
 
 def aberration_size(camera: Camera) -> dict[str, float]:
     """What annual aberration can do to a camera of this field: from corner to corner, and to f."""
-    diagonal_rad = 2.0 * np.arctan(camera.half_diagonal_px / camera.focal_px)
+    angle = get_model(camera.distortion).plane.angle
+    diagonal_rad = 2.0 * angle(camera.half_diagonal_px / camera.focal_px)
     return {
         "corners_arcsec": float(ABERRATION_RAD * diagonal_rad * ARCSEC),
         "f_px": ABERRATION_RAD * camera.focal_px,

@@ -172,6 +172,7 @@ def _distortion(results: Results) -> AnyDict:
         "radial_terms": radial,
         "decentring": [c.name for c in model.lens if not c.name.startswith("k")],
         "axes": model.axes,
+        "plane": model.plane.name,
         "from_point": "ideal" if forward else "distorted",
         "to_point": "distorted" if forward else "ideal",
     }
