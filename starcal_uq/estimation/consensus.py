@@ -172,7 +172,8 @@ def directions(
     point: FloatArray, focal_px: FloatArray | float, plane: Plane = PINHOLE
 ) -> FloatArray:
     """Unit vectors (3, N) of ideal points (2, N), for one focal length or one of each star."""
-    b = np.stack(plane.back(*point, np.broadcast_to(focal_px, point.shape[1:])))
+    u, v = point
+    b = np.stack(plane.back(u, v, np.broadcast_to(focal_px, u.shape)))
     unit: FloatArray = b / np.linalg.norm(b, axis=0)
     return unit
 
