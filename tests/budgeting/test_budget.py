@@ -654,7 +654,9 @@ def test_a_budget_beyond_the_samples_is_whole(stated: Path, tmp_path: Path) -> N
     assert math.isnan(found.total("roll").larger_arcsec)
     write_budget(found, tmp_path / "budget.xlsx")
     sheet = load_workbook(tmp_path / "budget.xlsx")["Totals"]
-    assert sheet["J2"].value == "not resolved" and sheet["D2"].number_format == "0.0000%"
+    first = {cell.value: sheet.cell(2, cell.column) for cell in sheet[1]}
+    assert first["Bound by sampling [arcsec]"].value == "not resolved"
+    assert first["Confidence"].number_format == "0.0000%"
     json.dumps(found.to_dict(), allow_nan=False)
     found.plot.contributors()
     assert "not resolved" in found._repr_html_()
@@ -770,9 +772,8 @@ def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None
         cell.data_type == "f" for cells in sheet.iter_rows() for cell in cells
     )
     requirements = book["Requirements"]
-    assert requirements["L2"].value == "violated" and requirements["A2"].fill.fgColor.rgb.endswith(
-        "FDE6DB"
-    )
+    assert "violated" in [cell.value for cell in requirements[2]]
+    assert requirements["A2"].fill.fgColor.rgb.endswith("FDE6DB")
     assert all(dimension.width > 5 for dimension in sheet.column_dimensions.values())
     write_budget(made(), tmp_path / "plain.xlsx")
     assert "Requirements" not in load_workbook(tmp_path / "plain.xlsx").sheetnames

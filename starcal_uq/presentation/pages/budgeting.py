@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.result import Budget
-from starcal_uq.budgeting.rows import AXIS_LABELS, Contributor, confidence_text
-from starcal_uq.budgeting.totals import Total
+from starcal_uq.budgeting.rows import confidence_text
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, atomic_write_text, cell_text
@@ -18,15 +16,29 @@ from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import template_environment
-from starcal_uq.presentation.sentences.budgeting import NOT_RESOLVED, axis_label, outcome_text
+from starcal_uq.presentation.sentences.budgeting import NOT_RESOLVED, outcome_text
 from starcal_uq.presentation.tables import tex
 from starcal_uq.presentation.words.budgeting import headline, tables
-from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
+from starcal_uq.propagation.attitude_error import NOT_ASSESSED
 
 if TYPE_CHECKING:
-    from openpyxl.worksheet.worksheet import Worksheet
+    import pandas as pd
+    from openpyxl import Workbook
 
-_RED, _AMBER, _GREEN, _HEAD = "FFFDE6DB", "FFFDF1D6", "FFE3F4EE", "FFDFE4E9"
+# Heads of columns that have another name than their field.
+_HEADS = {
+    "ecss_class": "ECSS class",
+    "interpretation": "random over",
+    "tail_997": "99.7 % half-width [sigma]",
+    "factor": "factor n [sigma]",
+    "rule_arcsec": "bound by the rule_arcsec",
+    "sampled_arcsec": "bound by sampling_arcsec",
+    "rule_least_arcsec": "rule at the least_arcsec",
+    "sampled_least_arcsec": "sampling at the least_arcsec",
+    "sampled_se_arcsec": "standard error of sampling_arcsec",
+    "explanation": "rule against sampling",
+}
+_RED, _AMBER, _GREEN, _GROUND = "FFFDE6DB", "FFFDF1D6", "FFE3F4EE", "FFDFE4E9"
 
 
 def write_tex(budget: Budget, path: PathLike) -> None:
@@ -80,216 +92,82 @@ def write_xlsx(budget: Budget, path: PathLike) -> None:
     """
     with extra("excel", "Excel workbooks", "write .csv or .html"):
         from openpyxl import Workbook
+    import pandas as pd
 
     book = Workbook()
-    sheet = book.active
-    sheet.title = "Contributors"
-    _contributors(sheet, budget)
-    _totals(book.create_sheet("Totals"), budget)
+    book.remove(book.active)
+    contributors = _contributors(budget)
+    marks = [not row.assessed or row.inflated for row in budget.rows]
+    _sheet(book, "Contributors", contributors, [_AMBER if mark else "" for mark in marks])
+    totals = _totals(budget)
+    _sheet(book, "Totals", totals, [_AMBER if row.at_least else "" for row in budget.totals])
     if budget.outcomes:
-        _requirements(book.create_sheet("Requirements"), budget)
-    notes = book.create_sheet("Notes")
+        requirements = budget.requirements_dataframe()
+        requirements["in_words"] = [outcome_text(outcome) for outcome in budget.outcomes]
+        colours = {Level.FAIL: _RED, Level.WARN: _AMBER, Level.PASS: _GREEN}
+        outcomes = [colours[outcome.level] for outcome in budget.outcomes]
+        _sheet(book, "Requirements", requirements, outcomes)
     created = budget.provenance.created_utc
-    lines = [
-        budget.title,
-        created,
-        headline(budget),
-        *tables(budget)["explanations"],
-        *budget.notes,
-    ]
-    _table(notes, ["Notes"], [[line] for line in lines if line], [110])
+    lines = [budget.title, created, headline(budget), *tables(budget)["explanations"]]
+    notes = pd.DataFrame({"notes": [line for line in (*lines, *budget.notes) if line]})
+    _sheet(book, "Notes", notes, [""] * len(notes))
     with atomic_path(path) as temporary:
         book.save(temporary)
 
 
-def _contributors(sheet: Worksheet, budget: Budget) -> None:
-    header = [
-        *("Contributor", "ECSS class", "Axis", "Mean [arcsec]", "Sigma [arcsec]"),
-        *(f"{name[0].upper()}{name[1:]} [arcsec]" for name in (WITH_MISFIT_FOUND, IF_MODEL_HOLDS)),
-        *(
-            "Distribution",
-            "99.7 % half-width [sigma]",
-            "Random over",
-            "Correlation group",
-            "Combination",
-        ),
-        *("Absorbed by alignment", "Conditions", "Provenance", "Source"),
-    ]
-    rows, colours = [], []
-    for row in budget.rows:
-        mean, sigma = (
-            (row.mean_arcsec, row.sigma_arcsec) if row.assessed else (NOT_ASSESSED, NOT_ASSESSED)
-        )
-        gaussian = row.assessed and row.applies and row.distribution == "gaussian"
-        rows.append(
-            [
-                *(row.name, row.ecss_class, AXIS_LABELS[row.axis], mean, sigma),
-                *(_with_misfit(row), row.if_model_holds_arcsec),
-                *(
-                    row.distribution if row.applies else "does not apply",
-                    row.tail_997 if gaussian else None,
-                ),
-                *(row.interpretation, row.correlation_group, row.combination),
-                *(row.absorbed_by_alignment, row.conditions, row.provenance, row.source),
-            ]
-        )
-        colours.append("" if row.assessed and not row.inflated else _AMBER)
-    _table(
-        sheet,
-        header,
-        rows,
-        [34, 20, 11, 13, 13, 17, 17, 15, 16, 13, 16, 24, 15, 50, 40, 13],
-        colours,
-    )
+def _contributors(budget: Budget) -> pd.DataFrame:
+    table = budget.to_dataframe().drop(columns=["axis_correlation"]).astype(object)
+    untested = table["with_misfit_found_arcsec"].isna() & table["if_model_holds_arcsec"].notna()
+    table.loc[untested, "with_misfit_found_arcsec"] = NOT_ASSESSED
+    unknown = [not row.assessed for row in budget.rows]
+    table.loc[unknown, ["mean_arcsec", "sigma_arcsec"]] = NOT_ASSESSED
+    gaussian = [row.assessed and row.distribution == "gaussian" for row in budget.rows]
+    table["tail_997"] = table["tail_997"].where(gaussian)
+    return table
 
 
-def _with_misfit(row: Contributor) -> float | str:
-    untested = not math.isnan(row.if_model_holds_arcsec) and math.isnan(
-        row.with_misfit_found_arcsec
-    )
-    return NOT_ASSESSED if untested else row.with_misfit_found_arcsec
+def _totals(budget: Budget) -> pd.DataFrame:
+    table = budget.totals_dataframe().astype(object)
+    names = ["mean_arcsec", "sigma_arcsec", "rule_arcsec", "sampled_arcsec"]
+    words = [NOT_RESOLVED if row.unresolved else NOT_ASSESSED for row in budget.totals]
+    for name in names:
+        table[name] = table[name].where(table[name].notna(), words)
+    return table
 
 
-def _totals(sheet: Worksheet, budget: Budget) -> None:
-    header = [
-        *(
-            "Scope",
-            "Axis",
-            "Random over",
-            "Confidence",
-            "Mean [arcsec]",
-            "Sigma [arcsec]",
-            "Factor n [sigma]",
-        ),
-        *("Worst case added [arcsec]", "Bound by the rule [arcsec]", "Bound by sampling [arcsec]"),
-        *("Rule at the least [arcsec]", "Sampling at the least [arcsec]"),
-        *(
-            "Standard error of sampling [arcsec]",
-            "Reads",
-            "Dominant",
-            "Not assessed",
-            "Rule against sampling",
-        ),
-    ]
-    rows = [
-        [
-            *(entry.scope, AXIS_LABELS[entry.axis], entry.interpretation, entry.confidence),
-            *(_numbers(entry)[:2]),
-            *(entry.factor, entry.worst_arcsec, *_numbers(entry)[2:]),
-            *(entry.rule_least_arcsec, entry.sampled_least_arcsec, entry.sampled_se_arcsec),
-            *(
-                "at least" if entry.at_least else "total",
-                entry.dominant,
-                "; ".join(entry.not_assessed),
-            ),
-            entry.explanation,
-        ]
-        for entry in budget.totals
-    ]
-    colours = [_AMBER if entry.at_least else "" for entry in budget.totals]
-    _table(
-        sheet,
-        header,
-        rows,
-        [17, 17, 13, 12, 13, 13, 11, 14, 14, 14, 14, 14, 16, 10, 30, 55, 60],
-        colours,
-    )
+def _head(name: str) -> str:
+    """The head of a column, with its unit."""
+    text = _HEADS.get(name, name).replace("_arcsec", " [arcsec]").replace("_", " ")
+    return text[0].upper() + text[1:]
 
 
-def _numbers(entry: Total) -> list[Any]:
-    values = (entry.mean_arcsec, entry.sigma_arcsec, entry.rule_arcsec, entry.sampled_arcsec)
-    missing = NOT_RESOLVED if entry.unresolved else NOT_ASSESSED
-    return [missing if math.isnan(value) else value for value in values]
-
-
-def _requirements(sheet: Worksheet, budget: Budget) -> None:
-    header = [
-        *(
-            "Requirement",
-            "Axis",
-            "Scope",
-            "Random over",
-            "Confidence",
-            "Limit [arcsec]",
-            "Bound by the rule [arcsec]",
-        ),
-        *(
-            "Bound by sampling [arcsec]",
-            "Judged by",
-            "Bound at the least [arcsec]",
-            "Margin [arcsec]",
-            "Outcome",
-            "In words",
-        ),
-    ]
-    rows = []
-    for outcome in budget.outcomes:
-        asked = outcome.requirement
-        rows.append(
-            [
-                *(
-                    asked.name,
-                    axis_label(asked),
-                    asked.scope,
-                    asked.interpretation,
-                    asked.confidence,
-                ),
-                *(
-                    asked.limit_arcsec,
-                    *_numbers(outcome.total)[2:],
-                    asked.judged_by,
-                    outcome.least_arcsec,
-                ),
-                outcome.margin_arcsec,
-                *(outcome.verdict, outcome_text(outcome)),
-            ]
-        )
-    colours = [
-        {Level.FAIL: _RED, Level.WARN: _AMBER, Level.PASS: _GREEN}[outcome.level]
-        for outcome in budget.outcomes
-    ]
-    _table(sheet, header, rows, [34, 17, 17, 13, 12, 12, 14, 14, 12, 14, 12, 12, 70], colours)
-
-
-def _table(
-    sheet: Worksheet,
-    header: Sequence[str],
-    rows: Sequence[Sequence[Any]],
-    widths: Sequence[float],
-    colours: Sequence[str] = (),
-) -> None:
-    """A table with a frozen header, a filter, widths, and coloured rows; NaN is an empty cell."""
+def _sheet(book: Workbook, title: str, table: pd.DataFrame, colours: Sequence[str]) -> None:
+    """A sheet with a frozen header, a filter, widths, and coloured rows; NaN is an empty cell."""
     from openpyxl.styles import Alignment, Border, Font, PatternFill, Side
     from openpyxl.utils import get_column_letter
 
-    sheet.append(list(header))
-    for row in rows:
-        sheet.append(
-            [
-                None if isinstance(value, float) and math.isnan(value) else _cell(value)
-                for value in row
-            ]
-        )
-    line = Side(style="thin", color="FFB8C1CA")
-    for cells in sheet.iter_rows():
-        for cell in cells:
-            head = cell.row == 1
+    sheet = book.create_sheet(title)
+    sheet.append([_head(name) for name in table])
+    for row in table.itertuples(index=False, name=None):
+        sheet.append([None if value != value else _cell(value) for value in row])
+    line = Border(bottom=Side(style="thin", color="FFB8C1CA"))
+    for number, name in enumerate(table, start=1):
+        letter = get_column_letter(number)
+        texts = [str(value) for value in table[name] if isinstance(value, str)]
+        sheet.column_dimensions[letter].width = min(60, 4 + max(map(len, ["0" * 10, *texts])))
+        head, *cells = sheet[letter]
+        head.font, head.fill = Font(bold=True), PatternFill("solid", fgColor=_GROUND)
+        head.alignment, head.border = Alignment(wrap_text=True), line
+        for cell, colour in zip(cells, colours, strict=True):
             text = isinstance(cell.value, str)
-            cell.alignment = Alignment(wrap_text=text, vertical="bottom" if head else "top")
-            cell.border = Border(bottom=line)
-            if head:
-                cell.font, cell.fill = Font(bold=True), PatternFill("solid", fgColor=_HEAD)
-                continue
-            colour = colours[cell.row - 2] if colours else ""
+            cell.alignment, cell.border = Alignment(wrap_text=text, vertical="top"), line
             if colour:
                 cell.fill = PatternFill("solid", fgColor=colour)
-            if not text and cell.value is not None:
-                share = header[cell.column - 1] == "Confidence"
-                cell.number_format = _share_format(cell.value) if share else _format(cell.value)
-    for index, width in enumerate(widths, start=1):
-        sheet.column_dimensions[get_column_letter(index)].width = width
-    sheet.freeze_panes = "B2" if len(header) > 1 else "A2"
-    if rows and len(header) > 1:
+            if isinstance(cell.value, float):
+                form = _share_format if name == "confidence" else _format
+                cell.number_format = form(cell.value)
+    sheet.freeze_panes = "B2" if len(table.columns) > 1 else "A2"
+    if len(table) and len(table.columns) > 1:
         sheet.auto_filter.ref = sheet.dimensions
     sheet.page_setup.orientation = "landscape"
     sheet.page_setup.fitToHeight = 0
@@ -316,18 +194,13 @@ def _share_format(value: float) -> str:
 
 
 def _format(value: float) -> str:
+    """Three digits or so, whatever the size."""
     size = abs(value)
     if size == 0.0:
         return "0"
-    return (
-        "0.0"
-        if size >= 100.0
-        else "0.00"
-        if size >= 1.0
-        else "0.0000"
-        if size >= 0.01
-        else "0.00E+00"
-    )
+    if size < 0.01:
+        return "0.00E+00"
+    return "0.0" if size >= 100.0 else "0.00" if size >= 1.0 else "0.0000"
 
 
 _WRITERS: dict[str, Callable[[Budget, PathLike], None]] = {
