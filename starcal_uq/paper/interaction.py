@@ -79,20 +79,6 @@ MAX_MAGS = (5.0, 5.5, 6.0, 6.5, 7.0)
 LEAST_STARS = 4
 _TEXT = ("axis", "method", "handling", "parameter", "unit")
 _WHOLE = ("n_frames", "min_stars", "seed", "n", "failed")
-_STATISTICS = (
-    *(
-        "bias",
-        "bias_se",
-        "design_spread",
-        "noise",
-        "noise_se",
-        "spread",
-        "spread_se",
-        "noise_shift",
-        "noise_shift_se",
-    ),
-    *("rmse", "bias_over_noise", "bias_over_noise_low", "bias_over_noise_high"),
-)
 
 
 class Threshold(NamedTuple):
@@ -569,17 +555,26 @@ def summary_rows(head: AnyDict, outcomes: Sequence[Outcome]) -> list[AnyDict]:
 def _summary(clean: FloatArray, full: FloatArray) -> AnyDict:
     n = len(clean)
     if n < 2:
-        return dict.fromkeys(_STATISTICS, np.nan)
+        return {}
     bias, design = float(np.mean(clean)), float(np.std(clean, ddof=1))
     change = full - clean
     noise, spread = float(np.std(change, ddof=1)), float(np.std(full, ddof=1))
     low, high = chi_interval(n)
-    values = (
-        *(bias, design / np.sqrt(n), design),
-        *(noise, noise / np.sqrt(2.0 * (n - 1))),
-        *(spread, spread / np.sqrt(2.0 * (n - 1))),
-        *(float(np.mean(change)), noise / np.sqrt(n)),
-        float(np.sqrt(np.mean(full**2))),
-        *(abs(bias) / noise, abs(bias) / noise * low, abs(bias) / noise * high),
-    )
-    return dict(zip(_STATISTICS, map(float, values), strict=True))
+    free = np.sqrt(2.0 * (n - 1))
+    ratio = abs(bias) / noise
+    found = {
+        "bias": bias,
+        "bias_se": design / np.sqrt(n),
+        "design_spread": design,
+        "noise": noise,
+        "noise_se": noise / free,
+        "spread": spread,
+        "spread_se": spread / free,
+        "noise_shift": np.mean(change),
+        "noise_shift_se": noise / np.sqrt(n),
+        "rmse": np.sqrt(np.mean(full**2)),
+        "bias_over_noise": ratio,
+        "bias_over_noise_low": ratio * low,
+        "bias_over_noise_high": ratio * high,
+    }
+    return {name: float(value) for name, value in found.items()}

@@ -5,7 +5,7 @@ printed number.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -107,25 +107,28 @@ class PaperRun:
         """
         rows = []
         for method, calibration in zip(self.methods, self.calibrations, strict=True):
-            errors = partial(
-                reprojection_error_px, self.truth, calibration.camera, self.observations.xy
+            camera, xy = calibration.camera, self.observations.xy
+            found = reprojection_error_px(self.truth, camera, xy)
+            noisy = reprojection_error_px(self.truth, camera, xy, noise_px=self.noise_px)
+            field = map_error(self.truth, camera)
+            pitch, yaw, roll = field.rotation_arcsec.tolist()
+            rows.append(
+                {
+                    "method": method.label,
+                    "eq16_px": found.rms_px,
+                    "eq16_max_px": found.max_px,
+                    "eq16_noisy_px": noisy.rms_px,
+                    "residual_px": PointErrors(calibration.residuals_px).rms_px,
+                    "map_stars_px": map_error(self.truth, camera, xy).rms_px,
+                    "map_px": field.rms_px,
+                    "map_max_px": field.max_px,
+                    "map_arcsec": field.rms_arcsec,
+                    "map_max_arcsec": field.max_arcsec,
+                    "pitch_arcsec": pitch,
+                    "yaw_arcsec": yaw,
+                    "roll_arcsec": roll,
+                }
             )
-            found, noisy = errors(), errors(noise_px=self.noise_px)
-            field = map_error(self.truth, calibration.camera)
-            row = {"method": method.label, "eq16_px": found.rms_px, "eq16_max_px": found.max_px}
-            row |= {
-                "eq16_noisy_px": noisy.rms_px,
-                "residual_px": PointErrors(calibration.residuals_px).rms_px,
-            }
-            row |= {
-                "map_stars_px": map_error(
-                    self.truth, calibration.camera, self.observations.xy
-                ).rms_px
-            }
-            row |= {"map_px": field.rms_px, "map_max_px": field.max_px}
-            row |= {"map_arcsec": field.rms_arcsec, "map_max_arcsec": field.max_arcsec}
-            names = ("pitch_arcsec", "yaw_arcsec", "roll_arcsec")
-            rows.append(row | dict(zip(names, field.rotation_arcsec.tolist(), strict=True)))
         return pd.DataFrame(rows)
 
 
@@ -321,47 +324,33 @@ class Reproduction(Shown):
             columns: dict[str, tuple[FloatArray, AnyDict]] = {}
             for parameter in sorted(cal.parameter_names, key=list(QUANTITIES).index):
                 i, unit = cal.parameter_names.index(parameter), per_px(run.truth, parameter)
-                truth, ours, sigma = (
-                    float(run.truth.theta[i]),
-                    float(cal.theta[i]),
-                    float(cal.sigmas[i]),
-                )
+                truth, ours, sigma = run.truth.theta[i], cal.theta[i], cal.sigmas[i]
                 numbers = {
                     "truth": truth * unit,
                     "ours": ours * unit,
                     "sigma_claimed": sigma * unit,
-                }
-                numbers |= {
-                    "sigma_crlb": float(run.crlb[i]) * unit,
+                    "sigma_crlb": run.crlb[i] * unit,
                     "z_truth": (ours - truth) / sigma,
                 }
-                columns[QUANTITIES[parameter]] = (
-                    over_seeds[np.isfinite(over_seeds[:, i]), i] * unit,
-                    numbers,
-                )
-            draws = self.readings.of(
-                AS_PRINTED, method.method, "reprojection_px", REPROJECTION[0].key
-            )
-            ours = reprojection_error_px(run.truth, cal.camera, run.observations.xy).rms_px
-            columns["reprojection_px"] = (
-                draws if in_paper else draws[:0],
-                {"truth": 0.0, "ours": ours},
-            )
+                good = np.isfinite(over_seeds[:, i])
+                columns[QUANTITIES[parameter]] = over_seeds[good, i] * unit, numbers
+            main = REPROJECTION[0].key
+            draws = self.readings.of(AS_PRINTED, method.method, "reprojection_px", main)
+            size = reprojection_error_px(run.truth, cal.camera, run.observations.xy).rms_px
+            found = draws if in_paper else draws[:0]
+            columns["reprojection_px"] = found, {"truth": 0.0, "ours": size}
             for quantity, (draws, numbers) in columns.items():
+                row: AnyDict = {"method": method.label, "quantity": quantity, **numbers}
+                row |= {"printed": "", "n": len(draws)}
                 one = judged.get((method.method, quantity)) if in_paper else None
-                row = (
-                    dict.fromkeys(_TABLE_2_COLUMNS, np.nan)
-                    | {"method": method.label, "quantity": quantity}
-                    | numbers
-                )
-                row |= (
-                    {"printed": one.printed.text, "z_printed": one.main.z}
-                    if one
-                    else {"printed": ""}
-                )
-                row |= {"mean": float(np.mean(draws)), "n": len(draws)} if len(draws) else {"n": 0}
-                rows.append(row | ({"spread": np.std(draws, ddof=1)} if len(draws) > 1 else {}))
-        return pd.DataFrame(rows)
+                if one is not None:
+                    row |= {"printed": one.printed.text, "z_printed": one.main.z}
+                if len(draws):
+                    row["mean"] = float(np.mean(draws))
+                if len(draws) > 1:
+                    row["spread"] = np.std(draws, ddof=1)
+                rows.append(row)
+        return pd.DataFrame(rows, columns=list(_TABLE_2_COLUMNS))
 
     def errors(self) -> pd.DataFrame:
         """Errors of the one run in px and arcsec; columns as in `PaperRun.errors`."""

@@ -12,7 +12,7 @@ import numpy as np
 from starcal_uq.camera.distortion import Parameter, parameters
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import fixed, significant
-from starcal_uq.core.types import AnyDict, FloatArray, floats
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.paper.errors import detector_grid, map_error, reprojection_error_px
 from starcal_uq.paper.field.published import FIELD_METHODS, RATE, printed_field
 from starcal_uq.paper.interaction import AXES as STUDY_AXES
@@ -22,6 +22,7 @@ from starcal_uq.paper.show.field import CAMERA_NAMES
 from starcal_uq.paper.show.tables import METHOD_NAMES, NAMES
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import symbol
+from starcal_uq.presentation.words.axes import value_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -45,6 +46,9 @@ _ARROWS = 12
 # z-values within this are drawn to scale.
 _LINEAR_Z = 3.0
 _PALETTE = (style.VERMILLION, style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.SKY)
+# First stages of several methods coincide: the shorter path is drawn as rings around the longer.
+_RINGS: AnyDict = {"markersize": 7.5, "markerfacecolor": "none", "linewidth": 2.6, "alpha": 0.75}
+_DOTS: AnyDict = {"markersize": 3.6, "linewidth": 1.3}
 # Optics in the order of the paper's Fig. 3: unit, and end of the linear part of the axis.
 _ORDER = {"f": ("mm", 1e-3), "x0": ("px", 0.1), "y0": ("px", 0.1)}
 
@@ -71,29 +75,20 @@ def plot_trajectories(found: Reproduction) -> Figure:
         true, to_unit = float(truth.theta[index]), per_px(truth, name)
         by_iteration, by_frame = (style.dress(ax, grid=True) for ax in panels[row])
         for method, (label, cal) in zip(PAPER_METHODS, calibrations.items(), strict=True):
-            colour = colours[label]
+            colour, ax = colours[label], by_frame if label in filters else by_iteration
             if label in filters:
-                _by_frame(by_frame, cal, index, true, to_unit, colour)
+                _by_frame(ax, cal, index, true, to_unit, colour)
             else:
-                path = (
-                    np.concatenate([s.trajectory[:, index] for s in cal.stages]) - true
-                ) * to_unit
-                # First stages of several methods coincide: the shorter path is drawn as rings
-                # around the longer.
-                short = len(cal.stages) == 1
-                rings: AnyDict = {
-                    "markersize": 7.5,
-                    "markerfacecolor": "none",
-                    "linewidth": 2.6,
-                    "alpha": 0.75,
-                }
-                dots: AnyDict = {"markersize": 3.6, "linewidth": 1.3}
-                by_iteration.plot(path, color=colour, marker="o", **(rings if short else dots))
+                path = np.concatenate([s.trajectory[:, index] for s in cal.stages])
+                look = _RINGS if len(cal.stages) == 1 else _DOTS
+                ax.plot((path - true) * to_unit, color=colour, marker="o", **look)
             value = printed(method, QUANTITIES[name]).value - true * to_unit
-            _mark(by_frame if label in filters else by_iteration, 1.0, value, colour, edge=True)
+            _mark(ax, 1.0, value, colour, edge=True)
         for ax in (by_iteration, by_frame):
             ax.axhline(0.0, color=style.INK, linewidth=1.0, dashes=(4, 2))
-        _distance_axis((by_iteration, by_frame), threshold)
+        # Linear near the truth, logarithmic beyond, and reaching the start.
+        style.log_scale(by_iteration.yaxis, threshold, linscale=0.6)
+        by_iteration.margins(y=0.08)
         name = symbol(parameters("none")[index].name)
         style.label(by_iteration, y=f"{name} − {true * to_unit:g} [{unit}]")
     by_frame.set_xscale("log")
@@ -121,27 +116,15 @@ def _by_frame(
     ax.plot(frames, values[1:], color=colour, linewidth=1.3)
     if stage.sigmas is not None:
         sigma = stage.sigmas[1:, index] * to_unit
-        ax.fill_between(
-            frames, values[1:] - sigma, values[1:] + sigma, color=colour, alpha=0.18, linewidth=0
-        )
+        style.band(ax, frames, values[1:] - sigma, values[1:] + sigma, colour, alpha=0.18)
 
 
 def _mark(ax: Axes, x: float, y: float, colour: str, *, edge: bool = False) -> None:
     """A printed value: at a place, or at the right edge for x = 1."""
-    options: AnyDict = {
-        "marker": ">",
-        "markersize": 7.0,
-        "markeredgecolor": style.INK,
-        "markeredgewidth": 0.6,
-    }
+    look: AnyDict = {"markersize": 7.0, "markeredgecolor": style.INK, "markeredgewidth": 0.6}
     if edge:
-        options |= {
-            "marker": "<",
-            "transform": ax.get_yaxis_transform(),
-            "clip_on": False,
-            "zorder": 5,
-        }
-    ax.plot(x, y, color=colour, linestyle="none", **options)
+        look |= {"transform": ax.get_yaxis_transform(), "clip_on": False, "zorder": 5}
+    ax.plot(x, y, color=colour, linestyle="none", marker="<" if edge else ">", **look)
 
 
 def _printed_key(
@@ -150,25 +133,6 @@ def _printed_key(
     return style.key(
         text, colour, marker=marker, markersize=7.0, markeredgecolor=style.INK, linestyle=""
     )
-
-
-def _distance_axis(axes: Sequence[Axes], threshold: float) -> None:
-    """Linear within the threshold, logarithmic beyond, and reaching the start; the axis is
-    shared.
-    """
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-
-    ax = axes[0]
-    values = np.concatenate([floats(line.get_ydata()) for one in axes for line in one.lines])
-    low, high = float(values.min()), float(values.max())
-    reach = max(-low, high)
-    powers = threshold * 10.0 ** np.arange(int(np.ceil(np.log10(max(reach / threshold, 10.0)))) + 1)
-    ax.set_yscale("symlog", linthresh=threshold, linscale=0.6)
-    ends = [min(low, -10.0 * threshold), max(high, 10.0 * threshold)]
-    ax.set_ylim(2.0 * ends[0], 2.0 * ends[1])
-    ax.yaxis.set_major_locator(FixedLocator([*(-powers[::-1]), 0.0, *powers]))
-    ax.yaxis.set_minor_locator(NullLocator())
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
 
 
 def plot_error_fields(found: Reproduction) -> Figure:
@@ -302,12 +266,7 @@ def plot_rates(found: FieldExperiment) -> Figure:
     figure = style.new_figure(8.6, 4.6)
     ax = style.dress(figure.add_subplot(), grid=True)
     ax.axvline(main_px, color=style.GREY, linewidth=1.0, dashes=(4, 3))
-    small: AnyDict = {
-        "textcoords": "offset points",
-        "fontsize": style.TICK_SIZE,
-        "color": style.GREY,
-    }
-    ax.annotate("main table", (main_px, 0.0), xytext=(4, 3), **small)
+    style.note(ax, "main table", (main_px, 0.0), (4, 3), color=style.GREY)
     for number, (name, colour) in enumerate(_COLOURS.items()):
         rows = rates[rates["camera"] == name].sort_values("tolerance_px")
         x = rows["tolerance_px"].to_numpy() * _SPREAD ** (number - 2)
@@ -448,34 +407,30 @@ def _errors(ax: Axes, rows: list[AnyDict], places: list[int], parameter: Paramet
     style.dress(ax)
     ax.axvspan(-1.0, 1.0, color=style.LIGHT, linewidth=0)
     ax.axvline(0.0, color=style.GREY, linewidth=0.7)
-    reach = 0.0
     for row, place in zip(rows, places, strict=True):
         bias, spread, claimed = (row[name] / row["crlb"] for name in ("bias", "spread", "claimed"))
-        colour = _WRONG if row["claim_wrong"] else _RIGHT
-        ends = [bias - spread, bias + spread]
-        ax.plot(ends, [place + 0.12] * 2, color=style.SKY, linewidth=4.0, solid_capstyle="butt")
-        ax.errorbar(
-            bias, place - 0.18, xerr=claimed, color=colour, linewidth=1.1, capsize=2.5, fmt="none"
-        )
-        ax.plot(bias, place + 0.12, "o", color=style.INK, markersize=3.5)
+        _range(ax, (bias - spread, bias + spread), bias, place)
+        look: AnyDict = {"color": _colour(row["claim_wrong"]), "capsize": 2.5, "fmt": "none"}
+        ax.errorbar(bias, place - 0.18, xerr=claimed, linewidth=1.1, **look)
         if abs(bias) > _LINEAR:
             # The logarithmic part has few ticks.
-            side = -1.0 if bias > 0.0 else 1.0
-            small: AnyDict = {
-                "textcoords": "offset points",
-                "fontsize": style.TICK_SIZE - 1.0,
-                "color": style.GREY,
-            }
-            end, anchor = (
-                (bias + side * max(spread, claimed), place),
-                "right" if side < 0.0 else "left",
-            )
-            ax.annotate(
-                fixed(bias, 0), end, xytext=(side * 5.0, 0.0), ha=anchor, va="center", **small
-            )
-        reach = max(reach, abs(bias) + max(spread, claimed))
-    _signed_axis(ax, reach)
+            side = -np.sign(bias)
+            end = bias + side * max(spread, claimed)
+            small: AnyDict = {"fontsize": style.TICK_SIZE - 1.0, "color": style.GREY}
+            small |= {"ha": "right" if side < 0.0 else "left", "va": "center"}
+            style.note(ax, fixed(bias, 0), (end, place), (side * 5.0, 0.0), **small)
+    _signed_axis(ax, float(np.abs(ax.dataLim.intervalx).max()))
     style.label(ax, symbol(parameter.name))
+
+
+def _colour(wrong: bool) -> str:
+    return _WRONG if wrong else _RIGHT
+
+
+def _range(ax: Axes, ends: Sequence[float], middle: float, place: float) -> None:
+    """A bar from end to end with a dot."""
+    ax.plot(ends, [place + 0.12] * 2, color=style.SKY, linewidth=4.0, solid_capstyle="butt")
+    ax.plot(middle, place + 0.12, "o", color=style.INK, markersize=3.5)
 
 
 def _signed_axis(ax: Axes, reach: float) -> None:
@@ -503,34 +458,20 @@ def plain_ticks(ax: Axes, ticks: Sequence[float] | FloatArray) -> None:
 def _widths(ax: Axes, rows: list[AnyDict], places: list[int]) -> None:
     style.dress(ax)
     ax.axvline(1.0, color=style.GREY, linewidth=0.9)
-    smallest, largest = 1.0, 1.0
     for row, place in zip(rows, places, strict=True):
         spread, claimed, classical = (
             row[name] / row["crlb"] for name in ("spread", "claimed", "claimed_classical")
         )
-        colour = _WRONG if row["claim_wrong"] else _RIGHT
         ends = [1.0 / np.sqrt(row[f"efficiency_{end}"]) for end in ("high", "low")]
-        ax.plot(ends, [place + 0.12] * 2, color=style.SKY, linewidth=4.0, solid_capstyle="butt")
-        ax.plot(spread, place + 0.12, "o", color=style.INK, markersize=3.5)
+        _range(ax, ends, spread, place)
+        colour, other = _colour(row["claim_wrong"]), _colour(row["classical_wrong"])
         ax.plot(claimed, place - 0.18, "D", color=colour, markersize=4.0)
-        shown = [*ends, claimed]
-        if np.isfinite(classical):
-            ax.plot(
-                classical,
-                place - 0.18,
-                "x",
-                color=_WRONG if row["classical_wrong"] else _RIGHT,
-                markersize=4.5,
-            )
-            shown.append(classical)
-        smallest, largest = min(smallest, *shown), max(largest, *shown)
+        ax.plot(classical, place - 0.18, "x", color=other, markersize=4.5)
+    low, high = ax.dataLim.intervalx * (0.8, 1.25)
     ax.set_xscale("log")
-    low, high = 0.8 * smallest, 1.25 * largest
     ax.set_xlim(low, high)
-    ticks = [
-        tick for tick in (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0) if low <= tick <= high
-    ]
-    plain_ticks(ax, ticks)
+    ticks = np.array([0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0])
+    plain_ticks(ax, ticks[(ticks >= low) & (ticks <= high)])
 
 
 def _legend(figure: Figure, found: Replicates) -> None:
@@ -623,48 +564,30 @@ def _panel(
         if np.max(bias) < low:
             unseen.append(method)
             continue
-        marker = _MARKERS.get(method, "o")
         # A bias of zero has no place on the axis; the line then starts from below it.
-        ax.plot(
-            at,
-            np.maximum(bias, 1e-3 * low),
-            "-",
-            color=colour,
-            linewidth=1.4,
-            marker=marker,
-            markersize=3.5,
-        )
+        look: AnyDict = {"marker": _MARKERS.get(method, "o"), "markersize": 3.5}
+        ax.plot(at, np.maximum(bias, 1e-3 * low), color=colour, linewidth=1.4, **look)
     if unseen and named:
         words, small = f"bias too small to show: {', '.join(unseen)}", style.TICK_SIZE - 1.0
         ax.text(0.03, 0.03, words, transform=ax.transAxes, fontsize=small, color=style.GREY)
 
 
 def _scale(ax: Axes, at: FloatArray) -> None:
-    """Logarithmic, with a place for zero where the axis starts there; ticks that say plain
-    numbers.
+    """Logarithmic, with a place for zero where the axis starts there; ticks at some of the
+    values.
     """
-    if len(at) == 0:
+    values = np.unique(at)
+    if not len(values):
         return
-    positive = np.unique(at[at > 0.0])
-    if at.min() <= 0.0 and len(positive):
+    positive = values[values > 0.0]
+    if values[0] <= 0.0 and len(positive):
         ax.set_xscale("symlog", linthresh=float(positive[0]), linscale=0.4)
         ax.set_xlim(-0.1 * float(positive[0]), 1.4 * float(positive[-1]))
     else:
         ax.set_xscale("log")
-    ticks = _ticks(positive) if len(positive) else positive
-    plain_ticks(ax, [*([0.0] if at.min() <= 0.0 else []), *ticks])
-
-
-def _ticks(values: FloatArray) -> FloatArray:
-    """Round numbers within the range: decades where it is wide, also 2 and 5 where it is not."""
-    low, high = np.log10(values[0]), np.log10(values[-1])
-    steps = (1.0,) if high - low > 2.2 else (1.0, 3.0) if high - low > 1.5 else (1.0, 2.0, 5.0)
-    decades = 10.0 ** np.arange(np.floor(low) - 1.0, np.ceil(high) + 1.0)
-    candidates: FloatArray = np.sort(np.outer(decades, steps).ravel())
-    chosen: FloatArray = candidates[
-        (candidates > 0.95 * values[0]) & (candidates < 1.05 * values[-1])
-    ]
-    return chosen
+    shown = values[:: -(-len(values) // 5)]
+    ax.set_xticks(shown, [value_words(value) for value in shown])
+    ax.set_xticks([], minor=True)
 
 
 def _interaction_legend(figure: Figure, methods: list[str]) -> None:
