@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 from collections.abc import Iterable
+from functools import cache
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +30,7 @@ from starcal_uq.pipeline.inspection import (
     Frames,
     InspectedFrame,
 )
+from starcal_uq.presentation.figures.scales import round_below
 from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.words.images import frames_text, next_step, outcome_words
 from starcal_uq.sky.names import short_name
@@ -50,6 +53,15 @@ _TOLD = 400
 _NAMED = 4
 # A notebook shows at most so many frames.
 _NOTEBOOK = 24
+# Outlines of marks of unit radius, in relative commands: a circle, a cross, a triangle, a cross
+# that is open in the middle, where the star is, and a square.
+_SHAPES = {
+    "i": "m-1 0c0 -1.33 2 -1.33 2 0c0 1.33 -2 1.33 -2 0",
+    "l": "m-.8 -.8l1.6 1.6m0 -1.6l-1.6 1.6",
+    "u": "m-.6 -.36h1.2l-.6 1.02z",
+    "e": "m.3 0h.35m-.95 0h-.35m.65 .3v.35m0 -.95v-.35",
+    "m": "m-1 -1h2v2h-2z",
+}
 # Name in the page, kind, what it is.
 _LEGEND = (
     ("i", IDENTIFIED, "identified: a star of the catalogue, calibrated"),
@@ -162,7 +174,7 @@ def _card(frame: InspectedFrame, frames: Frames, factor: float) -> AnyDict:
         "number": row.frame,
         "badge": "pass" if frame.n(IDENTIFIED) else "warning",
         "outcome": outcome_words(frame),
-        "svg": _markup(_drawing(frame, frames, factor)),
+        "drawing": _drawing(frame, frames, factor),
         "facts": list(_facts(frame)),
         "counts": counts,
         "reasons": _reasons(frame),
@@ -207,8 +219,7 @@ def _factor(frames: Frames) -> float:
     squares = frames.residuals_px**2
     typical = float(np.sqrt(np.median(squares.sum(axis=1)))) if len(squares) else 0.0
     wanted = _ARROW * frames.camera.width_px / max(typical, 1e-6)
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= wanted))
+    return round_below(wanted)
 
 
 def _radius(frames: Frames) -> float:
@@ -216,43 +227,31 @@ def _radius(frames: Frames) -> float:
     return frames.camera.width_px / (150.0 if frames.large else 90.0)
 
 
-def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> str:
+def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> AnyDict:
     """The picture with its marks, in px of the image."""
-    width, height = frame.width_px, frame.height_px
     r = _radius(frames)
-    words = escape(f"{frame.row.image}: {outcome_words(frame)}, {_told(frame)}", quote=True)
-    parts = [
-        (
-            f'<svg viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{words}" '
-            f'style="--u:{width / 100:g}px">'
-        ),
-        f'<rect x="-0.5" y="-0.5" width="{width}" height="{height}" class="sky"/>',
-    ]
+    drawn: AnyDict = {
+        "width": frame.width_px,
+        "height": frame.height_px,
+        "words": f"{frame.row.image}: {outcome_words(frame)}, {_told(frame)}",
+    }
     if frame.path is not None:
         widest = _LARGE_PX if frames.large else _WIDTH_PX
         try:
-            data = base64.b64encode(picture(frame.path, widest, frames.camera, flat=frame.solved))
-            parts.append(
-                f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" '
-                'preserveAspectRatio="none" '
-                f'href="data:image/jpeg;base64,{data.decode("ascii")}"/>'
-            )
+            data = picture(frame.path, widest, frames.camera, flat=frame.solved)
+            drawn["jpeg"] = base64.b64encode(data).decode("ascii")
         except (ImageError, MissingExtraError) as error:
-            parts.append(
-                f'<text x="{width / 2:g}" y="{height / 2:g}" '
-                f'class="middle">{escape(str(error))}</text>'
-            )
+            drawn["error"] = str(error)
     detections, stars = frame.detections, frame.stars
-    by_kind: AnyDict = {kind: detections[detections["kind"] == kind] for _, kind, _ in _LEGEND[:3]}
-    by_kind |= {"expected": stars, "missed": stars[stars["missed"]]}
-    for key in ("e", "u", "l", "m", "i"):
-        kind = next(kind for letter, kind, _ in _LEGEND if letter == key)
-        parts.append(_marks(key, by_kind[kind], r))
-    parts.append(_arrows(by_kind[IDENTIFIED], factor))
-    parts.append(_names(by_kind[IDENTIFIED], r, width))
+    by_key: AnyDict = {"e": stars}
+    by_key |= {key: detections[detections["kind"] == kind] for key, kind, _ in _LEGEND[:3]}
+    by_key["m"] = stars[stars["missed"]]
+    found = by_key["i"]
+    parts = [_marks(key, by_key[key], r) for key in "eulmi"]
+    parts += [_arrows(found, factor), _names(found, r, frame.width_px)]
     if frame.solved:
         parts.append(_compass(frame, r))
-    return "".join([*parts, "</svg>"])
+    return drawn | {"marks": _markup("".join(parts))}
 
 
 def _told(frame: InspectedFrame) -> str:
@@ -261,32 +260,16 @@ def _told(frame: InspectedFrame) -> str:
     return ", ".join(f"{count(frame.n(kind))} {kind}" for _, kind, _ in _LEGEND)
 
 
-def _shape(key: str, x: float, y: float, r: float) -> str:
-    """The path of a mark; each kind has a shape of its own, so that nothing rests on colour
-    alone.
+@cache
+def _outline(key: str, r: float) -> str:
+    """The outline of a mark about its place; each kind has a shape of its own, so that nothing
+    rests on colour alone.
     """
-    if key == "i":
-        return (
-            f"M{x - r:.1f} {y:.1f}a{r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0a{r:.1f} {r:.1f} 0 1 0 "
-            f"{-2 * r:.1f} 0"
-        )
-    if key == "l":
-        s = 0.8 * r
-        return (
-            f"M{x - s:.1f} {y - s:.1f}l{2 * s:.1f} {2 * s:.1f}m0 {-2 * s:.1f}l{-2 * s:.1f} "
-            f"{2 * s:.1f}"
-        )
-    if key == "u":
-        s = 0.6 * r
-        return f"M{x - s:.1f} {y - 0.6 * s:.1f}h{2 * s:.1f}l{-s:.1f} {1.7 * s:.1f}z"
-    if key == "e":
-        # Open in the middle, where the star is.
-        gap, tick = 0.3 * r, 0.35 * r
-        ends = ((1, 0), (-1, 0), (0, 1), (0, -1))
-        return "".join(
-            f"M{x + gap * i:.1f} {y + gap * j:.1f}l{tick * i:.1f} {tick * j:.1f}" for i, j in ends
-        )
-    return f"M{x - r:.1f} {y - r:.1f}h{2 * r:.1f}v{2 * r:.1f}h{-2 * r:.1f}z"
+    return re.sub(r"-?[\d.]+", lambda number: f"{r * float(number[0]):.1f}", _SHAPES[key])
+
+
+def _shape(key: str, x: float, y: float, r: float) -> str:
+    return f"M{x:.1f} {y:.1f}{_outline(key, r)}"
 
 
 def _symbol(key: str) -> Markup:
