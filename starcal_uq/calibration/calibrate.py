@@ -147,7 +147,10 @@ def calibrate(
         (`starcal_uq.attitude.load_relative_attitudes` describes the file): they tie the attitudes,
         so that the principal point is told apart from the boresight. It needs the ``efficient``
         method.
-    mount : {"free", "fixed"}
+    relative_alignment_arcsec : float, optional
+        How well the axes of the instrument that measured them are known in the camera, standard
+        deviation about each axis; by default, they are rotations of the camera itself.
+    mount : {"none", "fixed"}
         ``fixed``: the Earth turns the camera, and nothing else. It needs times in the table.
     mount_sigma_arcsec : float, optional
         How far a fixed mount moves from frame to frame about each axis, standard deviation.

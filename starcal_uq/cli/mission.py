@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from starcal_uq.planning.check import ForecastCheck
     from starcal_uq.planning.design import FrameChoice
     from starcal_uq.planning.plan import Plan
+    from starcal_uq.planning.ties import PlannedTies
 
 
 def check_output(out: Path | None, command: str, force: bool) -> None:
@@ -170,6 +171,9 @@ def plan_command(
     criterion: settings.Criterion = "A",
     after: Path | None = None,
     distortion_percent: tuple[float, float] | None = None,
+    relative_attitudes_arcsec: float | None = None,
+    relative_alignment_arcsec: float = 0.0,
+    mount_sigma_arcsec: float | None = None,
     check: int | None = None,
     out: Path | None = None,
     epoch: float = 2026.9,
@@ -184,6 +188,12 @@ def plan_command(
     if after is not None and check is not None:
         raise typer.BadParameter(
             "--check simulates campaigns from nothing: leave it out with --after."
+        )
+    ties = _planned_ties(relative_attitudes_arcsec, relative_alignment_arcsec, mount_sigma_arcsec)
+    if ties is not None and (choose is not None or check is not None):
+        raise typer.BadParameter(
+            "--choose and --check know no rotations between frames: leave them out, or leave out "
+            "--relative-attitudes-arcsec and --mount-sigma-arcsec."
         )
     sheet, known = sc.Camera.load(camera), None
     noise: float | NoiseModel = 0.05
@@ -208,6 +218,7 @@ def plan_command(
             scope=scope,
             after=known,
             distortion_percent=distortion_percent,
+            ties=ties,
             seed=seed,
             progress=progress,
         )
@@ -244,6 +255,26 @@ def plan_command(
     return Answer(results, int(target is not None and found.frames_needed is None))
 
 
+def _planned_ties(
+    chain_arcsec: float | None, alignment_arcsec: float, mount_arcsec: float | None
+) -> PlannedTies | None:
+    """Rotations that will be known, of a chain or of a fixed mount."""
+    if chain_arcsec is not None and mount_arcsec is not None:
+        raise typer.BadParameter(
+            "--relative-attitudes-arcsec and --mount-sigma-arcsec exclude each other: leave one of "
+            "them out."
+        )
+    if chain_arcsec is None and alignment_arcsec:
+        raise typer.BadParameter(
+            "--relative-alignment-arcsec needs --relative-attitudes-arcsec: give both, or leave it "
+            "out."
+        )
+    sigma = mount_arcsec if chain_arcsec is None else chain_arcsec
+    if sigma is None:
+        return None
+    return sc.planning.PlannedTies(sigma, alignment_arcsec, mount_arcsec is not None)
+
+
 def _show_plan(
     found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None
 ) -> list[str]:
@@ -253,10 +284,15 @@ def _show_plan(
         distortion_sentence,
         need_sentence,
         plan_table,
+        ties_sentence,
     )
 
     print_table(plan_table(found))
-    notes = [distortion_sentence(found), *(need_sentence(found, need) for need in found.needs)]
+    notes = [
+        distortion_sentence(found),
+        ties_sentence(found),
+        *(need_sentence(found, need) for need in found.needs),
+    ]
     notes = [sentence for sentence in notes if sentence]
     words = [found.text, *notes]
     if choice is not None:

@@ -33,11 +33,16 @@ def _calibration(result: Any) -> AnyDict:
             words for words in (fitted_noise_text(cal).strip(), fallback_words(cal)) if words
         ],
         "effects": cal.effects,
+        "ties": cal.ties,
     }
 
 
 def _effects(result: Any) -> AnyDict:
     return {"refused": [{"name": name, "gain_nat": gain} for name, gain in result.refused]}
+
+
+def _ties(result: Any) -> AnyDict:
+    return {"n_ties": len(result.known), "of_mount": result.known.of_mount}
 
 
 def _posterior(result: Any) -> AnyDict:
@@ -144,6 +149,7 @@ def _table_as(key: str) -> Callable[[Any], AnyDict]:
 TAKEN: Mapping[str, Callable[[Any], Mapping[str, Any]]] = {
     "Calibration": _calibration,
     "Effects": _effects,
+    "Ties": _ties,
     "Posterior": _posterior,
     "Coupling": _coupling,
     "Attitude": _attitude,

@@ -21,7 +21,7 @@ from starcal_uq.cli.options import (
     parse_start,
 )
 from starcal_uq.core import settings
-from starcal_uq.core.conflicts import conflict, sampled_by_default, typed
+from starcal_uq.core.conflicts import conflict, is_given, sampled_by_default, typed
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -38,6 +38,10 @@ class EstimationSettings:
     solver: settings.Solver = "lm"
     screen: bool = False
     effects: str | None = None
+    relative_attitudes: Path | None = None
+    relative_alignment_arcsec: float | None = None
+    mount: settings.MountKind = "none"
+    mount_sigma_arcsec: float | None = None
     start: str | None = None
     pixel_um: float | None = None
     max_iterations: int | None = None
@@ -47,10 +51,20 @@ class EstimationSettings:
 
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
+        if self.mount == "fixed" and self.mount_sigma_arcsec is None:
+            raise typer.BadParameter(
+                "--mount fixed needs --mount-sigma-arcsec: state how far the mount moves from "
+                "frame to frame, such as 1."
+            )
+        if self.relative_alignment_arcsec is not None and self.relative_attitudes is None:
+            raise typer.BadParameter(
+                "--relative-alignment-arcsec needs --relative-attitudes: give both, or leave it "
+                "out."
+            )
         own = vars(self) | {"screening": self.screen}
         for name in ("screen", "start", "pixel_um"):
             del own[name]
-        own["effects"] = None if self.effects == "none" else self.effects
+        own |= {name: None for name in ("effects", "mount") if own[name] == "none"}
         # No workers (0) are a choice, and no absence of one.
         return {
             name: value for name, value in own.items() if value is not None and value is not False
@@ -207,7 +221,7 @@ def refuse_conflicts(settings: AnyDict) -> None:
         raise typer.BadParameter(
             f"{given} {words or f'needs one table, and no folder: leave {given} out.'}"
         )
-    if other in (None, False):
+    if not is_given(other):
         raise typer.BadParameter(
             f"{given} needs {typed(rule.other, rule.allowed[0])}: give both, or leave {given} out."
         )

@@ -48,7 +48,7 @@ ModelName = Literal[
     "equidistant+axes",
     "fisheye+axes",
 ]
-MountKind = Literal["free", "fixed"]
+MountKind = Literal["none", "fixed"]
 EffectName = Literal[
     "axes",
     "field",

@@ -95,6 +95,7 @@ class Code(Enum):
     MODEL_THAT_THE_DATA_DETERMINE = "Model that the data determine", Question.TRUSTWORTHY
     TWO_ESTIMATORS = "Two estimators", Question.CONVERGED
     OTHER_STARTS = "Other starts", Question.CONVERGED
+    KNOWN_ROTATIONS = "Known rotations", Question.TRUSTWORTHY
     DATA_OF_THE_POSTERIOR = "Data of the posterior", Question.CONVERGED
     R_HAT = "R-hat", Question.CONVERGED
     EFFECTIVE_DRAWS = "Effective draws", Question.CONVERGED
@@ -149,6 +150,7 @@ class Advice(Enum):
     LEAVE_OUT_MAGNITUDES = auto()
     CHECK_THE_DIRECTIONS = auto()
     WITHOUT_STAR_ERRORS = auto()
+    WITHOUT_ROTATIONS = auto()
     COUNT_THE_PATTERN = auto()
     STATE_THE_SITE = auto()
     GIVE_THE_DIRECTIONS = auto()

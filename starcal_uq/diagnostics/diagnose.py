@@ -41,6 +41,7 @@ from starcal_uq.diagnostics.times import (
 from starcal_uq.estimation.effects import with_effects
 from starcal_uq.estimation.fit import fit
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.estimation.ties import without_ties
 from starcal_uq.estimation.weights import by_noise_model, weighed
 from starcal_uq.observations.splits import frame_sample
 
@@ -187,6 +188,7 @@ def diagnose_apart(
     `whole` is the calibration that partitioned observations have, where `cal` is that of their
     sample.
     """
+    cal, whole = without_ties(obs, cal), whole if whole is None else without_ties(obs, whole)
     stars, rest = star_test(obs, cal), remainder(obs, cal, seed)
     misfit = misfit_tests(obs, whole or cal)
     return Apart(
@@ -251,7 +253,9 @@ def diagnose(
     """
     step = progress or (lambda done, total: None)
     models = rivals(cal.camera.distortion) if models is None else models
-    obs, whole = weighed(obs, cal), cal
+    obs, theta = weighed(obs, cal), cal.theta
+    # What stars say of their model they say without rotations that others measured.
+    cal = whole = without_ties(obs, cal)
     if obs.n_frames < whole.n_frames and whole.partitions is not None:
         effects = whole.effects.names if whole.effects is not None else ()
         model = whole.nominal.distortion
@@ -277,7 +281,7 @@ def diagnose(
         jackknife=found,
         comparison=comparison,
         starts=rest.starts,
-        theta=tuple(whole.theta.tolist()),
+        theta=tuple(theta.tolist()),
         provenance=provenance(seed, settings, whole.data_hash_of(obs)),
         stars=rest.stars,
         air=rest.air,

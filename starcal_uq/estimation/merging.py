@@ -295,6 +295,11 @@ def check_mergeable(
                 "coefficients the frames of all runs share: calibrate all observations together, "
                 "or calibrate each run with effects 'none'."
             )
+        if cal.ties is not None:
+            raise CalibrationError(
+                f"{name}: holds known rotations between its frames, and attitudes of a merged run "
+                "are free: calibrate all observations together with them, or calibrate it without."
+            )
         for value in data_hashes(cal.provenance) if duplicates == "refuse" else ():
             if value in seen:
                 raise CalibrationError(

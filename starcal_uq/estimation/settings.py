@@ -52,6 +52,7 @@ class EstimationOptions(TypedDict, total=False):
     effects: str | Sequence[str] | None
     dof: float | str | None
     relative_attitudes: RelativeAttitudes | PathLike | None
+    relative_alignment_arcsec: float | None
     mount: str
     mount_sigma_arcsec: float | None
     recursion: MethodOptions | None
@@ -75,7 +76,8 @@ class EstimationSettings:
     effects: str | Sequence[str] | None = "none"
     dof: float | str | None = None
     relative_attitudes: RelativeAttitudes | PathLike | None = None
-    mount: str = "free"
+    relative_alignment_arcsec: float | None = None
+    mount: str = "none"
     mount_sigma_arcsec: float | None = None
     recursion: MethodOptions | None = None
     duplicates: Duplicates | str = "refuse"
@@ -98,7 +100,6 @@ class EstimationSettings:
         """Refuse settings that exclude each other or some others, such as ``partitioned=True``."""
         own = {field.name: getattr(self, field.name) for field in fields(self)}
         own["effects"] = joined_effects(self.effects)
-        own["mount"] = None if self.mount == "free" else self.mount
         own["relative_attitudes"] = None if self.mount == "fixed" else self.ties
         refuse_conflicts(**own | others)
 
@@ -107,10 +108,17 @@ class EstimationSettings:
         """What ties the attitudes of different frames."""
         if self.mount == "fixed":
             return FixedMount(self.mount_sigma_arcsec or 0.0)
-        known = self.relative_attitudes
-        if known is None or isinstance(known, RelativeAttitudes):
-            return known
-        return load_relative_attitudes(known)
+        known, alignment = self.relative_attitudes, self.relative_alignment_arcsec
+        if known is None:
+            if alignment is not None:
+                raise CalibrationError(
+                    "relative_alignment_arcsec is about relative_attitudes, which are not given: "
+                    "give both, or leave it out."
+                )
+            return None
+        if not isinstance(known, RelativeAttitudes):
+            known = load_relative_attitudes(known)
+        return known if alignment is None else replace(known, alignment_arcsec=alignment)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -15,11 +15,14 @@ from starcal_uq.attitude.rotations import (
     rotation_to_quaternion,
 )
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.assemble import PairEstimate, assemble
 from starcal_uq.estimation.stages import Search, Stage
 from starcal_uq.estimation.undetermined import coma_record, undetermined
 from starcal_uq.likelihood.compressed import settled, unit_covariance
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.sums import Attitudes, frame_sums
 from starcal_uq.likelihood.ties import FittedTies, FixedMount, TiedLikelihood, Ties
 from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
@@ -43,7 +46,7 @@ def ties_of(obs: Observations, given: RelativeAttitudes | FixedMount) -> Ties:
         if obs.time_utc is None:
             raise CalibrationError(
                 "a fixed mount turns with the Earth, and the table states no time_utc: add the "
-                "times of the frames, or leave mount='fixed' (--mount fixed) out."
+                "times of the frames, or leave the mount out."
             )
         times = obs.time_utc[obs.frame_starts[:-1]]
         given = RelativeAttitudes.of_earth(obs.frame_ids, times.tolist(), given.sigma_arcsec)
@@ -98,20 +101,18 @@ def with_ties(
     seconds = perf_counter() - began
     stage = Stage("ties", trajectory, cost, status, found.evaluations, seconds)
     residuals, turned, attitudes = _tied(likelihood, theta)
-    tails = cal.tail_factors
-    factors = factors if tails is None else factors * tails
-    record = {n: v for n, v in cal.provenance.items() if n != "without_coma"}
+    wide = factors * _tails(cal)
     known = likelihood.ties.known
     settings: AnyDict = {"relative_attitudes": len(known)}
     if known.of_mount:
         settings = {"mount": "fixed", "mount_sigma_arcsec": float(known.sigma_arcsec[0, 0])}
-    provenance = type(cal.provenance)(record | coma_record(cal.nominal, factors))
+    provenance = _with_coma(cal, factors)
     return cal.moved(
         theta,
         sigma,
         dof,
         Status.SINGULAR if names else status,
-        covariance=covariance * np.outer(factors, factors),
+        covariance=covariance * np.outer(wide, wide),
         stages=(*cal.stages, stage),
         undetermined=names,
         quaternions=rotation_to_quaternion(turned),
@@ -124,6 +125,42 @@ def with_ties(
         provenance=provenance.with_settings(**settings),
         ties=checked,
     )
+
+
+def without_ties(obs: Observations, cal: Calibration) -> Calibration:
+    """The estimate before known rotations were added, whose residuals the stars alone decide; that
+    with them where the stars leave parameters open.
+
+    `obs`: the table, with the weights of the calibration.
+    """
+    if cal.ties is None:
+        return cal
+    likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
+    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    stages, settings = [*cal.stages[:-1]], dict(cal.provenance.settings)
+    pairs = PairEstimate(cal.pair_theta, cal.pair_covariance)
+    found = assemble(obs, cal.nominal, likelihood, stages, Status.CONVERGED, pairs, settings)
+    if not found.status.ok:
+        return cal
+    provenance = _with_coma(cal, found.width_factors)
+    wide = _tails(cal)
+    return replace(
+        found,
+        covariance=found.covariance * np.outer(wide, wide),
+        provenance=provenance,
+        star_weights=cal.star_weights,
+    )
+
+
+def _tails(cal: Calibration) -> FloatArray:
+    """Factors (p,) on sigmas of the weights of tails; ones where there are none."""
+    return np.ones(len(cal.theta)) if cal.tail_factors is None else cal.tail_factors
+
+
+def _with_coma(cal: Calibration, factors: FloatArray) -> Provenance:
+    """The provenance of a calibration with other factors (p,) in place of its `without_coma`."""
+    kept = {name: entry for name, entry in cal.provenance.items() if name != "without_coma"}
+    return Provenance(kept | coma_record(cal.nominal, factors))
 
 
 def _tied(

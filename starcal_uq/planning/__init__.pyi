@@ -4,3 +4,4 @@ from .design import FrameChoice as FrameChoice
 from .design import choose_frames as choose_frames
 from .open_distortion import DistortionRange as DistortionRange
 from .plan import Plan as Plan
+from .ties import PlannedTies as PlannedTies

@@ -25,6 +25,7 @@ from starcal_uq.core.errors import PlanningError, check_known
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.linear import inverses
+from starcal_uq.planning.ties import PlannedTies
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -193,13 +194,14 @@ class Outlook:
 
     `confidence`, `scope`: probability of the two-axis radius, and one of `SCOPES`. `start` (p, p),
     `start_dof`: information that is there already, and the degrees of freedom of those data.
-    `n_campaigns`, `seed`: campaigns to draw.
+    `ties`: rotations between frames that will be known. `n_campaigns`, `seed`: campaigns to draw.
     """
 
     confidence: float = 0.997
     scope: str = "common"
     start: FloatArray | None = None
     start_dof: float = 0.0
+    ties: PlannedTies | None = None
     n_campaigns: int = N_CAMPAIGNS
     seed: int = 0
 
@@ -263,19 +265,18 @@ class Forecaster:
 
     def covariances(self, n_frames: int) -> FloatArray:
         """Covariances (C, p, p) of the parameters after drawn campaigns of n frames."""
-        return campaigns(
-            self.information,
-            n_frames,
-            self.outlook.n_campaigns,
-            self.outlook.seed,
-            self.outlook.start,
-        )
+        outlook = self.outlook
+        drawn = (n_frames, outlook.n_campaigns, outlook.seed, outlook.start)
+        if outlook.ties is not None:
+            return outlook.ties.campaigns(self.mission, self.information, *drawn)
+        return campaigns(self.information, *drawn)
 
     def dof(self, n_frames: int) -> float:
         """Independent numbers beyond the parameters, with those of the data that are there
         already.
         """
-        own = n_frames * (2.0 * self.mission.mean_stars - 3.0) - len(self._size)
+        tied = 0 if self.outlook.ties is None else 3 * (n_frames - 1)
+        own = n_frames * (2.0 * self.mission.mean_stars - 3.0) - len(self._size) + tied
         return float(max(1.0, own + self.outlook.start_dof))
 
     def noise_sigma(self, n_frames: int) -> float:

@@ -8,7 +8,7 @@ frames are forecast from them (`starcal_uq.planning.forecast`). No data are simu
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
@@ -40,6 +40,7 @@ from starcal_uq.planning.open_distortion import (
     open_range,
     with_distortion,
 )
+from starcal_uq.planning.ties import PlannedTies
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def plan(
     scope: str = "common",
     after: HasInformation | None = None,
     distortion_percent: tuple[float, float] | None = None,
+    ties: PlannedTies | None = None,
     sweeps: bool = True,
     n_geometries: int = 3000,
     n_campaigns: int = N_CAMPAIGNS,
@@ -121,6 +123,9 @@ def plan(
         frames and errors are forecast over this range. By default from the barrel distortion of an
         f-theta lens to as much pincushion distortion, at most 30 % and short of a fold;
         coefficients that are not zero are known, and nothing is open.
+    ties : PlannedTies, optional
+        Rotations from each frame to the next that will be known, such as by a gyro, or a fixed
+        mount. Sweeps over parts of the detector are then left out.
     sweeps : bool
         Also forecast 1000 frames with other magnitude limits, noise, and parts of the detector.
     n_geometries : int
@@ -166,10 +171,17 @@ def plan(
         scope=scope,
         start=start,
         start_dof=float(getattr(after, "dof", 0.0)),
+        ties=ties,
         n_campaigns=n_campaigns,
         seed=seed,
     )
-    forecast = Forecaster(frames, outlook).forecast(n_frames)
+    forecaster = Forecaster(frames, outlook)
+    forecast, frame_information = forecaster.forecast(n_frames), frames.information.mean(axis=0)
+    free = None
+    if ties is not None:
+        free = Forecaster(frames, replace(outlook, ties=None)).forecast(n_frames)
+        alone = Forecaster(frames, replace(outlook, start=None)).covariances(SWEEP_FRAMES)
+        frame_information = scaled_inverse(alone.mean(axis=0)) / SWEEP_FRAMES
     noise = float(np.sqrt(np.mean(noise_of(sigma_px, frames.mag, frames.frames.pixel) ** 2)))
     settings = {
         "n_geometries": n_geometries,
@@ -177,6 +189,7 @@ def plan(
         "stars": stars.source,
         "band": stars.band,
         "after": None if after is None else type(after).__name__,
+        **({} if ties is None else {"ties": asdict(ties)}),
         "distortion_percent": None if bounds is None else list(bounds),
     }
     spread = None
@@ -219,10 +232,12 @@ def plan(
         distortion=spread,
         seed=seed,
         provenance=provenance(seed, settings, None),
-        frame_information=frames.information.mean(axis=0),
+        frame_information=frame_information,
         start_information=start,
         rotation_per_theta=frames.common,
         attitude_noise=frames.noise.mean(axis=0),
+        ties=ties,
+        without_ties=free,
     )
 
 
@@ -265,6 +280,9 @@ def _sweep(
     rows: list[AnyDict] = []
     n_points = len(_MAG_STEPS) + len(_NOISE_FACTORS) + len(_FIELD_PARTS)
     for name, value, information, mission, sky in _points(base, frames, noise_px):
+        if outlook.ties is not None and information is not mission.information:
+            # Attitudes of frames with fewer stars are not those of the mission.
+            continue
         forecaster = Forecaster(mission, outlook, information)
         row = {"sweep": name, "value": value, "sky_fraction": sky, "mean_stars": mission.mean_stars}
         row |= forecaster.forecast((SWEEP_FRAMES,)).to_dataframe().iloc[0].to_dict()
@@ -445,6 +463,10 @@ class Plan(Shown):
         Common rotation that a parameter causes, rad.
     attitude_noise : (3, 3) array
         Covariance of one frame's attitude due to centroid noise, rad^2.
+    ties : PlannedTies or None
+        Rotations between frames that will be known.
+    without_ties : Forecast or None
+        The forecast without them.
     """
 
     camera: Camera
@@ -467,6 +489,8 @@ class Plan(Shown):
     start_information: FloatArray | None
     rotation_per_theta: FloatArray
     attitude_noise: FloatArray
+    ties: PlannedTies | None = None
+    without_ties: Forecast | None = None
 
     @bounded
     def expected(self, n_frames: int) -> Expected:

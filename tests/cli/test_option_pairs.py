@@ -18,6 +18,7 @@ from starcal_uq.cli.commands import app
 from starcal_uq.presentation.report import drawing
 from tests.helpers.ground_scenes import SITE
 from tests.helpers.outside import campaign
+from tests.helpers.ties import gyro, write_columns
 
 KINDS = ("plain.csv", "rich.csv", "space.ecsv", "parts")
 # Values of each option, None where it stands alone. Files are made by `tables`.
@@ -27,6 +28,10 @@ VALUES = {
     "--solver": ("minpack", "ipopt"),
     "--screen": (None,),
     "--effects": ("auto", "none", "field,frame", "star", "noise", "tails", "auto,noise,tails"),
+    "--relative-attitudes": ("gyro.csv",),
+    "--relative-alignment-arcsec": ("30",),
+    "--mount": ("none", "fixed"),
+    "--mount-sigma-arcsec": ("5",),
     "--start": ("x0_px=500",),
     "--max-iterations": ("500",),
     "--duplicates": ("drop", "keep"),
@@ -116,6 +121,7 @@ def tables(tmp_path):
     (tmp_path / "priors.toml").write_text("[priors]\nfocal_fraction = 0.05\n", encoding="utf-8")
     (tmp_path / "budget.toml").write_text("", encoding="utf-8")
     (tmp_path / "orbit.csv").write_text("time_s,temperature_c\n0,5\n60,25\n", encoding="utf-8")
+    write_columns(tmp_path / "gyro.csv", gyro(np.random.default_rng(6), c, 5.0))
     return tmp_path
 
 
@@ -209,6 +215,10 @@ def test_some_pairs_of_options_work_or_are_refused_in_words(asked):
     assert asked("plain.csv", [("--effects", "noise"), ("--likelihood", "pairs")])
     assert asked("plain.csv", [("--effects", "auto"), ("--screen", None)])
     assert asked("parts", [("--effects", "none")])
+    assert asked("plain.csv", [("--relative-attitudes", "gyro.csv"), ("--effects", "tails")])
+    assert asked("rich.csv", [("--mount", "fixed"), ("--mount-sigma-arcsec", "5")])
+    assert not asked("rich.csv", [("--mount", "fixed")])
+    assert not asked("rich.csv", [("--relative-attitudes", "gyro.csv"), ("--effects", "auto")])
     assert not asked("parts", [("--effects", "auto")])
     assert not asked("plain.csv", [("--effects", "none,frame")])
     assert not asked("plain.csv", [("--effects", "auto"), ("--method", "samaan")])

@@ -30,6 +30,7 @@ from starcal_uq.runs.folder import FILES
 from tests.helpers.ground_scenes import NOMINAL, SITE, ground_frames
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
+from tests.helpers.ties import gyro, known_of, stare
 
 PACKAGE = Path(sc.__file__).parent
 TIME = "2026-11-25T02:00:00"
@@ -66,9 +67,15 @@ def small(tmp_path_factory):
         sigma_px=lambda radius, mag, frame: 0.03 * (1.0 + 3.0 * radius),
     )
     uneven = sc.Observations(**c.columns)
-    bent = sc.Observations(**campaign(np.random.default_rng(3), n_frames=30).columns)
+    c = campaign(np.random.default_rng(3), n_frames=30)
+    bent, rotations = sc.Observations(**c.columns), gyro(np.random.default_rng(4), c, 5.0)
+    path, times = stare(np.random.default_rng(5), 12, 5.0, 40.0, 5.0)
+    columns = campaign(np.random.default_rng(6), n_frames=12, path=path).columns
+    turned = sc.Observations(**columns, time_utc=times[columns["frame"]])
+    turned.select(np.abs(turned.xy - 511.5).max(axis=1) < 511.0).save(folder / "TURNED_OBS.csv")
     patch.save(folder / "PATCH_OBS.csv")
-    sheet.save(folder / "PATCH_CAMERA.toml")
+    for name in ("PATCH", "TURNED"):
+        sheet.save(folder / f"{name}_CAMERA.toml")
     for name, seed in (("RUN_B", 5), ("RUN_A", 3)):
         obs = observations(n_frames=12, seed=seed)
         run = sc.Run(folder / name)
@@ -77,7 +84,8 @@ def small(tmp_path_factory):
         run.propagate(n_draws=50, seed=0)
     obs.save(folder / "OBS.csv")
     shutil.copytree(folder / "RUN_A", folder / "RUN")
-    tables = {"obs": obs, "patch": patch, "uneven": uneven, "bent": bent}
+    tables = {"obs": obs, "patch": patch, "uneven": uneven, "bent": bent, "turned": turned}
+    tables |= {"rotations": known_of(rotations, 0.2)}
     return SimpleNamespace(folder=folder, camera=camera, cal=cal, post=post, sheet=sheet, **tables)
 
 
@@ -183,6 +191,13 @@ EXAMPLES = {
     "diagnostics.verdict.estimate.estimators_agree": lambda s: [
         estimate.estimators_agree(
             dataclasses.replace(s.cal, pair_theta=s.cal.theta + 99.0 * s.cal.sigmas)
+        )
+    ],
+    "diagnostics.verdict.estimate.rotations_agree": lambda s: [
+        estimate.rotations_agree(sc.calibrate(obs, s.sheet, **options))
+        for obs, options in (
+            (s.bent, {"relative_attitudes": s.rotations}),
+            (s.turned, {"mount": "fixed", "mount_sigma_arcsec": 1.0}),
         )
     ],
     "diagnostics.verdict.estimate.against_truth": lambda s: [
@@ -451,7 +466,8 @@ def execute(small, cli, tmp_path):
         folder = tmp_path / f"files{len(list(tmp_path.iterdir()))}"
         shutil.copytree(small.folder, folder)
         words = [*shlex.split(command), *shlex.split(more)]
-        ground = "GROUND_" if "SITE" in words else "PATCH_" if "star" in words else ""
+        own = {"SITE": "GROUND_", "star": "PATCH_", "--mount": "TURNED_"}
+        ground = next((name for word, name in own.items() if word in words), "")
         files = {
             "OBS": f"{ground}OBS.csv",
             "CAMERA": f"{ground}CAMERA.toml",
@@ -498,8 +514,10 @@ def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
             execute(command, more, parse=words[0] == "validate")
         else:
             assert tried.startswith("sc."), tried
-            stars = {"obs": small.patch, "camera": small.sheet} if "'star'" in tried else {}
-            eval(tried, names | stars)
+            own = {"'star'": small.patch, "mount=": small.turned}
+            stars = next((obs for word, obs in own.items() if word in tried), None)
+            given = {} if stars is None else {"obs": stars, "camera": small.sheet}
+            eval(tried, names | given)
 
 
 def texts():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
+
 import numpy as np
 
 from starcal_uq.attitude import RelativeAttitudes
@@ -86,6 +89,14 @@ def stare(
     path = [exp(own) @ mount @ exp(-turn * pole) for own, turn in zip(moved, turns, strict=True)]
     seconds = np.round(60.0 * minutes * np.arange(n_frames)).astype("timedelta64[s]")
     return np.array(path), (np.datetime64(START) + seconds).astype(str)
+
+
+def write_columns(path: Path, columns: dict[str, np.ndarray]) -> None:
+    """Write columns as a table."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        rows = csv.writer(stream)
+        rows.writerow(columns)
+        rows.writerows(zip(*(own.tolist() for own in columns.values()), strict=True))
 
 
 def known_of(columns: dict[str, np.ndarray], claimed: float = 1.0) -> RelativeAttitudes:

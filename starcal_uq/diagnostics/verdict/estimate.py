@@ -61,6 +61,7 @@ if TYPE_CHECKING:
 # OUTLIER_P) add up to less, whatever the data.
 MISFIT_P, JACKKNIFE_P, STAR_P = ALPHA, 0.01, 0.01
 MISFIT_FAIL_P, STAR_FAIL_P, ESTIMATORS_P, TRUTH_P = 1e-4, 1e-3, 3e-4, 3e-4
+ROTATIONS_P = 3e-4
 _REMEDIES = {
     Status.MAX_ITERATIONS: calibrated(max_iterations=1000),
     Status.OUTSIDE_DETECTOR: calibrated(solver="ipopt"),
@@ -128,6 +129,27 @@ def estimators_agree(cal: Calibration) -> Check | None:
         pass_or_fail(good),
         {"below_sigma": limit},
         () if good else SCREEN,
+    )
+
+
+def rotations_agree(cal: Calibration) -> Check | None:
+    """Do known rotations between frames agree with the stars?"""
+    ties = cal.ties
+    if ties is None:
+        return None
+    good, bounds = ties.p_value >= ROTATIONS_P, {"p_least": ROTATIONS_P}
+    facts = {"chi2": ties.chi2, "dof": ties.dof, "p_value": ties.p_value}
+    if good:
+        return Check(Code.KNOWN_ROTATIONS, facts, bounds=bounds)
+    facts |= {"error_factor": ties.error_factor}
+    wider = float(f"{np.max(ties.known.sigma_arcsec) * ties.error_factor:.3g}")
+    return Check(
+        Code.KNOWN_ROTATIONS,
+        facts,
+        Level.FAIL,
+        bounds,
+        calibrated(mount="fixed", mount_sigma_arcsec=wider) if ties.known.of_mount else (),
+        (Order(Advice.WITHOUT_ROTATIONS),),
     )
 
 

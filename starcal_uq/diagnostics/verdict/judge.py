@@ -134,7 +134,7 @@ def judge(
     checks like the others.
     """
     checks: list[Check | None] = [estimate.estimation(cal, post), estimate.determined(cal)]
-    checks += [estimate.estimators_agree(cal)]
+    checks += [estimate.estimators_agree(cal), estimate.rotations_agree(cal)]
     if diagnosis is not None and diagnosis.starts is not None:
         checks += [estimate.starts(diagnosis.starts)]
     if post is not None:

@@ -166,15 +166,20 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
     panels = figure.subplots(1, 3 + (found is not None), sharey=True)
     here = {"magnitude limit": plan.max_mag, "noise": plan.sigma_px, "part of the detector": 1.0}
     if found is not None:
-        frames = found.frames[:, found.scopes.index(plan.scope)]
+        drawn = found.radius_after_arcsec
+        if of_frames:
+            drawn = found.frames[:, found.scopes.index(plan.scope)]
         own = np.abs(found.percent - found.own_percent)
         _changed(
             panels[3],
-            *(found.percent, frames if of_frames else found.radius_after_arcsec),
+            *(found.percent, drawn),
             *(np.arange(len(own)) == np.argmin(own), "distortion at the corner [%]"),
         )
     for ax, (name, words, logarithmic) in zip(panels[:3], _SWEEPS, strict=True):
         rows = plan.sweeps[plan.sweeps["sweep"] == name]
+        if rows.empty:
+            ax.set_visible(False)
+            continue
         x, y = rows[["value", column]].to_numpy(np.float64).T
         if logarithmic:
             ax.set_xscale("log")

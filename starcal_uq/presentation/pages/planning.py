@@ -38,6 +38,7 @@ from starcal_uq.presentation.words.planning import (
     range_words,
     settings_sentence,
     span,
+    ties_sentence,
 )
 
 PAGE = "plan.html"
@@ -214,7 +215,7 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> AnyDict:
         "created": plan.provenance.created_utc,
         "version": plan.provenance.version,
         "verdict": plan_text(plan),
-        "settings": settings_sentence(plan),
+        "settings": " ".join(filter(None, (settings_sentence(plan), ties_sentence(plan)))),
         "distortion_words": distortion_sentence(plan),
         "distortion_span": "" if plan.distortion is None else span(plan.distortion),
         "level": level(plan.confidence),

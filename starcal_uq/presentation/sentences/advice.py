@@ -41,6 +41,11 @@ _ORDERS = {
     Advice.WITHOUT_STAR_ERRORS: (
         "Leave star out of the list of effects, and see which checks then fail."
     ),
+    Advice.WITHOUT_ROTATIONS: (
+        "Leave the known rotations out, or correct them: numbers of the frames, sense of the "
+        "quaternions, axes of the instrument. If only their errors are too small, state them that "
+        "much larger."
+    ),
     Advice.COUNT_THE_PATTERN: (
         "Count the pattern as an error of the directions, as the attitude error with the misfit "
         "found does: no distortion model here follows it."

@@ -98,6 +98,20 @@ def _estimators(good: bool, difference_sigma: float, parameter: str, below_sigma
     return value, f"< {fixed(below_sigma, 1)} sigma", sentence
 
 
+@entry(Code.KNOWN_ROTATIONS)
+def _rotations(
+    good: bool, chi2: float, dof: int, p_value: float, p_least: float, error_factor: float = 1.0
+) -> Told:
+    value = f"chi-square {fixed(chi2, 1)} for {dof}, {p_words(p_value)}"
+    sentence = "The known rotations between frames agree with the stars within their errors."
+    if not good:
+        sentence = (
+            "The known rotations between frames contradict the stars: their errors would have to "
+            f"be {significant(error_factor)} times the stated ones."
+        )
+    return value, f"p ≥ {p_least:g}", sentence
+
+
 @entry(Code.KNOWN_TRUTH)
 def _truth(good: bool, error_sigma: float, parameter: str, below_sigma: float) -> Told:
     sentence = (

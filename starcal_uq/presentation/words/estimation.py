@@ -11,6 +11,8 @@ from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import (
     decimals_for,
     fixed,
+    join_words,
+    p_words,
     percent,
     plural,
     pretty_unit,
@@ -67,7 +69,27 @@ def calibration_text(cal: Calibration) -> str:
 def decided(cal: Calibration) -> list[str]:
     """What was decided of model and effects on the way, a sentence or a few each."""
     found = "" if cal.effects is None else effects_text(cal.effects)
-    return [words for words in (fallback_words(cal), found) if words]
+    return [words for words in (fallback_words(cal), found, ties_text(cal)) if words]
+
+
+def ties_text(cal: Calibration) -> str:
+    """What known rotations between frames tell of the principal point, and how they agree with the
+    stars; empty without any.
+    """
+    ties = cal.ties
+    if ties is None:
+        return ""
+    what = "A fixed mount" if ties.known.of_mount else plural(len(ties.known), "known rotation")
+    before, after = (
+        [f"{significant(sigma)} px" for sigma in sigmas[:2]]
+        for sigmas in (ties.sigmas_without, cal.sigmas)
+    )
+    verb = "ties" if ties.known.of_mount or len(ties.known) == 1 else "tie"
+    return (
+        f"{what} {verb} the attitudes of the frames: sigma of x0 and y0 is {join_words(after)}, "
+        f"without {join_words(before)}. Chi-square {fixed(ties.chi2, 1)} for {ties.dof} "
+        f"({p_words(ties.p_value)})."
+    )
 
 
 def calibration_tables(cal: Calibration) -> list[TextTable | None]:

@@ -23,6 +23,15 @@ SCOPE_NAMES = {
 }
 
 
+# Quantities that known rotations between frames tell.
+_TOLD_BY_TIES = (
+    ("x0_px", "x0", "px"),
+    ("y0_px", "y0", "px"),
+    ("common_pitch_arcsec", "the common rotation in pitch", "arcsec"),
+    ("common_yaw_arcsec", "in yaw", "arcsec"),
+)
+
+
 def frames(number: int | None) -> str:
     """A number of frames to three digits, rounded up; what cannot be reached is said."""
     if number is None:
@@ -162,6 +171,26 @@ def _largest(plan: Plan) -> str:
         "noise of "
         f"{significant(max(plan.nea_arcsec[:2]))} arcsec in every frame."
     )
+
+
+def ties_sentence(plan: Plan) -> str:
+    """What known rotations bring to the largest campaign; empty without any."""
+    if plan.ties is None or plan.without_ties is None:
+        return ""
+    known = f"to {plan.ties.sigma_arcsec:g} arcsec from each frame to the next"
+    what = f"Rotations that are known {known}"
+    if plan.ties.of_mount:
+        what = f"A fixed mount that moves by {plan.ties.sigma_arcsec:g} arcsec"
+    elif plan.ties.alignment_arcsec:
+        what += f", in axes that are known to {plan.ties.alignment_arcsec:g} arcsec,"
+    changes = [
+        f"{name} from {significant(float(before))} to {significant(float(after))} {unit}"
+        for key, name, unit in _TOLD_BY_TIES
+        for before, after in [(plan.without_ties.of(key)[-1], plan.forecast.of(key)[-1])]
+    ]
+    n = count(int(plan.forecast.n_frames[-1]))
+    verb = "changes" if plan.ties.of_mount else "change"
+    return f"{what} {verb} standard deviations after {n} frames: {join_words(changes)}."
 
 
 def settings_sentence(plan: Plan) -> str:
