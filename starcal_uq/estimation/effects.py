@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
-_STARS_AT_ONCE = 2_000
+_STARS_AT_ONCE = 1_500
 # Frames of a sample that the zenith of all is looked for in.
 _FRAMES_OF_ZENITH = 100
 # Rounds in which the noise beside air is found; moves of the zeniths beside other effects, and the
@@ -163,6 +163,10 @@ class TableStars:
         sums = EffectSums(self._chosen(names, zeniths), theta, sigma, 0, apart=False)
         known = self.likelihood.sums(theta)
         return expanded(self.likelihood, theta, whitening, known, sums.add), sums
+
+
+def _whole(exact: EffectLikelihood, found: Cross) -> Cross:
+    return replace(found, run=found.run + exact.mean[:, None])
 
 
 def _of_run(effects: Sequence[Effect]) -> list[Effect]:
@@ -314,7 +318,7 @@ class Rest:
 
     exact: EffectLikelihood
     state: Profile
-    coefficients: Cross
+    found: Cross  # Coefficients less those that are expected
     rotations: FloatArray  # (K, 3, 3)
     residuals_px: FloatArray  # (N, 2)
 
@@ -323,15 +327,20 @@ class Rest:
         """Those at theta (p,)."""
         state, _ = exact.profile(theta, exact.rotations)
         rest, found = exact.conditioned(state, state.e[None])
-        found = replace(found, run=found.run + exact.mean[:, None])
-        turned = exact.attitude_response(state, state.e[None]) - exact.turns(state, found)
+        by_effects = exact.turns(state, _whole(exact, found))
+        turned = exact.attitude_response(state, state.e[None]) - by_effects
         rotations = exp_rotation(turned[0].T) @ state.rotations
         return cls(exact, state, found, rotations, exact.frames.in_pixels(rest[0]).T)
+
+    @property
+    def coefficients(self) -> Cross:
+        """Best coefficients."""
+        return _whole(self.exact, self.found)
 
     def normals(self, theta: FloatArray, scale: FloatArray | None = None) -> FrameNormals:
         """What each frame says about the parameters at theta (p,), in these units (p,) or px."""
         scale = np.ones(len(theta)) if scale is None else scale
-        return FrameNormals.beside(self.exact, theta, scale)
+        return FrameNormals.beside(self.exact, theta, (self.state, self.found), scale)
 
     def size(self, name: str) -> float:
         """Root mean square, px, of the shifts by an effect."""

@@ -16,9 +16,9 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.residual_map import FrameScatter
-from starcal_uq.likelihood.effect_sums import EffectLikelihood
+from starcal_uq.likelihood.effect_sums import Cross, EffectLikelihood
 from starcal_uq.likelihood.elimination import products_by_frame
-from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.sums import frame_normals
 from starcal_uq.likelihood.terms import TermSums, add_by_group
@@ -87,15 +87,21 @@ class FrameNormals:
 
     @classmethod
     def beside(
-        cls, exact: EffectLikelihood, theta: FloatArray, scale: FloatArray | None = None
+        cls,
+        exact: EffectLikelihood,
+        theta: FloatArray,
+        known: tuple[Profile, Cross] | None = None,
+        scale: FloatArray | None = None,
     ) -> FrameNormals:
-        """Normal equations at theta (p,) beside effects.
+        """Normal equations at theta (p,) beside effects; `known` are the model and coefficients there.
 
         Those of frames are marginalised in each; those of the run and of stars, which frames share,
         are at their best.
         """
-        state, _ = exact.profile(theta, exact.rotations)
-        _, found = exact.conditioned(state, state.e[None])
+        if known is None:
+            state, _ = exact.profile(theta, exact.rotations)
+            known = state, exact.conditioned(state, state.e[None])[1]
+        state, found = known
         shared = exact.shifts(state, replace(found, frame=0.0 * found.frame))
         e = exact.project_out(state, state.e[None]) - shared
         columns = np.concatenate([e, exact.slopes(theta, state)])

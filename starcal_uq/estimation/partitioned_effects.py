@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any, Protocol
+
+import numpy as np
 
 from starcal_uq.core.errors import CalibrationError, ObservationError
 from starcal_uq.core.types import FloatArray
@@ -32,7 +35,7 @@ _COVARIATES = {
     "magnitude": "mag",
 }
 # Stars whose effects are taken off at once.
-_STARS_AT_ONCE = 20_000
+_STARS_AT_ONCE = 4_000
 
 
 class Total(Protocol):
@@ -176,8 +179,13 @@ class Beside:
         """Some frames at a time: the table, and what is left of it."""
         obs = self.files.reader.load(part)
         n = max(1, obs.n_frames * _STARS_AT_ONCE // obs.n_stars)
-        ids = [obs.frame_ids[i : i + n] for i in range(0, obs.n_frames, n)]
-        return [(some, self._rest(some)) for some in map(obs.select_frames, ids)]
+        edges = obs.frame_starts[np.append(np.arange(0, obs.n_frames, n), obs.n_frames)]
+        found = []
+        for first, last in pairwise(edges):
+            columns = {name: values[first:last] for name, values in obs.columns.items()}
+            some = replace(obs, **columns)
+            found.append((some, self._rest(some)))
+        return found
 
     def _rest(self, obs: Observations) -> Rest:
         held, at = self.effects, self.files.around

@@ -62,7 +62,7 @@ class Columns:
 
         def of(grouping: str) -> FloatArray:
             own = [e.columns.columns(view) for e in effects if e.grouping == grouping]
-            columns = np.concatenate([nothing, *own])
+            columns = own[0] if len(own) == 1 else np.concatenate([nothing, *own])
             part.frames.whiten(columns)
             return columns
 

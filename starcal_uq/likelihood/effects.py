@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -169,6 +170,7 @@ def _nights(obs: Observations, extent: Extent | None) -> FloatArray | None:
     return np.eye(len(nights))[:, np.searchsorted(nights[1:, 0], seconds, side="right")]
 
 
+@lru_cache(maxsize=8)
 def field_effect(camera: Camera) -> Effect:
     """A smooth displacement over the field: products of Legendre polynomials of x and y along each
     axis.

@@ -6,6 +6,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError
 from tests.helpers.effects import breathing, bump, nearest_camera, sheet, table, together
+from tests.helpers.full_model import drawn
 from tests.helpers.outside import campaign
 
 
@@ -138,3 +139,24 @@ def test_weights_follow_what_effects_leave(weighing: str) -> None:
         assert plain.noise_model.varies
     else:
         assert plain.sigma > 1.2 * cal.tail_scale
+
+
+@pytest.mark.slow
+def test_draws_are_those_of_a_long_chain_on_the_full_model_with_its_scale() -> None:
+    """Four frames tell the scale to 20 %, which widens what it moves: f."""
+    rng = np.random.default_rng(5)
+    c = campaign(rng, n_frames=4, stars_per_frame=30, displaced=breathing(rng, 4, 0.3))
+    obs = table(c)
+    cal = sc.calibrate(obs, sheet(c), effects="frame")
+    draws = sc.sample(obs, cal, seed=1).theta_draws.reshape(-1, 5)
+    at = cal.sigma, cal.effects.fitted[0].scale_px
+    full, held = drawn(c, *at, sampled=True, seed=1), drawn(c, *at, sampled=False, seed=2)
+
+    def width(values: np.ndarray) -> np.ndarray:
+        return np.diff(np.quantile(values, [0.025, 0.975], axis=0), axis=0)[0]
+
+    print("widths", width(draws) / width(full), "held", width(held) / width(full))
+    assert np.max(np.abs(draws.mean(axis=0) - full.mean(axis=0)) / full.std(axis=0)) < 0.08
+    np.testing.assert_allclose(width(draws), width(full), rtol=0.05)
+    # Control: with the scale held the interval of f is too narrow.
+    assert width(held)[2] < 0.92 * width(full)[2]

@@ -67,7 +67,7 @@ def together(*shifts: Displacement) -> Displacement:
     return lambda *where: np.sum([shift(*where) for shift in shifts], axis=0)
 
 
-def _projected(theta: np.ndarray, b: np.ndarray) -> np.ndarray:
+def projected(theta: np.ndarray, b: np.ndarray) -> np.ndarray:
     x0, y0, f, k1, k2 = theta
     u, v = f * b[0] / b[2], f * b[1] / b[2]
     r2 = u * u + v * v
@@ -96,11 +96,11 @@ def nearest(
     b = np.array([*(ideal / theta[2]), np.ones(ideal.shape[1])])
     steps = np.array([1e-2, 1e-2, 1e-2, 1e-2 / CORNER_PX**3, 1e-2 / CORNER_PX**5])
     columns = [
-        (_projected(theta + step, b) - _projected(theta - step, b)) / 2.0 for step in np.diag(steps)
+        (projected(theta + step, b) - projected(theta - step, b)) / 2.0 for step in np.diag(steps)
     ]
     for axis in np.eye(3):
         turned = 1e-6 * np.cross(axis, b.T).T
-        columns.append((_projected(theta, b + turned) - _projected(theta, b - turned)) / 2.0)
+        columns.append((projected(theta, b + turned) - projected(theta, b - turned)) / 2.0)
     moved = shift(seen, xy, np.full(xy.shape[1], 4.0), 0)
     matrix = np.array(columns).reshape(8, -1).T
     found = np.linalg.lstsq(matrix, moved.ravel(), rcond=None)[0]
