@@ -5,7 +5,7 @@ begins.
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,8 +22,9 @@ from starcal_uq.core.formatting import (
     significant,
     with_sigma,
 )
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.verdict.estimate import truth_z
+from starcal_uq.presentation.figures.scales import symbol as written
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable, with_units
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
@@ -50,70 +51,55 @@ def parameter_rows(results: Results) -> list[Row]:
     cal, post, truth = results.calibration, results.posterior, results.truth
     mean, sd = np.append(cal.theta, cal.sigma), np.append(cal.sigmas, cal.sigma_std)
     low, high = np.vstack([cal.interval(), cal.sigma_interval()]).T
-    prior: list[tuple[float, float] | None] = [None] * len(mean)
+    unknown = np.full(len(mean), np.nan)
+    prior, prior_sd, true, z = unknown, unknown, unknown.copy(), unknown.copy()
     if post is not None:
         mean, sd = post.draws.mean(axis=0), post.sd
         low, high = np.quantile(post.draws, (0.025, 0.975), axis=0)
-        names = post.parameter_names
-        prior = list(zip(post.priors.mean(names), post.priors.sd(names), strict=True))
-    start: list[float | None] = [*cal.nominal.theta.tolist(), None]
-    true: list[float | None] = [None] * len(mean)
-    z = np.full(len(mean), np.nan)
+        prior, prior_sd = (of(post.parameter_names) for of in (post.priors.mean, post.priors.sd))
+    start = np.append(cal.nominal.theta, np.nan)
     if truth is not None:
-        true[: len(cal.theta)] = truth.theta.tolist()
-        z[: len(cal.theta)] = truth_z(cal, truth, post)
+        true[:-1], z[:-1] = truth.theta, truth_z(cal, truth, post)
+    numbers = np.stack([mean, sd, low, high, prior, prior_sd, start, true], axis=1)
     rows = []
-    for i, parameter in enumerate(all_parameters(results)):
-        numbers = _Numbers(mean[i], sd[i], low[i], high[i], prior[i], start[i], true[i], z[i])
-        rows.append(_parameter_row(parameter, parameter.scaled_unit, parameter.scale, numbers))
+    for parameter, one, z_value in zip(all_parameters(results), numbers, z, strict=True):
+        scaled = one / parameter.scale
+        rows.append(_parameter_row(parameter, parameter.scaled_unit, scaled, z_value))
         if parameter.name == "f" and cal.camera.pixel_um is not None:
-            rows.append(_parameter_row(parameter, "mm", 1000.0 / cal.camera.pixel_um, numbers))
+            millimetres = one / (1000.0 / cal.camera.pixel_um)
+            rows.append(_parameter_row(parameter, "mm", millimetres, z_value))
             rows[-1]["description"] = "the same in millimetres"
     return rows
 
 
-class _Numbers(NamedTuple):
-    """Numbers of a parameter, with the prior's mean and spread."""
-
-    mean: float
-    sd: float
-    low: float
-    high: float
-    prior: tuple[float, float] | None
-    start: float | None
-    true: float | None
-    z: float
-
-
-def _parameter_row(parameter: Parameter, unit: str, scale: float, numbers: _Numbers) -> Row:
-    mean, sd, low, high, prior, start, true, z = numbers
-    spread = sd / scale
-    decimals = decimals_for(spread)
-    # A noise that was given has no spread: show it, and leave the rest empty.
-    known = spread > 0.0
-    prior_text = ""
-    if prior is not None and known:
-        if parameter.name.startswith("sigma"):
-            prior_text = "log-normal, below"
-        else:
-            prior_text = plus_minus(prior[0] / scale, prior[1] / scale)
-    return {
+def _parameter_row(parameter: Parameter, unit: str, numbers: FloatArray, z: float) -> Row:
+    """From mean, sd, interval, the prior's mean and sd, start and truth in the unit; NaN where
+    there is none.
+    """
+    mean, sd, low, high, prior, prior_sd, start, true = numbers.tolist()
+    row = {
         "name": parameter.name,
         "symbol": symbol(parameter.name),
         "description": parameter.description,
         "unit": pretty_unit(unit),
-        "estimate": fixed(mean / scale, decimals) if known else significant(mean / scale, 4),
-        "sigma": significant(spread) if known else "given",
-        "interval": f"{fixed(low / scale, decimals)} … {fixed(high / scale, decimals)}"
-        if known
-        else "",
-        "prior": prior_text,
-        "start": "" if start is None else with_sigma(start / scale, spread * 10.0),
-        "truth": ""
-        if true is None
-        else with_sigma(true / scale, spread / 10.0).rstrip("0").rstrip("."),
+        "estimate": significant(mean, 4),
+        "sigma": "given",
+        "interval": "",
+        "prior": "",
+        "start": "" if np.isnan(start) else with_sigma(start, sd * 10.0),
+        "truth": "" if np.isnan(true) else with_sigma(true, sd / 10.0).rstrip("0").rstrip("."),
         "z": "" if not np.isfinite(z) else ("+" if z > 0 else "") + fixed(z, 1),
     }
+    # A noise that was given has no spread: show it, and leave the rest empty.
+    if sd > 0.0:
+        decimals = decimals_for(sd)
+        row["estimate"], row["sigma"] = fixed(mean, decimals), significant(sd)
+        row["interval"] = f"{fixed(low, decimals)} … {fixed(high, decimals)}"
+        if parameter.name.startswith("sigma"):
+            row["prior"] = "" if np.isnan(prior) else "log-normal, below"
+        elif np.isfinite(prior):
+            row["prior"] = plus_minus(prior, prior_sd)
+    return row
 
 
 _ATTITUDE_NOTES = (
@@ -238,57 +224,45 @@ def _with_unit(number: str, parameter: Parameter) -> str:
     return f"{number} × {unit}" if parameter.scale != 1.0 else f"{number} {unit}".strip()
 
 
-def methods_rows(results: Results) -> list[Row]:
+def methods_table(results: Results) -> TextTable | None:
     """Estimate, Laplace approximation, importance sampling and emcee side by side."""
     cal, post = results.calibration, results.posterior
     if post is None:
-        return []
-    d, estimate = post.diagnostics, np.append(cal.theta, cal.sigma)
-    spread, draws_mean = np.append(cal.sigmas, cal.sigma_std), post.draws.mean(axis=0)
-    sources = (
-        (estimate, spread),
-        (d.laplace_mean, d.laplace_sd),
-        (d.psis_mean, d.psis_sd),
-        (draws_mean, post.sd),
-    )
+        return None
+    d = post.diagnostics
+    means = np.append(cal.theta, cal.sigma), d.laplace_mean, d.psis_mean, post.draws.mean(axis=0)
+    spreads = np.append(cal.sigmas, cal.sigma_std), d.laplace_sd, d.psis_sd, post.sd
     rows = []
     for i in post.sampled:
         parameter = post.parameters[i]
         # One digit more than elsewhere: the table is there to show small differences.
         decimals = decimals_for(post.sd[i] / parameter.scale, 3)
         cells = [
-            (
-                f"{fixed(m[i] / parameter.scale, decimals)} ± "
-                f"{fixed(s[i] / parameter.scale, decimals)}"
-            )
-            for m, s in sources
+            " ± ".join(fixed(values[i] / parameter.scale, decimals) for values in pair)
+            for pair in zip(means, spreads, strict=True)
         ]
-        unit = pretty_unit(parameter.scaled_unit)
-        rows.append({"symbol": symbol(parameter.name), "unit": unit, "cells": cells})
-    return rows
+        rows.append((parameter.name, *cells, pretty_unit(parameter.scaled_unit)))
+    heads = ("Calibration (no prior)", "Laplace approximation", "Importance sampling (PSIS)")
+    return TextTable(("", *heads, "emcee", "Unit"), tuple(rows), align="lrrrrl")
 
 
-def stage_rows(results: Results) -> list[Row]:
+def stage_table(results: Results) -> TextTable:
     """What each stage of the estimation did."""
     cal = results.calibration
-    names = parameters(cal.camera.distortion)
+    specs = parameters(cal.camera.distortion)
     rows = []
-    for i, stage in enumerate(cal.stages, 1):
+    for number, stage in enumerate(cal.stages, 1):
         ends = [
             with_sigma(float(v) / p.scale, float(s) / p.scale)
-            for v, s, p in zip(stage.trajectory[-1], cal.sigmas, names, strict=True)
+            for v, s, p in zip(stage.trajectory[-1], cal.sigmas, specs, strict=True)
         ]
-        rows.append(
-            {
-                "number": i,
-                "name": stage.name,
-                "iterations": len(stage.trajectory) - 1,
-                "ends": ends,
-                "status": stage.status.name.lower().replace("_", " "),
-                "seconds": f"{significant(1000.0 * stage.seconds)} ms",
-            }
-        )
-    return rows
+        status = stage.status.name.lower().replace("_", " ")
+        milliseconds = f"{significant(1000.0 * stage.seconds)} ms"
+        iterations = str(len(stage.trajectory) - 1)
+        rows.append((str(number), stage.name, iterations, *ends, status, milliseconds))
+    names = [written(p.name) for p in specs]
+    heads = ("Stage", "What it estimates", "Iterations", *names, "Ended", "Time")
+    return TextTable(heads, tuple(rows), align="rlr" + "r" * len(names) + "lr")
 
 
 def pair_table(cal: Calibration) -> TextTable:
@@ -347,7 +321,7 @@ def image_context(record: ImageRecord | None, cal: Calibration) -> AnyDict:
         "image_listing": "Every image."
         if len(record.rows) <= _LISTED
         else _listing(len(record.left_out)),
-        "round_rows": _round_rows(record, cal),
+        "round_table": _round_table(record, cal),
     }
 
 
@@ -357,32 +331,27 @@ def _listing(left_out: int) -> str:
     return "The images that were left out."
 
 
-def _round_rows(record: ImageRecord, cal: Calibration) -> list[Row]:
-    """One row per quantity, after the first and the last round; none where both have the same
+def _round_table(record: ImageRecord, cal: Calibration) -> TextTable | None:
+    """One row per quantity, after the first and the last round; None where both have the same
     stars.
     """
-    first, last = record.rounds[0], record.rounds[-1]
+    both = first, last = record.rounds[0], record.rounds[-1]
     if last.n_stars and not (last.new or last.given_up):
-        return []
-    both = (first, last)
-
-    def row(name: str, values: list[str], change: str = "", unit: str = "") -> Row:
-        return {"name": name, "values": values, "change": change, "unit": unit}
-
+        return None
     anew = f"{count(last.new)} identified anew, {count(last.given_up)} given up"
     rows = [
-        row("images identified", [count(r.n_frames) for r in both]),
-        row("stars calibrated", [count(r.n_stars) for r in both], anew),
+        ("Images identified", *(count(r.n_frames) for r in both), "", ""),
+        ("Stars calibrated", *(count(r.n_stars) for r in both), anew, ""),
     ]
     for parameter in parameters(cal.camera.distortion):
-        if parameter.name not in first.parameters or parameter.name not in last.parameters:
+        if not all(parameter.name in r.parameters for r in both):
             continue
-        (old, old_sigma), (new, sigma) = (r.parameters[parameter.name] for r in both)
-        scale = parameter.scale
-        values = [plus_minus(a / scale, b / scale) for a, b in ((old, old_sigma), (new, sigma))]
+        (old, _), (new, sigma) = pairs = [r.parameters[parameter.name] for r in both]
+        values = [plus_minus(a / parameter.scale, b / parameter.scale) for a, b in pairs]
         change = f"{fixed((new - old) / sigma, 1)} σ" if sigma > 0.0 else ""
         unit = pretty_unit(parameter.scaled_unit)
-        rows.append(row(symbol(parameter.name), values, change, unit))
+        rows.append((parameter.name, values[0], values[1], change, unit))
     unit = "times the stated noise" if last.sigma_name == "sigma_scale" else "px per axis"
-    rows.append(row("noise", [significant(r.sigma, 3) for r in both], unit=unit))
-    return rows
+    rows.append(("Noise", significant(first.sigma, 3), significant(last.sigma, 3), "", unit))
+    heads = ("", "Nominal camera", "Calibrated camera", "Change", "Unit")
+    return TextTable(heads, tuple(rows), align="lrrrl")
