@@ -193,7 +193,8 @@ def diagnose_apart(
     misfit = misfit_tests(obs, whole or cal)
     return Apart(
         misfit=misfit,
-        starts=multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None,
+        # Where the stars alone leave parameters open, starts without rotations end anywhere.
+        starts=multi_start(obs, cal, n_starts, seed) if n_starts > 0 and not cal.ties else None,
         stars=stars,
         air=air_test(obs, cal, seed=seed, stars=stars),
         cameras=MixedCameras.of(obs, cal.camera),

@@ -75,14 +75,8 @@ def with_ties(
     began = perf_counter()
     likelihood = TiedLikelihood(obs, cal.camera.distortion, ties_of(obs, given), cal.sigma)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
-    checked = _checked(likelihood, cal)
-    if checked.error_factor > _ASTRAY:
-        what = "a fixed mount contradicts" if checked.known.of_mount else "the rotations contradict"
-        raise CalibrationError(
-            f"{what} the stars: errors would have to be more than {_ASTRAY:g} times the stated "
-            "ones; check the numbers and times of the frames and the sense of the quaternions, or "
-            "leave the known rotations out."
-        )
+    before = _Squares(likelihood, cal.theta, cal.sigmas)
+    _refuse_others(before, likelihood.ties)
     dof = likelihood.dof - len(cal.theta)
     found = Search(tolerance=_STEP**2 / dof).minimum(likelihood.evaluate, cal.theta)
     theta, sigma, status = found.theta, float(np.sqrt(found.normal.cost / dof)), found.status
@@ -101,6 +95,7 @@ def with_ties(
     seconds = perf_counter() - began
     stage = Stage("ties", trajectory, cost, status, found.evaluations, seconds)
     residuals, turned, attitudes = _tied(likelihood, theta)
+    after = _Squares(likelihood, theta, np.sqrt(np.diag(covariance)))
     wide = factors * _tails(cal)
     known = likelihood.ties.known
     settings: AnyDict = {"relative_attitudes": len(known)}
@@ -123,7 +118,7 @@ def with_ties(
         attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
         compressed=compressed,
         provenance=provenance.with_settings(**settings),
-        ties=checked,
+        ties=_checked(cal, likelihood.ties, after, before.free),
     )
 
 
@@ -176,31 +171,53 @@ def _tied(
     return frames.in_pixels(residuals), turned, attitudes
 
 
-def _checked(likelihood: TiedLikelihood, cal: Calibration) -> FittedTies:
-    """How the ties agree with the stars, at the estimate without them."""
+class _Squares:
+    """Least sums of squares with ties of any errors, parameters following, around an estimate; in
+    units of the noise without ties.
+    """
+
+    def __init__(self, likelihood: TiedLikelihood, theta: FloatArray, scale: FloatArray) -> None:
+        self._sums, self._attitudes = super(TiedLikelihood, likelihood).sums(theta)
+        self._ties, self._sigma, self._scale = likelihood.ties, likelihood.sigma, scale
+        self.free = self._sums.cost / self._sigma**2
+
+    def of(self, factor: float) -> float:
+        """With errors that are `factor` times the stated ones."""
+        at, scale = self._attitudes, self._scale
+        ties = replace(self._ties, known=self._ties.known.scaled(factor))
+        tied = ties.around(at.at(at.theta), at.inverse, self._sigma)
+        columns = np.column_stack([tied.rest, tied.columns(at.response) * scale])
+        gram = columns.T @ tied.solve(columns)
+        matrix = self._sums.matrix * np.outer(scale, scale) + gram[1:, 1:]
+        slope = self._sums.gradient * scale + gram[1:, 0]
+        least = self._sums.cost + gram[0, 0] - slope @ np.linalg.solve(matrix, slope)
+        return float(least) / self._sigma**2
+
+
+def _refuse_others(squares: _Squares, ties: Ties) -> None:
+    """CalibrationError for rotations that have nothing to do with the frames."""
+    if squares.of(_ASTRAY) - squares.free < ties.dof:
+        return
+    what = "a fixed mount contradicts" if ties.known.of_mount else "the rotations contradict"
+    raise CalibrationError(
+        f"{what} the stars: errors would have to be more than {_ASTRAY:g} times the stated "
+        "ones; check the numbers and times of the frames and the sense of the quaternions, or "
+        "leave the known rotations out."
+    )
+
+
+def _checked(cal: Calibration, ties: Ties, squares: _Squares, free: float) -> FittedTies:
+    """How the ties agree with the stars: `squares` around the estimate with them, `free` those of
+    the calibration without.
+    """
     from scipy.optimize import brentq
     from scipy.special import fdtrc
 
-    sums, attitudes = super(TiedLikelihood, likelihood).sums(cal.theta)
-    ties, scale = likelihood.ties, cal.sigmas
-    matrix = sums.matrix * np.outer(scale, scale)
-    rotations = attitudes.at(cal.theta)
+    def excess(log: float) -> float:
+        return squares.of(float(np.exp(log))) - free - ties.dof
 
-    def added(known: RelativeAttitudes) -> float:
-        """What the ties add to the sum of squares, parameters following."""
-        tied = replace(ties, known=known).around(rotations, attitudes.inverse, cal.sigma)
-        columns = np.column_stack([tied.rest, tied.columns(attitudes.response) * scale])
-        gram = columns.T @ tied.solve(columns)
-        step = np.linalg.solve(matrix + gram[1:, 1:], gram[1:, 0])
-        return float(gram[0, 0] - gram[0, 1:] @ step) / cal.sigma**2
-
-    chi2, factor = added(ties.known), 1.0
+    chi2, factor, top = max(squares.of(1.0) - free, 0.0), 1.0, float(np.log(_ASTRAY))
     if chi2 > ties.dof:
-
-        def excess(log: float) -> float:
-            return added(ties.known.scaled(float(np.exp(log)))) - ties.dof
-
-        top = float(np.log(_ASTRAY))
         factor = float(np.exp(brentq(excess, 0.0, top, xtol=1e-3))) if excess(top) < 0 else np.inf
     return FittedTies(
         ties.known,

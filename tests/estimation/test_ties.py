@@ -89,6 +89,10 @@ def test_a_narrow_field_whose_point_the_stars_leave_open_is_determined() -> None
     assert cal.status.ok
     assert np.all(np.abs(cal.theta - c.theta[:3]) < 4.0 * cal.sigmas)
     assert np.all(cal.sigmas[:2] < 1.0)
+    # Around the point that the stars alone give, hundreds of pixels away, nothing is linear.
+    assert cal.ties is not None
+    assert cal.ties.p_value > 0.001
+    assert sc.diagnose(table(c), cal, models=(), n_starts=2).starts is None
 
 
 def test_a_calibration_with_ties_survives_its_file_and_is_sampled(tmp_path) -> None:
