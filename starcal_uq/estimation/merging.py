@@ -291,9 +291,10 @@ def check_mergeable(
         if cal.effects is not None and cal.effects.fitted:
             held = ", ".join(effect.name for effect in cal.effects.fitted)
             raise CalibrationError(
-                f"{name}: holds effects ({held}), whose scales and "
-                "coefficients the frames of all runs share: calibrate all observations together, "
-                "or calibrate each run with effects 'none'."
+                f"{name}: holds effects ({held}), whose scales and coefficients all runs share, "
+                "and its likelihood has integrated them: calibrate the observations of all runs "
+                "together with these effects (sc.runs.join_observations makes one table of "
+                "theirs), or calibrate each run without any (--effects none) and merge those."
             )
         if cal.ties is not None:
             raise CalibrationError(

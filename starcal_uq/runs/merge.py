@@ -81,6 +81,7 @@ def merge_runs(
     names = _names(runs)
     tables = [_own_observations(run) for run in runs]
     if duplicates == "drop":
+        check_mergeable(calibrations, names, noise, duplicates="keep")
         _drop_shared(calibrations, tables, names)
         duplicates = "refuse"
     check_mergeable(calibrations, names, noise, duplicates)

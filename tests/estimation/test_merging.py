@@ -429,5 +429,20 @@ def test_runs_that_hold_effects_are_not_merged() -> None:
     one, two = calibrated(1), calibrated(2)
     held = calibrate(simulated(1), NOMINAL, effects="field")
     merge([one, two])
-    with pytest.raises(CalibrationError, match=r"run 1: holds effects \(field\).*together"):
+    with pytest.raises(CalibrationError, match=r"run 1: holds effects \(field\).*join_obs"):
         merge([held, two])
+
+
+def test_runs_with_effects_are_calibrated_together_instead() -> None:
+    """What the refusal names gives the joint fit; effects of either run alone do not."""
+    tables = [simulated(1), simulated(2)]
+    joined = join_observations(tables, ["one", "two"])
+    assert joined.n_frames == sum(table.n_frames for table in tables)
+    both = calibrate(joined, NOMINAL, effects="field,frame")
+    halves = [calibrate(table, NOMINAL, effects="field,frame") for table in tables]
+    assert both.effects is not None
+    assert all(np.all(both.sigmas < half.sigmas) for half in halves)
+    # Without effects it is what merging gives.
+    alone = merge([calibrate(table, NOMINAL) for table in tables], joined)
+    plain = calibrate(joined, NOMINAL)
+    assert np.max(np.abs(alone.theta - plain.theta) / plain.sigmas) < 1e-3
