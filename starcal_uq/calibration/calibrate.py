@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Unpack, get_args
 
@@ -12,6 +12,7 @@ from starcal_uq.calibration.fallback import fit_determined
 from starcal_uq.calibration.methods import offered
 from starcal_uq.calibration.plausibility import explained
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model, like, with_axes
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import RecursiveMethod, bounded
@@ -30,6 +31,7 @@ from starcal_uq.estimation.ties import with_ties
 from starcal_uq.estimation.weighing import with_weighing
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood import paths
+from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 
@@ -190,18 +192,64 @@ def _estimate(
     method, sheet = settings.method, camera.distortion
     if settings.model is not None:
         camera = camera.replace(distortion=settings.model)
+    if get_model(camera.distortion).axes:
+        settings = _without_axes(settings)
     if method not in RECURSIVE_METHODS:
         if isinstance(obs, PartitionedObservations):
-            return _of_partitions(obs, camera, settings, scheduler, workers, progress)
+            parts = obs
+
+            def of_partitions(camera: Camera, settings: EstimationSettings) -> Calibration:
+                return _of_partitions(parts, camera, settings, scheduler, workers, progress)
+
+            return _with_axes_of_camera(camera, settings, of_partitions)
         if not isinstance(obs, Observations):
             raise CalibrationError(
                 f"method {method!r} needs all frames at once, as Observations: load them, or use "
                 "samaan or griffith."
             )
         if method in OWN_METHODS:
-            return _of_table(obs, camera, settings, sheet, throw)
+            table = obs
+
+            def of_table(camera: Camera, settings: EstimationSettings) -> Calibration:
+                return _of_table(table, camera, settings, like(sheet, camera.distortion), throw)
+
+            return _with_axes_of_camera(camera, settings, of_table)
     estimate = offered(method)
     return estimate(obs, camera, settings.recursion, settings.solver, settings.max_iterations)
+
+
+def _without_axes(settings: EstimationSettings) -> EstimationSettings:
+    """The settings for a camera whose axes are among its parameters."""
+    rest = tuple(name for name in settings.names if name != "axes")
+    return settings.changed(effects=rest or "none")
+
+
+def _with_axes_of_camera(
+    camera: Camera,
+    settings: EstimationSettings,
+    estimate: Callable[[Camera, EstimationSettings], Calibration],
+) -> Calibration:
+    """The calibration by `estimate`; the effect of the axes, where it was taken up or asked for,
+    is two parameters of the camera.
+    """
+    found = estimate(camera, settings)
+    held = found.effects
+    taken = [] if held is None else [e for e in held.fitted if e.name == "axes"]
+    if held is None or not taken:
+        return found
+    free = camera.replace(distortion=with_axes(camera.distortion))
+    try:
+        again = estimate(free, _without_axes(settings))
+    except CalibrationError:
+        return found
+    if not again.status.ok:
+        return found
+    # They have no scale any more.
+    none = {"scale_px": np.nan, "low_px": np.nan, "high_px": np.nan}
+    effects = again.effects or Effects((), held.selected, (), held.penalty_nat)
+    effects = replace(effects, of_camera=(replace(taken[0], **none),), asked=held.asked)
+    record = again.provenance.with_settings(effects=list(effects.names))
+    return replace(again, effects=effects, provenance=record)
 
 
 def _of_partitions(

@@ -138,6 +138,7 @@ class Effects(Shown):
     star_sigmas: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     extent: Extent | None = None  # Of all frames, where their residuals are those of a sample
     weighing: tuple[FittedEffect, ...] = ()  # Noise that varies, and tails
+    of_camera: tuple[FittedEffect, ...] = ()  # Those that became parameters of the camera: axes
     asked: tuple[str, ...] = ()  # Names of those that were asked for
     # Root mean square of the direction errors that the catalogue of the effect `star` states, px
     stated_px: float = 0.0
@@ -156,8 +157,15 @@ class Effects(Shown):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all effects: of those that weigh stars, then of those that shift them."""
-        return tuple(effect.name for effect in (*self.weighing, *self.fitted))
+        """Names of all effects: of those that weigh stars, of those that are parameters of the
+        camera, then of the others that shift stars.
+        """
+        return tuple(effect.name for effect in self.held)
+
+    @property
+    def held(self) -> tuple[FittedEffect, ...]:
+        """All effects, in the order of their names."""
+        return (*self.weighing, *self.of_camera, *self.fitted)
 
     def scale(self, name: str) -> float:
         """Scale of an effect, px at the corner; zero of one that is not there."""
@@ -197,8 +205,7 @@ class Effects(Shown):
         """One row per effect, those not taken up with their gain alone."""
         import pandas as pd
 
-        held = (*self.weighing, *self.fitted)
-        fitted = [vars(effect) | {"taken": True} for effect in held]
+        fitted = [vars(effect) | {"taken": True} for effect in self.held]
         refused = [{"name": n, "gain_nat": gain, "taken": False} for n, gain in self.refused]
         columns = [*(each.name for each in fields(FittedEffect)), "taken"]
         return pd.DataFrame([*fitted, *refused], columns=columns)

@@ -137,6 +137,11 @@ def test_the_aspect_of_dawn_is_a_parameter_of_its_camera() -> None:
     print("stretch", stretch, "+-", cal.sigmas[5], "wanted", wanted, "skew", skew)
     assert abs(stretch - wanted) < 3.0 * cal.sigmas[5] < 0.1 * abs(wanted)
     assert abs(skew) < 3.0 * cal.sigmas[6]
+    # The effect of the axes, which the data take up, is the same two parameters.
+    chosen = sc.calibrate(table(c), sheet(c), effects="auto")
+    assert (chosen.effects.names, chosen.camera.distortion) == (("axes",), "brown+axes")
+    np.testing.assert_allclose(chosen.theta, cal.theta, rtol=1e-9, atol=1e-12)
+    assert (chosen.effects.scale("axes"), len(chosen.effects.coefficients)) == (0.0, 0)
     assert map_error_px(c, cal, shift) < 0.5 * SIGMA_PX
     assert cal.sigma == pytest.approx(SIGMA_PX, rel=0.05)
 

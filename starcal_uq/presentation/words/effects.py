@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, significant
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
 from starcal_uq.presentation.sentences.observed import air_words
@@ -9,7 +11,7 @@ from starcal_uq.presentation.tables import TextTable
 
 # What every effect is, in one sentence.
 MEANINGS = {
-    "axes": "The pixels are longer along one axis than along the other, or the axes are skewed.",
+    "axes": "Pixels that are not square, or skewed axes: stretch and skew, parameters of the camera.",
     "field": "The lens shifts images smoothly over the field, as no polynomial of the radius does.",
     "frame": "Every frame has a scale and two shears of its own: breathing, refraction, seeing.",
     "zenith": "Air raises stars towards a zenith that is estimated.",
@@ -30,7 +32,10 @@ def effects_table(effects: Effects, *, path: bool = False) -> TextTable | None:
     """
     if not effects.names:
         return None
-    rows = (*map(_weighing_row, effects.weighing), *map(_row, effects.fitted))
+    rows = (
+        *map(_weighing_row, effects.weighing),
+        *map(_row, (*effects.of_camera, *effects.fitted)),
+    )
     if path:
         rows += tuple(
             (name, "", "", "", fixed(gain, 1), "not taken up") for name, gain in effects.refused
@@ -48,13 +53,17 @@ def _weighing_row(effect: FittedEffect) -> tuple[str, ...]:
 
 
 def _row(effect: FittedEffect) -> tuple[str, ...]:
-    decimals = decimals_for(effect.low_px)
-    interval = f"{fixed(effect.low_px, decimals)} – {fixed(effect.high_px, decimals)}"
-    known = effect.low_px == effect.high_px
+    scale, interval = "known", ""
+    if math.isnan(effect.scale_px):
+        scale = "in the camera"
+    elif effect.low_px != effect.high_px:
+        decimals = decimals_for(effect.low_px)
+        scale = fixed(effect.scale_px, decimals)
+        interval = f"{fixed(effect.low_px, decimals)} – {fixed(effect.high_px, decimals)}"
     return (
         effect.name,
-        "known" if known else fixed(effect.scale_px, decimals),
-        "" if known else interval,
+        scale,
+        interval,
         significant(effect.size_px),
         fixed(effect.gain_nat, 1),
         f"{effect.moved_name} by {significant(effect.moved_sigma)} sigma",
