@@ -245,9 +245,9 @@ def _with_axes_of_camera(
     if not again.status.ok:
         return found
     # They have no scale any more.
-    none = {"scale_px": np.nan, "low_px": np.nan, "high_px": np.nan}
+    axes = replace(taken[0], scale_px=np.nan, low_px=np.nan, high_px=np.nan)
     effects = again.effects or Effects((), held.selected, (), held.penalty_nat)
-    effects = replace(effects, of_camera=(replace(taken[0], **none),), asked=held.asked)
+    effects = replace(effects, of_camera=(axes,), asked=held.asked)
     record = again.provenance.with_settings(effects=list(effects.names))
     return replace(again, effects=effects, provenance=record)
 
