@@ -174,6 +174,9 @@ def plan_command(
     relative_attitudes_arcsec: float | None = None,
     relative_alignment_arcsec: float = 0.0,
     mount_sigma_arcsec: float | None = None,
+    effects: str | None = None,
+    temperature_range: float = 20.0,
+    nights: int = 3,
     check: int | None = None,
     out: Path | None = None,
     epoch: float = 2026.9,
@@ -181,6 +184,7 @@ def plan_command(
     force: bool = False,
 ) -> Answer:
     """What a calibration of this camera will give, and the frames it needs, before any data."""
+    from starcal_uq.planning.effects import PlannedEffects
     from starcal_uq.planning.forecast import N_FRAMES
     from starcal_uq.presentation.pages.write import write_page
 
@@ -195,6 +199,13 @@ def plan_command(
             "--choose and --check know no rotations between frames: leave them out, or leave out "
             "--relative-attitudes-arcsec and --mount-sigma-arcsec."
         )
+    planned = None
+    if effects is not None:
+        planned = PlannedEffects.parsed(effects, temperature_range, nights)
+        if choose is not None or check is not None:
+            raise typer.BadParameter(
+                "--choose and --check plan calibrations without effects: leave them out."
+            )
     sheet, known = sc.Camera.load(camera), None
     noise: float | NoiseModel = 0.05
     if after is not None:
@@ -219,6 +230,7 @@ def plan_command(
             after=known,
             distortion_percent=distortion_percent,
             ties=ties,
+            effects=planned,
             seed=seed,
             progress=progress,
         )
@@ -281,6 +293,8 @@ def _show_plan(
     """Show the plan; the sentences beside its own text."""
     from starcal_uq.presentation.words.planning import (
         choice_table,
+        costs_sentence,
+        costs_table,
         distortion_sentence,
         need_sentence,
         plan_table,
@@ -288,7 +302,11 @@ def _show_plan(
     )
 
     print_table(plan_table(found))
+    costs = found.effects
+    if costs is not None:
+        print_table(costs_table(costs))
     notes = [
+        "" if costs is None else costs_sentence(costs),
         distortion_sentence(found),
         ties_sentence(found),
         *(need_sentence(found, need) for need in found.needs),

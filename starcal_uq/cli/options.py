@@ -165,6 +165,15 @@ def check_effects(text: str | None) -> None:
         raise typer.BadParameter(str(error)) from None
 
 
+def _check_planned(text: str) -> None:
+    from starcal_uq.planning.effects import PlannedEffects
+
+    try:
+        PlannedEffects.parsed(text)
+    except StarcalError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
 def parse_frames(text: str | None) -> list[tuple[int, int]] | None:
     """``0-4,7`` as first and last number of each stretch of frames."""
     if text is None:
@@ -258,6 +267,7 @@ _CHECKS: Mapping[str, Callable[[Any], object]] = {
     "frames": parse_frames,
     "labels": parse_labels,
     "names": check_names,
+    "planned effects": _check_planned,
     "schema": _check_schema,
     "start": parse_start,
     "time": _check_time,

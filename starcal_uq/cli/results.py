@@ -107,7 +107,16 @@ def _plan(result: Any) -> AnyDict:
         | {"sigma": {key: row[key] for key in row if key not in own and key[:7] != "radius_"}}
         for row in result.to_dataframe().to_dict("records")
     ]
-    return {"camera": result.camera.to_dict(), "forecast": forecast}
+    costs = result.effects
+    effects = [
+        {
+            "effects": model,
+            "sigma": dict(zip(costs.names, costs.sigma[i].tolist(), strict=True)),
+            "camera_alone": dict(zip(costs.names, costs.camera_alone[i].tolist(), strict=True)),
+        }
+        for i, model in enumerate(costs.models if costs is not None else ())
+    ]
+    return {"camera": result.camera.to_dict(), "forecast": forecast, "effects": effects}
 
 
 def _study(result: Any) -> AnyDict:

@@ -25,6 +25,7 @@ from starcal_uq.core.errors import PlanningError, check_known
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.linear import inverses
+from starcal_uq.planning.effects import joint_inverses
 from starcal_uq.planning.ties import PlannedTies
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
     camera = mission.camera
     known = parameters(camera.distortion)
     p = len(known)
-    unit = np.eye(p)
+    unit = np.eye(mission.information.shape[1])
     chosen = [
         _quantity(f"{k.name}_{_suffix(k.unit)}", unit[i : i + 1]) for i, k in enumerate(known)
     ]
@@ -119,6 +120,11 @@ def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
                 f"rest_{name}_arcsec", ARCSEC * mission.rest[:, axis] / np.sqrt(mission.n_frames)
             )
         )
+    joint = mission.joint
+    if joint is not None and "temperature" in joint.places:
+        slopes = unit[joint.places["temperature"]] * joint.per_kelvin
+        for name, row in zip(("x0", "y0", "f"), slopes, strict=True):
+            chosen.append(_quantity(f"{name}_px_per_K", row[None]))
     return tuple(chosen)
 
 
@@ -148,7 +154,7 @@ def _corner_displacement(mission: FrameSet) -> FloatArray:
         side[np.argmax(np.abs(side - point))] - point
         for side, point in zip(edges(camera), camera.theta[:2], strict=True)
     )
-    columns = np.zeros((2, len(camera.theta)))
+    columns = np.zeros((2, mission.information.shape[1]))
     for j, one in enumerate(np.eye(len(model.lens)).tolist()):
         columns[:, 3 + j] = model.displacement(u, v, one)
     return columns
@@ -163,19 +169,37 @@ def nea_arcsec(mission: FrameSet) -> FloatArray:
 
 
 def campaigns(
-    information: FloatArray, n_frames: int, n_campaigns: int, seed: int, start: FloatArray | None
+    information: FloatArray,
+    n_frames: int,
+    n_campaigns: int,
+    seed: int,
+    start: FloatArray | None,
+    n_parameters: int,
 ) -> FloatArray:
-    """Covariances (C, p, p) after campaigns of n frames drawn, with replacement, from those of
-    `information` (M, p, p).
+    """Covariances (C, q, q) after campaigns of n frames drawn, with replacement, from those of
+    `information` (M, q, q).
 
-    `start` (p, p) is information that is there already. What a campaign does not determine is
-    infinite.
+    `start` (q, q) is information that is there already; all but the first `n_parameters` have some.
+    What a campaign does not determine is infinite.
     """
     m, p = information.shape[:2]
     rng = np.random.default_rng([seed, n_frames])
     counts = rng.multinomial(n_frames, np.full(m, 1.0 / m), size=n_campaigns)
     total = (counts @ information.reshape(m, -1)).reshape(-1, p, p)
-    return inverses(total if start is None else total + start)
+    total = total if start is None else total + start
+    return inverses(total) if p == n_parameters else joint_inverses(total, n_parameters)
+
+
+def start_with(mission: FrameSet, start: FloatArray | None) -> FloatArray | None:
+    """Information (q, q) that is there already, on the parameters by `start` (p, p) and on effects
+    by their prior; None where there is none.
+    """
+    if mission.joint is None:
+        return start
+    total = np.diag(mission.joint.prior)
+    if start is not None:
+        total[: len(start), : len(start)] += start
+    return total
 
 
 def spreads(forms: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -240,6 +264,8 @@ class Forecaster:
         )
         self._size = np.einsum("kap,kaq->pq", self._response, self._response) / len(self._response)
 
+        self._start = start_with(mission, outlook.start)
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the quantities."""
@@ -266,17 +292,18 @@ class Forecaster:
     def covariances(self, n_frames: int) -> FloatArray:
         """Covariances (C, p, p) of the parameters after drawn campaigns of n frames."""
         outlook = self.outlook
-        drawn = (n_frames, outlook.n_campaigns, outlook.seed, outlook.start)
+        drawn = (n_frames, outlook.n_campaigns, outlook.seed, self._start)
         if outlook.ties is not None:
             return outlook.ties.campaigns(self.mission, self.information, *drawn)
-        return campaigns(self.information, *drawn)
+        return campaigns(self.information, *drawn, len(self.mission.camera.theta))
 
     def dof(self, n_frames: int) -> float:
         """Independent numbers beyond the parameters, with those of the data that are there
         already.
         """
         tied = 0 if self.outlook.ties is None else 3 * (n_frames - 1)
-        own = n_frames * (2.0 * self.mission.mean_stars - 3.0) - len(self._size) + tied
+        p = len(self.mission.camera.theta)
+        own = n_frames * (2.0 * self.mission.mean_stars - 3.0) - p + tied
         return float(max(1.0, own + self.outlook.start_dof))
 
     def noise_sigma(self, n_frames: int) -> float:

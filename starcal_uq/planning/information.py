@@ -10,7 +10,7 @@ the camera's own parameters and without noise.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,7 @@ from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.sums import frame_normals
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.planning.effects import JointMatrices, PlannedEffects, SeenEffects
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ class FrameSet:
     `mag` (N,); `information` (M, p, p) is that of each frame on the parameters, its attitude
     eliminated (px units), `response` (M, 3, p) the derivative of its attitude (pitch, yaw, roll;
     rad) with respect to them, and `noise` (M, 3, 3) the covariance of its attitude due to centroid
-    noise, rad^2.
+    noise, rad^2. With effects, their `seen` columns and what they say together, the coefficients of
+    the run stand behind the parameters, and what a frame has for itself is eliminated.
     """
 
     camera: Camera
@@ -54,6 +56,8 @@ class FrameSet:
     information: FloatArray
     response: FloatArray
     noise: FloatArray
+    seen: SeenEffects | None = None
+    joint: JointMatrices | None = None
 
     @property
     def n_frames(self) -> int:
@@ -95,11 +99,34 @@ class FrameSet:
         kept = inside & np.repeat(enough, self.frames.sizes)
         information = np.zeros_like(self.information)
         if enough.any():
-            some, _, _ = frame_matrices(
-                self.camera, self.frames.select(kept), self.rotations[enough]
-            )
-            information[enough] = some
+            at = self.camera, self.frames.select(kept), self.rotations[enough]
+            if self.seen is None:
+                information[enough] = frame_matrices(*at)[0]
+            else:
+                some = self.seen.of(enough).matrices(*at, self.mag[kept])
+                information[enough] = some.information
         return information
+
+    def with_noise(self, factor: float) -> FrameSet:
+        """The same frames with so many times the centroid noise."""
+        if self.seen is None:
+            return replace(
+                self, information=self.information / factor**2, noise=self.noise * factor**2
+            )
+        frames = replace(self.frames, weight=np.asarray(self.frames.weight) / factor)
+        return replace(self, frames=frames).with_effects(self.seen)
+
+    def with_effects(self, seen: SeenEffects) -> FrameSet:
+        """The same frames for a calibration that holds effects."""
+        joint = seen.matrices(self.camera, self.frames, self.rotations, self.mag)
+        return replace(
+            self,
+            information=joint.information,
+            response=joint.response,
+            noise=joint.noise,
+            seen=seen,
+            joint=joint,
+        )
 
 
 def look_at(
@@ -128,16 +155,24 @@ def look_at(
 
 
 def random_frames(
-    stars: StarCatalogue, camera: Camera, noise: Noise, *, n_frames: int, min_stars: int, seed: int
+    stars: StarCatalogue,
+    camera: Camera,
+    noise: Noise,
+    *,
+    n_frames: int,
+    min_stars: int,
+    seed: int,
+    effects: PlannedEffects | None = None,
 ) -> FrameSet:
     """Frames at uniformly random attitudes that show at least `min_stars` stars, as `simulate`
-    takes them.
+    takes them; for a calibration with `effects`, at random temperatures and times.
     """
     sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera))
     rng = np.random.default_rng(seed)
-    return _frame_set(
+    found = _frame_set(
         stars, camera, *choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars), noise
     )
+    return found if effects is None else found.with_effects(effects.seen(n_frames, seed))
 
 
 def noise_of(noise: Noise, mag: FloatArray, pixel: FloatArray) -> FloatArray:

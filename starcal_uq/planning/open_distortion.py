@@ -186,7 +186,8 @@ def distortion_range(
     camera = base.camera
     percent = nodes(camera, bounds)
     scopes = () if target_arcsec is None else tuple(SCOPES)
-    outlook = replace(outlook, n_campaigns=_CAMPAIGNS)
+    outlook = replace(outlook, n_campaigns=min(_CAMPAIGNS, outlook.n_campaigns))
+    effects = None if base.seen is None else base.seen.planned
     frames, radius, sigmas = [], [], []
     for value in percent.tolist():
         other = with_distortion(camera, value)
@@ -196,9 +197,10 @@ def distortion_range(
                 stars,
                 other,
                 noise,
-                n_frames=_GEOMETRIES,
+                n_frames=_GEOMETRIES if effects is None else min(_GEOMETRIES, base.n_frames),
                 min_stars=min_stars,
                 seed=outlook.seed,
+                effects=effects,
             )
         needed = (
             Forecaster(seen, replace(outlook, scope=name)).frames_needed(target_arcsec or np.nan)

@@ -20,10 +20,13 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError, require
 from starcal_uq.core.provenance import Provenance, provenance
+from starcal_uq.core.records import to_plain
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, Progress, floats
 from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.planning.costs import EffectCosts, effect_costs
+from starcal_uq.planning.effects import PlannedEffects
 from starcal_uq.planning.forecast import (
     N_CAMPAIGNS,
     N_FRAMES,
@@ -32,6 +35,7 @@ from starcal_uq.planning.forecast import (
     Forecaster,
     Outlook,
     nea_arcsec,
+    start_with,
 )
 from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
 from starcal_uq.planning.open_distortion import (
@@ -49,6 +53,7 @@ if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 SWEEP_FRAMES = 1000
+_FIELD_GEOMETRIES, _FIELD_CAMPAIGNS = 600, 40
 _SWEEP_GEOMETRIES, _SWEEP_CAMPAIGNS, _TRIED_ATTITUDES = 1000, 64, 1000
 # With fewer attitudes than this that show enough stars, a magnitude limit is left out of the sweep.
 _LEAST_SKY = 0.02
@@ -84,6 +89,7 @@ def plan(
     after: HasInformation | None = None,
     distortion_percent: tuple[float, float] | None = None,
     ties: PlannedTies | None = None,
+    effects: PlannedEffects | str | None = None,
     sweeps: bool = True,
     n_geometries: int = 3000,
     n_campaigns: int = N_CAMPAIGNS,
@@ -126,6 +132,11 @@ def plan(
     ties : PlannedTies, optional
         Rotations from each frame to the next that will be known, such as by a gyro, or a fixed
         mount. Sweeps over parts of the detector are then left out.
+    effects : PlannedEffects or str, optional
+        Effects that the calibration will hold, such as ``"field,temperature=0.2"`` with scales in
+        px at the corner (1 px by default). Everything is then forecast with them, known to the
+        mission's software; `Plan.effects` has what they cost. The effect ``field`` has 90
+        coefficients: at most 600 geometries and 40 campaigns are then taken.
     sweeps : bool
         Also forecast 1000 frames with other magnitude limits, noise, and parts of the detector.
     n_geometries : int
@@ -146,6 +157,14 @@ def plan(
         When the field is too narrow for the catalogue to show `min_stars`.
     """
     _check(n_frames, min_stars, target_arcsec, n_geometries, n_campaigns)
+    effects = PlannedEffects.parsed(effects) if isinstance(effects, str) else effects
+    if effects is not None and ties is not None:
+        raise PlanningError(
+            "known rotations and effects are not planned together: leave out one of the two."
+        )
+    if effects is not None and "field" in effects.scales:
+        n_geometries = min(n_geometries, _FIELD_GEOMETRIES)
+        n_campaigns = min(n_campaigns, _FIELD_CAMPAIGNS)
     if isinstance(sigma_px, (int, float)) and not 0.0 < sigma_px <= _WORST_NOISE_PX:
         raise PlanningError(
             f"the centroid noise is {sigma_px:g} px: give a number above zero, at most "
@@ -162,7 +181,13 @@ def plan(
             f"no star is brighter than max_mag={limit:g}: raise it or use another catalogue."
         )
     frames = random_frames(
-        seen, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed
+        seen,
+        camera,
+        sigma_px,
+        n_frames=n_geometries,
+        min_stars=min_stars,
+        seed=seed,
+        effects=effects,
     )
     # A posterior does not say how many data it rests on; its noise is then as uncertain as the new
     # frames make it.
@@ -191,6 +216,7 @@ def plan(
         "after": None if after is None else type(after).__name__,
         **({} if ties is None else {"ties": asdict(ties)}),
         "distortion_percent": None if bounds is None else list(bounds),
+        "effects": None if effects is None else to_plain(effects),
     }
     spread = None
     if bounds is not None and bounds[0] < bounds[1]:
@@ -206,15 +232,20 @@ def plan(
         )
     table = None
     if sweeps:
-        base = _Base(stars, camera, sigma_px, limit, min_stars, seed)
+        base = _Base(stars, camera, sigma_px, limit, min_stars, seed, effects)
         table = _sweep(
             base,
             frames,
             noise,
-            replace(outlook, n_campaigns=_SWEEP_CAMPAIGNS),
+            replace(outlook, n_campaigns=min(_SWEEP_CAMPAIGNS, n_campaigns)),
             target_arcsec,
             progress,
         )
+    needs = () if target_arcsec is None else _needs(frames, target_arcsec, outlook)
+    costs = None
+    if effects is not None:
+        after_frames = next((need.frames for need in needs if need.scope == scope), None)
+        costs = effect_costs(frames, after_frames or SWEEP_FRAMES, start)
     return Plan(
         camera=camera,
         sigma_px=noise,
@@ -227,14 +258,15 @@ def plan(
         confidence=confidence,
         scope=scope,
         target_arcsec=target_arcsec,
-        needs=() if target_arcsec is None else _needs(frames, target_arcsec, outlook),
+        needs=needs,
+        effects=costs,
         sweeps=table,
         distortion=spread,
         seed=seed,
         provenance=provenance(seed, settings, None),
         frame_information=frame_information,
-        start_information=start,
-        rotation_per_theta=frames.common,
+        start_information=start_with(frames, start),
+        rotation_per_theta=frames.common[:, : len(camera.theta)],
         attitude_noise=frames.noise.mean(axis=0),
         ties=ties,
         without_ties=free,
@@ -250,6 +282,7 @@ class _Base(NamedTuple):
     max_mag: float
     min_stars: int
     seed: int
+    effects: PlannedEffects | None
 
 
 def _needs(frames: FrameSet, target_arcsec: float, outlook: Outlook) -> tuple[Need, ...]:
@@ -315,17 +348,16 @@ def _points(
             stars,
             base.camera,
             base.noise,
-            n_frames=_SWEEP_GEOMETRIES,
+            n_frames=min(_SWEEP_GEOMETRIES, frames.n_frames) if base.effects else _SWEEP_GEOMETRIES,
             min_stars=base.min_stars,
             seed=base.seed,
+            effects=base.effects,
         )
         yield "magnitude limit", limit, some.information, some, sky
     seen = base.stars.select(base.stars.mag <= base.max_mag)
     sky = _sky_fraction(seen, base.camera, base.noise, base.min_stars, base.seed)
     for factor in _NOISE_FACTORS:
-        scaled = replace(
-            frames, information=frames.information / factor**2, noise=frames.noise * factor**2
-        )
+        scaled = frames.with_noise(factor)
         yield "noise", factor * noise_px, scaled.information, scaled, sky
     for part in _FIELD_PARTS:
         yield "part of the detector", part, frames.seen_within(part), frames, sky
@@ -455,9 +487,12 @@ class Plan(Shown):
         Seed of the drawn geometries.
     provenance : Provenance
         Versions, settings and time.
-    frame_information : (p, p) array
-        Mean information of a frame, its attitude eliminated, px units.
-    start_information : (p, p) array or None
+    effects : EffectCosts or None
+        What effects cost; None for a calibration without any.
+    frame_information : (q, q) array
+        Mean information of a frame, its attitude eliminated, px units: on the parameters, and on
+        the coefficients of effects behind them.
+    start_information : (q, q) array or None
         Information that is there already.
     rotation_per_theta : (3, p) array
         Common rotation that a parameter causes, rad.
@@ -485,6 +520,7 @@ class Plan(Shown):
     distortion: DistortionRange | None
     seed: int
     provenance: Provenance
+    effects: EffectCosts | None
     frame_information: FloatArray
     start_information: FloatArray | None
     rotation_per_theta: FloatArray
@@ -497,10 +533,14 @@ class Plan(Shown):
         """What n frames will give; their information is that of so many average frames."""
         total = n_frames * self.frame_information
         total = total if self.start_information is None else total + self.start_information
+        covariance, p = scaled_inverse(total), len(self.camera.theta)
+        if p < len(total):
+            covariance = covariance[:p, :p]
+            total = scaled_inverse(covariance)
         return Expected(
             self.camera,
             n_frames,
-            scaled_inverse(total),
+            covariance,
             total,
             self.rotation_per_theta,
             self.attitude_noise,

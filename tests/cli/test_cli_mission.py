@@ -299,6 +299,33 @@ def test_plan_before_any_data(cli, run, tmp_path, small_plans):
     assert status == 1
 
 
+def test_plan_states_what_effects_cost(cli, run, tmp_path, small_plans):
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
+    words = ("plan", "camera.toml", "--frames", 100, "--distortion-percent", 0, 0, "--effects")
+    wide = ("frame=0.1,temperature", "--temperature-range", 40)
+    status, out, err = cli(*words, *wide, "-o", "held")
+    assert status == 0, err
+    assert "What effects cost after" in out
+    assert "camera alone" in out and "Over 40 K, slopes with the temperature are known" in out
+    table = pd.read_csv(tmp_path / "held" / "effects.csv", index_col="effects")
+    assert list(table.index) == ["none", "frame", "temperature", "all"]
+    assert table.f_px["frame"] > 1.1 * table.f_px["none"]
+    assert 'id="effects"' in (tmp_path / "held" / "plan.html").read_text("utf-8")
+    status, out, _ = cli(*words, "temperature", "--json")
+    rows = json.loads(out)["plan"]["effects"]
+    assert rows[0]["effects"] == "none" and rows[0]["sigma"]["f_px_per_K"] is None
+    # Half the range, twice the sigma of the slope.
+    slope = rows[1]["sigma"]["f_px_per_K"]
+    assert slope == pytest.approx(2.0 * table.f_px_per_K["temperature"], rel=0.05)
+    for wrong, word in (
+        (("star",), "the effect 'star' cannot be planned"),
+        (("epoch", "--nights", 1), "the effect 'epoch' needs at least 2"),
+        (("field", "--choose", 5), "--choose and --check plan calibrations without effects"),
+    ):
+        status, _, err = cli(*words, *wrong)
+        assert status == 2 and word in err
+
+
 def test_square_brackets_are_no_markup(cli, run, tmp_path):
     (tmp_path / "b.toml").write_text(REQUIREMENTS.replace("R-1 impossible", "R-1 [/x] rev [b]"))
     status, out, err = cli("budget", "run", "--budget", "b.toml")

@@ -16,6 +16,7 @@ from starcal_uq.core.manifest import making
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.planning.check import ForecastCheck
+from starcal_uq.planning.costs import EffectCosts
 from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.plan import Plan
 from starcal_uq.presentation.figures.planning import (
@@ -31,6 +32,8 @@ from starcal_uq.presentation.words.planning import (
     SCOPE_NAMES,
     check_text,
     choice_text,
+    costs_sentence,
+    costs_table,
     distortion_sentence,
     level,
     need_words,
@@ -92,6 +95,7 @@ def write_plan(
         "sweeps": plan.sweeps,
         "frames": None if choice is None else choice.to_dataframe(),
         "check": None if check is None else check.to_dataframe(),
+        "effects": None if plan.effects is None else plan.effects.to_dataframe(),
     }
     with making(folder, "plan", PAGE, force=True) as path:
         figures = new_folder(path / "figures")
@@ -112,6 +116,7 @@ def plan_record(plan: Plan) -> AnyDict:
         "verdict": plan_text(plan),
         "camera": plan.camera.to_dict(),
         **{name: getattr(plan, name) for name in _RECORDED},
+        "effects": None if plan.effects is None else _costs(plan.effects),
         "distortion": None if plan.distortion is None else _finite(to_plain(plan.distortion)),
         "distortion_words": distortion_sentence(plan),
         "needs": to_plain(plan.needs),
@@ -119,6 +124,13 @@ def plan_record(plan: Plan) -> AnyDict:
         "forecast": _finite(plan.to_dataframe().to_dict("records")),
         "provenance": plan.provenance,
     }
+
+
+def _costs(costs: EffectCosts) -> AnyDict:
+    """Effects with their scales, and their costs, model by model."""
+    rows = _finite(costs.to_dataframe().to_dict("records"))
+    planned: AnyDict = to_plain(costs.planned)
+    return planned | {"n_frames": costs.n_frames, "costs": rows}
 
 
 def _finite(value: Any) -> Any:
@@ -218,6 +230,8 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> AnyDict:
         "settings": " ".join(filter(None, (settings_sentence(plan), ties_sentence(plan)))),
         "distortion_words": distortion_sentence(plan),
         "distortion_span": "" if plan.distortion is None else span(plan.distortion),
+        "costs": None if plan.effects is None else costs_table(plan.effects),
+        "costs_words": "" if plan.effects is None else costs_sentence(plan.effects),
         "level": level(plan.confidence),
         "scope": SCOPE_NAMES[plan.scope],
         "target": None if plan.target_arcsec is None else f"{plan.target_arcsec:g} arcsec",

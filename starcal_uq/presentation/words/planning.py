@@ -8,6 +8,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent, plural, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.planning.check import ForecastCheck
+from starcal_uq.planning.costs import EffectCosts
 from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.open_distortion import AFTER_FRAMES, DistortionRange
 from starcal_uq.planning.plan import Need, Plan
@@ -270,6 +271,54 @@ def plan_table(plan: Plan) -> TextTable:
     title = "Forecast, standard deviations; the radius holds the stated confidence"
     spread = () if plan.distortion is None else ("radius_least_arcsec", "radius_most_arcsec")
     return TextTable.of(plan.to_dataframe(), title, (*columns, "radius_arcsec", *spread))
+
+
+def costs_table(costs: EffectCosts) -> TextTable:
+    """What effects cost: the growth of what is known of the camera, and attitude errors."""
+    columns = {"x₀": ("x0_px", "y0_px"), "f": ("f_px",)}
+    if "distortion_corner_px" in costs.names:
+        columns["corner"] = ("distortion_corner_px",)
+    columns["common"] = _across("common")
+    rest = [costs.names.index(name) for name in _across("rest")]
+    rows = []
+    for i, model in enumerate(costs.models):
+        errors = (costs.sigma[i, rest], costs.camera_alone[i, rest])
+        rows.append(
+            (
+                model,
+                px if (px := costs.planned.scales.get(model)) is None else significant(px),
+                *(f"× {fixed(costs.growth(model, *names), 2)}" for names in columns.values()),
+                *(significant(np.sqrt(np.mean(error**2))) for error in errors),
+            )
+        )
+    heads = ("effects", "scale [px]", *columns, "rest [arcsec]", "camera alone aboard")
+    title = f"What effects cost after {frames(costs.n_frames)}: growth of sigmas, and the rest"
+    cells = tuple(tuple(cell or "" for cell in row) for row in rows)
+    return TextTable(heads, cells, title, "lr" + "r" * (len(columns) + 2))
+
+
+def _across(part: str) -> tuple[str, ...]:
+    return tuple(f"{part}_{axis}_arcsec" for axis in AXES[:2])
+
+
+def costs_sentence(costs: EffectCosts) -> str:
+    """What the costs rest on, and how well slopes with the temperature are known."""
+    planned = costs.planned
+    assumed = (
+        "The scales are assumptions, standard deviations in px at the corner. Attitudes are those "
+        "of a mission whose software knows the effects; with the camera alone aboard they err by "
+        "the effects themselves."
+    )
+    if "temperature" not in planned.scales:
+        return assumed
+    slopes = [
+        f"{name} to {significant(costs.of('temperature', f'{name}_px_per_K'))}"
+        for name in ("x0", "y0", "f")
+    ]
+    return (
+        f"{assumed} Over {planned.temperature_range_c:g} K, slopes with the temperature are known "
+        f"({join_words(slopes)} px/K); half the range doubles these."
+    )
 
 
 def need_sentence(plan: Plan, need: Need) -> str:
