@@ -83,7 +83,9 @@ Criterion = Literal["D", "A"]
 PairCovariance = Literal["full", "diagonal"]
 Filtered = Literal["optics", "all"]
 Truth = Literal["fixed", "prior"]
-StudyTemplate = Literal["fov-distortion", "frames-stars", "magnitude-noise", "distortion-models"]
+StudyTemplate = Literal[
+    "fov-distortion", "frames-stars", "magnitude-noise", "distortion-models", "effects"
+]
 Convention = Literal["eq14", "eq6"]
 FieldReading = Literal["window", "full"]
 Starter = Literal["camera", "site", "budget", "study", "example"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,14 +11,18 @@ from starcal_uq.calibration.calibrate import METHODS
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, get_model, model_names
 from starcal_uq.camera.projection import fold_radius_px
-from starcal_uq.core.errors import StudyError
+from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import KEYS, Limit
 from starcal_uq.core.types import AnyDict, AnyMapping
 from starcal_uq.inference.named import LIKELIHOODS
+from starcal_uq.planning.effects import PlannedEffects
 from starcal_uq.simulation.pointing import POINTINGS
 
 FLAT = "flat"
+# A calibration without effects, and the axes that are about those of one that holds some.
+NO_EFFECTS = "none"
+EFFECT_AXES = ("effects", "temperature_range_c", "nights")
 # Terms of a distortion that cancel to less than this share of their sum have no size that could be
 # scaled.
 _CANCELLED = 0.02
@@ -37,6 +42,7 @@ class Axis:
     limit: Limit | None = None
     choices: tuple[str, ...] = ()
     base: Any = None
+    parse: Callable[[str], object] | None = None  # What refuses names that are none
 
     def check(self, value: Any, where: str) -> Any:
         """The value in its own type; `StudyError` with `where` in front if it does not fit."""
@@ -50,6 +56,11 @@ class Axis:
             good = number and self.limit.holds(value)
         if not good:
             raise StudyError(f"{where}: {self.name} is {shown(value)}; {self.wanted}.")
+        if self.parse is not None:
+            try:
+                self.parse(value)
+            except StarcalError as error:
+                raise StudyError(f"{where}: {error}") from None
         return float(value) if self.kind == "number" else value
 
     @property
@@ -71,6 +82,20 @@ class Axis:
 
 def _number(name: str, words: str, unit: str = "", base: Any = None, key: str = "") -> Axis:
     return Axis(name, words, unit, KEYS[key or name], base=base)
+
+
+def planned_effects(settings: AnyMapping) -> PlannedEffects | None:
+    """Effects of the calibration of a cell; None without any."""
+    text = settings.get("effects", NO_EFFECTS)
+    if text == NO_EFFECTS:
+        return None
+    spread = {name: settings[name] for name in EFFECT_AXES[1:] if name in settings}
+    return PlannedEffects.parsed(text, **spread)
+
+
+def _check_effects(text: str) -> None:
+    if text != NO_EFFECTS:
+        PlannedEffects.parsed(text)
 
 
 AXES = {
@@ -99,6 +124,9 @@ AXES = {
         Axis("prior", "prior", base=FLAT),
         Axis("method", "method of calibration", "", choices=METHODS, base="efficient"),
         Axis("likelihood", "likelihood", "", choices=LIKELIHOODS, base="marginal"),
+        Axis("effects", "effects beyond the camera that are estimated", parse=_check_effects),
+        _number("temperature_range_c", "width of the range of temperatures", "K"),
+        _number("nights", "nights over which frames are spread", ""),
     )
 }  # fmt: skip
 # Axes that make another camera.

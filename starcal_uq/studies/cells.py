@@ -24,8 +24,9 @@ from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
 from starcal_uq.inference.priors import Priors
 from starcal_uq.maths.linear import correlation_of, inverses
+from starcal_uq.planning.effects import JointMatrices, PlannedEffects, joint_inverses
 from starcal_uq.propagation.coupling import weak_directions
-from starcal_uq.studies.axes import CAMERA_AXES, camera_of
+from starcal_uq.studies.axes import CAMERA_AXES, camera_of, planned_effects
 from starcal_uq.studies.definition import Cell, StudyDefinition
 from starcal_uq.studies.geometry import (
     Geometry,
@@ -137,10 +138,16 @@ class FisherCells(Cells):
         key = geometry_key(camera, settings, self.definition.seed, cell.seed_index, False)
         offset = offset_of(camera, settings)
         shape, scale = noise_shape(settings)
-        if offset > 0.0:
-            # Two sizes of noise have no common factor.
+        effects = planned_effects(settings)
+        if effects is not None and offset > 0.0:
+            raise StudyError(
+                "effects and errors of the stars are not studied together: leave effects or "
+                "direction_mas out."
+            )
+        if offset > 0.0 or effects is not None:
+            # Two sizes of noise have no common factor, and noise none with effects of frames.
             shape, scale = (settings["sigma_px"], *shape[1:]), 1.0
-        whole = (key, settings.get("stars"), shape, offset)
+        whole = (key, settings.get("stars"), shape, offset, effects)
         if self._stated is None or self._stated[0] != whole:
             stated = self._state(*whole)
             if key.pointing != "random":
@@ -149,10 +156,15 @@ class FisherCells(Cells):
         return self._stated[1], scale
 
     def _state(
-        self, key: GeometryKey, stars: int | None, shape: NoiseShape, offset: float
+        self,
+        key: GeometryKey,
+        stars: int | None,
+        shape: NoiseShape,
+        offset: float,
+        effects: PlannedEffects | None,
     ) -> Statements:
         chosen = self.geometry(key).brightest(stars)
-        return statements(chosen, star_noise(chosen.mag, shape), offset)
+        return statements(chosen, star_noise(chosen.mag, shape), offset, effects)
 
 
 def prior_precision(table: AnyMapping | None, camera: Camera) -> FloatArray | None:
@@ -176,7 +188,8 @@ def campaign_numbers(
     camera = stated.camera
     frame = np.tensordot(counts, stated.information, 1) / n
     found = coupling_numbers(frame, prior, n, stated)
-    found |= simpler_numbers(frame, n, float(counts @ stated.weights), stated)
+    own = frame if stated.joint is None else without_effects(frame, stated.joint, n)
+    found |= simpler_numbers(own, n, float(counts @ stated.weights), stated)
     return found | {
         "n_frames": n,
         "mean_stars": stated.mean_stars,
@@ -186,15 +199,25 @@ def campaign_numbers(
     }
 
 
+def without_effects(frame: FloatArray, joint: JointMatrices, n: int) -> FloatArray:
+    """Mean information (p, p) on the parameters of n frames, effects eliminated."""
+    p = int(np.count_nonzero(joint.prior == 0.0))
+    inner = frame[p:, p:] + np.diag(joint.prior[p:]) / n
+    return np.asarray(frame[:p, :p] - frame[:p, p:] @ np.linalg.solve(inner, frame[p:, :p]))
+
+
 def covariances(
     frame: FloatArray,
     prior: FloatArray,
     spread: tuple[FloatArray, FloatArray] | None,
     n: FloatArray,
+    p: int,
 ) -> FloatArray:
-    """Covariances (k, p, p) after numbers of frames (k,): the module's formula."""
+    """Covariances (k, q, q) of p parameters, and of what has a prior behind them, after numbers of
+    frames (k,): the module's formula.
+    """
     total = n[:, None, None] * frame + np.diag(prior)
-    inverse = inverses(total)
+    inverse = inverses(total) if p == len(frame) else joint_inverses(total, p)
     if spread is None:
         return inverse
     a, b = spread
@@ -209,36 +232,51 @@ def coupling_numbers(
     stated: Statements,
 ) -> Numbers:
     """What couples after n frames with a mean information of `frame` each."""
-    precision = np.zeros(len(frame)) if prior is None else prior
+    p, joint = len(stated.camera.theta), stated.joint
+    plain = np.zeros(len(frame)) if joint is None else joint.prior
+    precision = plain.copy()
+    precision[:p] += 0.0 if prior is None else prior
     numbers = np.concatenate([[1.0], FRAME_FACTORS]) * n
-    every = covariances(frame, precision, stated.star_spread, numbers)
+    every = covariances(frame, precision, stated.star_spread, numbers, p)
     if not np.isfinite(every[0]).all():
         raise StudyError(UNDETERMINED)
     data = (
         every[0]
         if prior is None
-        else covariances(frame, np.zeros(len(frame)), stated.star_spread, numbers[:1])[0]
+        else covariances(frame, plain, stated.star_spread, numbers[:1], p)[0]
     )
     common, forms = stated.common, stated.rest_forms
     cross = 0.5 * (forms[0] + forms[1])
     with np.errstate(invalid="ignore"):
         curve = ARCSEC * np.sqrt(np.einsum("kpq,pq->k", every[1:], cross))
-        sigma_curve = np.sqrt(np.diagonal(every[1:], axis1=1, axis2=2))
+        sigma_curve = np.sqrt(np.diagonal(every[1:], axis1=1, axis2=2))[:, :p]
     total = n * frame + np.diag(precision)
-    return covariance_numbers(every[0], stated.camera.distortion, common, forms) | {
-        "sigma_data": np.sqrt(np.diag(data)),
-        "condition_number": condition(total),
-        "error_curve_arcsec": curve,
-        "sigma_curve": sigma_curve.T,
-    }
+    slopes: Numbers = {}
+    if joint is not None:
+        total = np.linalg.inv(every[0][:p, :p])
+        if "temperature" in joint.places:
+            sigma = np.sqrt(np.diag(every[0]))[joint.places["temperature"]] * joint.per_kelvin
+            slopes = dict(zip(("slope_x0", "slope_y0", "slope_f"), sigma.tolist(), strict=True))
+    return (
+        slopes
+        | covariance_numbers(every[0], stated.camera.distortion, common, forms)
+        | {
+            "sigma_data": np.sqrt(np.diag(data))[:p],
+            "condition_number": condition(total),
+            "error_curve_arcsec": curve,
+            "sigma_curve": sigma_curve.T,
+        }
+    )
 
 
 def covariance_numbers(
     covariance: FloatArray, model: str, common: FloatArray, forms: FloatArray
 ) -> Numbers:
-    """What couples in a covariance (p, p), and what it does to attitudes."""
+    """What couples in a covariance (q, q) of parameters and effects, and what it does to
+    attitudes.
+    """
     names = parameter_names(model)
-    correlation, sigma = correlation_of(covariance)
+    correlation, sigma = correlation_of(covariance[: len(names), : len(names)])
     conditional = sigma / np.sqrt(np.diag(np.linalg.inv(correlation)))
     weakest = weak_directions(correlation, names)[0]
     rotation = common @ covariance @ common.T
@@ -251,7 +289,7 @@ def covariance_numbers(
         "weak_direction": weakest.weights,
         "weak_variance": weakest.variance,
         "weak_words": weakest.words,
-        "attitude_correlation": (covariance @ common.T) / np.outer(sigma, turn),
+        "attitude_correlation": (covariance @ common.T)[: len(names)] / np.outer(sigma, turn),
         "common_rotation_arcsec": ARCSEC * turn,
         "frame_error_arcsec": ARCSEC * np.sqrt(np.einsum("pq,apq->a", covariance, forms)),
     }
@@ -273,6 +311,7 @@ def simpler_numbers(frame: FloatArray, n: int, weight: float, stated: Statements
     """
     camera = stated.camera
     names = list(camera.parameter_names)
+    forms = stated.rest_forms[:, : len(names), : len(names)]
     found: Numbers = {
         "model_bias_arcsec": {},
         "model_bias_attitude_arcsec": {},
@@ -293,7 +332,7 @@ def simpler_numbers(frame: FloatArray, n: int, weight: float, stated: Statements
         sigmas[kept] = shift / np.sqrt(np.diag(inverse) / n)
         found["model_bias_arcsec"][model] = ARCSEC * rms / camera.focal_px
         found["model_bias_attitude_arcsec"][model] = ARCSEC * np.sqrt(
-            np.maximum(np.einsum("p,apq,q->a", error, stated.rest_forms, error), 0.0)
+            np.maximum(np.einsum("p,apq,q->a", error, forms, error), 0.0)
         )
         found["model_bias_sigma"][model] = sigmas
     return found

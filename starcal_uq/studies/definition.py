@@ -26,7 +26,7 @@ from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 from starcal_uq.inference.priors import PRIORS
-from starcal_uq.studies.axes import AXES, EXCLUSIVE, FLAT, base_settings, camera_of
+from starcal_uq.studies.axes import AXES, EFFECT_AXES, EXCLUSIVE, FLAT, base_settings, camera_of
 
 MODES = ("fisher", "simulate")
 POSTERIORS = ("importance", "ensemble", "none")
@@ -295,6 +295,11 @@ class StudyDefinition:
                 raise StudyError(
                     f"{where}: {name} makes no difference to Fisher information; set mode to "
                     "'simulate', or remove it."
+                )
+            if self.mode != "fisher" and name in EFFECT_AXES:
+                raise StudyError(
+                    f"{where}: {name} is studied by Fisher information; set mode to 'fisher', or "
+                    "remove it."
                 )
         for name in (*self.sweep.get("prior", ()), self.observation.get("prior", FLAT)):
             if name != FLAT and name not in self.priors:

@@ -25,10 +25,11 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
 from starcal_uq.likelihood.terms import add_by_group
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.planning.effects import JointMatrices, PlannedEffects
 from starcal_uq.planning.information import frame_matrices
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Window
 from starcal_uq.simulation.pointing import pattern_rotations
-from starcal_uq.studies.axes import CAMERA_AXES
+from starcal_uq.studies.axes import CAMERA_AXES, EFFECT_AXES
 from starcal_uq.studies.definition import Cell
 
 if TYPE_CHECKING:
@@ -326,7 +327,9 @@ def weights_of(cell: Cell) -> str:
     these.
     """
     settings = cell.settings
-    return repr((settings.get("stars"), noise_shape(settings)[0], settings["direction_mas"]))
+    effects = [settings.get(name) for name in EFFECT_AXES]
+    noise = settings["sigma_px"] if effects[0] else noise_shape(settings)[0]
+    return repr((settings.get("stars"), noise, settings["direction_mas"], effects))
 
 
 def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
@@ -401,7 +404,8 @@ class Statements:
     a parameter; `rest_forms` (3, p, p), the mean square over frames of what an attitude adds to it,
     rad^2; `noise` (3,), the mean over frames of the variance of an attitude, rad^2; `star_spread`,
     by errors of the stars, (p, p) each: variance of a frame's score beyond its information, and
-    covariance of two frames'.
+    covariance of two frames'. With effects, their coefficients stand behind the parameters, and
+    `joint` has their prior.
     """
 
     camera: Camera
@@ -412,21 +416,33 @@ class Statements:
     rest_forms: FloatArray
     noise: FloatArray
     star_spread: tuple[FloatArray, FloatArray] | None = None
+    joint: JointMatrices | None = None
 
     def for_mission(self, other: Statements) -> Statements:
         """The same information, for attitudes of other frames."""
         return replace(self, common=other.common, rest_forms=other.rest_forms, noise=other.noise)
 
 
-def statements(geometry: Geometry, noise_px: FloatArray, offset_px: float = 0.0) -> Statements:
+def statements(
+    geometry: Geometry,
+    noise_px: FloatArray,
+    offset_px: float = 0.0,
+    effects: PlannedEffects | None = None,
+) -> Statements:
     """What the frames of a geometry say with centroid noise (N,), px per axis.
 
     `offset_px` is the error of a star's direction, px at the boresight per axis, the same in all of
-    its images; images are weighed by both together.
+    its images; images are weighed by both together. `effects` are those that a calibration holds.
     """
     frames = geometry.frames(np.hypot(noise_px, offset_px))
     camera = geometry.camera
-    information, response, noise = frame_matrices(camera, frames, geometry.rotations)
+    joint = None
+    if effects is None:
+        information, response, noise = frame_matrices(camera, frames, geometry.rotations)
+    else:
+        seen = effects.seen(geometry.n_frames, 0)
+        joint = seen.matrices(camera, frames, geometry.rotations, geometry.mag)
+        information, response, noise = joint.information, joint.response, joint.noise
     common = response.mean(axis=0)
     rest = response - common
     return Statements(
@@ -440,6 +456,7 @@ def statements(geometry: Geometry, noise_px: FloatArray, offset_px: float = 0.0)
         star_spread=_star_spread(geometry, frames, noise_px, offset_px)
         if offset_px > 0.0
         else None,
+        joint=joint,
     )
 
 

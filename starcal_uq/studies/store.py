@@ -50,8 +50,14 @@ class Store(store.Store):
 
 
 def _read(path: Path) -> pa.Table:
+    import pyarrow as pa
+
     with reading(path, "a part of a study", "delete it, and its cells are computed again"):
         table = read_parquet(path)
+        # Cells of earlier versions have no slopes.
+        for place, each in enumerate(_schema()):
+            if each.name.startswith("slope_") and each.name not in table.column_names:
+                table = table.add_column(place, each, pa.nulls(len(table), each.type))
         if table.schema != _schema():
             raise StudyError("it has other columns")
         return table

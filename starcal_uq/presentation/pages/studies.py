@@ -34,6 +34,7 @@ from starcal_uq.presentation.words.studies import (
     study_text,
     summary_columns,
 )
+from starcal_uq.presentation.words.study_effects import effects_answer, effects_table
 from starcal_uq.studies.result import Study
 
 PAGE = "report.html"
@@ -150,11 +151,11 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
         "created": data.attrs.get("created_utc", ""),
         "version": data.attrs.get("starcal_uq", ""),
         "verdict": study_text(study),
-        "answer": study_answer(study)[1:],
+        "answer": [*study_answer(study)[1:], *effects_answer(study)],
         "advice": study_advice(study),
         "limits": study_limits(study),
         "failed": failed,
-        "tables": study_tables(study),
+        "tables": [*study_tables(study), *filter(None, [effects_table(study)])],
         "figures": figures,
         "cells": cells_table(study, _CELLS_SHOWN),
         "cells_words": (

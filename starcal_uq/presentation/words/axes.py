@@ -33,6 +33,9 @@ _NAMES = {
     "prior": "prior",
     "method": "method",
     "likelihood": "likelihood",
+    "effects": "effects",
+    "temperature_range_c": "range of temperatures",
+    "nights": "nights",
 }
 # Units as they are printed, where that is not how they are written.
 _PRINTED = {"deg": "°", "um": "µm"}
