@@ -175,7 +175,8 @@ class SeenEffects:
         columns = Columns.of(effects, likelihood, state, camera.theta, slice(None))
         slopes = likelihood.derivatives(camera.theta, state)
         turns = -likelihood.attitudes(state).coefficients(slopes)
-        response = np.concatenate([turns, -columns.run_turns]).transpose(2, 1, 0)
+        run_turns = columns.attitudes.coefficients(columns.raw)
+        response = np.concatenate([turns, -run_turns]).transpose(2, 1, 0)
         every = np.concatenate([likelihood.project_out(state, slopes), columns.run])
         information = _products(frames, every)
         prior = [np.zeros(len(camera.theta))]

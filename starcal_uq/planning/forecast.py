@@ -103,7 +103,6 @@ def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
     """Parameters, and per axis the common rotation and the rest over the attitudes of a mission."""
     camera = mission.camera
     known = parameters(camera.distortion)
-    p = len(known)
     unit = np.eye(mission.information.shape[1])
     chosen = [
         _quantity(f"{k.name}_{_suffix(k.unit)}", unit[i : i + 1]) for i, k in enumerate(known)
