@@ -38,7 +38,7 @@ from starcal_uq.diagnostics.verdict.judge import judge  # noqa: E402
 from starcal_uq.likelihood.pairs import PairObjective  # noqa: E402
 from starcal_uq.maths.intervals import binomial_interval  # noqa: E402
 from starcal_uq.observations.frames import StarFrames  # noqa: E402
-from tests.diagnostics import test_air, test_pattern  # noqa: E402
+from tests.diagnostics import test_air, test_found  # noqa: E402
 from tests.helpers.outside import Campaign, campaign, measured_again  # noqa: E402
 
 # A fact of the data and no test: few frames and empty corners are warned of in every run of such a
@@ -255,18 +255,16 @@ def uneven(name: str, *, effects: str = "none", runs: int = 100, **options: Any)
 
 
 def misfit_to_attitude(rng: np.random.Generator, planted: str) -> Outcome:
-    """A planted misfit: what it is said to do to the rest over what it does, and by its whole size
-    in each axis.
-    """
+    """A planted misfit: what it is said to do to the rest over what it does."""
     seed = int(rng.integers(2**31))
-    run, found = test_pattern.calibrated(planted, seed), {}
+    shape, found = test_found.PLANTED[planted][0](seed), {}
     for where in ("observed", "random", "slew"):
-        through, whole = test_pattern.ratios(run, where, seed + 1)
+        run = test_found.rest(shape, seed, where, 60)
+        ratio, own = run.stated / run.true, run.with_effects / run.true_with_effects
         for part, at in (("across", slice(0, 2)), ("about", slice(2, 3))):
-            if len(through[at]):
-                found[f"{where}, {part}"] = float(np.mean(through[at]))
-                if where == "random":
-                    found[f"whole size, {part}"] = float(np.mean(whole[at]))
+            found[f"{where}, {part}"] = float(np.mean(ratio[at]))
+            if where == "random":
+                found[f"{where} with effects, {part}"] = float(np.mean(own[at]))
     return Outcome(figures=found)
 
 
@@ -368,7 +366,7 @@ REGIMES: list[Regime] = [
     ),
     *(
         Regime(f"misfit planted: {name}", partial(misfit_to_attitude, planted=name), 4, "attitude")
-        for name in test_pattern.PLANTED
+        for name in test_found.PLANTED
     ),
     air("no air: 60 frames of 40 stars", 60, **PATCH),
     air("no air: 40 stars with errors of 0.03 px", 60, star_sigma_px=0.03, **PATCH),

@@ -124,7 +124,7 @@ def budget(
         )
     check_memory(f"n_samples={n_samples}", 8.0 * 12 * n_samples)
     if misfit is not None and attitude.misfit is None:
-        from starcal_uq.diagnostics.inflation import with_misfit
+        from starcal_uq.diagnostics.found import with_misfit
 
         attitude = with_misfit(attitude, misfit, post, obs)
     untested = () if attitude.misfit is not None else (UNTESTED,)

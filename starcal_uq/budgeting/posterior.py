@@ -33,9 +33,8 @@ from starcal_uq.propagation.attitude_error import (
     CONTRIBUTORS,
     IF_MODEL_HOLDS,
     WITH_MISFIT_FOUND,
-    choice,
 )
-from starcal_uq.propagation.onboard_error import with_cross
+from starcal_uq.propagation.onboard_error import OnboardError, with_cross
 from starcal_uq.propagation.thermal import TEMPERATURE
 
 if TYPE_CHECKING:
@@ -67,10 +66,8 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
     expected = list(FROM_POSTERIOR)
     if np.all(np.isfinite(attitude.interaction_arcsec)):
         expected.append(INTERACTING)
-    found = attitude.misfit
-    reasons = {} if found is None else {COMMON: found.common_reasons, REST: found.rest_reasons}
-    factors = {} if found is None else dict.fromkeys(reasons, found.factor)
     tails = _tails(attitude)
+    names = _effects(attitude)
     rows = []
     for entry in expected:
         place = CONTRIBUTORS.index(entry.name)
@@ -79,16 +76,16 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
             attitude.with_misfit_found_arcsec[place],
         )
         counted = attitude.headline_arcsec[place]
-        factor = factors.get(entry.name, 1.0)
-        scale = np.divide(factor * held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
+        scale = np.divide(held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
+        scale = np.minimum(scale, 1.0)
         correlation = axis_correlations(attitude.covariance_arcsec2[place], scale)
         alignment = f"; alignment on {attitude.alignment}" if entry.name == COMMON else ""
+        asked = f"; with effects ({names})" if names and entry.name in (COMMON, REST) else ""
         for index, axis in enumerate(AXES):
-            # What the misfit adds has no frame-by-frame sigma: the excess of the tail shrinks with
-            # its share.
-            share = (factor * held[index] / counted[index]) ** 2 if counted[index] > 0.0 else 1.0
+            # What effects add has no frame-by-frame sigma: the excess of the tail shrinks with its
+            # share.
+            share = scale[index] ** 2 if counted[index] > 0.0 else 1.0
             excess = tails.get((entry.name, axis), GAUSSIAN_997) - GAUSSIAN_997
-            why = "; ".join(reasons.get(entry.name, ())) if counted[index] > held[index] else ""
             rows.append(
                 Contributor(
                     name=entry.name,
@@ -104,7 +101,7 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
                     absorbed_by_alignment=entry.absorbed_by_alignment,
                     axis_correlation=correlation[index],
                     tail_997=GAUSSIAN_997 + float(share) * excess,
-                    conditions=conditions + (f"; inflated: {why}" if why else "") + alignment,
+                    conditions=conditions + asked + alignment,
                     provenance=provenance,
                     source="posterior",
                     if_model_holds_arcsec=float(held[index]),
@@ -133,14 +130,17 @@ def without_effects(attitude: AttitudeError) -> AttitudeError:
     widths = attitude.p95_arcsec.copy(), attitude.p997_arcsec.copy()
     for width in widths:
         width[:3] *= scale
+    both = np.hypot(own.common_arcsec, own.rest_arcsec)
+    parts = OnboardError(attitude.onboard, own.common_arcsec, own.rest_arcsec, both, ())
     return replace(
         attitude,
+        misfit=None if attitude.misfit is None else parts,
         nea_arcsec=noise,
         common_arcsec=own.common_arcsec,
         rest_arcsec=own.rest_arcsec,
         p95_arcsec=widths[0],
         p997_arcsec=widths[1],
-        total_arcsec=np.hypot(own.common_arcsec, own.rest_arcsec),
+        total_arcsec=both,
         rest_constant_arcsec=own.rest_constant_arcsec,
         covariance_arcsec2=covariance,
         variants=(),
@@ -281,26 +281,27 @@ def stated_instead(
 
 def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
     """What the tests of the model did to the rows, in sentences."""
-    found = attitude.misfit
-    if found is None:
+    if attitude.misfit is None:
         return (
-            f"The model was not tested: the calibration rows hold {IF_MODEL_HOLDS}, and what "
-            "they are "
-            f"{WITH_MISFIT_FOUND} is not assessed ({Remedy('diagnose', (RUN,))}).",
+            "The model was not tested, or what was found could not be fitted: the calibration rows "
+            f"hold {IF_MODEL_HOLDS}, and what they are {WITH_MISFIT_FOUND} is not assessed "
+            f"({Remedy('diagnose', (RUN,))}).",
         )
-    rows = [
-        name for name, why in ((COMMON, found.common_reasons), (REST, found.rest_reasons)) if why
-    ]
-    note = (
-        "Inflated by what the tests of the model found: "
-        f"{join_words([repr(name) for name in rows])}."
+    if names := _effects(attitude):
+        return (
+            f"The data ask for effects ({names}): {COMMON!r} and {REST!r} are errors of the calibrated camera "
+            "if the one with these effects is right.",
+        )
+    return (
+        "The tests of the model ask for no further effects; what they cannot see is in no row.",
     )
-    none = (
-        "The tests of the model found nothing that inflates the calibration rows; what they "
-        "cannot see is not in them."
-    )
-    other = (one.sentence for one in choice(attitude))
-    return (note if rows else none, *other, *filter(None, found.notes))
+
+
+def _effects(attitude: AttitudeError) -> str:
+    """The effects that the calibration lacks and its data ask for; empty where there are none."""
+    if attitude.misfit is None or attitude.variants:
+        return ""
+    return join_words([effect.name for effect in attitude.misfit.effects])
 
 
 def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[float, ...], ...]:

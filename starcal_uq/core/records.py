@@ -212,7 +212,8 @@ def _hints(cls: type) -> AnyDict:
 
 def _record(cls: Any, data: Mapping[str, Any], arrays: Arrays, name: str) -> Any:
     hints, known = _hints(cls), fields(cls)
-    for key in set(data) - {field.name for field in known}:
+    # Files of earlier versions hold more.
+    for key in set(data) - {field.name for field in known} - set(getattr(cls, "GONE", ())):
         if not isinstance(getattr(cls, key, None), property):
             raise ValueError(f"{cls.__name__} has no field {key!r}")
     values: AnyDict = {}

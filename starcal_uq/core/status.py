@@ -185,7 +185,6 @@ class Note(Enum):
     NOISE_IS_THE_MAGNITUDES = auto()
     NOISE_LIKE_MAGNITUDES = auto()
     NOISE_LIKE_ARCSECONDS = auto()
-    CHOICE_OF_MODEL = auto()
     MODEL_IS_WRONG = auto()
     HEADLINE = auto()
     NO_MODEL_EXPLAINS = auto()

@@ -1,7 +1,7 @@
 from .air import AirTest as AirTest
 from .air import air_test as air_test
 from .diagnose import Diagnosis as Diagnosis
-from .inflation import with_misfit as with_misfit
+from .found import with_misfit as with_misfit
 from .jackknife import Jackknife as Jackknife
 from .jackknife import jackknife_frames as jackknife_frames
 from .misfit import Misfit as Misfit

@@ -22,14 +22,16 @@ from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.status import Level
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, Progress
 from starcal_uq.diagnostics.air import AirTest, air_test
 from starcal_uq.diagnostics.beside import has_effects, without_effects
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
-from starcal_uq.diagnostics.models import ModelComparison, compare_models, of_all_stars
+from starcal_uq.diagnostics.models import ModelComparison, compare_models
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
+from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.diagnostics.times import (
     TimeTest,
@@ -38,12 +40,15 @@ from starcal_uq.diagnostics.times import (
     time_test,
     unseen_aberration,
 )
+from starcal_uq.diagnostics.verdict.observed import terms
 from starcal_uq.estimation.effects import with_effects
 from starcal_uq.estimation.fit import fit
+from starcal_uq.estimation.prediction import effects_about
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.ties import without_ties
 from starcal_uq.estimation.weights import by_noise_model, weighed
 from starcal_uq.observations.splits import frame_sample
+from starcal_uq.propagation.onboard import Extended
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -131,9 +136,13 @@ class Diagnosis(Shown, Saved):
     aberration : UnseenAberration or None
         What aberration that is left out or applied twice would do to f unseen; None where it would
         be seen, or in a diagnosis of an earlier version.
-    effects : tuple of str
-        Effects that the data would take up: of a calibration without any in whose residuals the
-        tests find structure.
+    extended : Extended or None
+        The calibration with the effects that the data would take up: of one without any in whose
+        residuals the tests find structure.
+    assessed : bool
+        Whether it is known what the structure that was found does to attitudes: it was looked which
+        effects the data would take up, or there was no need to. False in a diagnosis of an earlier
+        version.
     """
 
     misfit: Misfit
@@ -148,9 +157,15 @@ class Diagnosis(Shown, Saved):
     cameras: MixedCameras | None = None
     times: TimeTest | None = None
     aberration: UnseenAberration | None = None
-    effects: tuple[str, ...] = ()
+    extended: Extended | None = None
+    assessed: bool = False
 
     FILE = "a diagnosis", Remedy("diagnose", (RUN,), {"force": True}, "to write it again")
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that the data would take up."""
+        return () if self.extended is None else self.extended.effects.names
 
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
@@ -171,7 +186,8 @@ class Apart:
     cameras: MixedCameras | None
     times: TimeTest | None
     aberration: UnseenAberration | None
-    effects: tuple[str, ...]
+    extended: Extended | None
+    assessed: bool
 
 
 @one_thread()
@@ -191,6 +207,7 @@ def diagnose_apart(
     cal, whole = without_ties(obs, cal), whole if whole is None else without_ties(obs, whole)
     stars, rest = star_test(obs, cal), remainder(obs, cal, seed)
     misfit = misfit_tests(obs, whole or cal)
+    asked, assessed = extended(obs, whole or cal, misfit)
     return Apart(
         misfit=misfit,
         # Where the stars alone leave parameters open, starts without rotations end anywhere.
@@ -200,20 +217,33 @@ def diagnose_apart(
         cameras=MixedCameras.of(obs, cal.camera),
         times=time_test(obs, cal, seed=seed, rest=rest),
         aberration=unseen_aberration(obs, cal, seed=seed, rest=rest),
-        effects=_effects_that_help(obs, whole or cal, misfit),
+        extended=asked,
+        assessed=assessed,
     )
 
 
-def _effects_that_help(obs: Observations, cal: Calibration, misfit: Misfit) -> tuple[str, ...]:
-    """Effects that the data would take up, where tests find structure beside none."""
-    allowed = cal.method == "efficient" and cal.partitions is None
-    if cal.effects is not None or not allowed or not misfit.found(ALPHA):
-        return ()
+def extended(obs: Observations, cal: Calibration, misfit: Misfit) -> tuple[Extended | None, bool]:
+    """The calibration with the effects that the data would take up, where tests find structure
+    beside none, and whether that is known.
+    """
+    found = misfit.found(ALPHA)
+    of_files = terms(cal)
+    bent = any(not test.is_of_noise for test in found)
+    if of_files is not None and of_files.level is not Level.PASS:
+        bent = True
+    looked = has_effects(cal) or (cal.effects is not None and cal.effects.selected)
+    if looked or not (found or bent):
+        return None, True
+    if cal.method != "efficient" or cal.partitions is not None:
+        return None, not bent
     try:
-        found = with_effects(obs, cal).effects
+        made = with_effects(*of_heard(obs, cal))
     except StarcalError:
-        return ()
-    return () if found is None else found.names
+        return None, not bent
+    if made.effects is None or not made.effects.fitted:
+        return None, True
+    effects = effects_about(made, made.theta, made.covariance)
+    return Extended(made.camera, made.covariance, effects, made.provenance), True
 
 
 @bounded
@@ -268,8 +298,6 @@ def diagnose(
     # A single frame cannot be left out, and a field holds what other models would add to the lens.
     asked = obs.n_frames > 1 and not (cal.effects is not None and "field" in cal.effects.names)
     comparison = compare_models(obs, cal, models, seed=seed) if models and asked else None
-    if comparison is not None:
-        comparison = of_all_stars(comparison, obs, whole)
     step(3, 4)
     rest = None if apart is None or whole.partitions is not None else apart()
     if rest is None:
@@ -289,7 +317,8 @@ def diagnose(
         cameras=rest.cameras,
         times=rest.times,
         aberration=rest.aberration,
-        effects=rest.effects,
+        extended=rest.extended,
+        assessed=rest.assessed,
     )
 
 

@@ -14,12 +14,12 @@ chi-square. Two estimates of each frame's density without itself:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import left_error, quaternion_to_rotation, rotation_to_quaternion
+from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
 from starcal_uq.camera.distortion import rivals
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
@@ -45,8 +45,6 @@ KHAT_BOUND = 0.7
 # frames, and by more than chance between equal models (Sivula et al. 2020: below four, a difference
 # of elpd says nothing).
 REJECT_P, REJECT_ELPD = 0.005, 4.0
-# Up to the quantile of this probability a difference is no preference.
-_CHANCE_P = 0.05
 _DRAWS = 1000
 # Frames whose densities are sampled as well; the closed form, which is exact for the same model,
 # costs nothing.
@@ -85,10 +83,6 @@ class ModelScore:
         Root mean square over frames of what is left of the rotation.
     rejected : bool
         True if another model predicts better beyond doubt.
-    preferred : float
-        How far the data prefer this model to the fitted one: 0 up to a difference of their scores
-        that its own error gives in one case of twenty, 1 where the fitted one is rejected against
-        it, linear between. 0 of an earlier version.
     """
 
     model: str
@@ -104,7 +98,8 @@ class ModelScore:
     common_arcsec: tuple[float, float, float]
     rest_arcsec: tuple[float, float, float]
     rejected: bool
-    preferred: float = 0.0
+
+    GONE: ClassVar = ("preferred",)
 
 
 @dataclass(frozen=True)
@@ -119,8 +114,6 @@ class ModelComparison(Shown):
         The model of the calibration that was compared.
     failed : dict
         Models that could not be calibrated, and why.
-    share : float
-        Frames that were compared, of those that the calibration rests on.
     n_frames, n_sampled_frames : int
         Frames, and those of them whose densities were sampled; the others are in closed form. 0 in
         a comparison of a version that sampled all.
@@ -129,9 +122,10 @@ class ModelComparison(Shown):
     scores: tuple[ModelScore, ...]
     fitted: str
     failed: dict[str, str]
-    share: float = 1.0
     n_frames: int = 0
     n_sampled_frames: int = 0
+
+    GONE: ClassVar = ("share",)
 
     @property
     def accepted(self) -> tuple[ModelScore, ...]:
@@ -218,7 +212,6 @@ def compare_models(
     found_scores = {name: _leave_out(normals, n_draws, rng) for name, normals in fits.items()}
     best = max(found_scores, key=lambda name: float(np.sum(found_scores[name].pointwise)))
     reference = found_scores[best].pointwise
-    mine = found_scores.get(cal.camera.distortion)
     scores = []
     for name, normals in fits.items():
         loo = found_scores[name]
@@ -242,7 +235,6 @@ def compare_models(
                 common_arcsec=common,
                 rest_arcsec=rest,
                 rejected=-total > _beyond_doubt(difference),
-                preferred=0.0 if mine is None else _preference(loo.pointwise - mine.pointwise),
             )
         )
     scores.sort(key=lambda score: -score.elpd)
@@ -264,39 +256,6 @@ def _spread(pointwise: FloatArray) -> float:
 def _beyond_doubt(pointwise: FloatArray) -> float:
     return max(
         student_quantile(1.0 - 2.0 * REJECT_P, len(pointwise) - 1) * _spread(pointwise), REJECT_ELPD
-    )
-
-
-def _preference(pointwise: FloatArray) -> float:
-    """`ModelScore.preferred` of a model from its scores less those of the fitted one, frame by
-    frame (K,).
-    """
-    chance = student_quantile(1.0 - 2.0 * _CHANCE_P, len(pointwise) - 1) * _spread(pointwise)
-    share = (float(np.sum(pointwise)) - chance) / (_beyond_doubt(pointwise) - chance)
-    return float(np.clip(share, 0.0, 1.0))
-
-
-def of_all_stars(found: ModelComparison, obs: Observations, cal: Calibration) -> ModelComparison:
-    """The comparison on a sample of partitioned observations, with the moves by richer models that
-    all stars give.
-    """
-    if cal.partitions is None or obs.n_frames == cal.n_frames:
-        return found
-    rotations = quaternion_to_rotation(cal.quaternions)
-    richer = {other.model: other.theta for other in cal.partitions.richer}
-    scores = []
-    for score in found.scores:
-        if score.model in richer:
-            common, rest = _moved(
-                cal, FrameNormals.around(obs, score.model, richer[score.model], rotations)
-            )
-            score = replace(score, common_arcsec=common, rest_arcsec=rest)
-        scores.append(score)
-    sampled = any(
-        score.model not in richer and score.model != found.fitted for score in found.accepted
-    )
-    return replace(
-        found, scores=tuple(scores), share=obs.n_frames / cal.n_frames if sampled else 1.0
     )
 
 

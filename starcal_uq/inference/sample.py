@@ -22,6 +22,7 @@ from starcal_uq.core.settings import Evaluation, LikelihoodName, Moves, bounded,
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress, floats
+from starcal_uq.estimation.prediction import effects_about
 from starcal_uq.estimation.undetermined import open_parameters
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.inference.checks import (
@@ -46,9 +47,7 @@ from starcal_uq.inference.target import (
     start_target,
 )
 from starcal_uq.inference.update import check_chain
-from starcal_uq.likelihood.compressed import optimum
 from starcal_uq.likelihood.fitted_effects import Effects
-from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
@@ -404,27 +403,10 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
 
 
 def _effects(cal: Calibration, theta: FloatArray) -> Effects | None:
-    """The effects of a calibration beside draws (n, p) of the parameters, which their coefficients
-    follow as far as the data tie these together.
-    """
-    effects = cal.effects
-    if effects is None or not effects.fitted:
+    """The effects of a calibration beside draws (n, p) of the parameters."""
+    if cal.effects is None or not cal.effects.fitted:
         return None
-    # The draws hold the scales already, and no camera that flies needs the zeniths.
-    effects = replace(
-        effects, node_grams=np.zeros((0, 0, 0)), node_log_weights=np.zeros(0), zeniths=None
-    )
-    if not len(effects.coefficients):
-        return effects
-    best = optimum(cal.compressed).covariance
-    follow = scaled_inverse(best) @ effects.cross
-    covariance = np.cov(theta, rowvar=False)
-    return replace(
-        effects,
-        coefficients=effects.coefficients + (theta.mean(axis=0) - cal.theta) @ follow,
-        covariance=effects.covariance + follow.T @ (covariance - best) @ follow,
-        cross=covariance @ follow,
-    )
+    return effects_about(cal, theta.mean(axis=0), np.cov(theta, rowvar=False))
 
 
 def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, FloatArray]:

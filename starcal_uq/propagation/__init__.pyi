@@ -1,6 +1,5 @@
 from .attitude_error import Agreement as Agreement
 from .attitude_error import AttitudeError as AttitudeError
-from .attitude_error import MisfitFound as MisfitFound
 from .coupling import Coupling as Coupling
 from .distortion import DistortionCurve as DistortionCurve
 from .distortion import distortion_curve as distortion_curve

@@ -2,8 +2,9 @@
 `starcal_uq.propagation.propagate.propagate`.
 
 Every error has two figures, under the same two names wherever it is shown: *if the model holds*, by
-the posterior alone, and *with the misfit found*, with what the tests of the model add. The second
-is the headline, and it is not assessed, never equal to the first, until the model has been tested.
+the posterior alone, and *with the misfit found*, beside the effects that the data ask for where
+tests of the model find structure. The second is the headline, and it is not assessed, never equal
+to the first, until the model has been tested.
 Both are computed here and nowhere else.
 """
 
@@ -20,12 +21,10 @@ import numpy as np
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
-from starcal_uq.core.findings import Finding
 from starcal_uq.core.formatting import count, plural
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import OnboardModel
-from starcal_uq.core.status import Note
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, PathLike, floats
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
@@ -62,7 +61,6 @@ _SMALLEST_ARCSEC = 1e-6
 
 IF_MODEL_HOLDS, WITH_MISFIT_FOUND = "if the model holds", "with the misfit found"
 NOT_ASSESSED = "not assessed"
-CHOICE_OF_MODEL = "choice of model"
 # Confidences of the half-widths, and the two-sided quantiles of a Gaussian error.
 _CONFIDENCES = (0.95, 0.997)
 _GAUSSIAN = (HALF_WIDTH_95, HALF_WIDTH_997)
@@ -106,45 +104,6 @@ class Agreement(Shown):
                 "sampled_over_first_order": self.ratio.ravel(),
             }
         )
-
-
-@dataclass(frozen=True, eq=False)
-class MisfitFound:
-    """What the tests of the model add to the calibration's part of the attitude error.
-
-    Attributes
-    ----------
-    factor : float
-        Factor on the standard deviations of common rotation and rest, from the jackknife over
-        frames; 1 if they agree.
-    common_arcsec, rest_arcsec : (3,) array
-        Errors added in squares to the common rotation and to the rest, arcsec.
-    common_reasons, rest_reasons : tuple of str
-        Reasons for each of the two; empty if nothing was found.
-    notes : tuple of str
-        Further sentences for the reader.
-    choice_models : tuple of str
-        Distortion models that the data do not prefer but do not reject either, and that move either
-        by more than its standard deviation.
-    choice_common_arcsec, choice_rest_arcsec : (3,) array
-        How far these models move the common rotation and the rest, arcsec: a choice, which no error
-        here holds.
-    """
-
-    factor: float
-    common_arcsec: FloatArray
-    rest_arcsec: FloatArray
-    common_reasons: tuple[str, ...] = ()
-    rest_reasons: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    choice_models: tuple[str, ...] = ()
-    choice_common_arcsec: FloatArray = field(default_factory=lambda: np.zeros(3))
-    choice_rest_arcsec: FloatArray = field(default_factory=lambda: np.zeros(3))
-
-    @property
-    def reasons(self) -> tuple[str, ...]:
-        """Reasons for either, each once."""
-        return tuple(dict.fromkeys((*self.common_reasons, *self.rest_reasons)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,8 +161,9 @@ class AttitudeError(Shown):
         version without.
     aligned : Observations or None
         Frames of the alignment; None when read from a file.
-    misfit : MisfitFound or None
-        What the tests of the model add; None as long as it was not tested.
+    misfit : OnboardError or None
+        The calibration's part beside the effects that its data ask for; what holds if the model
+        does where they ask for none. None where that is not assessed.
     seen : Observations or None
         The frames themselves; None when read from a file.
     onboard : {"model", "effects"}
@@ -239,7 +199,7 @@ class AttitudeError(Shown):
     nea_per_frame_arcsec: FloatArray | None = None
     interaction_arcsec: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     frames: str = OBSERVED
-    misfit: MisfitFound | None = None
+    misfit: OnboardError | None = None
     seen: Observations | None = None
     total_arcsec: FloatArray | None = None
     analytic_total_arcsec: FloatArray | None = None
@@ -334,36 +294,14 @@ class AttitudeError(Shown):
 
     @property
     def with_misfit_found_arcsec(self) -> FloatArray:
-        """Standard deviations (5, 4) with what the tests of the model found; NaN as long as it was
-        not tested.
+        """Standard deviations (5, 4) with what the tests of the model found; NaN as long as that is
+        not assessed.
         """
         found, held = self.misfit, self.if_model_holds_arcsec
         if found is None:
             return np.full_like(held, np.nan)
-        common = np.hypot(found.factor * self.common_arcsec, found.common_arcsec)
-        rest = np.hypot(found.factor * self.rest_arcsec, found.rest_arcsec)
-        both = np.hypot(
-            found.factor * self.calibration_total_arcsec,
-            np.hypot(found.common_arcsec, found.rest_arcsec),
-        )
-        calibration = [with_cross(values) for values in (common, rest, both)]
-        return np.stack([held[0], *calibration, held[4]])
-
-    @property
-    def choice_of_model_arcsec(self) -> FloatArray:
-        """How far models move attitudes that the data neither prefer nor reject (5, 4); in no other
-        figure.
-
-        0 where no model moves them by more than the standard deviation; NaN as long as the model
-        was not tested.
-        """
-        made = np.full((len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
-        if (found := self.misfit) is not None:
-            common, rest = found.choice_common_arcsec, found.choice_rest_arcsec
-            nothing = np.zeros(3)
-            rows = (nothing, common, rest, np.hypot(common, rest), nothing)
-            made[:] = [with_cross(row) for row in rows]
-        return made
+        parts = (found.common_arcsec, found.rest_arcsec, found.total_arcsec)
+        return np.stack([held[0], *(with_cross(values) for values in parts), held[4]])
 
     @property
     def headline_arcsec(self) -> FloatArray:
@@ -377,13 +315,14 @@ class AttitudeError(Shown):
         """Half-widths (2, 5, 4) that hold 95 % and 99.7 % of the errors with the misfit found; NaN
         if not assessed.
 
-        What the misfit adds is taken as Gaussian: the excess of the tails over Gaussian ones
-        shrinks with its share.
+        What effects add is taken as Gaussian: the excess of the tails over Gaussian ones shrinks
+        with its share.
         """
         held, found = self.if_model_holds_arcsec, self.with_misfit_found_arcsec
-        factor = 1.0 if self.misfit is None else self.misfit.factor
-        scale = np.where([[False], [True], [True], [True], [False]], factor, 1.0)
-        share = np.where(found > 0.0, scale * held / np.where(found > 0.0, found, 1.0), 1.0) ** 2
+        share = np.minimum(
+            np.where(found > 0.0, held / np.where(found > 0.0, found, 1.0), 1.0), 1.0
+        )
+        share = share**2
         widths = np.stack((self.p95_arcsec, self.p997_arcsec))
         tails = widths / np.where(held > 0.0, held, np.nan)
         gaussian = np.stack(
@@ -402,9 +341,9 @@ class AttitudeError(Shown):
         Columns are ``contributor``, ``axis``, the standard deviations ``if_model_holds_arcsec`` and
         ``with_misfit_found_arcsec`` (NaN: not assessed), the half-widths
         ``p95_if_model_holds_arcsec``, ``p95_with_misfit_found_arcsec`` and the same for ``p997``,
-        ``first_order_arcsec`` (sigma by first-order propagation), ``choice_of_model_arcsec`` (in no
-        other column) and ``absorbed_by_alignment`` (yes, no, in part). The cross-boresight rows
-        hold the root mean square of the sigmas of pitch and yaw.
+        ``first_order_arcsec`` (sigma by first-order propagation) and ``absorbed_by_alignment``
+        (yes, no, in part). The cross-boresight rows hold the root mean square of the sigmas of
+        pitch and yaw.
         """
         import pandas as pd
 
@@ -429,7 +368,6 @@ class AttitudeError(Shown):
                 "p997_if_model_holds_arcsec": self.p997_arcsec.ravel(),
                 "p997_with_misfit_found_arcsec": p997.ravel(),
                 "first_order_arcsec": np.concatenate([with_cross(values) for values in analytic]),
-                "choice_of_model_arcsec": self.choice_of_model_arcsec.ravel(),
                 "absorbed_by_alignment": np.repeat(_ABSORBED, len(TOTAL_AXES)).astype(object),
             }
         )
@@ -525,8 +463,10 @@ class AttitudeError(Shown):
             others["n_sampled_frames"] = int(first.get("n_sampled_frames") or 0)
             others["frames"] = first.get("frames") or OBSERVED
             others["interaction_arcsec"] = sigma[4, :3]
-            if first.get("misfit"):
-                others["misfit"] = from_plain(MisfitFound, json.loads(first["misfit"]))
+            # Of an earlier version: estimates of a pattern in squares, which is no assessment.
+            misfit = json.loads(first.get("misfit") or "{}")
+            if "onboard" in misfit:
+                others["misfit"] = from_plain(OnboardError, misfit)
             if first.get("onboard"):
                 others |= vars(from_plain(_Aboard, json.loads(first["onboard"])))
             if first.get("alignment"):
@@ -553,17 +493,6 @@ class _Aboard:
     onboard: OnboardModel
     variants: tuple[OnboardError, ...]
     thermal_response: ThermalResponse | None = None
-
-
-def choice(error: AttitudeError) -> tuple[Finding, ...]:
-    """What other models that the data do not reject would do to attitudes; nothing where it is
-    little.
-    """
-    if error.misfit is None or not error.misfit.choice_models:
-        return ()
-    common, rest = (tuple(map(float, row[[3, 2]])) for row in error.choice_of_model_arcsec[1:3])
-    facts = {"models": error.misfit.choice_models, "common_arcsec": common, "rest_arcsec": rest}
-    return (Finding(Note.CHOICE_OF_MODEL, facts),)
 
 
 def _gaussian_tails(sigmas: FloatArray, confidence: float, one_axis: float) -> FloatArray:

@@ -16,13 +16,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.provenance import Provenance
+from starcal_uq.core.types import FloatArray, IntArray, Shapes
 from starcal_uq.likelihood.effects import Effect, effects_of
+from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.propagation.geometry import FrameGeometry
 from starcal_uq.propagation.onboard_error import PARAMETERS
@@ -44,6 +47,35 @@ _ROUNDING = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
+class Extended:
+    """A calibration with the effects that its data ask for, as far as attitudes need it.
+
+    Attributes
+    ----------
+    camera : Camera
+        The estimate beside the effects.
+    covariance : (p, p) array
+        Covariance of its parameters, px units.
+    effects : Effects
+        The effects, without the nodes of their scales.
+    provenance : Provenance
+        That of the calibration.
+    """
+
+    camera: Camera
+    covariance: FloatArray
+    effects: Effects
+    provenance: Provenance
+
+    SHAPES: ClassVar[Shapes] = {"covariance": ("p", "p")}
+
+    @property
+    def mean(self) -> FloatArray:
+        """The parameters (p,), px units."""
+        return self.camera.theta
+
+
+@dataclass(frozen=True, eq=False)
 class Turns:
     """Turns of K frames, rad.
 
@@ -59,11 +91,13 @@ class Turns:
 class Aboard:
     """Parameters and coefficients that attitudes err by.
 
-    `calibrated` is the table of the calibration, which says what effects change with.
+    `calibrated` is the table of the calibration, which says what effects change with. `theta` (p,)
+    are the parameters aboard; those of the posterior by default.
     """
 
-    post: Posterior
+    post: Posterior | Extended
     calibrated: Observations
+    theta: FloatArray | None = None
 
     @cached_property
     def _effects(self) -> list[Effect]:
@@ -117,17 +151,19 @@ class Aboard:
 
     @cached_property
     def _joint(self) -> tuple[FloatArray, FloatArray]:
-        """Expected values (q,), those of the parameters zero, and covariance (q, q)."""
+        """Expected values (q,), of the parameters less those aboard, and covariance (q, q)."""
         found, p = self.post.effects, len(self.post.mean)
+        off = np.zeros(p) if self.theta is None else self.post.mean - self.theta
         if found is None or not self.places:
-            return np.zeros(p), self.post.covariance
+            return off, self.post.covariance
         kept = np.concatenate([np.arange(0), *self._run.values()])
         nothing = np.zeros((p + len(kept), len(self._night)))
-        cross = found.cross[:, kept]
-        covariance = np.block(
-            [[self.post.covariance, cross], [cross.T, found.covariance[np.ix_(kept, kept)]]]
-        )
-        return np.concatenate([np.zeros(p), found.coefficients[kept], nothing[0]]), np.block(
+        # Files do not tell the sizes of arrays that hold nothing.
+        m = len(found.coefficients)
+        cross = found.cross.reshape(p, m)[:, kept]
+        own = found.covariance.reshape(m, m)[np.ix_(kept, kept)]
+        covariance = np.block([[self.post.covariance, cross], [cross.T, own]])
+        return np.concatenate([off, found.coefficients[kept], nothing[0]]), np.block(
             [[covariance, nothing], [nothing.T, np.diag(self._night)]]
         )
 

@@ -48,7 +48,7 @@ from starcal_uq.propagation.attitude_error import (
     AttitudeError,
 )
 from starcal_uq.propagation.geometry import FrameGeometry
-from starcal_uq.propagation.onboard import Aboard, Turns
+from starcal_uq.propagation.onboard import Aboard, Extended, Turns
 from starcal_uq.propagation.onboard_error import PARAMETERS, EffectError, OnboardError
 from starcal_uq.propagation.thermal import TemperatureProfile, ThermalResponse, thermal_error
 
@@ -348,8 +348,16 @@ def _variants(
     stars = frames.of_stars
     if aboard.post.effects is None or not (aboard.places or split.own or stars is not None):
         return ()
+    own, nothing = _own_effects(split), (np.zeros(3), np.zeros((3, 3)))
+    if stars is not None:
+        own.append(EffectError.of("star", nothing, (nothing[0], stars * ARCSEC**2), nothing[0]))
+    return tuple(_variant(each, aboard, split, own, sampled) for each in get_args(OnboardModel))
+
+
+def _own_effects(split: _Split) -> list[EffectError]:
+    """Shares of effects that every frame draws for itself."""
     nothing = np.zeros(3), np.zeros((3, 3))
-    own = [
+    return [
         EffectError.of(
             name,
             (nothing[0], split.own_together.get(name, nothing[1]) * ARCSEC**2),
@@ -358,19 +366,54 @@ def _variants(
         )
         for name, apart in split.own_apart.items()
     ]
-    if stars is not None:
-        own.append(EffectError.of("star", nothing, (nothing[0], stars * ARCSEC**2), nothing[0]))
-    made = []
-    for onboard in get_args(OnboardModel):
-        moments, expected = aboard.moments(onboard), aboard.expected(onboard)
-        sigmas = split.variances(moments).with_sampled(sampled).sigmas
-        camera, *effects = (
-            split.share(name, root, expected[at], at, sampled if name == PARAMETERS else None)
-            for name, at, root in aboard.shares
-        )
-        common, rest, both = (sigma * ARCSEC for sigma in sigmas)
-        made.append(OnboardError(onboard, common, rest, both, (*effects, *own), camera))
-    return tuple(made)
+
+
+def _variant(
+    onboard: OnboardModel,
+    aboard: Aboard,
+    split: _Split,
+    own: Sequence[EffectError],
+    sampled: _Sampled | None = None,
+) -> OnboardError:
+    """The calibration's part with one onboard model; to first order without a sample."""
+    moments, expected = aboard.moments(onboard), aboard.expected(onboard)
+    variances = split.variances(moments)
+    sigmas = (variances if sampled is None else variances.with_sampled(sampled)).sigmas
+    camera, *effects = (
+        split.share(name, root, expected[at], at, sampled if name == PARAMETERS else None)
+        for name, at, root in aboard.shares
+    )
+    common, rest, both = (sigma * ARCSEC for sigma in sigmas)
+    return OnboardError(onboard, common, rest, both, (*effects, *own), camera)
+
+
+def extended_error(
+    error: AttitudeError, extended: Extended, post: Posterior, obs: Observations
+) -> OnboardError:
+    """The calibration's part of an attitude error beside effects that the calibration lacks.
+
+    Aboard are the parameters of the posterior. They err by what the effects move them by, by their
+    covariance beside these, and by the effects themselves, to first order.
+
+    Parameters
+    ----------
+    error : AttitudeError
+        The propagated posterior, with its frames.
+    extended : Extended
+        The calibration with the effects.
+    post, obs : Posterior, Observations
+        The posterior without them, and the table of the calibration.
+    """
+    seen = obs if error.seen is None else error.seen
+    aligning = seen if error.aligned is None else error.aligned
+    frames = FrameGeometry.of(post, seen)
+    aligned = frames if aligning is seen else FrameGeometry.of(post, aligning)
+    weights, _ = alignment_weights(aligned.noise_covariance)
+    aboard = Aboard(extended, obs, post.mean)
+    turns = aboard.turns(frames, seen)
+    there = None if aligned is frames else aboard.turns(aligned, aligning)
+    split = _Split.of(turns, there, weights)
+    return _variant("model", aboard, split, _own_effects(split))
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,13 +47,11 @@ from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.core.findings import Finding
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import to_plain
-from starcal_uq.diagnostics.inflation import with_misfit
-from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
-from starcal_uq.diagnostics.pattern import Pattern
 from starcal_uq.presentation.pages.budgeting import budget_context, write_budget
 from starcal_uq.presentation.tables import tex
 from starcal_uq.presentation.words.budgeting import explanations
-from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
+from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.propagation.onboard_error import EffectError, OnboardError
 from tests.helpers.scenes import observations
 
 FILE = """
@@ -145,14 +143,14 @@ def stated(tmp_path: Path) -> Path:
     return path
 
 
-def diagnosis(*tests: MisfitTest, comparison: Any = None, jackknife: Any = None) -> Any:
-    nothing = Pattern((), *(np.zeros((0, 0)),) * 4, np.zeros((3, 3)), 1.0)
-    misfit = Misfit(tests, 1.0, 1000, 100, None, nothing)
-    return SimpleNamespace(misfit=misfit, comparison=comparison, jackknife=jackknife)
+NOTHING_FOUND: Any = SimpleNamespace(extended=None, assessed=True)
 
 
-def pattern(size_px: float, p: float, against: str = "radius", dof: int = 5) -> MisfitTest:
-    return MisfitTest(f"pattern over {against}", against, 9.0, dof, 1000, p, p, size_px, 0.5)
+def with_effects(common: Any, rest: Any, *names: str) -> OnboardError:
+    """The calibration's part beside effects: independent common rotation and rest."""
+    nothing = np.zeros(3)
+    effects = tuple(EffectError(name, nothing, nothing) for name in names)
+    return OnboardError("model", common, rest, np.hypot(common, rest), effects)
 
 
 # --- rows
@@ -186,7 +184,7 @@ def test_the_posterior_fills_its_rows_and_no_others() -> None:
         math.isnan(rows[REST, "roll"].with_misfit_found_arcsec)
         and rows[REST, "roll"].if_model_holds_arcsec == 0.05
     )
-    assert UNTESTED.name not in made(misfit=diagnosis()).not_assessed
+    assert UNTESTED.name not in made(misfit=NOTHING_FOUND).not_assessed
     for row in found.rows:
         assert row.assessed is (row.source == "posterior")
         assert row.assessed or (math.isnan(row.sigma_arcsec) and math.isnan(row.mean_arcsec))
@@ -239,7 +237,7 @@ def test_rows_of_the_file_replace_what_is_not_assessed(stated: Path) -> None:
     assert rows["=my own", "pitch"].ecss_class == "other" and not rows["=my own", "yaw"].assessed
 
 
-# --- inflation
+# --- misfit
 # --------------------------------------------------------------------------------------------------
 
 
@@ -247,10 +245,12 @@ def test_without_a_diagnosis_the_budget_says_that_the_model_was_not_tested() -> 
     assert any("not tested" in note for note in made().notes)
 
 
-def test_nothing_found_nothing_inflated() -> None:
-    found = made(misfit=diagnosis(pattern(0.02, 0.4)))
+def test_nothing_found_leaves_the_rows() -> None:
+    found = made(misfit=NOTHING_FOUND)
     assert not any(row.inflated for row in found.rows)
-    assert any("found nothing" in note for note in found.notes)
+    assert any("no further effects" in note for note in found.notes)
+    unknown: Any = SimpleNamespace(extended=None, assessed=False)
+    assert UNTESTED.name in made(misfit=unknown).not_assessed
 
 
 def test_classes_hold_what_counts_in_a_scope(stated: Path) -> None:
@@ -298,20 +298,17 @@ def test_tables_say_what_rows_totals_and_requirements_are(stated: Path) -> None:
                 assert value == expected or (math.isnan(value) and math.isnan(expected)), name
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.3])
-def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor: float) -> None:
+def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path) -> None:
     """The attitude error brings it along; from pixels to there see
-    `tests/diagnostics/test_pattern.py`.
+    `tests/diagnostics/test_found.py`.
     """
-    found = MisfitFound(
-        factor, np.zeros(3), np.array([0.7, 0.7, 10.0]), (), ("misfit, pattern over radius",)
-    )
     held = attitude().if_model_holds_arcsec[:, :3]
     covariance = (
         held[:, :, None]
         * held[:, None]
         * np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
     )
+    found = with_effects(held[1], np.hypot(held[2], [0.7, 0.7, 10.0]), "field")
     made_of = budget(
         POST, OBS, attitude(misfit=found, covariance_arcsec2=covariance), n_samples=20_000
     )  # type: ignore[arg-type]
@@ -321,21 +318,19 @@ def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor
         lines = [rows[name, axis] for axis in ("pitch", "yaw", "roll")]
         sigma = np.array([line.sigma_arcsec for line in lines])
         kept = np.array([line.axis_correlation for line in lines]) * np.outer(sigma, sigma)
-        added = np.diag(sigma**2 - (factor * held[place]) ** 2)
-        assert np.allclose(kept - factor**2 * covariance[place], added, rtol=1e-9, atol=1e-12)
-    assert rows[REST, "pitch"].sigma_arcsec == pytest.approx(np.hypot(factor * 0.006, 0.7))
-    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(factor * 0.05, 10.0))
+        added = np.diag(sigma**2 - held[place] ** 2)
+        assert np.allclose(kept - covariance[place], added, rtol=1e-9, atol=1e-12)
+    assert rows[REST, "pitch"].sigma_arcsec == pytest.approx(np.hypot(0.006, 0.7))
+    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(0.05, 10.0))
     # Common rotations are one Gaussian, whatever the tail of their draws.
     assert rows[COMMON, "pitch"].tail_997 == GAUSSIAN_997 < rows[NEA, "pitch"].tail_997
     # The added part has no tail of its own; with next to all of the variance it leaves next to
     # nothing of the tail.
     assert GAUSSIAN_997 < rows[REST, "pitch"].tail_997 < GAUSSIAN_997 + 0.01
     assert rows[REST, "pitch"].if_model_holds_arcsec == 0.006 and rows[REST, "pitch"].inflated
-    assert "pattern over radius" in rows[REST, "pitch"].conditions
-    assert rows[COMMON, "pitch"].inflated == (factor > 1.0) and not rows[NEA, "pitch"].inflated
-    if factor > 1.0:
-        return
-    assert any(REST in note and "Inflated" in note for note in made_of.notes)
+    assert "with effects (field)" in rows[REST, "pitch"].conditions
+    assert not rows[COMMON, "pitch"].inflated and not rows[NEA, "pitch"].inflated
+    assert any(REST in note and "effects (field)" in note for note in made_of.notes)
     # A file of the version before has the sigma of inflated rows alone.
     made_of.save(tmp_path / "budget.csv")
     older = pd.read_csv(tmp_path / "budget.csv", dtype=str, keep_default_na=False).drop(
@@ -349,56 +344,6 @@ def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor
         (REST, axis) for axis in ("pitch", "yaw", "roll")
     ]
     assert read[0].if_model_holds_arcsec == 0.006
-
-
-def score(model: str, rejected: bool, common: Any, rest: Any, preferred: float = 0.0) -> Any:
-    return SimpleNamespace(
-        model=model, rejected=rejected, common_arcsec=common, rest_arcsec=rest, preferred=preferred
-    )
-
-
-def comparison(rejected: bool, preferred: float = 0.0) -> Any:
-    scores = [
-        score("brown3", False, (9.0, 0.1, 0.0), (0.001, 0.02, 0.0), preferred),
-        score("brown", rejected, (0.0,) * 3, (0.0,) * 3),
-        score("none", True, (99.0,) * 3, (99.0,) * 3),
-    ]
-    return SimpleNamespace(
-        scores=tuple(scores),
-        fitted="brown",
-        share=1.0,
-        of=lambda name: next(s for s in scores if s.model == name),
-    )
-
-
-def test_models_count_as_far_as_the_data_prefer_them() -> None:
-    found = with_misfit(attitude(), diagnosis(comparison=comparison(False)), POST, OBS).misfit  # type: ignore[arg-type]
-    assert not found.common_arcsec.any() and not found.rest_arcsec.any() and not found.reasons
-    # Beside the error, where it exceeds the standard deviation.
-    assert found.choice_models == ("brown3",)
-    assert found.choice_common_arcsec.tolist() == [9.0, 0.0, 0.0]
-    assert found.choice_rest_arcsec.tolist() == [0.0, 0.02, 0.0]
-    half: Any = diagnosis(comparison=comparison(False, preferred=0.25))
-    found = with_misfit(attitude(), half, POST, OBS).misfit
-    np.testing.assert_allclose(found.common_arcsec, [4.5, 0.05, 0.0])
-    np.testing.assert_allclose(found.choice_common_arcsec, [9.0 * 0.75**0.5, 0.0, 0.0])
-    assert "brown3" in found.common_reasons[0] and "none" not in found.common_reasons[0]
-    worse = with_misfit(attitude(), diagnosis(comparison=comparison(True)), POST, OBS).misfit  # type: ignore[arg-type]
-    assert worse.common_arcsec.tolist() == [9.0, 0.1, 0.0] and worse.rest_arcsec.tolist() == [
-        0.001,
-        0.02,
-        0.0,
-    ]
-
-
-def test_frames_that_disagree_multiply_both_calibration_rows() -> None:
-    flagged = SimpleNamespace(ratio=np.array([1.0, 1.5]), p_values=np.array([0.5, 1e-6]))
-    rows = {(row.name, row.axis): row for row in made(misfit=diagnosis(jackknife=flagged)).rows}
-    assert rows[COMMON, "pitch"].sigma_arcsec == pytest.approx(1.5 * 4.8)
-    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(1.5 * 0.05)
-    assert not rows[NEA, "pitch"].inflated
-    chance = SimpleNamespace(ratio=np.array([1.0, 1.5]), p_values=np.array([0.5, 0.1]))
-    assert not any(row.inflated for row in made(misfit=diagnosis(jackknife=chance)).rows)
 
 
 def test_reasons_that_differ_in_numbers_alone_are_told_once() -> None:
@@ -582,7 +527,7 @@ def complete(limit: float, judged_by: str = "both") -> str:
 def test_met_only_if_everything_is_assessed(tmp_path: Path) -> None:
     path = tmp_path / "complete.toml"
     path.write_text(complete(30.0), encoding="utf-8")
-    found = made(path, misfit=diagnosis())
+    found = made(path, misfit=NOTHING_FOUND)
     assert found.outcomes[0].verdict == "met" and not found.not_assessed and not found.violations
     assert "is met" in found.outcomes[0].text
     assert not any(entry.at_least for entry in found.totals)
@@ -597,7 +542,7 @@ def test_what_judges_decides_where_rule_and_sampling_disagree(
     # 6.6 arcsec of noise whose sigma varies: 19.6 by the rule, 21.1 by sampling.
     path = tmp_path / "complete.toml"
     path.write_text(complete(20.2, judged_by), encoding="utf-8")
-    assert made(path, misfit=diagnosis(), n_samples=200_000).outcomes[0].verdict == verdict
+    assert made(path, misfit=NOTHING_FOUND, n_samples=200_000).outcomes[0].verdict == verdict
 
 
 @pytest.fixture(scope="module")
@@ -605,7 +550,7 @@ def resolved(tmp_path_factory: pytest.TempPathFactory) -> Budget:
     """A budget at a confidence that the samples just resolve."""
     path = tmp_path_factory.mktemp("resolved") / "complete.toml"
     path.write_text(complete(60.0).replace("0.997", "0.999"), encoding="utf-8")
-    return made(path, misfit=diagnosis(), n_samples=20_000)
+    return made(path, misfit=NOTHING_FOUND, n_samples=20_000)
 
 
 @pytest.mark.usefixtures("unpainted")
@@ -624,7 +569,7 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
 ) -> None:
     path = tmp_path / "complete.toml"
     path.write_text(complete(limit, judged_by).replace("0.997", "0.9999999"), encoding="utf-8")
-    found = made(path, misfit=diagnosis(), n_samples=20_000)
+    found = made(path, misfit=NOTHING_FOUND, n_samples=20_000)
     outcome = found.outcomes[0]
     assert outcome.verdict == verdict
     assert math.isnan(outcome.total.sampled_arcsec) and math.isnan(outcome.total.sampled_se_arcsec)
@@ -698,7 +643,7 @@ def test_totals_answer_to_the_labels_of_the_tables(label: str, axis: str) -> Non
 
 
 def test_csv_is_lossless(stated: Path, tmp_path: Path) -> None:
-    found = made(stated, misfit=diagnosis(pattern(0.02, 1e-6)))
+    found = made(stated, misfit=NOTHING_FOUND)
     found.save(tmp_path / "budget.csv")
     back = Budget.load(tmp_path / "budget.csv")
     for name in ("rows", "totals", "outcomes", "confidence", "title", "notes", "provenance"):
@@ -859,7 +804,7 @@ def test_the_report_gets_one_name(stated: Path) -> None:
 
 
 def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Path) -> None:
-    found = made(stated, misfit=diagnosis())
+    found = made(stated, misfit=NOTHING_FOUND)
     figure = found.plot.contributors()
     left, right = figure.axes
     labels = [text.get_text() for text in left.get_yticklabels()]
@@ -951,9 +896,7 @@ def test_the_budget_of_a_run_is_written_to_its_folder(full: Any, stated: Path) -
     )
 
 
-def test_a_diagnosed_run_is_inflated_or_says_that_nothing_was_found(
-    full: Any, tmp_path: Path
-) -> None:
+def test_a_diagnosed_run_is_assessed(full: Any, tmp_path: Path) -> None:
     shutil.copytree(full.path, tmp_path / "run")
     sc.Run(tmp_path / "run").diagnose(n_starts=0)
     assert not any("not tested" in note for note in sc.Run(tmp_path / "run").budget().notes)
@@ -979,28 +922,27 @@ def test_rows_of_the_posterior_to_every_field() -> None:
     """
     held = attitude().if_model_holds_arcsec[:, :3]
     correlation = np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
+    common, rest = held[1], held[2]
+    sigmas = [np.hypot(common, [1.0, 0.0, 0.1]), np.hypot(rest, [0.1, 0.02, 0.3]), held[0], held[4]]
     error = attitude(
         covariance_arcsec2=held[:, :, None] * held[:, None] * correlation,
-        misfit=MisfitFound(
-            1.3, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.02, 0.3]), ("why one",), ("a", "b")
-        ),
+        misfit=with_effects(*sigmas[:2], "field", "frame"),
         rest_constant_arcsec=np.array([0.0043, 0.0042, 0.0]),
         alignment="12 frames of sky",
         alignment_covariance_arcsec2=np.outer([0.1, 0.2, 0.3], [0.1, 0.2, 0.3]) * correlation,
     )
-    common, rest = 1.3 * held[1], 1.3 * held[2]
-    sigmas = [np.hypot(common, [1.0, 0.0, 0.0]), np.hypot(rest, [0.0, 0.02, 0.3]), held[0], held[4]]
     tails = [None, np.full(3, 3.9), np.full(3, 3.2), None]
+    found = "; with effects (field and frame)"
     names = [
-        (COMMON, "bias", "ensemble", "yes", 1.3, "; inflated: why one"),
-        (REST, "FOV spatial", "mixed", "no", 1.3, "; inflated: a; b"),
-        (NEA, "temporal noise (NEA)", "temporal", "no", 1.0, ""),
-        (INTERACTION, "temporal noise (NEA)", "mixed", "no", 1.0, ""),
+        (COMMON, "bias", "ensemble", "yes", found),
+        (REST, "FOV spatial", "mixed", "no", found),
+        (NEA, "temporal noise (NEA)", "temporal", "no", ""),
+        (INTERACTION, "temporal noise (NEA)", "mixed", "no", ""),
     ]
     expected = []
-    for place, (name, group, kind, absorbed, factor, why) in zip((1, 2, 0, 4), names, strict=True):
+    for place, (name, group, kind, absorbed, why) in zip((1, 2, 0, 4), names, strict=True):
         index = len(expected) // 3
-        sigma, own = sigmas[index], factor * held[place]
+        sigma, own = sigmas[index], held[place]
         for i, axis in enumerate(AXES):
             line = [
                 1.0 if i == j else correlation[i, j] * own[i] * own[j] / sigma[i] / sigma[j]
@@ -1042,9 +984,9 @@ def test_rows_of_the_posterior_to_every_field() -> None:
                 source="posterior",
             )
         )
-    found = [*posterior_rows(error, POST), *alignment_rows(error)]  # type: ignore[arg-type]
-    assert len(found) == len(expected) == 15
-    for one, other in zip(found, expected, strict=True):
+    rows = [*posterior_rows(error, POST), *alignment_rows(error)]  # type: ignore[arg-type]
+    assert len(rows) == len(expected) == 15
+    for one, other in zip(rows, expected, strict=True):
         for field in dataclasses.fields(Contributor):
             value, wanted = getattr(one, field.name), getattr(other, field.name)
             number = isinstance(wanted, (float, tuple))
@@ -1062,14 +1004,8 @@ def test_rows_of_the_posterior_to_every_field() -> None:
     first = posterior_rows(plain, nameless)[6]  # type: ignore[arg-type]
     assert (first.axis_correlation, first.tail_997, first.sigma_arcsec) == ((), GAUSSIAN_997, 0.0)
     assert first.provenance == "posterior of 1 draw"
-    assert misfit_notes(error) == (
-        f"Inflated by what the tests of the model found: {COMMON!r} and {REST!r}.",
-    )
-    quiet = MisfitFound(1.0, np.zeros(3), np.zeros(3), notes=("more",))
-    assert (
-        len(misfit_notes(attitude(misfit=quiet))) == 2
-        and misfit_notes(attitude(misfit=quiet))[1] == "more"
-    )
+    assert "effects (field and frame)" in misfit_notes(error)[0]
+    assert "no further effects" in misfit_notes(attitude(misfit=with_effects(common, rest)))[0]
 
 
 def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1112,9 +1048,8 @@ def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.Monke
     missing = [entry.name + partly.get(entry.name, "") for entry in (UNTESTED, *FROM_FILE[1:])]
     assert found.notes == (
         "After alignment: an alignment calibration on the frames themselves.",
-        "The model was not tested: the calibration rows hold if the model holds, and what they "
-        "are with the misfit "
-        "found is not assessed (run `starcal-uq diagnose RUN`).",
+        "The model was not tested, or what was found could not be fitted: the calibration rows hold "
+        "if the model holds, and what they are with the misfit found is not assessed (run `starcal-uq diagnose RUN`).",
         f"Not assessed, and in no total: {', '.join(missing[:-1])} and {missing[-1]}. The totals "
         "say at least how "
         "large the error is.",
@@ -1123,7 +1058,7 @@ def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.Monke
         "after alignment, and not at all where these would violate a requirement.",
     )
     # A misfit that the attitude error holds is not found again.
-    tested = attitude(misfit=MisfitFound(1.0, np.zeros(3), np.zeros(3)))
+    tested = attitude(misfit=with_effects(np.zeros(3), np.zeros(3)))
     twice = budget(POST, OBS, tested, misfit=object(), n_samples=10_000)  # type: ignore[arg-type]
     assert UNTESTED.name not in {row.name for row in twice.rows}
     with pytest.raises(BudgetError, match=r"n_samples is 9999, too few .* use at least 10000\."):

@@ -15,7 +15,8 @@ import starcal_uq as sc
 from benchmarks import regimes
 from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.diagnostics.misfit import ALPHA, Misfit, _Columns, misfit_tests
+from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
+from starcal_uq.diagnostics.shape_sums import _Columns
 from starcal_uq.diagnostics.verdict.estimate import misfit
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import View, shapes
@@ -298,7 +299,7 @@ def test_parts_of_the_table_give_the_same_sums(monkeypatch):
     obs = observations(n_frames=60)
     cal = sc.calibrate(obs, sc.paper.paper_start())
     whole = misfit_tests(obs, cal)
-    monkeypatch.setattr("starcal_uq.diagnostics.misfit._STARS_AT_ONCE", 100)
+    monkeypatch.setattr("starcal_uq.diagnostics.shape_sums._STARS_AT_ONCE", 100)
     parts = misfit_tests(obs, cal)
     assert len(StarFrames.from_observations(obs).parts(100)) > 5
     for a, b in zip(whole.tests, parts.tests, strict=True):

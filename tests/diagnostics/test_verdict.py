@@ -15,7 +15,6 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Check, Code, Level, Question
 from starcal_uq.diagnostics.diagnose import diagnose
 from starcal_uq.diagnostics.models import REJECT_P
-from starcal_uq.diagnostics.pattern import Pattern
 from starcal_uq.diagnostics.residuals import (
     bin_residuals,
     normalised_residuals,
@@ -28,10 +27,13 @@ from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.diagnostics.verdict.observed import OUTLIER_P, PATTERN_P
 from starcal_uq.inference.checks import check_draws
+from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.presentation.report.tables import mean_to_mcse
 from starcal_uq.presentation.sentences.observed import aberration_words
 from starcal_uq.presentation.words.diagnostics import sensitivity
-from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
+from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.propagation.onboard import Extended
+from starcal_uq.propagation.onboard_error import OnboardError
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import camera, observations, with_sigmas
 
@@ -244,18 +246,14 @@ class TestDiagnosis:
         # The same shapes, once the fit has taken up so much of them that a parameter is off.
         for taken, level in ((0.5, Level.WARN), (2.0, Level.FAIL)):
             changed = self.reject(found, "error with the pixel phase in x", 1e-9)
-            pattern = Pattern(
-                families=("error with the pixel phase in x",),
-                directions=np.zeros((4, 1)),
-                amplitudes=np.ones(1),
-                covariance=np.zeros((1, 1)),
-                parameters=taken * run.cal.sigmas[None] * np.array([0.0, 1.0, 0.0, 0.0, 0.0]),
-                frame_covariance=np.zeros((3, 3)),
-                variance=1.0,
+            theta = run.cal.theta - taken * run.cal.sigmas * np.array([0.0, 1.0, 0.0, 0.0, 0.0])
+            extended = Extended(
+                run.cal.camera.with_theta(theta),
+                run.cal.covariance,
+                Effects((), True, (), 0.0),
+                run.cal.provenance,
             )
-            changed = dataclasses.replace(
-                changed, misfit=dataclasses.replace(changed.misfit, pattern=pattern)
-            )
+            changed = dataclasses.replace(changed, extended=extended)
             check = self.check(run, changed, "Unexplained structure")
             assert check.level is level and f"y0 by {significant(taken)}" in check.sentence
 
@@ -481,7 +479,8 @@ def test_limits_name_the_largest_term_and_the_coupling(run):
         "what remains is 0.020 arcsec if the model holds (with the misfit found: not assessed)"
         in sentences[0]
     )
-    found = MisfitFound(1.0, np.zeros(3), np.array([0.5, 0.5, 7.0]))
+    parts = error.common_arcsec, np.array([0.5, 0.5, 7.0]), np.array([5.5, 5.5, 7.0])
+    found = OnboardError("model", *parts, ())
     tested = limits(run.obs, run.cal, attitude=dataclasses.replace(error, misfit=found))[0]
     assert "what remains is 0.50 arcsec with the misfit found (0.020 if the model holds)" in tested
     assert "k1 trades against k2" in sentences[1] or "f trades against" in sentences[1]

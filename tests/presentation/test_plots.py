@@ -39,7 +39,8 @@ from starcal_uq.presentation.figures.inference import (
 from starcal_uq.presentation.figures.propagation import plot_attitude, plot_field_map
 from starcal_uq.presentation.figures.scales import axis_scale, symbol
 from starcal_uq.presentation.figures.style import figure_of, new_figure, panels, png_bytes
-from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
+from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.propagation.onboard_error import OnboardError
 from tests.helpers.scenes import camera, nominal, observations
 
 ROOT = Path(__file__).parents[2]
@@ -253,12 +254,11 @@ def test_attitude_bars(errors):
 
 def test_attitude_bars_are_with_the_misfit_found_and_lines_if_the_model_holds(errors):
     attitude, _ = errors
-    found = MisfitFound(2.0, np.array([3.0, 0.0, 0.0]), np.array([0.5, 0.1, 0.0]))
+    parts = np.array([[12.0, 11.0, 0.2], [0.5, 0.1, 0.4], [12.0, 11.0, 0.5]])
+    found = OnboardError("model", *parts, ())
     ax = plot_attitude(dataclasses.replace(attitude, misfit=found))
     bars = np.array([bar.get_height() for bar in ax.patches])
-    assert bars[3] == pytest.approx(np.hypot(2.0 * 5.4, 3.0)) and bars[6] == pytest.approx(
-        np.hypot(0.04, 0.5)
-    )
+    assert bars[3] == pytest.approx(12.0) and bars[6] == pytest.approx(0.5)
     lines = [line.get_ydata()[0] for line in ax.lines]
     assert lines == pytest.approx([0.5, 0.5, 7.0, 5.4, 5.5, 0.1, 0.02, 0.02, 0.2])
     drawn(ax)

@@ -25,7 +25,8 @@ from starcal_uq.presentation.report.drawing import FIGURES, Ahead, draw_figures
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.summary import terminal_summary, verdict_lines
 from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, weak_directions
-from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
+from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.propagation.onboard_error import EffectError, OnboardError
 from tests.helpers.scenes import camera, nominal, observations
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -555,10 +556,14 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
 
 @pytest.mark.usefixtures("unpainted")
 def test_every_place_shows_the_same_two_figures_under_the_same_two_names(unrecorded, capsys):
-    found = MisfitFound(
-        1.3, np.array([0.7, 0.3, 0.02]), np.array([0.52, 0.41, 7.3]), ("test",), ("test",)
+    error = AttitudeError.load(unrecorded.attitude)
+    parts = (
+        np.hypot(1.3 * error.common_arcsec, [0.7, 0.3, 0.02]),
+        np.hypot(1.3 * error.rest_arcsec, [0.52, 0.41, 7.3]),
     )
-    error = dataclasses.replace(AttitudeError.load(unrecorded.attitude), misfit=found)
+    effects = (EffectError("field", *parts),)
+    found = OnboardError("model", *parts, np.hypot(*parts), effects)
+    error = dataclasses.replace(error, misfit=found)
     error.save(unrecorded.attitude)
     sc.Run(unrecorded.path).budget()
     wanted = both_figures(error)

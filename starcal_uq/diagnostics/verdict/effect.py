@@ -21,14 +21,14 @@ from starcal_uq.likelihood.shapes import IN_FIELD
 
 if TYPE_CHECKING:
     from starcal_uq.core.types import FloatArray
-    from starcal_uq.diagnostics.misfit import MisfitTest
-    from starcal_uq.diagnostics.pattern import Pattern
+    from starcal_uq.diagnostics.misfit_test import MisfitTest
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.onboard import Extended
 
-# What keeps its place in the field bends directions; so does a scale of each frame's own, whose
-# mean no frame shows.
-_BENDING = (*IN_FIELD, "frame")
+# Effects that bend directions: what keeps its place in the field, and a scale of each frame's own,
+# whose mean no frame shows.
+_BENDING = {"axes", "field", "frame", "zenith"}
 
 
 @dataclass(frozen=True)
@@ -66,28 +66,29 @@ def on_directions(noncentrality: float, n_parameters: int) -> Effect:
     )
 
 
-def of_pattern(
-    pattern: Pattern | None, found: Sequence[MisfitTest], cal: Calibration
+def of_misfit(
+    extended: Extended | None, found: Sequence[MisfitTest], cal: Calibration
 ) -> list[Effect]:
-    """Effects on parameters and directions of a pattern, and of these tests, which rejected.
-
-    Where there is no pattern, as in a diagnosis of an earlier version, the tests stand for it.
+    """Effects on parameters and directions of the effects that the data would take up; of these
+    tests, which rejected, where that is not known.
     """
-    effects, absorbed = [], 0.0
-    if pattern is not None and pattern.amplitudes.size:
-        taken = pattern.parameters / cal.sigmas
-        shifts = taken.T @ pattern.products @ taken
-        sizes = np.sqrt(np.maximum(np.diag(shifts), 0.0))
-        worst = int(np.argmax(sizes))
-        effects.append(Effect(cal.parameter_names[worst], float(sizes[worst])))
-        weight = np.linalg.pinv(cal.covariance / np.outer(cal.sigmas, cal.sigmas), hermitian=True)
-        absorbed = float(np.sum(weight * shifts))
-    fitted = pattern.families if pattern is not None else ()
-    bending = [
-        test for test in found if test.against in _BENDING and (not fitted or test.name in fitted)
-    ]
-    seen = max((_noncentrality(test) for test in bending), default=0.0)
-    return [*effects, on_directions(absorbed + seen, len(cal.theta))]
+    if extended is not None:
+        moved = (extended.mean - cal.theta) / cal.sigmas
+        weight = np.linalg.pinv(cal.correlation, hermitian=True)
+        names, sizes = cal.parameter_names, np.abs(moved)
+        bent = sum(e.gain_nat for e in extended.effects.fitted if e.name in _BENDING)
+        # A gain of one nat is what a displacement gives whose square is two units of the noise.
+        seen = float(moved @ weight @ moved) + 2.0 * bent
+    else:
+        names = tuple(test.moved_name for test in found)
+        own, errors = (
+            np.array([getattr(t, f"moved_{n}") for t in found]) for n in ("sigma", "std")
+        )
+        sizes = np.sqrt(np.maximum(np.nan_to_num(own**2 - errors**2), 0.0))
+        bending = [test for test in found if test.against in (*IN_FIELD, "frame")]
+        seen = max((_noncentrality(test) for test in bending), default=0.0)
+    worst = int(np.argmax(sizes))
+    return [Effect(names[worst], float(sizes[worst])), on_directions(seen, len(cal.theta))]
 
 
 def _noncentrality(test: MisfitTest) -> float:
@@ -100,23 +101,23 @@ def _noncentrality(test: MisfitTest) -> float:
 
 
 def on_attitudes(error: AttitudeError | None) -> list[Effect]:
-    """Effects of what the tests of a model have added to the attitude error; none where it was not
-    propagated.
+    """Effects of what the tests of a model have added to the attitude error; none where that is not
+    assessed.
 
     A frame's attitude is stated to err by noise and by the rest, against which the rest of the
     misfit is held.
     """
     if error is None or error.misfit is None:
         return []
+    found, nea = error.misfit, error.nea_arcsec
     pairs = (
-        ("the common rotation", error.misfit.common_arcsec, error.common_arcsec),
-        (
-            "a frame’s attitude",
-            error.misfit.rest_arcsec,
-            np.hypot(error.nea_arcsec, error.rest_arcsec),
-        ),
+        ("the common rotation", found.common_arcsec, error.common_arcsec, 0.0 * nea),
+        ("a frame’s attitude", found.rest_arcsec, error.rest_arcsec, nea),
     )
-    return [_worst_axis(name, added, stated) for name, added, stated in pairs]
+    return [
+        _worst_axis(name, np.sqrt(np.maximum(every**2 - held**2, 0.0)), np.hypot(held, noise))
+        for name, every, held, noise in pairs
+    ]
 
 
 def _worst_axis(name: str, added: FloatArray, stated: FloatArray) -> Effect:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,7 +26,7 @@ from starcal_uq.diagnostics.predictive import EXTREME_P
 from starcal_uq.diagnostics.verdict.effect import (
     Effect,
     largest,
-    of_pattern,
+    of_misfit,
     on_attitudes,
     on_directions,
 )
@@ -48,13 +47,15 @@ if TYPE_CHECKING:
     from starcal_uq.core.types import FloatArray
     from starcal_uq.diagnostics.diagnose import Diagnosis, MultiStart
     from starcal_uq.diagnostics.jackknife import Jackknife
-    from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
+    from starcal_uq.diagnostics.misfit import Misfit
+    from starcal_uq.diagnostics.misfit_test import MisfitTest
     from starcal_uq.diagnostics.models import ModelComparison
     from starcal_uq.diagnostics.predictive import PredictiveCheck
     from starcal_uq.diagnostics.stars import StarTest
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.onboard import Extended
 
 # False alarms by design. A run whose model holds is warned of in at most 5 % of cases and failed in
 # at most 1 %: the sizes of all checks that ask noise a question (these, and PATTERN_P and
@@ -204,7 +205,7 @@ def model_checks(
     better = None if diagnosis.comparison is None else diagnosis.comparison.better
     moving = EFFECTS if _OF_FRAMES_APART & set(diagnosis.effects) else ()
     checks = [
-        misfit(diagnosis.misfit, cal, attitude, better, diagnosis.effects),
+        misfit(diagnosis.misfit, cal, attitude, better, diagnosis.extended),
         even_noise(diagnosis.misfit, EFFECTS if diagnosis.effects else ()),
     ]
     checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
@@ -231,10 +232,10 @@ def misfit(
     cal: Calibration,
     attitude: AttitudeError | None = None,
     better: str | None = None,
-    effects: Sequence[str] = (),
+    extended: Extended | None = None,
 ) -> Check:
     """Is there structure in the residuals, and does it do more than is stated? `better` as for
-    `lens_remedy`; `effects` are those that the data would take up.
+    `lens_remedy`; `extended` has the effects that the data would take up.
     """
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
     facts: AnyDict = {"p_value": min(patterns, default=1.0), "n_tests": len(found.tests)}
@@ -242,8 +243,7 @@ def misfit(
     rejected = [test for test in found.found(MISFIT_P) if not test.is_of_noise]
     if not rejected:
         return Check(code, facts, bounds=bounds)
-    booked = on_attitudes(attitude) if found.pattern is not None and found.pattern.families else []
-    effect = largest([*of_pattern(found.pattern, rejected, cal), *booked])
+    effect = largest([*of_misfit(extended, rejected, cal), *on_attitudes(attitude)])
     facts["tests"] = tuple((test.name, test.p_holm, test.size_px) for test in rejected)
     facts |= effect.facts | _hardly_told(rejected[0])
     level = effect.level if min(patterns) < MISFIT_FAIL_P else Level.WARN
@@ -252,8 +252,8 @@ def misfit(
     orders: tuple[Order, ...] = (Order(_NOT_OF_THE_LENS.get(rejected[0].against, _OF_FRAMES)),)
     if any(t.against in IN_FIELD for t in rejected):
         remedies, orders = lens_remedy(cal.camera.distortion, better)
-    if effects:
-        facts["effects"] = tuple(effects)
+    if extended is not None:
+        facts["effects"] = extended.effects.names
         remedies, orders = EFFECTS + remedies, ()
     return Check(code, facts, level, bounds, remedies, orders)
 

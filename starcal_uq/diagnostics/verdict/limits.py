@@ -12,7 +12,6 @@ from starcal_uq.core.findings import Finding
 from starcal_uq.diagnostics.residuals import bin_residuals
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.observed import PATTERN_P
-from starcal_uq.propagation.attitude_error import choice
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -46,7 +45,7 @@ def limits(
     """What limits the result, the most important first."""
     found = [_systematic(obs, cal)]
     found += [_structure(cal, diagnosis)] if diagnosis is not None else []
-    found += [*choice(attitude), _attitude(attitude)] if attitude is not None else []
+    found += [_attitude(attitude)] if attitude is not None else []
     found += [_coupled(coupling)] if coupling is not None else []
     return tuple(one for one in found if one is not None)
 

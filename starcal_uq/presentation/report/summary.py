@@ -25,7 +25,6 @@ from starcal_uq.propagation.attitude_error import (
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
     WITH_MISFIT_FOUND,
-    choice,
 )
 
 if TYPE_CHECKING:
@@ -322,8 +321,6 @@ def terminal_summary(results: Results) -> list[str]:
         untested = f"{IF_MODEL_HOLDS}; {WITH_MISFIT_FOUND}: {NOT_ASSESSED}"
         differ = f"{WITH_MISFIT_FOUND}; in brackets {IF_MODEL_HOLDS}, where that differs"
         lines.append(f"  {untested if error.misfit is None else differ}")
-        for other in choice(error):
-            lines += _wrapped(other.sentence, "  ")
     if (budget := results.budget) is not None:
         table = budget_summary(budget)
         lines.append(

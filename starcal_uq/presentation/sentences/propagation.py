@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from starcal_uq.core.formatting import join_words, significant
-from starcal_uq.core.status import Note
+from starcal_uq.core.formatting import significant
 from starcal_uq.diagnostics.verdict.limits import Limit
 from starcal_uq.presentation.sentences.table import SENTENCES, entry
 from starcal_uq.propagation.attitude_error import (
-    CHOICE_OF_MODEL,
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
     WITH_MISFIT_FOUND,
@@ -43,24 +39,6 @@ def two_figures(with_misfit_found: float, if_model_holds: float) -> str:
         f"{held} arcsec"
         if found == held
         else f"{found} arcsec {WITH_MISFIT_FOUND} ({held} {IF_MODEL_HOLDS})"
-    )
-
-
-@entry(Note.CHOICE_OF_MODEL)
-def _choice(
-    models: Sequence[str], common_arcsec: tuple[float, float], rest_arcsec: tuple[float, float]
-) -> str:
-    """Sizes are those across the boresight and in roll."""
-    verb = "predicts" if len(models) == 1 else "predict"
-    moved = []
-    for what, pair in (("the common rotation", common_arcsec), ("the rest", rest_arcsec)):
-        sizes = zip(pair, ("across the boresight", "in roll"), strict=True)
-        stated = [f"{significant(size)} arcsec {where}" for size, where in sizes if size > 0.0]
-        moved += [f"{what} by up to {join_words(stated)}"] if stated else []
-    return (
-        f"{CHOICE_OF_MODEL[0].upper()}{CHOICE_OF_MODEL[1:]}, in none of these errors: "
-        f"{join_words([repr(name) for name in models])} {verb} about as well as the fitted model, "
-        f"and would move {', '.join(moved)}."
     )
 
 

@@ -23,14 +23,11 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.sentences.propagation import two_figures
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import (
-    CHOICE_OF_MODEL,
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
     WITH_MISFIT_FOUND,
     Agreement,
     AttitudeError,
-    MisfitFound,
-    choice,
 )
 from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
@@ -98,31 +95,23 @@ def one_number_sentence(error: AttitudeError) -> str:
 
 
 def misfit_sentence(error: AttitudeError, place: Place | None = None) -> str:
-    """What the tests of the model added, or the command that makes them for the run."""
+    """What the tests of the model mean for the errors, or the command that makes them."""
     if error.misfit is None:
         tests = Remedy("diagnose", (RUN,))
         return (
             f"What the errors are {WITH_MISFIT_FOUND} is {NOT_ASSESSED}: the model was not tested "
-            f"(`{(tests if place is None else place.of(tests)).command}`)."
+            f"(`{(tests if place is None else place.of(tests)).command}`), or what was found could "
+            "not be fitted."
         )
-    others = (one.sentence for one in choice(error))
-    return " ".join(filter(None, (_found_sentence(error.misfit), *others)))
-
-
-def _found_sentence(found: MisfitFound) -> str:
-    if not found.reasons:
+    if error.variants or not error.misfit.effects:
         return (
-            f"The tests of the model found nothing: an error {WITH_MISFIT_FOUND} is that "
-            f"{IF_MODEL_HOLDS}."
+            "The tests of the model ask for no further effects: an error "
+            f"{WITH_MISFIT_FOUND} is that {IF_MODEL_HOLDS}."
         )
-    common, rest = found.common_reasons, found.rest_reasons
-    parts = (
-        ("common rotation", [reason for reason in common if reason not in rest]),
-        ("rest", [reason for reason in rest if reason not in common]),
-        ("common rotation and the rest", [reason for reason in common if reason in rest]),
-    )
-    return " ".join(
-        f"Found for the {name}: {'; '.join(reasons)}." for name, reasons in parts if reasons
+    names = join_words([effect.name for effect in error.misfit.effects])
+    return (
+        f"The data ask for effects ({names}): an error {WITH_MISFIT_FOUND} is that of the calibrated "
+        "camera if the one with these effects is right."
     )
 
 
@@ -194,8 +183,6 @@ def attitude_table(error: AttitudeError) -> TextTable:
         once = error.misfit is None or figures[0][1:] == figures[1][1:]
         rows.append((str(contributor), *(figures[1][1:-1] if once else [""] * 5), str(words)))
         rows += [] if once else figures
-        if (choice := error.choice_of_model_arcsec[place]).any() and error.misfit is not None:
-            rows.append((f"  {CHOICE_OF_MODEL}", *(significant(v) for v in choice), "", ""))
     heads = ("contributor", *TOTAL_AXES, "two-axis 95 %", "absorbed by alignment")
     which = f", {IF_MODEL_HOLDS}" if error.misfit is None else ""
     return TextTable(heads, tuple(rows), f"Attitude error, arcsec, 1 sigma{which}", "lrrrrrl")

@@ -61,13 +61,13 @@ def with_misfit(run: StoredRun, error: AttitudeError) -> AttitudeError:
     diagnosis = run.diagnosis
     if diagnosis is None:
         return error
-    from starcal_uq.diagnostics import inflation
+    from starcal_uq.diagnostics import found
 
     if error.seen is None:
         mission = _frames_of(run.folder.mission) if run.has("mission") else run.observations
         aligned = _frames_of(run.folder.alignment) if run.has("alignment") else None
         error = replace(error, seen=mission, aligned=aligned)
-    return inflation.with_misfit(error, diagnosis, run.posterior, run.observations)
+    return found.with_misfit(error, diagnosis, run.posterior, run.observations)
 
 
 def _frames_of(path: Path) -> Observations:
