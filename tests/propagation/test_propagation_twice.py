@@ -5,8 +5,8 @@ responses by differences.
 from __future__ import annotations
 
 import dataclasses
-import json
 import inspect
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
