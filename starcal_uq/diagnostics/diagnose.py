@@ -43,7 +43,6 @@ from starcal_uq.diagnostics.times import (
 from starcal_uq.diagnostics.verdict.observed import terms
 from starcal_uq.estimation.effects import with_effects
 from starcal_uq.estimation.fit import fit
-from starcal_uq.estimation.prediction import effects_about
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.ties import without_ties
 from starcal_uq.estimation.weights import by_noise_model, weighed
@@ -242,7 +241,7 @@ def extended(obs: Observations, cal: Calibration, misfit: Misfit) -> tuple[Exten
         return None, not bent
     if made.effects is None or not made.effects.fitted:
         return None, True
-    effects = effects_about(made, made.theta, made.covariance)
+    effects = made.effects.about(made.compressed, np.zeros(len(made.theta)), made.covariance)
     return Extended(made.camera, made.covariance, effects, made.provenance), True
 
 

@@ -10,7 +10,7 @@ seen draws offsets of its own.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,13 +18,10 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, floats
-from starcal_uq.likelihood.compressed import optimum
 from starcal_uq.likelihood.effects import corner_unit, pixels_of, place_effects
 from starcal_uq.likelihood.shapes import TIME_DEGREE, seconds_utc
-from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
-    from starcal_uq.estimation.result import Calibration
     from starcal_uq.likelihood.fitted_effects import Effects
 
 
@@ -119,26 +116,4 @@ def _known(values: tuple[float, float], name: str, names: tuple[str, ...]) -> tu
     raise CalibrationError(
         f"the calibration holds no effect {name!r}: calibrate with effects={name!r}, or leave it "
         "out of the question."
-    )
-
-
-def effects_about(cal: Calibration, mean: FloatArray, covariance: FloatArray) -> Effects:
-    """The effects of a calibration that has some, where its parameters have this mean (p,) and
-    covariance (p, p), px units; coefficients follow them as far as the data tie these together.
-
-    The covariance holds what is known of the scales, and no camera that flies needs the zeniths.
-    """
-    assert cal.effects is not None
-    effects = replace(
-        cal.effects, node_grams=np.zeros((0, 0, 0)), node_log_weights=np.zeros(0), zeniths=None
-    )
-    if not len(effects.coefficients):
-        return effects
-    best = optimum(cal.compressed).covariance
-    follow = scaled_inverse(best) @ effects.cross
-    return replace(
-        effects,
-        coefficients=effects.coefficients + (mean - cal.theta) @ follow,
-        covariance=effects.covariance + follow.T @ (covariance - best) @ follow,
-        cross=covariance @ follow,
     )

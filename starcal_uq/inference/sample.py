@@ -22,7 +22,6 @@ from starcal_uq.core.settings import Evaluation, LikelihoodName, Moves, bounded,
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress, floats
-from starcal_uq.estimation.prediction import effects_about
 from starcal_uq.estimation.undetermined import open_parameters
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.inference.checks import (
@@ -406,7 +405,8 @@ def _effects(cal: Calibration, theta: FloatArray) -> Effects | None:
     """The effects of a calibration beside draws (n, p) of the parameters."""
     if cal.effects is None or not cal.effects.fitted:
         return None
-    return effects_about(cal, theta.mean(axis=0), np.cov(theta, rowvar=False))
+    shift, covariance = theta.mean(axis=0) - cal.theta, np.cov(theta, rowvar=False)
+    return cal.effects.about(cal.compressed, shift, covariance)
 
 
 def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, FloatArray]:

@@ -9,10 +9,11 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.likelihood.compressed import CompressedLikelihood
+from starcal_uq.likelihood.compressed import CompressedLikelihood, optimum
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.shapes import Extent
 from starcal_uq.likelihood.zenith import Zeniths
+from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -200,6 +201,30 @@ class Effects(Shown):
         known = effects_of(obs, camera, zeniths=self.zeniths, extent=self.extent)
         names = [effect.name for effect in self.fitted]
         return [known[n] for n in names if n != "zenith" or self.zeniths is not None]
+
+    def about(
+        self, compressed: CompressedLikelihood, shift: FloatArray, covariance: FloatArray
+    ) -> Effects:
+        """The effects where the camera's parameters are off the best ones of their compressed
+        likelihood by (p,), with this covariance (p, p), px units: coefficients follow as far as the
+        data tie them to these.
+
+        The covariance holds what is known of the scales, and no camera that flies needs the
+        zeniths.
+        """
+        effects = replace(
+            self, node_grams=np.zeros((0, 0, 0)), node_log_weights=np.zeros(0), zeniths=None
+        )
+        if not len(effects.coefficients):
+            return effects
+        best = optimum(compressed).covariance
+        follow = scaled_inverse(best) @ effects.cross
+        return replace(
+            effects,
+            coefficients=effects.coefficients + shift @ follow,
+            covariance=effects.covariance + follow.T @ (covariance - best) @ follow,
+            cross=covariance @ follow,
+        )
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per effect, those not taken up with their gain alone."""
