@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from starcal_uq.budgeting.posterior import effect_rows, posterior_rows, without_effects
 from starcal_uq.budgeting.result import Budget
-from starcal_uq.budgeting.rows import COMMON, NEA, REST
+from starcal_uq.budgeting.rows import COMMON, NEA, OF_EFFECTS, REST
+from starcal_uq.core.settings import WEIGHING, EffectName
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.onboard_error import PARAMETERS, EffectError, OnboardError
 from tests.budgeting.test_budget import POST, attitude, made
@@ -127,6 +128,11 @@ def test_a_statement_of_the_file_replaces_what_was_computed(tmp_path) -> None:
     assert any(note.startswith(replaced) for note in budget.notes)
     twice = "'drift of focal length and distortion' is stated in the file, and 'thermo-elastic"
     assert any(note.startswith(twice) for note in budget.notes)
+
+
+def test_every_effect_that_shifts_stars_has_a_row_that_a_file_may_state() -> None:
+    assert set(OF_EFFECTS) == set(get_args(EffectName)) - set(WEIGHING)
+    assert len({entry.name for entry in OF_EFFECTS.values()}) == len(OF_EFFECTS)
 
 
 def test_an_attitude_error_without_shares_is_taken_whole() -> None:

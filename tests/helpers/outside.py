@@ -225,7 +225,7 @@ def through_air(c: Campaign, zeniths: np.ndarray, arcsec: float = 58.0) -> Campa
     """The same images with directions that lack `arcsec` tan z of refraction towards zeniths (K,
     3).
     """
-    zenith, r = zeniths[c.columns["frame"]], _directions(c)
+    zenith, r = zeniths[c.columns["frame"]], star_directions(c)
     sine = np.sum(r * zenith, axis=1, keepdims=True)
     # The way to the zenith is as long as the cosine of the altitude.
     return _redirected(c, r - np.radians(arcsec / 3600.0) * (zenith - sine * r) / sine)
@@ -235,10 +235,10 @@ def aberrated(c: Campaign, velocity_km_s: np.ndarray) -> Campaign:
     """The same images with directions that are aberrated by this velocity, ICRS axes; a negative
     one takes it off.
     """
-    return _redirected(c, _directions(c) + velocity_km_s / 299792.458)
+    return _redirected(c, star_directions(c) + velocity_km_s / 299792.458)
 
 
-def _directions(c: Campaign) -> np.ndarray:
+def star_directions(c: Campaign) -> np.ndarray:
     ra, dec = np.radians(c.columns["ra_deg"]), np.radians(c.columns["dec_deg"])
     return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
 
@@ -300,7 +300,7 @@ def attitude_errors(c: Campaign, theta: np.ndarray) -> np.ndarray:
         ideal = d / (1.0 + k1 * r2 + k2 * r2**2)
     b = np.column_stack([ideal.T, np.full(d.shape[1], f)])
     b /= np.linalg.norm(b, axis=1)[:, None]
-    r = _directions(c)
+    r = star_directions(c)
     errors = []
     for frame, truth in enumerate(c.attitudes):
         mine = c.columns["frame"] == frame
