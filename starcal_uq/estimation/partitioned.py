@@ -153,9 +153,9 @@ def _residuals(
     obs = reader.load(part) if beside is None else beside.cleared(rests)
     likelihood = MarginalLikelihood(obs, camera.distortion)
     whole, e = likelihood.frames, np.empty((2, obs.n_stars))
-    normal, attitudes = settled_sums(
-        whole, camera.distortion, theta, likelihood.start_rotations(theta), e
-    )
+    known = [rest.rotations for _, rest in rests]
+    start = np.concatenate(known) if known else likelihood.start_rotations(theta)
+    normal, attitudes = settled_sums(whole, camera.distortion, theta, start, e)
     if rests:
         frames = FrameNormals.joined([rest.normals(theta) for _, rest in rests])
         slopes, matrix = frames.slopes.sum(axis=0), frames.matrix

@@ -441,6 +441,14 @@ def test_effects_of_partitions_are_those_of_the_table(
     assert np.max(np.abs(sc.calibrate(obs, camera).theta - many.theta) / many.sigmas) > 0.5
 
 
+def test_clean_partitions_take_up_nothing_and_change_nothing(small) -> None:
+    _, camera, parts = small
+    plain, cal = sc.calibrate(parts, camera), sc.calibrate(parts, camera, effects="auto")
+    assert cal.effects is not None and not cal.effects.fitted and cal.effects.refused
+    np.testing.assert_array_equal(cal.theta, plain.theta)
+    np.testing.assert_array_equal(cal.covariance, plain.covariance)
+
+
 def test_effects_that_partitions_cannot_have_are_refused(moved, tmp_path: Path) -> None:
     obs, camera, parts = moved
     with pytest.raises(CalibrationError, match="effect 'star' needs all stars"):

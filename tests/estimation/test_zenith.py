@@ -188,3 +188,24 @@ def test_place_and_camera_are_covered() -> None:
     assert 0.75 < np.sqrt(np.mean(np.square(latitude))) < 1.35
     # Control: frames with scales and shears of their own do not cover the focal length.
     assert np.mean(np.abs(without) < 1.96) < 0.3
+
+
+def test_the_zenith_of_partitions_is_that_of_the_table(tmp_path) -> None:
+    c, _ = night(4, 15)
+    times = np.full(len(c.columns["frame"]), "2026-03-01T21:00:00")
+    obs = table(c, time_utc=times)
+    for name, ids in enumerate(np.array_split(obs.frame_ids, 3)):
+        obs.select_frames(ids).save(tmp_path / f"{name}.parquet")
+    parts = sc.observations.open_partitions(tmp_path)
+    one = sc.calibrate(obs, sheet(c), effects="auto")
+    many = sc.calibrate(parts, sheet(c), effects="auto")
+    assert one.effects is not None and many.effects is not None
+    assert one.effects.names == many.effects.names == ("zenith",)
+    # The moves of the zenith end within the gain that one has to bring.
+    assert np.max(np.abs(many.theta - one.theta) / one.sigmas) < 0.01
+    np.testing.assert_allclose(many.sigmas, one.sigmas, rtol=1e-3)
+    air, other = many.effects.air, one.effects.air
+    assert abs(air.latitude_deg - other.latitude_deg) < 0.05 * other.latitude_std_deg
+    assert air.density == pytest.approx(other.density, abs=0.05 * other.density_std)
+    # Control: without it f is too short.
+    assert (one.theta[2] - sc.calibrate(parts, sheet(c)).theta[2]) / one.sigmas[2] > 3.0
