@@ -189,8 +189,8 @@ JOBS = (
         (
             "new example -o .",
             f"run stars.ecsv camera.toml -o first --seed {{seed}} {SAMPLER}",
-            "run stars.ecsv camera.toml -o run --site site.toml --effects noise --screen --seed {seed}",
-            f"run stars.ecsv camera.toml -o json --site site.toml --effects tails --seed {{seed}} {SAMPLER} --json",
+            "run stars.ecsv camera.toml -o run --site site.toml --effects auto,noise --screen --seed {seed}",
+            f"run stars.ecsv camera.toml -o json --site site.toml --effects auto,tails --seed {{seed}} {SAMPLER} --json",
             "calibrate stars.ecsv camera.toml -o screened --site site.toml --screen",
             "report run --notebook --force",
         ),
@@ -200,7 +200,7 @@ JOBS = (
         (
             "new example -o example",
             f"run esa_tetra3_observations.csv {ESA} -o run --directions catalogue --site example/site.toml"
-            " --time 2019-07-29T20:47:26 --effects noise --seed {seed}",
+            " --time 2019-07-29T20:47:26 --effects auto,noise --seed {seed}",
             f"calibrate esa_tetra3_observations.csv {ESA} -o apparent --directions apparent"
             " --column ra_deg=ra_apparent_deg --column dec_deg=dec_apparent_deg --only-frames 0-5 --model k1",
         ),

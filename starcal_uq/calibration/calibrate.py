@@ -28,7 +28,7 @@ from starcal_uq.estimation.robust import with_tail_weights
 from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
 from starcal_uq.estimation.ties import with_ties
-from starcal_uq.estimation.weighing import with_weighing
+from starcal_uq.estimation.weighing import gains, with_weighing
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood import paths
 from starcal_uq.likelihood.fitted_effects import Effects
@@ -40,6 +40,8 @@ OWN_METHODS = ("efficient", "three_stage")
 _Stars = Observations | PartitionedObservations | Iterable[Observations]
 # Starting processes takes two seconds.
 _STARS_WORTH_PROCESSES = 1_000_000
+# Effects whose coefficients are those of the images of one frame or star.
+_OF_FEW_IMAGES = ("frame", "star")
 
 
 @bounded
@@ -123,7 +125,8 @@ def calibrate(
         Limit for each stage.
     effects : {"none", "auto"} or sequence of str
         Effects beyond the camera, by name or joined by commas; ``auto`` takes up those that the
-        data ask for, beside any that are named (`Calibration.effects`). Scales of ``axes``,
+        data ask for, beside any that are named, and one of ``noise`` and ``tails`` at most
+        (`Calibration.effects`). Scales of ``axes``,
         ``field``, ``frame``, ``zenith``, ``temperature``, ``time``, ``epoch``, ``star``, ``phase``
         and ``magnitude`` are estimated by restricted likelihood and marginalised in estimate,
         covariance and `compressed`. Two effects decide how much the stars count:
@@ -295,9 +298,65 @@ def _of_table(
         asked=settings.model is not None,
         throw=throw,
     )
-    if calibration.status.ok and settings.shifting:
-        calibration = _with_all(obs, calibration, settings)
-    return with_weighing(obs, calibration, settings.noise, settings.tails)
+    if not (calibration.status.ok and settings.shifting):
+        return with_weighing(obs, calibration, settings.noise, settings.tails)
+    if "auto" in settings.names:
+        return _selected(obs, calibration, settings)
+    found = _with_all(obs, calibration, settings)
+    return with_weighing(obs, found, settings.noise, settings.tails)
+
+
+def _selected(obs: Observations, cal: Calibration, settings: EstimationSettings) -> Calibration:
+    """The calibration with the effects that the data ask for, noise or tails among them.
+
+    Where one of these gains more than the first effect that shifts stars, or enough beside all of
+    them, the others are selected again with it. Where either was asked for, the data do not choose.
+    """
+    found = _with_all(obs, cal, settings)
+    assert found.effects is not None
+    if settings.noise or settings.tails:
+        return with_weighing(obs, found, settings.noise, settings.tails)
+    fitted, least = found.effects.fitted, found.effects.penalty_nat
+    gained = gains(obs, cal)
+    if fitted and max(gained.values()) < max(effect.gain_nat for effect in fitted):
+        # What effects of few images leave is uneven by itself: beside the others they have to gain
+        # less.
+        shared = [effect.name for effect in fitted if effect.name not in _OF_FEW_IMAGES]
+        beside = (
+            with_effects(weighed(obs, cal), cal, shared) if len(shared) < len(fitted) else found
+        )
+        gained = gains(without_effects(obs, beside), beside)
+        least = max([least, *(one.gain_nat for one in fitted if one.name not in shared)])
+    best, other = sorted(gained, key=gained.__getitem__, reverse=True)
+    if gained[best] > least:
+        more = settings.changed(effects=[*settings.names, best])
+        again = fit_weighed(obs, cal.nominal, more)
+        if again.status.ok:
+            known = {name: cal.provenance[name] for name in ("fallback",) if name in cal.provenance}
+            again = replace(again, provenance=again.provenance.adding(**known))
+            again = _with_all(obs, again, more)
+            again = with_weighing(obs, again, more.noise, more.tails)
+            assert again.effects is not None
+            if again.effects.weighing[0].gain_nat > found.effects.penalty_nat:
+                return _told(again, found, (other, gained[other]))
+    refused = sorted((*found.effects.refused, *gained.items()), key=lambda one: -one[1])
+    return replace(found, effects=replace(found.effects, refused=tuple(refused)))
+
+
+def _told(cal: Calibration, before: Calibration, other: tuple[str, float]) -> Calibration:
+    """The calibration with what noise or tails, which the data chose, have moved, and what the
+    other one would have gained.
+    """
+    assert cal.effects is not None
+    moved = np.abs(cal.theta - before.theta) / cal.sigmas
+    worst = int(np.argmax(moved))
+    name, size = cal.parameter_names[worst], float(moved[worst])
+    (own,) = cal.effects.weighing
+    own = replace(own, moved_sigma=size, moved_name=name)
+    refused = tuple(sorted((*cal.effects.refused, other), key=lambda one: -one[1]))
+    asked = tuple(one for one in cal.effects.asked if one != own.name)
+    held = replace(cal.effects, weighing=(own,), refused=refused, asked=asked)
+    return replace(cal, effects=held)
 
 
 def _with_all(obs: Observations, cal: Calibration, settings: EstimationSettings) -> Calibration:

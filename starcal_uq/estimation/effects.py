@@ -21,6 +21,7 @@ from starcal_uq.attitude.rotations import (
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.settings import WEIGHING
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.local_effects import local_coefficients
@@ -208,9 +209,10 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
     restricted = model.restricted(names, zeniths)
     refused: list[tuple[str, float]] = []
     logs, steps = forced(restricted, asked)
-    least = penalty(len(names) - len(asked))
+    # Noise and tails are candidates as well, of `calibrate`.
+    least = penalty(len(names) - len(asked) + len(WEIGHING))
     if selecting:
-        logs, steps, refused = selected(restricted, names, logs, steps)
+        logs, steps, refused = selected(restricted, names, logs, steps, least)
     if not logs:
         return replace(
             cal,

@@ -304,6 +304,40 @@ def _stated(obs: Observations) -> FloatArray:
     return obs.sigma_or_one
 
 
+def uneven_p(
+    obs: Observations, camera: Camera, squares: FloatArray, share: FloatArray
+) -> list[float]:
+    """Probabilities of so much less even noise by chance: by radius, by magnitude and from frame
+    to frame.
+
+    `squares`, `share` (N,): as of `star_squares` where all stars have one noise.
+    """
+    from scipy.special import chdtrc
+
+    stars = _Stars.of(obs, camera, squares, share)
+    even, found = _fitted(stars, (), False), []
+    for name in QUANTITIES:
+        power = stars.highest(name)
+        if power:
+            fit = _fitted(stars, _terms({name: power}), False)
+            gain = max(fit.log_likelihood - even.log_likelihood, 0.0)
+            found.append(float(chdtrc(power, 2.0 * gain)))
+    if stars.n_frames > 2:
+        dof, x = stars.per_frame(share), np.append(even.beta, _FRAME_LOG_DOF[1])
+        alike = -_frames_cost(x, stars, np.ones((len(share), 1)), dof)[0]
+        gain = max(_fitted(stars, (), True).log_likelihood - alike, 0.0)
+        # A variance on its bound.
+        found.append(0.5 * float(chdtrc(1.0, 2.0 * gain)))
+    return found
+
+
+def axes_p(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
+    """Probability of so much noise of x against that of y, and correlation, by chance."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(2.0, np.sum(np.square(axis_noise(likelihood, theta).z()))))
+
+
 def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: float) -> FloatArray:
     """Real over stated standard deviations (p,) of an estimate with one noise, if the noise is that
     of a model.

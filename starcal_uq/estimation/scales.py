@@ -134,12 +134,12 @@ def selected(
     candidates: Sequence[str],
     logs: dict[str, float],
     steps: list[Step],
+    least: float,
 ) -> tuple[dict[str, float], list[Step], list[tuple[str, float]]]:
     """Logs of the scales of the effects that the data ask for beside those of `logs`, how they were
-    taken up, and what the others would gain.
+    taken up, and what the others would gain. `least`: gain that an effect has to exceed.
     """
     asked = tuple(logs)
-    least = penalty(len(candidates) - len(asked))
     now, solved, sigma = restricted.at(logs)
     while True:
         tried = {n: restricted.alone(logs, n) for n in candidates if n not in logs}

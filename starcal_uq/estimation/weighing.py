@@ -7,8 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.noise_model import axes_p, star_squares, uneven_p
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
+from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.student import DEFAULT_DOF, DOF_RANGE
+from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
@@ -36,6 +41,35 @@ def log_density(squares: FloatArray, nu: float | None) -> float:
 
     bounds = (middle - _LOG_SCALE, middle + _LOG_SCALE)
     return -float(minimize_scalar(cost, bounds=bounds, method="bounded").fun)
+
+
+def gains(obs: Observations, cal: Calibration) -> dict[str, float]:
+    """What noise that varies, and tails, would gain at an estimate with one noise, nat.
+
+    Noise by radius, by magnitude, of each frame, and of each axis are tests of their own; the gain
+    is that of a single scale with their joint probability. `obs`: the stars, freed of effects that
+    shift them.
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.special import chdtri
+
+    frames = StarFrames.from_observations(obs)
+    likelihood = MarginalLikelihood(frames, cal.camera.distortion)
+    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    squares, share = star_squares(likelihood, cal.theta)
+    freed = 2.0 * squares / share
+    tails = minimize_scalar(
+        lambda log_nu: -log_density(freed, float(np.exp(log_nu))),
+        bounds=np.log((DEFAULT_DOF, DOF_RANGE[1])),
+        method="bounded",
+        options={"xatol": 0.05},
+    )
+    p = [*uneven_p(obs, cal.camera, squares, share), axes_p(likelihood, cal.theta)]
+    chance = min(len(p) * min(p), 0.5)
+    return {
+        "noise": 0.5 * float(chdtri(1.0, 2.0 * chance)),
+        "tails": max(-float(tails.fun) - log_density(freed, None), 0.0),
+    }
 
 
 def with_weighing(obs: Observations, cal: Calibration, noise: bool, tails: bool) -> Calibration:

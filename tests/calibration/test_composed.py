@@ -101,3 +101,55 @@ def test_intervals_of_parts_together_hold(made, effect):
     assert coverage > 0.88, coverage
     if effect == "star":
         assert control < 0.87, control
+
+
+def uneven_gaussian(rng):
+    return campaign(rng, n_frames=30, sigma_px=worse_outside), None
+
+
+def heavy(rng):
+    """One star in twenty is off by several times the noise."""
+    c = campaign(rng, n_frames=30)
+    wrong = rng.random(len(c.columns["x_px"])) < 0.05
+    return c, 0.3 * rng.standard_normal((2, len(wrong))) * wrong
+
+
+def clean(rng):
+    return campaign(rng, n_frames=30), None
+
+
+def selected(made, seed):
+    c, off = made(np.random.default_rng([seed, 92]))
+    columns = {name: np.array(values) for name, values in c.columns.items()}
+    if off is not None:
+        columns["x_px"], columns["y_px"] = np.array([columns["x_px"], columns["y_px"]]) + off
+    obs = sc.Observations(**columns, meta={"directions": "apparent"})
+    camera = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+    return c, sc.calibrate(obs, camera, effects="auto")
+
+
+@pytest.mark.parametrize(
+    ("made", "chosen"), [(clean, ()), (uneven_gaussian, ("noise",)), (heavy, ("tails",))]
+)
+def test_auto_takes_up_noise_or_tails_where_the_data_ask_for_them(made, chosen):
+    c, cal = selected(made, 1)
+    assert cal.effects.names == chosen and cal.effects.asked == ()
+    assert np.all(np.abs(cal.theta - c.theta) < 4.0 * cal.sigmas)
+    refused = dict(cal.effects.refused)
+    assert {"noise", "tails"} - set(chosen) <= refused.keys()
+    for effect in cal.effects.weighing:
+        assert effect.gain_nat > 30.0 and effect.moved_name in cal.parameter_names
+
+
+@pytest.mark.slow
+def test_auto_takes_up_noise_and_tails_in_no_clean_campaign_and_in_all_others():
+    found = [selected(clean, seed)[1].effects.weighing for seed in range(120)]
+    # 1 % of campaigns take up anything, these two among them: more than 5 of 120 is a chance of 2e-3.
+    assert sum(map(bool, found)) <= 5
+    z = []
+    for seed in range(100, 112):
+        c, cal = selected(uneven_gaussian, seed)
+        assert cal.effects.names == ("noise",)
+        z.append((cal.theta - c.theta) / cal.sigmas)
+        assert selected(heavy, seed)[1].effects.names == ("tails",)
+    assert np.mean(np.abs(np.array(z)) < 1.96) > 0.85

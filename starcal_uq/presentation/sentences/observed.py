@@ -279,7 +279,7 @@ def _model_is_wrong(
             f"wrong identifications leave {allowed} at most"
         )
     tails = ", with the heavy tails of a Student t" if robust else ""
-    remedy = "Fit noise that varies (--noise model), or another distortion"
+    remedy = "Fit noise that varies (--effects noise), or another distortion"
     if follows_place:
         remedy = "Their residuals follow the place on the detector: fit another distortion"
     return (

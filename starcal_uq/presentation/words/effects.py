@@ -49,7 +49,8 @@ def _weighing_row(effect: FittedEffect) -> tuple[str, ...]:
     """Of noise, how far it varies from star to star; of tails, their degrees of freedom."""
     scale = significant(effect.scale_px if effect.dof is None else effect.dof)
     scale += "" if effect.dof is None else " dof"
-    return effect.name, scale, "", "", fixed(effect.gain_nat, 1), ""
+    moved = f"{effect.moved_name} by {significant(effect.moved_sigma)} sigma"
+    return effect.name, scale, "", "", fixed(effect.gain_nat, 1), moved if effect.moved_name else ""
 
 
 def _row(effect: FittedEffect) -> tuple[str, ...]:
