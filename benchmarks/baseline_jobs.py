@@ -190,7 +190,8 @@ JOBS = (
             "new example -o .",
             f"run stars.ecsv camera.toml -o first --seed {{seed}} {SAMPLER}",
             "run stars.ecsv camera.toml -o run --site site.toml --effects auto,noise --screen --seed {seed}",
-            f"run stars.ecsv camera.toml -o json --site site.toml --effects auto,tails --seed {{seed}} {SAMPLER} --json",
+            "run stars.ecsv camera.toml -o json --site site.toml --effects auto,tails"
+            f" --seed {{seed}} {SAMPLER} --json",
             "calibrate stars.ecsv camera.toml -o screened --site site.toml --screen",
             "report run --notebook --force",
         ),
