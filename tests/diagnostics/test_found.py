@@ -179,8 +179,10 @@ def rms(rows: Iterable[FloatArray]) -> FloatArray:
     return np.asarray(np.sqrt(np.mean(np.square(list(rows)), axis=0)))
 
 
-def check(runs: list[Rest], effect: str, most: float = 1.5) -> None:
-    """Stated within a factor in the root mean square, with effects asked for or not."""
+def check(runs: list[Rest], effect: str, bounded: int = 3) -> None:
+    """Stated within a factor of 1.5 in the root mean square, with effects asked for or not; from
+    above on so many axes.
+    """
     stated, true = rms(run.stated for run in runs), rms(run.true for run in runs)
     own, of_own = (
         rms(run.with_effects for run in runs),
@@ -189,7 +191,7 @@ def check(runs: list[Rest], effect: str, most: float = 1.5) -> None:
     print(f"\n{effect}: stated over true {stated / true}, with effects {own / of_own}")
     assert all(effect in run.names for run in runs), [run.names for run in runs]
     for ratio in (stated / true, own / of_own):
-        assert ratio.min() > 1.0 / 1.5 and ratio.max() < most, ratio
+        assert ratio.min() > 1.0 / 1.5 and ratio[:bounded].max() < 1.5, ratio
     # Control: the error if the model holds knows nothing of it.
     held = rms(run.held for run in runs) / true
     assert held.min() < 1.0 / 1.5, held
@@ -208,10 +210,10 @@ def test_frames_of_their_own_shape_are_stated() -> None:
 def test_every_misfit_through_the_geometry_of_other_missions(planted: str) -> None:
     shape, effect = PLANTED[planted]
     # A radial misfit hardly turns frames about the boresight: what is stated there is mostly what
-    # the data leave open of a smooth field.
-    most = 2.2 if planted == "radial" else 1.5
+    # the data leave open of a smooth field, which may be more.
+    bounded = 2 if planted == "radial" else 3
     for mission, n_frames in (("random", 12), ("slew", 40)):
-        check([rest(shape(seed), seed, mission, n_frames) for seed in range(2)], effect, most)
+        check([rest(shape(seed), seed, mission, n_frames) for seed in range(2)], effect, bounded)
 
 
 def headlines(seeds: range, planted: Displacement = nothing) -> FloatArray:
