@@ -401,7 +401,7 @@ def moved(
     [
         ("auto", 1e-7),
         ("field", 1e-7),
-        ("temperature,time,epoch,magnitude,phase,axes,frame", 1e-3),
+        ("temperature,time,epoch,magnitude,phase,frame", 1e-3),
     ],
 )
 def test_effects_of_partitions_are_those_of_the_table(
