@@ -112,6 +112,33 @@ budget = sc.budget(post, obs, error, file=sc.budgeting.BudgetFile(requirements=(
         },
     ),
     Scene(
+        "An orbit's temperatures",
+        "A camera whose focal length follows the temperature, on an orbit of ninety minutes.",
+        """\
+import dataclasses
+
+import numpy as np
+
+warmth = np.random.default_rng(4).uniform(-20.0, 20.0, obs.n_frames)[obs.frame]
+grown = 1.0 + 5e-6 * warmth
+warm = dataclasses.replace(
+    obs,
+    x_px=truth.x0_px + grown * (obs.x_px - truth.x0_px),
+    y_px=truth.y0_px + grown * (obs.y_px - truth.y0_px),
+    temperature_c=warmth,
+)
+followed = sc.calibrate(warm, camera, effects="temperature")
+t_s = np.linspace(0.0, 5400.0, 91)
+orbit = sc.propagation.TemperatureProfile(t_s, 5.0 + 25.0 * np.sin(2.0 * np.pi * t_s / 5400.0))
+warmed = sc.propagate(sc.sample(warm, followed, seed=1), warm, temperature_profile=orbit)""",
+        {
+            "ThermalError.profile": (
+                "What does the temperature do over an orbit?",
+                "warmed.thermal.plot.profile()",
+            ),
+        },
+    ),
+    Scene(
         "A slew",
         (
             "Calibration errors change as stars move over the detector: along a slew they become a "

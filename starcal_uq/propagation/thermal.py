@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 TEMPERATURE = "temperature"
-_WITH_IT = Remedy("calibrate", (OBS, CAMERA), {"effects": TEMPERATURE})
+# Spelt out, as all that a command names.
+_WITH_IT = Remedy("calibrate", (OBS, CAMERA), {"effects": "temperature"})
 # Temperatures of optics, degC; others are of another unit.
 _COLDEST_C, _HOTTEST_C = -150.0, 150.0
 

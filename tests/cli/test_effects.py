@@ -110,7 +110,7 @@ def test_the_remedy_that_a_misfit_prints_first_leads_to_a_usable_answer(cli, tmp
 
 
 @pytest.fixture
-def warmed(tmp_path):
+def warmed(cli, tmp_path):
     """A run whose calibration follows the temperature, and a profile of an orbit beside it."""
     rng = np.random.default_rng(8)
     warmth = rng.uniform(-1.0, 1.0, 12)
@@ -118,8 +118,9 @@ def warmed(tmp_path):
     obs = table(c, temperature_c=-25.0 + 15.0 * warmth[c.columns["frame"]])
     obs.save(tmp_path / "obs.csv")
     sheet(c).save(tmp_path / "camera.toml")
+    words = ("obs.csv", "camera.toml", "--effects", "temperature", "-o", "run")
+    assert cli("calibrate", *words)[0] == 0
     run = sc.Run(tmp_path / "run")
-    run.calibrate(obs, sheet(c), effects="temperature")
     run.sample(seed=0, n_ensembles=2, n_walkers=16, n_steps=20)
     (tmp_path / "orbit.csv").write_text("time_s,temperature_c\n0,-40\n60,-10\n90,5\n", "utf-8")
     return tmp_path

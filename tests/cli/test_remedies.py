@@ -343,6 +343,7 @@ COMMANDS = {
 }
 # These take long or files of their own; the tests that execute them stand beside them.
 ELSEWHERE = {
+    "calibrate OBS CAMERA --effects temperature": "tests/cli/test_effects.py",
     "centroid": "tests/cli/test_cli_images.py",
     "demo": "tests/cli/test_cli.py",
     "diagnose RUN": "tests/cli/test_cli_statistics.py",

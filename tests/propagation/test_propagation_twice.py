@@ -345,6 +345,7 @@ def test_what_is_taken_where_nothing_is_said() -> None:
                 "alignment_frames": None,
                 "onboard": "model",
                 "calibrated": None,
+                "temperature_profile": None,
             },
         ),
         (error_spectrum, {"times_s": None, "n_draws": 100, "seed": 0}),
