@@ -77,7 +77,8 @@ def kind_of_effects(effects: Any) -> str | None:
 # "sampled" and "sampled_dof" are likelihood and degrees of freedom of the draws.
 RULES = (
     Rule("effects", (), "method", (None, "efficient")),
-    Rule("effects", WEIGHING, "partitioned", (None,)),
+    # Errors of the stars and weights need all stars in memory.
+    Rule("effects", (*WEIGHING, "star"), "partitioned", (None,)),
     Rule("relative_attitudes", (), "mount", (None,)),
     Rule("mount_sigma_arcsec", (), "mount", ("fixed",)),
     *(

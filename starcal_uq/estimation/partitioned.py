@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import like, model_names, simpler_models
+from starcal_uq.camera.distortion import get_model, like, model_names, simpler_models
 from starcal_uq.core.cluster import Cluster
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import provenance
@@ -132,11 +132,11 @@ class _Residuals:
 
 
 def _richer(camera: Camera) -> list[Camera]:
-    """The same camera by every model with more terms."""
+    """The same camera by every model with more terms that models are compared with."""
     return [
         camera.replace(distortion=name)
         for name in (like(base, camera.distortion) for base in model_names())
-        if camera.distortion in simpler_models(name)
+        if get_model(name).compared and camera.distortion in simpler_models(name)
     ]
 
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from starcal_uq.core.errors import CalibrationError, ObservationError
+from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.effects import Around, Rest, TableStars, shown_by
 from starcal_uq.likelihood.compressed import GramSums
@@ -104,11 +104,6 @@ class FileStars:
         wanted: Sequence[str],
         total: Total,
     ) -> None:
-        if "star" in wanted:
-            raise CalibrationError(
-                "the effect 'star' needs all stars in memory, and these observations are "
-                "partitions: leave it out, or calibrate the frames of `obs.sample()` with it."
-            )
         asked = _COVARIATES if "auto" in wanted else wanted
         names = sorted({_COVARIATES[name] for name in asked if name in _COVARIATES})
         names = [name for name in names if name in obs.columns]

@@ -26,7 +26,7 @@ from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.effects import joint_inverses
-from starcal_uq.planning.ties import PlannedTies
+from starcal_uq.planning.ties import PlannedTies, tied_campaigns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -293,7 +293,7 @@ class Forecaster:
         outlook = self.outlook
         drawn = (n_frames, outlook.n_campaigns, outlook.seed, self._start)
         if outlook.ties is not None:
-            return outlook.ties.campaigns(self.mission, self.information, *drawn)
+            return tied_campaigns(outlook.ties, self.mission, self.information, *drawn)
         return campaigns(self.information, *drawn, len(self.mission.camera.theta))
 
     def dof(self, n_frames: int) -> float:

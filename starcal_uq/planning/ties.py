@@ -48,27 +48,9 @@ class PlannedTies:
                 "above zero, such as 5."
             )
 
-    def campaigns(
-        self,
-        mission: FrameSet,
-        information: FloatArray,
-        n_frames: int,
-        n_campaigns: int,
-        seed: int,
-        start: FloatArray | None,
-    ) -> FloatArray:
-        """Covariances (C, p, p) as `starcal_uq.planning.forecast.campaigns` gives them, with frames
-        tied in the order in which they are drawn.
-        """
-        n = min(n_frames, _LONG)
-        rng = np.random.default_rng([seed, n])
-        size = (min(n_campaigns, max(_FRAMES // n, _FEWEST)), n)
-        chosen = rng.integers(len(information), size=size)
-        total = information[chosen].sum(axis=1)
-        if n > 1:
-            total += (self._of_mount if self.of_mount else self._of_chain)(mission, chosen)
-        total *= n_frames / n
-        return inverses(total if start is None else total + start)
+    def information(self, mission: FrameSet, chosen: IntArray) -> FloatArray:
+        """Information (C, p, p) on the parameters that ties add to campaigns of frames (C, n)."""
+        return (self._of_mount if self.of_mount else self._of_chain)(mission, chosen)
 
     def _of_chain(self, mission: FrameSet, chosen: IntArray) -> FloatArray:
         """Information (C, p, p) of rotations from each of the frames (C, n) to the next."""
@@ -108,3 +90,26 @@ class PlannedTies:
         if not self.of_mount:
             inner = inner + (ARCSEC / self.alignment_arcsec) ** 2 * np.eye(3)
         return gram[:, :p, :p] - gram[:, :p, p:] @ np.linalg.solve(inner, gram[:, p:, :p])
+
+
+def tied_campaigns(
+    ties: PlannedTies,
+    mission: FrameSet,
+    information: FloatArray,
+    n_frames: int,
+    n_campaigns: int,
+    seed: int,
+    start: FloatArray | None,
+) -> FloatArray:
+    """Covariances (C, p, p) as `starcal_uq.planning.forecast.campaigns` gives them, with frames
+    tied in the order in which they are drawn.
+    """
+    n = min(n_frames, _LONG)
+    rng = np.random.default_rng([seed, n])
+    size = (min(n_campaigns, max(_FRAMES // n, _FEWEST)), n)
+    chosen = rng.integers(len(information), size=size)
+    total = information[chosen].sum(axis=1)
+    if n > 1:
+        total += ties.information(mission, chosen)
+    total *= n_frames / n
+    return inverses(total if start is None else total + start)

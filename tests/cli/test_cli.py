@@ -175,7 +175,7 @@ def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_comm
     places = [out.index(f" {words} ") for words in panels]
     assert (
         places == sorted(places)
-        and places[1] < out.index("--noise") < places[2] < out.index("--gain") < places[3]
+        and places[1] < out.index("--effects") < places[2] < out.index("--gain") < places[3]
     )
     status, _, err = cli("calibrate", inputs / "obs.csv", "site/camera.toml", "-o", "run")
     assert (

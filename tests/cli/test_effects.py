@@ -68,8 +68,8 @@ def test_nothing_taken_up_is_one_sentence(cli, tmp_path) -> None:
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        ("fild", "effect 'fild' is unknown: use auto or none alone, or some of axes, field,"),
-        ("auto,field", "effect 'auto' is unknown: use auto or none alone"),
+        ("fild", "effect 'fild' is unknown: use none alone, or some of auto, axes, field,"),
+        ("none,field", "effect 'none' is unknown: use none alone, or some of auto, axes"),
         ("temperature", "the effect 'temperature' needs what does not vary in this table"),
     ],
 )

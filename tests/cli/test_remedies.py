@@ -350,6 +350,8 @@ ELSEWHERE = {
     "diagnose RUN --force": "tests/cli/test_cli_statistics.py",
     "inspect RUN": "tests/cli/test_cli_images.py",
     "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
+    "propagate RUN --temperature-profile FILE": "tests/cli/test_effects.py",
+    "propagate RUN --temperature-profile FILE --force": "tests/cli/test_effects.py",
     "report": "tests/presentation/test_report.py",
     "report RUN --format pdf": "tests/presentation/test_report.py",
     "report RUN --notebook": "tests/presentation/test_report.py",

@@ -94,7 +94,7 @@ def test_errors_of_stars_that_no_catalogue_has_are_no_way_out():
         )
         levels[size] = stars(sc.diagnostics.star_test(obs, cal))
     assert levels[0.1].level is Level.PASS
-    assert levels[5.0].level is Level.FAIL and "--effects star" in levels[5.0].advice
+    assert levels[5.0].level is Level.FAIL and "Leave star out of the list" in levels[5.0].advice
 
 
 def test_a_calibration_alone_is_no_verdict_and_names_the_command_that_makes_one(call, tmp_path):

@@ -164,7 +164,10 @@ def test_a_camera_without_a_pitch_keeps_its_pixels(tmp_path):
             "focal_px = 5114.0\nfocal_mm = 35.0\n",
             "keys focal_mm and focal_px both state the focal length; remove one.",
         ),
-        ("focal_mm = 35.0\n", "key pixel_um is missing; add the pitch of the square pixels"),
+        (
+            "focal_mm = 35.0\n",
+            "key pixel_um is missing; add the pitch of the pixels in micrometres",
+        ),
         ("pixel_um = 5.0\n", "key focal_mm is missing"),
         ("focal_px = -1\n", "key focal_px is -1; write the focal length in pixels"),
     ],

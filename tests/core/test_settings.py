@@ -195,6 +195,7 @@ def test_cells_at_the_limits_of_an_axis_have_numbers_or_a_reason(name):
         content["sweep"][name].append(limit.high)
     models = {"k3": "brown3", "p1": "brown_tangential", "p2": "brown_tangential"}
     models |= dict.fromkeys(("stretch", "skew"), "brown+axes")
+    models |= dict.fromkeys(("s1", "s2"), "thin_prism") | {"k4": "fisheye"}
     content["camera"]["distortion"] = models.get(name, "brown")
     found = sc.study(StudyDefinition.from_dict(content), workers=0)
     assert found.ok.sum() + sum(found.problems.values()) == found.n_cells

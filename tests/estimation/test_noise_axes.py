@@ -10,7 +10,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.records import from_plain
 from starcal_uq.core.status import Level
-from starcal_uq.diagnostics import misfit
+from starcal_uq.diagnostics import shape_sums
 from starcal_uq.diagnostics.misfit import misfit_tests
 from starcal_uq.diagnostics.verdict.estimate import even_noise
 from starcal_uq.estimation.merging import merge
@@ -140,7 +140,7 @@ def test_shapes_are_whitened_as_their_residuals_are():
     part = MarginalLikelihood(weighed(obs, cal), "brown", axes=True)
     state, _ = part.profile(cal.theta)
     view = View.of(part, state, cal.theta, slice(None))
-    columns = misfit._Columns.of(shapes(obs, cal.camera), view)
+    columns = shape_sums._Columns.of(shapes(obs, cal.camera), view)
     every = columns.all()
     flat = every.reshape(len(every), -1)
     np.testing.assert_allclose(

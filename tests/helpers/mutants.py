@@ -199,6 +199,14 @@ SAMPLES = (
     Sample(
         "profile.parquet", sc.attitude.load_attitude_profile, ("attitude.load_attitude_profile",)
     ),
+    Sample(
+        "relative.csv", sc.attitude.load_relative_attitudes, ("attitude.load_relative_attitudes",)
+    ),
+    Sample(
+        "orbit.csv",
+        sc.propagation.load_temperature_profile,
+        ("propagation.load_temperature_profile",),
+    ),
     Sample("catalogue.csv", sc.sky.read_catalogue, ("sky.read_catalogue",)),
     Sample("catalogue.ecsv", sc.sky.read_catalogue, ("sky.read_catalogue",)),
     Sample("catalogue.fits", sc.sky.read_catalogue, ("sky.read_catalogue",)),
@@ -333,6 +341,12 @@ def _write_tables(folder: Path) -> None:
     profile.write(folder / "profile.csv", format="ascii.csv")
     profile.write(folder / "profile.ecsv", format="ascii.ecsv", delimiter=",")
     profile.to_pandas().to_parquet(folder / "profile.parquet")
+    turns = {name: profile[name] for name in ("qx", "qy", "qz", "qw")}
+    pairs = {"frame_a": np.arange(8), "frame_b": np.arange(1, 9), "sigma_arcsec": np.full(8, 2.0)}
+    Table({**pairs, **turns}).write(folder / "relative.csv", format="ascii.csv")
+    Table({"time_s": np.arange(8.0), "temperature_c": rng.uniform(-20.0, 20.0, 8)}).write(
+        folder / "orbit.csv", format="ascii.csv"
+    )
     stars = Table(
         {
             **{
