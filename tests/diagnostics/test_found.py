@@ -180,21 +180,23 @@ def rms(rows: Iterable[FloatArray]) -> FloatArray:
 
 
 def check(runs: list[Rest], effect: str, bounded: int = 3) -> None:
-    """Stated within a factor of 1.5 in the root mean square, with effects asked for or not; from
-    above on so many axes.
+    """Stated within a factor of 1.5 in the root mean square, with effects asked for or not.
+
+    From above that holds of the first `bounded` axes, and where the misfit more than doubles the
+    error: about other axes two campaigns scatter by more, and most of what is stated is what the
+    data leave open of the effect.
     """
-    stated, true = rms(run.stated for run in runs), rms(run.true for run in runs)
-    own, of_own = (
-        rms(run.with_effects for run in runs),
-        rms(run.true_with_effects for run in runs),
-    )
-    print(f"\n{effect}: stated over true {stated / true}, with effects {own / of_own}")
+    held = rms(run.held for run in runs)
+    plain = rms(run.stated for run in runs), rms(run.true for run in runs)
+    own = rms(run.with_effects for run in runs), rms(run.true_with_effects for run in runs)
+    print(f"\n{effect}: stated over true {plain[0] / plain[1]}, with effects {own[0] / own[1]}")
     assert all(effect in run.names for run in runs), [run.names for run in runs]
-    for ratio in (stated / true, own / of_own):
-        assert ratio.min() > 1.0 / 1.5 and ratio[:bounded].max() < 1.5, ratio
+    for stated, true in (plain, own):
+        ratio, turned = stated / true, held < 0.5 * true
+        assert ratio.min() > 1.0 / 1.5, ratio
+        assert np.max(ratio[:bounded], where=turned[:bounded], initial=0.0) < 1.5, ratio
     # Control: the error if the model holds knows nothing of it.
-    held = rms(run.held for run in runs) / true
-    assert held.min() < 1.0 / 1.5, held
+    assert np.any(held < 0.5 * plain[1]), held / plain[1]
 
 
 def test_a_pattern_of_the_field_is_stated() -> None:

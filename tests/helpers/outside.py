@@ -289,11 +289,13 @@ def slew(n_frames: int, step_deg: float) -> np.ndarray:
 
 
 def attitude_errors(c: Campaign, theta: np.ndarray) -> np.ndarray:
-    """Rotation vectors (K, 3), arcsec, by which attitudes err that a camera `theta` finds: Wahba's
-    problem by SVD.
+    """Rotation vectors (K, 3), arcsec, by which attitudes err that a camera `theta` finds, the axes of its
+    detector square or its last two parameters: Wahba's problem by SVD.
     """
-    x0, y0, f, k1, k2 = theta
-    d = np.array([c.columns["x_px"] - x0, c.columns["y_px"] - y0])
+    x0, y0, f, k1, k2, *axes = theta
+    stretch, skew = axes or (0.0, 0.0)
+    d = np.array([c.columns["x_px"] - x0, (c.columns["y_px"] - y0) / (1.0 + stretch)])
+    d[0] -= skew * d[1]
     ideal = d.copy()
     for _ in range(50):
         r2 = np.sum(ideal**2, axis=0)
