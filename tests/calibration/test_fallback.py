@@ -197,7 +197,7 @@ def test_noise_in_the_distortion_of_a_narrow_field_tells_no_principal_point(monk
     # Believed, it does: many estimates come with sigmas that are too small.
     monkeypatch.setattr(
         "starcal_uq.estimation.undetermined._without_coma",
-        lambda covariance, told, size: np.ones(len(told)),
+        lambda covariance, told, size, lens: np.ones(len(told)),
     )
     models, z = narrow_fields(40)
     kept = np.array(models) == "brown"
