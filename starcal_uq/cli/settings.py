@@ -205,6 +205,7 @@ def settings_of(
     if sampling is not None:
         settings["sampled"] = sampling.likelihood or sampled_by_default(settings)
         settings["sampled_dof"] = sampling.dof
+        settings["evaluation"] = sampling.evaluation
     return settings
 
 

@@ -146,16 +146,19 @@ class FileStars:
 
 
 def _check_columns(parts: PartitionedObservations, names: Sequence[str]) -> None:
-    """Columns that effects go by must be in all files."""
-    for part in parts.parts:
-        for name in names:
-            own = column_behind(parts.reader.columns.get(name, name), part.names)
-            if own not in part.names:
-                raise ObservationError(
-                    f"{part.path}: column {own} ({COLUMNS[name].description}) is missing, and other files "
-                    "have it; write it to all files, or to none.",
-                    column=own,
-                )
+    """Columns that effects go by must be in all files, or in none where they are declared for all
+    stars.
+    """
+    for name in names:
+        own = [column_behind(parts.reader.columns.get(name, name), p.names) for p in parts.parts]
+        held = [column in part.names for column, part in zip(own, parts.parts, strict=True)]
+        if any(held) and not all(held):
+            lacking = held.index(False)
+            raise ObservationError(
+                f"{parts.parts[lacking].path}: column {own[lacking]} ({COLUMNS[name].description}) "
+                "is missing, and other files have it; write it to all files, or to none.",
+                column=own[lacking],
+            )
 
 
 @dataclass(frozen=True)

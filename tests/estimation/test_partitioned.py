@@ -4,6 +4,7 @@ processes.
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 import signal
@@ -447,6 +448,20 @@ def test_clean_partitions_take_up_nothing_and_change_nothing(small) -> None:
     assert cal.effects is not None and not cal.effects.fitted and cal.effects.refused
     np.testing.assert_array_equal(cal.theta, plain.theta)
     np.testing.assert_array_equal(cal.covariance, plain.covariance)
+
+
+def timed(obs: sc.Observations) -> sc.Observations:
+    """The table with one time for all stars, as `--time` declares it."""
+    return dataclasses.replace(obs, time_utc=np.full(obs.n_stars, "2026-01-01T00:00:00"))
+
+
+def test_times_that_are_declared_for_all_files_are_no_missing_column(moved, tmp_path: Path) -> None:
+    obs, camera, _ = moved
+    bare = dataclasses.replace(obs, time_utc=None)
+    parts = divided(bare, tmp_path / "frames", [0, 26, 90])
+    parts = dataclasses.replace(parts, reader=dataclasses.replace(parts.reader, prepare=timed))
+    many = sc.calibrate(parts, camera, effects="auto")
+    assert many.effects.names == sc.calibrate(timed(bare), camera, effects="auto").effects.names
 
 
 def test_effects_that_partitions_cannot_have_are_refused(moved, tmp_path: Path) -> None:
