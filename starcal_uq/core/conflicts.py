@@ -101,6 +101,8 @@ RULES = (
     Rule("sampled", ("marginal",), "effects", (None, "shifts")),
     Rule("sampled", (*_COMPOSITE, "student_t"), "effects", (None, "tails")),
     Rule("sampled", (*_COMPOSITE, "student_t"), "partitioned", (None,)),
+    Rule("sampled", (*_COMPOSITE, "student_t"), "relative_attitudes", (None,)),
+    Rule("sampled", (*_COMPOSITE, "student_t"), "mount", (None,)),
     Rule("evaluation", ("exact",), "partitioned", (None,)),
     Rule("sampled", _COMPOSITE, "method", (None, "efficient", *_IN_MEMORY)),
     Rule("site", (), "in_space", (None,)),
