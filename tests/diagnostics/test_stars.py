@@ -112,7 +112,7 @@ def test_false_alarms_and_power_are_as_stated():
     p_values = {0.0: [], 0.01: [], 0.03: []}
     for tau in p_values:
         for _ in range(400 if tau == 0.0 else 40):
-            u = tau * rng.standard_normal(z.prior_scale.shape)[z.groups]
+            u = tau * rng.standard_normal((z.n_groups, 2))[z.groups]
             noise = 0.05 * rng.standard_normal((2, obs.n_stars)) + np.einsum("nj,jxn->xn", u, shift)
             step = np.linalg.solve(h @ h.T, h @ likelihood.project_out(state, noise[None]).ravel())
             x, y = model.T + noise

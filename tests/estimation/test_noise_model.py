@@ -106,7 +106,7 @@ def test_every_reader_of_a_run_sees_the_same_weights_and_the_data_stay_what_they
 def test_screening_measures_stars_by_the_noise_where_they_are():
     _, obs, camera = scene(worse_outside, n_frames=60)
     plain, fitted = (
-        sc.calibration.screen(obs, camera, noise=noise) for noise in ("common", "model")
+        sc.calibration.screen(obs, camera, effects=effects) for effects in ("none", "noise")
     )
     assert plain.model_is_wrong and not fitted.model_is_wrong and fitted.n_rejected == 0
     assert fitted.observations.sigma_px is None and fitted.calibration.noise_model.varies
