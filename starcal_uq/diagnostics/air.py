@@ -15,44 +15,33 @@ lack are fitted beside the air. What these explain as well as air does cannot be
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.earth import (
-    DENSITY_SPREAD,
-    LOWEST,
-    air_constants,
-    normalised,
-    raising,
-    sphere,
-    tangents,
-)
-from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.diagnostics.beside import has_effects, with_effects_of, without_effects
+from starcal_uq.core.types import FloatArray
+from starcal_uq.diagnostics.beside import StarNoise, has_effects, images_beside, without_effects
 from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.noise_model import fit_noise
 from starcal_uq.estimation.weights import weighed
+from starcal_uq.estimation.zenith import (
+    Images,
+    Settled,
+    found_air,
+    of_each_frame,
+    of_one_place,
+    orthonormal,
+)
 from starcal_uq.likelihood.effect_sums import EffectLikelihood
-from starcal_uq.likelihood.effects import star_effect
-from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
-from starcal_uq.likelihood.shapes import View, focal_drift, frame_shapes, lens_shapes
-from starcal_uq.likelihood.star_errors import StarModel, star_numbers
-from starcal_uq.likelihood.zenith import frame_axes
+from starcal_uq.likelihood.shapes import focal_drift, lens_shapes
 from starcal_uq.maths.linear import principal
-from starcal_uq.observations.splits import one_of_each
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
@@ -63,15 +52,9 @@ _THIN, _THICK = 0.64, 1.06
 # What leaves all of these with less probability is another misfit: chi-square of the amplitude, or
 # a share of what air explains that refraction by two constants may leave.
 _AIR_CHI2, _INEXACT = 10.8, 0.01
-_PLACES, _DRAWS, _FRAMES, _STARS = 600, 4000, 200, 4000
-# Frames that get a zenith each.
-_FRAMES_APIECE = 80
-# Damped steps towards the best zeniths, until chi-square falls by less than a tenth.
-_STEPS, _STEP_RAD, _LONGEST_RAD, _SETTLED = 24, 1e-3, 0.2, 0.1
-# Zeniths that are tried for a frame by itself: distances from its boresight, degrees, and
-# directions. Tangents of a distance common to all frames from which the search starts, and its
-# rounds.
-_DISTANCES_DEG, _AROUND, _TANGENTS, _ROUNDS = np.arange(5.0, 81.0, 7.5), 16, (0.4, 1.0, 2.0), 6
+_DRAWS = 4000
+# Frames that are looked at, and where each gets a zenith.
+_FRAMES, _FRAMES_APIECE = 200, 80
 # A share of a shape's square that is not there, where all of the rest is absorbed.
 _ABSORBED = 1e-8
 
@@ -148,7 +131,7 @@ def air_test(
     obs, cal = of_heard(weighed(obs, cal), cal)
     errors = _star_noise(obs, cal, stars)
     air = _Air(obs, cal, seed, errors)
-    found = air.test(seed)
+    found = air.test()
     if found is None or not (found.is_air or found.like_others) or cal.noise_model is not None:
         return found
     # Noise that grows towards the edge looks like scale and shape of single frames.
@@ -160,7 +143,7 @@ def air_test(
         own = errors.sigma * _rms(obs.sigma_px) / _rms(weighted.sigma_px)
         errors = errors._replace(sigma=own)
     again = _Air(weighted, cal, seed, errors)
-    found = again.test(seed)
+    found = again.test()
     if found is None or np.isnan(found.f_px):
         return found
     # What the estimate took up of it is by the weights that it was made with.
@@ -172,15 +155,7 @@ def _rms(sigma_px: FloatArray | None) -> float:
     return 1.0 if sigma_px is None else float(np.sqrt(np.mean(sigma_px**2)))
 
 
-class _StarNoise(NamedTuple):
-    """Direction errors of the stars per axis, px, the noise of their images, and how many recur."""
-
-    tau_px: float
-    sigma: float
-    n_recurring: int
-
-
-def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> _StarNoise | None:
+def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> StarNoise | None:
     """Direction errors that recurring stars show."""
     # Effects hold what stars bring along, where the data ask for that.
     if not found.tau_px > 0.0 or has_effects(cal):
@@ -188,255 +163,97 @@ def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> _StarNo
     # The estimate's noise holds both.
     of_stars = found.tau_px**2 * float(np.mean(obs.sigma_or_one**-2.0))
     own = float(np.sqrt(max(cal.sigma**2 - of_stars, 0.1 * cal.sigma**2)))
-    return _StarNoise(found.tau_px, own, found.n_recurring)
-
-
-class Remainder:
-    """Residuals of some frames, and of what displaces stars that part which attitudes and
-    parameters cannot take up.
-
-    `obs` has the noise of its stars as the estimate weighs them. `residuals` (m,) are whitened,
-    with `dof` degrees of freedom and scatter `sigma`: m = 2 N, x of all stars before y, and where
-    stars bring errors along, which `errors` holds with the noise of images, two more for each star;
-    or one more for each coefficient of the effects of the calibration. `clean` are the images
-    without these.
-    """
-
-    def __init__(
-        self,
-        obs: Observations,
-        cal: Calibration,
-        seed: int,
-        errors: _StarNoise | None = None,
-        most: int = _FRAMES,
-    ) -> None:
-        chosen = one_of_each(
-            obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed
-        )
-        clean = without_effects(obs, cal)
-        self.obs, self.clean = (
-            one if len(chosen) == obs.n_frames else one.select_frames(obs.frame_ids[chosen])
-            for one in (obs, clean)
-        )
-        model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
-        self.focal_px = cal.camera.focal_px
-        self.likelihood = MarginalLikelihood(self.obs, model, axes=True)
-        if errors is not None:
-            stars = star_effect(StarModel(self.obs, float(cal.theta[2])))
-            ratio = {stars.name: (errors.tau_px / errors.sigma) ** 2}
-            at = (cal.theta, rotations, errors.sigma)
-            frames = self.likelihood.frames
-            self.likelihood = EffectLikelihood(frames, model, [stars], ratio, *at)
-        elif has_effects(cal):
-            self.likelihood = with_effects_of(self.obs, cal, rotations, obs)
-        self.state, _ = self.likelihood.profile(cal.theta, rotations)
-        slopes = self.likelihood.whitened(
-            self.state, self.likelihood.derivatives(cal.theta, self.state)
-        )
-        self.basis, self._triangle = np.linalg.qr(slopes.T)
-        e = self.likelihood.whitened(self.state, self.state.e[None])[0]
-        self.residuals: FloatArray = e - self.basis @ (self.basis.T @ e)
-        self.dof = max(self.likelihood.dof - len(cal.theta), 1)
-        # Errors of few stars are known less well than the noise of their images.
-        self.least_dof = (
-            self.dof if errors is None else max(2 * errors.n_recurring - 3 - len(cal.theta), 1)
-        )
-
-    @cached_property
-    def groups(self) -> tuple[IntArray, IntArray]:
-        """Star and frame of every image, (N,) each, from 0."""
-        numbers = star_numbers(self.obs, self.focal_px)
-        return numbers, np.repeat(np.arange(self.obs.n_frames), self.likelihood.frames.sizes)
-
-    @property
-    def sigma(self) -> float:
-        """Scatter of the residuals."""
-        return float(np.sqrt(self.residuals @ self.residuals / self.dof))
-
-    def shift(self, moved: FloatArray) -> FloatArray:
-        """Whitened shifts (2, N) of images by small moves (3, N) of the stars, camera frame,
-        rad.
-        """
-        shifts: FloatArray = np.einsum(
-            "ixn,in->xn", self.state.attitude, np.cross(self.state.b, moved, axis=0)
-        )
-        return shifts
-
-    def left(self, shifts: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What is left (g, m) of shifts (g, 2, N), and what parameters took up (g, p)."""
-        flat = self.likelihood.whitened(self.state, shifts)
-        along = flat @ self.basis
-        taken = np.linalg.solve(self._triangle, along[:, : len(self._triangle)].T).T
-        return flat - along @ self.basis.T, taken
-
-    def cleared(self, columns: FloatArray) -> FloatArray:
-        """Columns (g, m) without what is fitted."""
-        left: FloatArray = columns - (columns @ self.basis) @ self.basis.T
-        return left
-
-    def beside(self, shifts: FloatArray) -> Remainder:
-        """The same where shifts (g, 2, N) are fitted as well."""
-        flat = (
-            self.left(shifts)[0] / np.linalg.norm(shifts.reshape(len(shifts), -1), axis=1)[:, None]
-        )
-        more = _orthonormal(flat)
-        found = copy(self)
-        found.basis = np.concatenate([self.basis, more.T], axis=1)
-        found.residuals = self.residuals - (more @ self.residuals) @ more
-        found.dof = max(self.dof - len(more), 1)
-        return found
-
-
-def _orthonormal(rows: FloatArray, least: float = 1e-6) -> FloatArray:
-    """Directions (r, m) of rows (g, m) whose squares are above `least` of the rows'."""
-    values, vectors = principal(rows @ rows.T, least)
-    found: FloatArray = (vectors / np.sqrt(values)).T @ rows
-    return found
-
-
-class _Settled(NamedTuple):
-    """Zeniths (n, 3) whose air explains the most, its density, shifts (2, N) by it, what is left of
-    these (m,).
-    """
-
-    zeniths: FloatArray
-    density: float
-    shift: FloatArray
-    column: FloatArray
-    # Standard errors: of moves of the zeniths along their tangents, rad, and of the density
-    errors: FloatArray
+    return StarNoise(found.tau_px, own, found.n_recurring)
 
 
 class _Air:
     """Refraction of some frames from any place."""
 
     def __init__(
-        self,
-        obs: Observations,
-        cal: Calibration,
-        seed: int,
-        errors: _StarNoise | None,
+        self, obs: Observations, cal: Calibration, seed: int, errors: StarNoise | None
     ) -> None:
-        rest = Remainder(obs, cal, seed, errors, _FRAMES if obs.timed else _FRAMES_APIECE)
+        self._timed, self._seed = obs.timed, seed
+        most = _FRAMES if obs.timed else _FRAMES_APIECE
         # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is
         # without these.
-        likelihood, state, camera = rest.likelihood, rest.state, cal.camera
-        view = View.of(likelihood, state, camera.theta, slice(0, likelihood.frames.n_stars))
-        others = (*lens_shapes(camera), *focal_drift(rest.obs))
-        shifts = np.concatenate([shape.columns(view) for shape in others])
-        self._alone, self._rest = rest, rest.beside(shifts)
-        own = frame_shapes(camera).columns(view)
-        for columns in (shifts, own):
-            likelihood.frames.whiten(columns)
-        own = self._apart(own)
-        self._own = own.reshape(3, -1, *own.shape[1:])
-        self._cal = cal
-        self._axes, self.timed = frame_axes(rest.obs)
-        self._constants = air_constants()
-        self.seen_px = np.zeros((2, likelihood.frames.n_stars))
+        self._alone = alone = images_beside(obs, cal, seed, errors, most)
+        others = (*lens_shapes(cal.camera), *focal_drift(alone.obs))
+        self._rest = alone.beside(np.concatenate([alone.whitened(shape) for shape in others]))
+        # Errors of few stars are known less well than the noise of their images.
+        p, few = len(cal.theta), np.inf if errors is None else errors.n_recurring
+        self._most_dof = max(2 * few - 3 - p, 1)
+        own = alone.by_frame
+        rows = alone.left(own.reshape(-1, *own.shape[2:]))[0].reshape(*own.shape[:2], -1)
+        self._own = rows / np.linalg.norm(own, axis=(2, 3))[:, :, None]
+        self._cal, self._whole = cal, obs
+        self.seen_px = np.zeros_like(alone.state.e)
 
-    def test(self, seed: int) -> AirTest | None:
+    def test(self) -> AirTest | None:
         """Test the air of one place, and without times of a zenith for each frame."""
-        found = self.of_one_place(seed)
-        if not self.timed and (found is None or not found.is_air):
+        found = self.of_one_place()
+        if not self._timed and (found is None or not found.is_air):
             apiece = self.of_each_frame()
             if apiece is not None and (found is None or apiece.is_air or apiece.like_others):
                 return apiece
         return found
 
-    def _taken(self, shift_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened shifts (1, 2, N) of shifts (2, N) of images, px, and what parameters take up of
-        them (p,).
+    def _taken(self, shift_px: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Whitened shifts (1, 2, N) of shifts (2, N) of images, px, what is left of them (1, m) and
+        what parameters take up of them (p,).
         """
         shifts = np.array(shift_px)[None]
         self._alone.likelihood.frames.whiten(shifts)
-        return shifts, self._alone.left(shifts)[1][0]
+        left, taken = self._alone.left(shifts)
+        return shifts, left, taken[0]
 
     def f_px(self, shift_px: FloatArray) -> float:
         """How much too short f is without air that shifts images so, (2, N) px."""
-        return -float(self._taken(shift_px)[1][2])
+        return -float(self._taken(shift_px)[2][2])
 
     def noise(self) -> NoiseModel:
         """Fit the noise that the images have without the air that was found."""
-        rest, theta = self._alone, self._cal.theta
-        shifts, taken = self._taken(self.seen_px)
-        left = shifts[0] - np.tensordot(taken, rest.likelihood.derivatives(theta, rest.state), 1)
-        likelihood = rest.likelihood
+        images, theta = self._alone, self._cal.theta
+        likelihood, state = images.likelihood, images.state
+        shifts, _, taken = self._taken(self.seen_px)
+        left = shifts[0] - np.tensordot(taken, likelihood.derivatives(theta, state), 1)
         if has_effects(self._cal) and isinstance(likelihood, EffectLikelihood):
             # Effects have taken their part of it off the images already.
-            left = likelihood.conditioned(rest.state, left[None])[0][0]
+            left = likelihood.conditioned(state, left[None])[0][0]
         x, y = likelihood.frames.in_pixels(left)
-        clean = replace(rest.clean, x_px=rest.clean.x_px - x, y_px=rest.clean.y_px - y)
+        clean = without_effects(self._whole, self._cal).select_frames(images.obs.frame_ids)
+        clean = replace(clean, x_px=clean.x_px - x, y_px=clean.y_px - y)
         return fit_noise(clean, self._cal.camera, rounds=1)[0]
 
-    def _apart(self, shifts: FloatArray) -> FloatArray:
-        """Shifts (q, 2, N) of each frame by itself, (q K, 2, N)."""
-        frames = self._rest.likelihood.frames
-        number = self._rest.groups[1]
-        spread = np.zeros((len(shifts), frames.n_frames, 2, frames.n_stars))
-        spread[:, number, :, np.arange(frames.n_stars)] = shifts.transpose(2, 0, 1)
-        return spread.reshape(-1, 2, frames.n_stars)
-
-    def _raised(self, zenith: FloatArray) -> FloatArray:
-        """Whitened shifts (2, N) by standard air below zeniths (3, N), camera frame."""
-        sine = np.sum(zenith * self._rest.state.b, axis=0)
-        return self._rest.shift(zenith * raising(sine, self._constants)[0])
-
-    def _above(self, places: FloatArray) -> FloatArray:
-        """Zeniths (K, 3) of the frames, camera frame, at one place (1, 3)."""
-        found: FloatArray = np.einsum(
-            "kij,akj,a->ki", self._rest.state.rotations, self._axes.transpose(1, 0, 2), places[0]
-        )
-        return found
-
-    def _shift(self, zeniths: FloatArray) -> FloatArray:
-        """Whitened shifts (2, N) by standard air below zeniths (K, 3) of the frames, camera
-        frame.
-        """
-        return self._raised(self._rest.likelihood.frames.spread(np.ascontiguousarray(zeniths.T)))
-
-    def _possible(self, places: FloatArray) -> FloatArray:
-        """Those places (g, 3) from which all stars were above the horizon."""
-        frames = self._rest.likelihood.frames
-        turned = [frames.spread(np.ascontiguousarray(self._axes[:, axis].T)) for axis in range(3)]
-        seen = np.stack([np.sum(axis * frames.r, axis=0) for axis in turned])
-        found: FloatArray = places[np.min(places @ seen, axis=1) > LOWEST]
-        return found
-
-    def of_one_place(self, seed: int) -> AirTest | None:
+    def of_one_place(self) -> AirTest | None:
         """The air of one place; None where from no place all stars were above the horizon."""
-        places = self._possible(sphere(_PLACES))
+        places = self._alone.possible()
         if not len(places):
             return None
-        alone, _ = self._alone.left(
-            np.stack([self._shift(self._above(place[None])) for place in places])
-        )
-        rest, columns = self._rest, self._rest.cleared(alone)
-        p_value, amplitude, std = _largest(rest, columns, seed)
+        below = self._alone.below(places)
+        rest, columns = self._rest, self._rest.cleared(below)
+        most = (self._most_dof, self._seed)
+        p_value, amplitude, std = _largest(rest, columns, *most)
         found = AirTest(p_value, amplitude, std, n_frames=rest.obs.n_frames)
         if p_value >= AIR_P:
-            if _largest(self._alone, alone, seed)[0] >= AIR_P:
+            if _largest(self._alone, below, *most)[0] >= AIR_P:
                 return found
-            rest, columns = self._alone, alone
-        gain = 2.0 * columns @ rest.residuals - np.sum(columns**2, axis=1)
-        settled = self._settled(rest, places[np.argmax(gain)][None], self._above)
-        gained, most = _gained(rest, settled.column), _most(rest, columns)
-        good = most - gained < max(_AIR_CHI2, _INEXACT * most) and self._nothing_else(
-            rest, settled.column
-        )
-        if not good:
+            rest, columns = self._alone, below
+        settled = of_one_place(rest, places, columns)
+        shift, column = self._of(settled, rest)
+        chi2 = _most(rest, columns)
+        good = chi2 - _gained(rest, column) < max(_AIR_CHI2, _INEXACT * chi2)
+        if not good or not self._nothing_else(rest, column):
             return found
-        found = self._with(found, settled, rest)
-        if not (self.timed and found.is_air):
+        found = self._with(found, settled, shift, rest)
+        if not (self._timed and found.is_air):
             return found
-        x, y, z = settled.zeniths[0]
-        north, east, _ = np.degrees(settled.errors)
+        air = found_air(*settled, rest.boresights)
         return replace(
             found,
-            latitude_deg=float(np.degrees(np.arcsin(z))),
-            longitude_deg=float(np.degrees(np.arctan2(y, x))),
-            latitude_std_deg=float(north),
-            longitude_std_deg=float(east / max(np.hypot(x, y), 1e-3)),
+            latitude_deg=air.latitude_deg,
+            longitude_deg=air.longitude_deg,
+            latitude_std_deg=air.latitude_std_deg,
+            longitude_std_deg=air.longitude_std_deg,
         )
 
     def of_each_frame(self) -> AirTest | None:
@@ -448,14 +265,15 @@ class _Air:
             self._of_each_frame(self._alone) if found is None or found.p_value >= AIR_P else found
         )
 
-    def _of_each_frame(self, rest: Remainder) -> AirTest | None:
+    def _of_each_frame(self, rest: Images) -> AirTest | None:
         own, k = self._own_shapes(rest), rest.obs.n_frames
         if _f_tail(_explained(rest, own), len(own), rest) >= AIR_P:
             return None
-        settled = self._settled(rest, self._zeniths_apiece(), lambda zeniths: zeniths)
-        gained = _gained(rest, settled.column)
+        settled = of_each_frame(rest, self._alone)
+        shift, column = self._of(settled, rest)
+        gained = _gained(rest, column)
         p_value = _f_tail(gained * rest.sigma**2, len(own), rest)
-        good = p_value < AIR_P and self._nothing_else(rest, settled.column, k)
+        good = p_value < AIR_P and self._nothing_else(rest, column, k)
         if rest is not self._alone:
             # A focal length of each frame, or a shape without the scale of air, is not air: that
             # has to explain more than either, even with all that noise gives to what that one
@@ -463,169 +281,92 @@ class _Air:
             for first, last in ((0, 1), (1, 3)):
                 one = _explained(rest, self._own_shapes(rest, slice(first, last))) / rest.sigma**2
                 good = good and gained > one + (3 - last + first) * k + _AIR_CHI2
-        found = AirTest(p_value, settled.density, float(settled.errors[-1]), n_frames=k)
-        return self._with(found, settled, rest) if good else found
+        found = AirTest(p_value, *_density(settled), n_frames=k)
+        return self._with(found, settled, shift, rest) if good else found
 
-    def _with(self, found: AirTest, settled: _Settled, rest: Remainder) -> AirTest:
+    def _of(self, settled: Settled, rest: Images) -> tuple[FloatArray, FloatArray]:
+        """Shifts px (2, N) by the air that was found, of a density that there is, and what is left
+        of them (m,).
+        """
+        air, (moves, *_) = settled.coefficients.copy(), settled.zeniths.sizes
+        air[:moves], air[-1] = 0.0, np.clip(air[-1], _THIN, _THICK)
+        shift = rest.likelihood.frames.in_pixels(np.tensordot(air, rest.of_air(settled.zeniths), 1))
+        return shift, rest.cleared(self._taken(shift)[1])[0]
+
+    def _with(
+        self, found: AirTest, settled: Settled, shift_px: FloatArray, rest: Images
+    ) -> AirTest:
         """What was found, with the air that explains it, beside terms of the lens or only without
         these.
         """
-        self.seen_px = rest.likelihood.frames.in_pixels(settled.shift)
-        f_px = self.f_px(self.seen_px)
-        alike, errors = rest is self._alone, float(settled.errors[-1])
-        found = replace(
-            found,
-            amplitude=settled.density,
-            amplitude_std=errors,
-            is_air=not alike,
-            like_others=alike,
-        )
+        self.seen_px = shift_px
+        f_px, alike = self.f_px(shift_px), rest is self._alone
+        amplitude, std = _density(settled)
+        found = replace(found, amplitude=amplitude, amplitude_std=std)
+        found = replace(found, is_air=not alike, like_others=alike)
         return replace(found, f_px=f_px, f_sigma=f_px / float(self._cal.sigmas[2]))
 
-    @cached_property
-    def _own_left(self) -> FloatArray:
-        """What is left of scale and shape of each frame by itself, (3, K, m)."""
-        rows, _ = self._alone.left(self._own.reshape(-1, *self._own.shape[2:]))
-        return rows.reshape(*self._own.shape[:2], -1)
-
-    def _own_shapes(self, rest: Remainder, which: slice = slice(None)) -> FloatArray:
+    def _own_shapes(self, rest: Images, which: slice = slice(None)) -> FloatArray:
         """What is left of scale and shape of each frame by itself, as orthonormal rows; `which` of
         the three.
         """
-        shifts = self._own[which].reshape(-1, *self._own.shape[2:])
-        rows = self._own_left[which].reshape(len(shifts), -1)
-        if rest is self._rest:
-            rows = rest.cleared(rows)
-        return _orthonormal(
-            rows / np.linalg.norm(shifts.reshape(len(rows), -1), axis=1)[:, None], _ABSORBED
-        )
+        rows = self._own[which].reshape(-1, self._own.shape[2])
+        return orthonormal(rest.cleared(rows), _ABSORBED)
 
-    def _nothing_else(self, rest: Remainder, column: FloatArray, fitted: int = 0) -> bool:
+    def _nothing_else(self, rest: Images, column: FloatArray, fitted: int = 0) -> bool:
         """Whether frames by themselves, without that air, differ in scale and shape no more than by
         noise.
 
         `fitted` is how many numbers of the air the frames' own shapes have determined.
         """
-        left, rows = rest.residuals - column, self._own_shapes(rest)
+        left, rows = rest.e - column, self._own_shapes(rest)
         explained = float(np.sum((rows @ left) ** 2))
         tail = _f_tail(explained, max(len(rows) - fitted, 1), rest, float(left @ left))
         return tail > AIR_P or explained < _INEXACT * float(column @ column)
 
-    def _settled(
-        self, rest: Remainder, zeniths: FloatArray, above: Callable[[FloatArray], FloatArray]
-    ) -> _Settled:
-        """The zeniths (n, 3) near to these whose air explains the most; `above` makes the frames'
-        (K, 3) of them.
 
-        Levenberg's damped steps; the density of the air is fitted as well, with what is known of
-        it.
-        """
-        scale, damping, least = rest.sigma**2, 1e-3, np.inf
-        known, density, trial, trial_density = zeniths, 1.0, zeniths, 1.0
-        for _ in range(_STEPS):
-            shift = trial_density * self._shift(above(trial))
-            column = rest.left(shift[None])[0][0]
-            away = (trial_density - 1.0) / DENSITY_SPREAD
-            cost = float(np.sum((rest.residuals - column) ** 2)) / scale + away**2
-            if cost < least:
-                gained, least, damping = least - cost, cost, 0.2 * damping
-                known, density, found = trial, trial_density, (shift, column)
-                ways = tangents(known)
-                moved = [
-                    self._shift(above(normalised(known + _STEP_RAD * way))) * density
-                    for way in ways
-                ]
-                slopes = (np.stack(moved) - shift) / _STEP_RAD
-                if len(known) > 1:
-                    slopes = self._apart(slopes)
-                rows = np.concatenate([rest.left(slopes)[0], column[None] / density])
-                matrix, pull = rows @ rows.T / scale, rows @ (rest.residuals - column) / scale
-                matrix[-1, -1] += DENSITY_SPREAD**-2
-                pull[-1] -= away / DENSITY_SPREAD
-                if gained < _SETTLED:
-                    break
-            else:
-                damping *= 10.0
-            diagonal = np.diag(matrix)
-            step = np.linalg.solve(
-                matrix + np.diag(damping * (diagonal + 1e-9 * diagonal.max())), pull
-            )
-            turn = step[:-1].reshape(2, -1)
-            turn = turn * np.minimum(1.0, _LONGEST_RAD / np.maximum(np.hypot(*turn), 1e-12))
-            trial = normalised(known + turn[0][:, None] * ways[0] + turn[1][:, None] * ways[1])
-            trial_density = float(np.clip(density + step[-1], _THIN, _THICK))
-        return _Settled(
-            known, density, *found, np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True)))
-        )
-
-    def _zeniths_apiece(self) -> FloatArray:
-        """Zeniths (K, 3), camera frame, that explain the most of each frame by itself, from a grid.
-
-        What all frames take up together, most of all the focal length, is fitted in turn with them.
-        """
-        likelihood, state = self._rest.likelihood, self._rest.state
-        frames, n = likelihood.frames, likelihood.frames.n_stars
-        grid = _around(_DISTANCES_DEG)
-        shifts = np.stack(
-            [self._raised(np.broadcast_to(zenith[:, None], (3, n))) for zenith in grid]
-        )
-        lowest = np.minimum.reduceat(grid @ state.b, frames.starts[:-1], axis=1)
-        columns = likelihood.project_out(state, shifts)
-        size = np.where(lowest > LOWEST, frames.sum(np.sum(columns**2, axis=1)), np.inf)
-        h = likelihood.slopes(self._cal.theta, state)
-        e = likelihood.project_out(state, state.e[None])[0]
-        basis = np.linalg.qr(h.reshape(len(h), -1).T)[0]
-        number, star = self._rest.groups[1], np.arange(n)
-        best, least = np.zeros(frames.n_frames, dtype=np.int64), np.inf
-        for tangent in _TANGENTS:
-            left = e - h[2] * (
-                self._cal.camera.focal_px * self._constants[0] * (1.0 + 0.5 * tangent**2)
-            )
-            for _ in range(_ROUNDS):
-                gain = 2.0 * frames.sum(np.sum(columns * left, axis=1)) - size
-                chosen = np.argmax(gain, axis=0)
-                total = columns[chosen[number], :, star].T
-                left = e - (basis @ (basis.T @ (e - total).ravel())).reshape(2, -1)
-                cost = float(np.sum((left - total) ** 2))
-                if cost < least:
-                    best, least = chosen, cost
-        return grid[best]
+def _density(settled: Settled) -> tuple[float, float]:
+    """Density of the air, as far as there is air of it, and its standard error."""
+    density = float(np.clip(settled.coefficients[-1], _THIN, _THICK))
+    return density, float(np.sqrt(settled.covariance[-1, -1]))
 
 
-def _largest(rest: Remainder, columns: FloatArray, seed: int) -> tuple[float, float, float]:
+def _largest(
+    rest: Images, columns: FloatArray, most_dof: float, seed: int
+) -> tuple[float, float, float]:
     """Probability that noise gives so large an amplitude of one of columns (g, m); that amplitude
     and its error.
     """
     length = np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
-    z = columns @ rest.residuals / length / rest.sigma
+    z = columns @ rest.e / length / rest.sigma
     best = int(np.argmax(z))
     rng = np.random.default_rng(seed)
     products = columns @ columns.T / np.outer(length, length)
     values, vectors = principal(products, 1e-10, relative=True)
     noise = rng.standard_normal((_DRAWS, len(values))) @ (vectors * np.sqrt(values)).T
-    dof = min(rest.dof, rest.least_dof)
+    dof = min(rest.dof, most_dof)
     noise /= np.sqrt(rng.chisquare(dof, _DRAWS) / dof)[:, None]
     p_value = (1.0 + float(np.count_nonzero(noise.max(axis=1) >= z[best]))) / (_DRAWS + 1.0)
     return p_value, float(z[best] * rest.sigma / length[best]), float(rest.sigma / length[best])
 
 
-def _explained(rest: Remainder, rows: FloatArray) -> float:
+def _explained(rest: Images, rows: FloatArray) -> float:
     """Sum of squares that orthonormal rows (r, m) explain."""
-    return float(np.sum((rows @ rest.residuals) ** 2))
+    return float(np.sum((rows @ rest.e) ** 2))
 
 
-def _gained(rest: Remainder, column: FloatArray) -> float:
+def _gained(rest: Images, column: FloatArray) -> float:
     """Chi-square that a column (m,) explains as it stands."""
-    return float(2.0 * column @ rest.residuals - column @ column) / rest.sigma**2
+    return float(2.0 * column @ rest.e - column @ column) / rest.sigma**2
 
 
-def _most(rest: Remainder, columns: FloatArray) -> float:
+def _most(rest: Images, columns: FloatArray) -> float:
     """Chi-square that the best of columns (g, m) explains with an amplitude of its own."""
-    along = np.maximum(columns @ rest.residuals, 0.0)
+    along = np.maximum(columns @ rest.e, 0.0)
     return float(np.max(along**2 / np.maximum(np.sum(columns**2, axis=1), 1e-300))) / rest.sigma**2
 
 
-def _f_tail(explained: float, rank: int, rest: Remainder, total: float | None = None) -> float:
+def _f_tail(explained: float, rank: int, rest: Images, total: float | None = None) -> float:
     """Probability that noise gives so much of a sum of squares `total`, that of the residuals, to
     `rank` numbers.
     """
@@ -634,18 +375,5 @@ def _f_tail(explained: float, rank: int, rest: Remainder, total: float | None = 
     dof = rest.dof - rank
     if dof < 1 or rank < 1:
         return 1.0
-    total = float(rest.residuals @ rest.residuals) if total is None else total
+    total = float(rest.e @ rest.e) if total is None else total
     return float(fdtrc(rank, dof, max(explained, 0.0) / rank / ((total - explained) / dof)))
-
-
-def _around(distances_deg: FloatArray) -> FloatArray:
-    """Directions (g, 3) at some distances from +z, all around."""
-    distance, angle = (
-        grid.ravel()
-        for grid in np.meshgrid(
-            np.radians(distances_deg), 2.0 * np.pi / _AROUND * np.arange(_AROUND), indexing="ij"
-        )
-    )
-    return np.column_stack(
-        [np.sin(distance) * np.cos(angle), np.sin(distance) * np.sin(angle), np.cos(distance)]
-    )

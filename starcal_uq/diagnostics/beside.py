@@ -9,7 +9,7 @@ of effects have no prior, so that what is left is noise alone, however large the
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,17 +17,21 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.camera.projection import project
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.estimation.zenith import Images
 from starcal_uq.likelihood.effect_sums import Columns, EffectLikelihood
-from starcal_uq.likelihood.effects import Effect, effects_of
+from starcal_uq.likelihood.effects import Effect, effects_of, star_effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.maths.linear import principal
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.splits import one_of_each
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
+_STARS = 4000
 # Directions of which what is fitted already takes all but this share of the square are not there.
 _ABSORBED = 1e-8
 
@@ -59,6 +63,39 @@ def with_effects_of(
     ratio = {effect.name: cal.effects.ratio(cal.sigma)[effect.name] for effect in effects}
     at = (cal.theta, rotations, cal.sigma)
     return EffectLikelihood(frames, cal.camera.distortion, effects, ratio, *at)
+
+
+class StarNoise(NamedTuple):
+    """Direction errors of the stars per axis, px, the noise of their images, and how many recur."""
+
+    tau_px: float
+    sigma: float
+    n_recurring: int
+
+
+def images_beside(
+    obs: Observations,
+    cal: Calibration,
+    seed: int,
+    errors: StarNoise | None = None,
+    most: int = 200,
+) -> Images:
+    """Images of some frames beside the effects of a calibration, or beside errors of stars."""
+    chosen = one_of_each(
+        obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed
+    )
+    some = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
+    model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
+    likelihood = None
+    if errors is not None:
+        stars = star_effect(StarModel(some, float(cal.theta[2])))
+        ratio = {stars.name: (errors.tau_px / errors.sigma) ** 2}
+        frames = StarFrames.from_observations(some, axes=True)
+        at = (cal.theta, rotations, errors.sigma)
+        likelihood = EffectLikelihood(frames, model, [stars], ratio, *at)
+    elif has_effects(cal):
+        likelihood = with_effects_of(some, cal, rotations, obs)
+    return Images(some, cal, rotations, likelihood)
 
 
 def without_effects(obs: Observations, cal: Calibration) -> Observations:

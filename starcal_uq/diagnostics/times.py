@@ -16,12 +16,15 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from starcal_uq.attitude.earth import LOWEST
 from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR
 from starcal_uq.core.types import FloatArray, StrArray
-from starcal_uq.diagnostics.air import Remainder
+from starcal_uq.diagnostics.beside import images_beside
 from starcal_uq.estimation.weights import weighed
+from starcal_uq.estimation.zenith import Images
+from starcal_uq.likelihood.zenith import raised
 from starcal_uq.sky.apparent import earth_velocity_km_s
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
@@ -42,7 +45,6 @@ _LONGEST_YEARS = 250.0
 # Other dates and hours, in days and hours.
 _DATES = np.arange(-180.0, 181.0, 4.0)
 _HOURS = np.arange(-14.0, 14.1, 0.25)
-_LOWEST = np.sin(np.radians(5.0))
 
 
 @dataclass(frozen=True)
@@ -110,14 +112,14 @@ class _Moved:
     later: FloatArray
 
 
-def remainder(obs: Observations, cal: Calibration, seed: int) -> Remainder:
+def remainder(obs: Observations, cal: Calibration, seed: int) -> Images:
     """What `time_test` and `unseen_aberration` look at."""
-    return Remainder(weighed(obs, cal), cal, seed)
+    return images_beside(weighed(obs, cal), cal, seed)
 
 
 @bounded
 def time_test(
-    obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remainder | None = None
+    obs: Observations, cal: Calibration, *, seed: int = 0, rest: Images | None = None
 ) -> TimeTest | None:
     """Look for a wrong time in the residuals of a calibration.
 
@@ -127,7 +129,7 @@ def time_test(
         The data and the estimate made from them.
     seed : int
         Seed of the choice of frames, where there are many.
-    rest : Remainder, optional
+    rest : Images, optional
         What `remainder` gives for these, where it is known already.
 
     Returns
@@ -140,7 +142,7 @@ def time_test(
     for moved in _causes(rest):
         columns, absorbed = rest.left(moved.shifts)
         size = np.einsum("gi,gi->g", columns, columns)
-        along = columns @ rest.residuals
+        along = columns @ rest.e
         with np.errstate(all="ignore"):
             gain = np.nan_to_num(along**2 / size if moved.cause == "epoch" else 2.0 * along - size)
         i = int(np.argmax(gain))
@@ -156,7 +158,7 @@ def time_test(
             if moved.cause in ("date", "hour"):
                 a, b = max(i - 1, 0), min(i + 1, len(size) - 1)
                 slope = (columns[b] - columns[a]) / (moved.later[b] - moved.later[a])
-                step, later_std, _ = _fitted(slope, rest, rest.residuals - columns[i])
+                step, later_std, _ = _fitted(slope, rest, rest.e - columns[i])
                 later += step
         if good and sure > _SIGNIFICANT:
             shift = np.abs(absorbed[i] * (factor if moved.cause == "epoch" else 1.0)) / cal.sigmas
@@ -169,7 +171,7 @@ def time_test(
 
 @bounded
 def unseen_aberration(
-    obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remainder | None = None
+    obs: Observations, cal: Calibration, *, seed: int = 0, rest: Images | None = None
 ) -> UnseenAberration | None:
     """Ask how far annual aberration would move f without being seen in the residuals of a
     calibration.
@@ -180,7 +182,7 @@ def unseen_aberration(
         The data and the estimate made from them.
     seed : int
         Seed of the choice of frames, where there are many.
-    rest : Remainder, optional
+    rest : Images, optional
         What `remainder` gives for these, where it is known already.
 
     Returns
@@ -200,7 +202,7 @@ def unseen_aberration(
 
 
 def _fitted(
-    column: FloatArray, rest: Remainder, residuals: FloatArray | None = None
+    column: FloatArray, rest: Images, residuals: FloatArray | None = None
 ) -> tuple[float, float, float]:
     """The factor of a column, its error and how many errors it is.
 
@@ -212,7 +214,7 @@ def _fitted(
 
     groups, n = rest.groups, 2 * rest.obs.n_stars
     # Coefficients of effects have no star.
-    column, residuals = column[:n], (rest.residuals if residuals is None else residuals)[:n]
+    column, residuals = column[:n], (rest.e if residuals is None else residuals)[:n]
     own = (column**2).reshape(2, -1).sum(axis=0)
     by_star = np.bincount(groups[0], own)
     most = float(by_star.sum())
@@ -235,20 +237,13 @@ def _fitted(
     return factor, max(errors), abs(factor) / float(np.max(np.multiply(errors, few)))
 
 
-def _causes(rest: Remainder) -> Iterator[_Moved]:
+def _causes(rest: Images) -> Iterator[_Moved]:
     obs = rest.obs
-    frames = rest.likelihood.frames
-
-    def seen(moves: FloatArray) -> FloatArray:
-        """Shifts of images by moves (3, N), ICRS axes."""
-        turned = rest.state.rotations[rest.groups[1]]
-        return rest.shift(np.einsum("nij,jn->in", turned, moves))
-
+    frames, state = rest.likelihood.frames, rest.state
+    towards = frames.spread(state.rotations.T)
     # One and the same for all stars of a frame, so that three columns hold the velocities of all
     # candidates.
-    basis = np.stack(
-        [seen(np.repeat(np.eye(3)[:, i : i + 1], frames.n_stars, axis=1)) for i in range(3)]
-    )
+    basis = state.shifts(towards)
 
     def aberrated(cause: Cause, velocities: FloatArray, later: FloatArray) -> _Moved:
         """By velocities (g, K, 3), km/s."""
@@ -271,7 +266,8 @@ def _causes(rest: Remainder) -> Iterator[_Moved]:
         yield aberrated("date", velocities - now, _DATES)
     if obs.origin.site is not None and apparent and timed:
         yield from _other_hours(rest, Site.from_dict(obs.origin.site), stated)
-    yield _Moved("epoch", seen(_proper_motion(obs))[None], np.zeros(1))
+    moving = np.einsum("jin,jn->in", towards, _proper_motion(obs))
+    yield _Moved("epoch", state.shifts(moving)[None], np.zeros(1))
 
 
 def _proper_motion(obs: Observations) -> FloatArray:
@@ -298,23 +294,21 @@ def _velocities(times: np.ndarray, days: FloatArray) -> FloatArray:
     return np.stack([np.interp(at, known, axis) for axis in table.T], axis=-1)
 
 
-def _other_hours(rest: Remainder, site: Site, times: StrArray) -> Iterator[_Moved]:
+def _other_hours(rest: Images, site: Site, times: StrArray) -> Iterator[_Moved]:
     """Refraction towards the zenith of other hours, in the place of that of the stated ones."""
     frames, state = rest.likelihood.frames, rest.state
     constants = refraction_constants(site)
 
-    def raised(hours: float) -> FloatArray | None:
+    def seen(hours: float) -> FloatArray | None:
         zenith = site_among_stars(site.later(hours), times)[0]
-        up = frames.spread(np.ascontiguousarray(np.einsum("kij,kj->ik", state.rotations, zenith)))
-        sine = np.sum(up * state.b, axis=0)
-        if sine.min() < _LOWEST:
+        up = frames.spread(np.einsum("kij,kj->ik", state.rotations, zenith))
+        if np.sum(up * state.b, axis=0).min() < LOWEST:
             return None
-        a, b = constants
-        return rest.shift(up * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
+        return state.shifts(raised(state.b, up, constants))
 
-    stated = raised(0.0)
+    stated = seen(0.0)
     found = (
-        [] if stated is None else [(h, s - stated) for h in _HOURS if (s := raised(h)) is not None]
+        [] if stated is None else [(h, s - stated) for h in _HOURS if (s := seen(h)) is not None]
     )
     if found:
         yield _Moved(

@@ -8,27 +8,31 @@ of k t^2 / 2, along the direction to the zenith or away from it.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from starcal_uq.attitude.earth import LOWEST, air_constants, normalised, sphere
 from starcal_uq.likelihood.elimination import products_by_frame
-from starcal_uq.likelihood.fitted_effects import Effects, FoundAir
+from starcal_uq.likelihood.fitted_effects import FoundAir
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.shapes import View
-from starcal_uq.likelihood.zenith import Zeniths, frame_axes
+from starcal_uq.likelihood.shapes import Shape, View, frame_shapes
+from starcal_uq.likelihood.star_errors import star_numbers
+from starcal_uq.likelihood.zenith import Zeniths, frame_axes, raised
+from starcal_uq.maths.linear import principal
 
 if TYPE_CHECKING:
-    from starcal_uq.core.types import FloatArray
+    from starcal_uq.core.types import FloatArray, IntArray
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
 # Places of the grid; frames that get a zenith each, and fewest stars that tell one. What noise does
 # to the density of the air by way of each frame's zenith is known to first order: of more frames,
 # what is left of it would exceed the errors.
-_PLACES, _APIECE, _FEWEST = 500, 12, 4
+_PLACES, _APIECE, _FEWEST = 600, 12, 4
 _STEPS, _SETTLED = 30, 0.05
 # Half width of differences, rad.
 _STEP_RAD = 0.02
@@ -37,45 +41,119 @@ _TANGENTS = (0.2, 3.0)
 
 
 class Images:
-    """Images of some frames around an estimate, and what of shifts attitudes and parameters leave."""
+    """Images of some frames around an estimate, and what of shifts attitudes and parameters leave.
 
-    def __init__(self, obs: Observations, cal: Calibration, rotations: FloatArray) -> None:
-        self.obs = obs
-        self.likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
-        self.state, _ = self.likelihood.profile(cal.theta, rotations)
-        self.view = View.of(self.likelihood, self.state, cal.theta, slice(None))
-        self.slopes = self.likelihood.slopes(cal.theta, self.state)
-        h = self.slopes.reshape(len(cal.theta), -1)
-        self._basis = np.linalg.qr((h / np.linalg.norm(h, axis=1)[:, None]).T)[0]
-        e = self.likelihood.project_out(self.state, self.state.e[None])
-        self.e = self.left(e)[0]
-        self.sigma = float(np.sqrt(self.e @ self.e / max(self.likelihood.dof - len(h), 1)))
+    `e` (m,) are whitened residuals with `dof` degrees of freedom: m = 2 N, x of all stars before y,
+    and where a likelihood has effects, one more for each of their coefficients. `rotations` (K, 3,
+    3) are attitudes.
+    """
 
-    def left(self, columns: FloatArray) -> FloatArray:
-        """Whitened columns (q, 2, N) without attitudes, as (q, 2 N) without parameters."""
-        flat = columns.reshape(len(columns), -1)
-        return np.asarray(flat - (flat @ self._basis) @ self._basis.T)
+    def __init__(
+        self,
+        obs: Observations,
+        cal: Calibration,
+        rotations: FloatArray,
+        likelihood: MarginalLikelihood | None = None,
+    ) -> None:
+        if likelihood is None:
+            likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
+        self.obs, self.camera, self.likelihood = obs, cal.camera, likelihood
+        self.state, _ = likelihood.profile(cal.theta, rotations)
+        self.view = View.of(likelihood, self.state, cal.theta, slice(None))
+        h = likelihood.derivatives(cal.theta, self.state)
+        self.basis, self._triangle = np.linalg.qr(likelihood.whitened(self.state, h).T)
+        self.e = self.cleared(likelihood.whitened(self.state, self.state.e[None]))[0]
+        self.dof = max(likelihood.dof - len(h), 1)
 
-    def of_air(self, zeniths: Zeniths) -> FloatArray:
-        """What is left of the columns of the effect, (m, 2 N)."""
-        columns = zeniths.shape(self.obs).columns(self.view)
-        self.likelihood.frames.whiten(columns)
-        return self.left(self.likelihood.project_out(self.state, columns))
-
-    def by_frame(self, zeniths: Zeniths) -> FloatArray:
-        """Products (K, 3, 3) of the columns of zeniths of single frames, attitudes removed."""
-        columns = zeniths.shape(self.obs).columns(self.view)[:-1]
-        frames = self.likelihood.frames
-        # Every frame has three of its own, which are zero elsewhere.
-        own = columns.reshape(3, -1, *columns.shape[1:]).sum(axis=1)
-        frames.whiten(own)
-        own = self.likelihood.project_out(self.state, own)
-        return products_by_frame(frames, own, own)
+    @property
+    def sigma(self) -> float:
+        """Scatter of the residuals."""
+        return float(np.sqrt(self.e @ self.e / self.dof))
 
     @property
     def boresights(self) -> FloatArray:
         """Boresights (K, 3), ICRS axes."""
         return self.state.rotations[:, 2]
+
+    @cached_property
+    def groups(self) -> tuple[IntArray, IntArray]:
+        """Star and frame of every image, (N,) each, from 0."""
+        frames = self.likelihood.frames
+        numbers = star_numbers(self.obs, self.camera.focal_px)
+        return numbers, np.repeat(np.arange(frames.n_frames), frames.sizes)
+
+    def cleared(self, columns: FloatArray) -> FloatArray:
+        """Columns (g, m) without what is fitted."""
+        return np.asarray(columns - (columns @ self.basis) @ self.basis.T)
+
+    def left(self, shifts: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What is left (g, m) of whitened shifts (g, 2, N), and what parameters took up (g, p)."""
+        flat = self.likelihood.whitened(self.state, shifts)
+        along = flat @ self.basis[:, : len(self._triangle)]
+        return self.cleared(flat), np.linalg.solve(self._triangle, along.T).T
+
+    def beside(self, shifts: FloatArray) -> Images:
+        """The same where whitened shifts (g, 2, N) are fitted as well."""
+        unit = np.linalg.norm(shifts, axis=(1, 2))[:, None]
+        more = orthonormal(self.left(shifts)[0] / unit)
+        found = copy(self)
+        found.basis = np.concatenate([self.basis, more.T], axis=1)
+        found.e = self.e - (more @ self.e) @ more
+        found.dof = max(self.dof - len(more), 1)
+        return found
+
+    def whitened(self, shape: Shape) -> FloatArray:
+        """Whitened shifts (q, 2, N) by a shape."""
+        columns = shape.columns(self.view)
+        self.likelihood.frames.whiten(columns)
+        return columns
+
+    def of_air(self, zeniths: Zeniths) -> FloatArray:
+        """Whitened shifts (m, 2, N) by the coefficients of the effect."""
+        return self.whitened(zeniths.shape(self.obs))
+
+    @cached_property
+    def by_frame(self) -> FloatArray:
+        """Whitened shifts (3, K, 2, N) by scale and shape of each frame by itself."""
+        own, frames = self.whitened(frame_shapes(self.camera)), self.likelihood.frames
+        spread = np.zeros((len(own), frames.n_frames, *own.shape[1:]))
+        spread[:, self.groups[1], :, np.arange(frames.n_stars)] = own.transpose(2, 0, 1)
+        return spread
+
+    @cached_property
+    def _towards(self) -> FloatArray:
+        """Axes of the sky, or of the Earth where there are times, at every star: (3, 3, N), camera
+        frame.
+        """
+        axes = frame_axes(self.obs)[0]
+        turned = self.state.rotations @ np.swapaxes(axes, 1, 2)
+        return self.likelihood.frames.spread(turned.T)
+
+    def possible(self) -> FloatArray:
+        """Places (g, 3) of a grid from which all stars were above the horizon."""
+        places = sphere(_PLACES)
+        sines = places @ np.einsum("jin,in->jn", self._towards, self.state.b)
+        return np.asarray(places[sines.min(axis=1) > LOWEST])
+
+    def below(self, places: FloatArray) -> FloatArray:
+        """What is left (g, m) of shifts by standard air below places (g, 3)."""
+        b, air = self.state.b, air_constants()
+        moves = (raised(b, np.tensordot(place, self._towards, 1), air) for place in places)
+        return self.left(np.stack([self.state.shifts(move) for move in moves]))[0]
+
+
+def orthonormal(rows: FloatArray, least: float = 1e-6) -> FloatArray:
+    """Directions (r, m) of rows (g, m) whose squares are above `least` of the rows'."""
+    values, vectors = principal(rows @ rows.T, least)
+    return np.asarray((vectors / np.sqrt(values)).T @ rows)
+
+
+class Settled(NamedTuple):
+    """Zeniths whose air explains the most, the coefficients (m,) there and their covariance."""
+
+    zeniths: Zeniths
+    coefficients: FloatArray
+    covariance: FloatArray
 
 
 def candidates(obs: Observations, cal: Calibration, rotations: FloatArray) -> list[Zeniths]:
@@ -88,86 +166,60 @@ def candidates(obs: Observations, cal: Calibration, rotations: FloatArray) -> li
     origin = obs.origin
     if origin.air == "corrected" or origin.without_air or origin.simulated or obs.n_frames == 0:
         return []
-    images = Images(obs, cal, rotations)
-    axes, timed = frame_axes(obs)
-    found = []
-    places = _possible(images, axes)
+    images, found = Images(obs, cal, rotations), []
+    places = images.possible()
     if len(places):
-        start = Zeniths(obs.frame_ids, axes, places[:1], timed)
-        found.append(_settled(images, _best_place(images, start, places)))
+        found.append(of_one_place(images, places, images.below(places)).zeniths)
     if 1 < obs.n_frames <= _APIECE and obs.stars_per_frame.min() >= _FEWEST:
-        level = np.tile(np.eye(3), (obs.n_frames, 1, 1))
-        start = Zeniths(obs.frame_ids, level, images.boresights, False)
-        found.append(_settled(images, _by_shears(images, start)))
+        found.append(of_each_frame(images, images).zeniths)
     return found
 
 
-def _possible(images: Images, axes: FloatArray) -> FloatArray:
-    """Places (g, 3) of a grid from which all stars were above the horizon."""
-    frames, places = images.likelihood.frames, sphere(_PLACES)
-    lowest = np.full(len(places), np.inf)
-    for k, (first, last) in enumerate(zip(frames.starts[:-1], frames.starts[1:], strict=True)):
-        seen = places @ (axes[k] @ frames.r[:, first:last])
-        lowest = np.minimum(lowest, seen.min(axis=1))
-    return places[lowest > LOWEST]
+def of_one_place(images: Images, places: FloatArray, columns: FloatArray) -> Settled:
+    """The place near the best of some (g, 3), below which air leaves columns (g, m)."""
+    gain = 2.0 * columns @ images.e - np.sum(columns**2, axis=1)
+    axes, timed = frame_axes(images.obs)
+    place = places[np.argmax(gain)][None]
+    return _settled(images, Zeniths(images.obs.frame_ids, axes, place, timed))
 
 
-def _best_place(images: Images, start: Zeniths, places: FloatArray) -> Zeniths:
-    """The place of a grid (g, 3) whose air explains the most."""
-    trials = [replace(start, places=place[None]) for place in places]
-    return trials[int(np.argmin([_cost(images, trial) for trial in trials]))]
-
-
-def _by_shears(images: Images, start: Zeniths) -> Zeniths:
-    """Zeniths that the shears of single frames point to, on either side."""
-    frames, state, k = images.likelihood.frames, images.state, images.likelihood.frames.n_frames
-    u, v = state.b[:2] / state.b[2]
-    rates = np.zeros((2, 3, frames.n_stars))
-    # Angles that grow as (u, -v) and as (v, u), as moves of the stars across the boresight.
-    rates[0, :2], rates[1, :2] = (u, -v), (v, u)
-    moved = np.cross(state.b[None], rates, axis=1)
-    shifts = np.einsum("ixn,ain->axn", state.attitude, moved)
-    number = np.repeat(np.arange(k), frames.sizes)
-    apart = np.zeros((2, k, 2, frames.n_stars))
-    apart[:, number, :, np.arange(frames.n_stars)] = shifts.transpose(2, 0, 1)
-    columns = images.left(images.likelihood.project_out(state, apart.reshape(2 * k, 2, -1)))
-    shear = np.linalg.lstsq(columns.T, images.e)[0].reshape(2, k)
+def of_each_frame(images: Images, start: Images) -> Settled:
+    """Zeniths of single frames, near to those that the shears of frames in `start` point to."""
+    k = start.obs.n_frames
+    own = start.by_frame[1:].reshape(2 * k, 2, -1)
+    shear = np.linalg.lstsq(start.left(own)[0].T, start.e)[0].reshape(2, k)
+    shear = shear / start.camera.corner_radius_px
     # Refraction moves stars to the zenith, so that the field shrinks along that way.
     tangent = np.clip(np.sqrt(2.0 * np.hypot(*shear) / air_constants()[0]), *_TANGENTS)
     angle = 0.5 * np.arctan2(-shear[1], -shear[0])
     across = np.stack([tangent * np.cos(angle), tangent * np.sin(angle), np.ones(k)], axis=1)
-    return replace(start, places=normalised(np.einsum("kji,kj->ki", state.rotations, across)))
+    places = normalised(np.einsum("kji,kj->ki", start.state.rotations, across))
+    axes = np.tile(np.eye(3), (k, 1, 1))
+    return _settled(images, Zeniths(images.obs.frame_ids, axes, places, False))
 
 
-def _cost(images: Images, zeniths: Zeniths) -> float:
-    """Chi-square with air below these zeniths, density and choice of a side the best ones."""
-    moves = zeniths.sizes[0]
-    columns = images.of_air(zeniths)[moves:] / images.sigma
-    mean, prior = zeniths.mean[moves:], zeniths.prior[moves:]
-    e = images.e / images.sigma - mean @ columns
-    step = np.linalg.solve(columns @ columns.T + np.diag(prior**-2), columns @ e)
-    return float(e @ e - step @ (columns @ e))
-
-
-def _settled(images: Images, zeniths: Zeniths) -> Zeniths:
+def _settled(images: Images, start: Zeniths) -> Settled:
     """The zeniths near to these whose air explains the most."""
-    known, least, damping, trial = zeniths, np.inf, 1e-3, zeniths
+    least, damping, trial = np.inf, 1e-3, start
     for _ in range(_STEPS):
-        cost = _cost(images, trial)
-        if cost < least:
-            gained, known, least, damping = least - cost, trial, cost, 0.2 * damping
+        columns = images.left(images.of_air(trial))[0] / images.sigma
+        e = images.e / images.sigma - trial.mean @ columns
+        own = columns @ e, columns @ columns.T + np.diag(trial.prior**-2)
+        # Density and choice of a side are the best ones.
+        free = slice(trial.sizes[0], None)
+        cost = float(e @ e - own[0][free] @ np.linalg.solve(own[1][free, free], own[0][free]))
+        gained = least - cost
+        if gained > 0.0:
+            known, pull, matrix = trial, *own
+            least, damping = cost, 0.2 * damping
             if gained < _SETTLED:
                 break
-            columns = images.of_air(known) / images.sigma
-            pull = columns @ (images.e / images.sigma - known.mean @ columns)
-            matrix = columns @ columns.T + np.diag(known.prior**-2)
         else:
             damping *= 10.0
-        diagonal = np.diag(matrix)
-        trial = known.moved(
-            np.linalg.solve(matrix + np.diag(damping * diagonal), pull), images.boresights
-        )
-    return known
+        step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), pull)
+        trial = known.moved(step, images.boresights)
+    covariance = np.linalg.inv(matrix)
+    return Settled(known, known.mean + covariance @ pull, covariance)
 
 
 def pulled(images: Images, zeniths: Zeniths, sigma: float) -> Zeniths:
@@ -180,30 +232,36 @@ def pulled(images: Images, zeniths: Zeniths, sigma: float) -> Zeniths:
     if not zeniths.apiece:
         return zeniths
     n, precision = len(zeniths.places), np.diag(zeniths.prior[[0, 0, -2]] ** -2)
+    likelihood = images.likelihood
+
+    def products(zeniths: Zeniths) -> FloatArray:
+        """Products (K, 3, 3) of the columns of each frame, which are zero in all others."""
+        own = images.of_air(zeniths)[:-1].reshape(3, n, 2, -1).sum(axis=1)
+        own = likelihood.project_out(images.state, own)
+        return products_by_frame(likelihood.frames, own, own) / sigma**2
 
     def volume(step: FloatArray) -> FloatArray:
         turned = np.zeros(len(zeniths.prior))
         turned[: 2 * n] = np.repeat(step, n)
-        moved = zeniths.moved(turned, images.boresights)
-        found = images.by_frame(moved) / sigma**2
+        found = products(zeniths.moved(turned, images.boresights))
         return np.asarray(-0.5 * np.linalg.slogdet(found + precision)[1])
 
     slopes = [volume(step) - volume(-step) for step in _STEP_RAD * np.eye(2)]
-    products = images.by_frame(zeniths) / sigma**2
-    left = np.linalg.solve(products + precision, products)
+    own = products(zeniths)
+    left = np.linalg.solve(own + precision, own)
     density = -float(np.trace(left[:, :2, :2], axis1=1, axis2=2).sum())
     pull = np.concatenate([np.ravel(slopes) / (2.0 * _STEP_RAD), np.zeros(n), [density]])
     return replace(zeniths, pull=pull)
 
 
-def found_air(effects: Effects, zeniths: Zeniths, rotations: FloatArray) -> FoundAir:
-    """The air of estimated effects; `rotations` (K, 3, 3) are the attitudes of the frames."""
-    place = effects.at("zenith")
-    coefficients, covariance = effects.coefficients[place], effects.covariance[place, place]
+def found_air(
+    zeniths: Zeniths, coefficients: FloatArray, covariance: FloatArray, boresights: FloatArray
+) -> FoundAir:
+    """The air of coefficients (m,) with this covariance; `boresights` (K, 3) are along ICRS axes."""
     n = zeniths.sizes[0] // 2
     moves = np.stack([covariance[[i, i, n + i, n + i], [i, n + i, i, n + i]] for i in range(n)])
     worst = np.sqrt(np.linalg.eigvalsh(moves.reshape(n, 2, 2))[:, 1])
-    level = np.sum(zeniths.among_stars * rotations[:, 2], axis=1)
+    level = np.sum(zeniths.among_stars * boresights, axis=1)
     distances = np.degrees(np.arccos(np.clip(level, -1.0, 1.0)))
     found = FoundAir(
         "frames" if zeniths.apiece else "place" if zeniths.timed else "moment",
@@ -215,7 +273,7 @@ def found_air(effects: Effects, zeniths: Zeniths, rotations: FloatArray) -> Foun
     )
     if zeniths.apiece:
         return found
-    x, y, z = zeniths.moved(coefficients, rotations[:, 2]).places[0]
+    x, y, z = zeniths.moved(coefficients, boresights).places[0]
     north, east = np.degrees(np.sqrt(np.diag(covariance)[:2]))
     found = replace(
         found, latitude_deg=float(np.degrees(np.arcsin(z))), latitude_std_deg=float(north)

@@ -60,6 +60,13 @@ class Profile:
     inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
     log_determinant: FloatArray  # (K,): log |A^T A|
 
+    def shifts(self, moves: FloatArray) -> FloatArray:
+        """Whitened shifts (..., 2, N) of images by small moves (..., 3, N) of the stars, camera
+        frame, rad: a move d of a direction b is the rotation ``b x d``.
+        """
+        turns = np.cross(self.b, moves, axis=-2)
+        return np.asarray(np.einsum("ixn,...in->...xn", self.attitude, turns))
+
 
 class MarginalLikelihood:
     """Exact attitude-marginalised likelihood of a table of observations.

@@ -402,15 +402,9 @@ def axes_shape(camera: Camera) -> Shape:
 
 def _aberration() -> Shape:
     def columns(view: View) -> FloatArray:
-        # A velocity V/c moves b by the rotation b x V/c, whose effect on pixels is that of an
-        # attitude error.
+        # A velocity V/c moves all stars by V/c: columns of the rotations are those along its axes.
         frames, state = view.part.frames, view.state
-        b = state.b
-        found = np.empty((3, 2, frames.n_stars))
-        for axis in range(3):
-            towards = frames.spread(np.ascontiguousarray(state.rotations[:, :, axis].T))
-            found[axis] = np.einsum("ixn,in->xn", state.attitude, np.cross(b, towards, axis=0))
-        return frames.in_pixels(found)
+        return frames.in_pixels(state.shifts(frames.spread(state.rotations.T)))
 
     labels = tuple((f"velocity along {axis}", "km/s") for axis in ("ICRS x", "ICRS y", "ICRS z"))
     return Shape(

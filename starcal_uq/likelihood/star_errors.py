@@ -91,15 +91,10 @@ def offset_columns(
 ) -> FloatArray:
     """Whitened shift (2, 2, n) of every image for one px (at the boresight) of offset of its star
     along `axes`.
-
-    A small change d of a direction b is the rotation ``b x d``, so that the attitude columns hold
-    it already.
     """
-    turned = np.cross(part.frames.r[None], axes, axis=1)
-    rotation = [part.frames.spread(np.ascontiguousarray(state.rotations[:, i].T)) for i in range(3)]
-    angles = np.stack([np.sum(row * turned, axis=1) for row in rotation], axis=1)
-    shift: FloatArray = np.einsum("jin,ixn->jxn", angles, state.attitude, optimize=True) / focal_px
-    return shift
+    rotations = part.frames.spread(state.rotations.T)
+    moves = np.einsum("kin,jkn->jin", rotations, axes, optimize=True)
+    return state.shifts(moves) / focal_px
 
 
 def _turn(z: FloatArray) -> FloatArray:

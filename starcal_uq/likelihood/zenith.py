@@ -125,50 +125,42 @@ class Zeniths:
         def columns(view: View) -> FloatArray:
             rows, state, frames = number[view.rows], view.state, view.part.frames
             rotations = np.repeat(state.rotations, frames.sizes, axis=0)
-            air = _Air(view, known[view.rows])
+            constants = air_constants()
             zenith, *moving = (
                 np.einsum("nij,nj->in", rotations, vector[rows])
                 for vector in (self.among_stars, *ways)
             )
+
+            def seen(moves: FloatArray) -> FloatArray:
+                return frames.in_pixels(state.shifts(moves) * known[view.rows])
+
             found = np.zeros((2, len(self.places), 2, frames.n_stars))
             star, own = np.arange(frames.n_stars), member[view.rows]
             for axis, way in enumerate(moving):
-                found[axis, own, :, star] = air.moved(zenith, way).T
-            raised = air.raised(zenith)
+                found[axis, own, :, star] = seen(_moved(state.b, zenith, way, constants)).T
+            air = seen(raised(state.b, zenith, constants))
             odd = np.zeros((choices, 2, frames.n_stars))
             if choices:
                 mirrored = zenith * np.array([[-1.0], [-1.0], [1.0]])
-                half = 0.5 * (raised - air.raised(mirrored))
+                half = 0.5 * (air - seen(raised(state.b, mirrored, constants)))
                 odd[own, :, star] = half.T
-                raised = raised - half
-            return np.concatenate([found.reshape(moves, 2, -1), odd, raised[None]])
+                air = air - half
+            return np.concatenate([found.reshape(moves, 2, -1), odd, air[None]])
 
         return Shape("refraction", "zenith", sum(self.sizes), columns)
 
 
-class _Air:
-    """Shifts px of the images of some stars by standard air."""
+def raised(b: FloatArray, zenith: FloatArray, air: tuple[float, float]) -> FloatArray:
+    """Moves (3, N) of stars b (3, N) by air of these constants below zeniths (3, N)."""
+    return zenith * raising(np.sum(zenith * b, axis=0), air)[0]
 
-    def __init__(self, view: View, known: FloatArray) -> None:
-        self._view, self._known = view, known
-        self._constants = air_constants()
 
-    def _shift(self, moved: FloatArray) -> FloatArray:
-        state = self._view.state
-        turned = np.cross(state.b, moved, axis=0)
-        shifts = np.einsum("ixn,in->xn", state.attitude, turned) * self._known
-        return self._view.part.frames.in_pixels(shifts)
-
-    def raised(self, zenith: FloatArray) -> FloatArray:
-        """By refraction below zeniths (3, n), camera frame."""
-        sine = np.sum(zenith * self._view.state.b, axis=0)
-        return self._shift(zenith * raising(sine, self._constants)[0])
-
-    def moved(self, zenith: FloatArray, way: FloatArray) -> FloatArray:
-        """By a move of the zeniths along this way (3, n), per rad."""
-        b = self._view.state.b
-        length, slope = raising(np.sum(zenith * b, axis=0), self._constants)
-        return self._shift(way * length + zenith * (slope * np.sum(way * b, axis=0)))
+def _moved(
+    b: FloatArray, zenith: FloatArray, way: FloatArray, air: tuple[float, float]
+) -> FloatArray:
+    """The same by a move of the zeniths along this way (3, N), per rad."""
+    length, slope = raising(np.sum(zenith * b, axis=0), air)
+    return way * length + zenith * (slope * np.sum(way * b, axis=0))
 
 
 def frame_axes(obs: Observations) -> tuple[FloatArray, bool]:
