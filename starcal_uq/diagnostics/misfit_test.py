@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from starcal_uq.core.formatting import plus_minus
 
+# Fewest degrees of freedom of a test's noise.
+LEAST_DOF = 10
+
 
 @dataclass(frozen=True)
 class Amplitude:

@@ -7,12 +7,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
+from starcal_uq.diagnostics.misfit_test import LEAST_DOF
+from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.shapes import run_clock
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
+    from starcal_uq.diagnostics.beside import Freed
     from starcal_uq.observations.table import Observations
+
+
+# Frames with less than one degree of freedom have no noise of their own to compare.
+_LEAST_FRAMES, _LEAST_FRAME_DOF = 3, 1.0
 
 
 def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:
@@ -32,54 +38,78 @@ def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:
     return found
 
 
-class NoiseSums:
-    """Sums over stars that the moments need, for several weights (N,) by name, with p
-    parameters.
-    """
+def noise_tests(freed: Freed, weights: dict[str, FloatArray]) -> list[tuple[str, float, float]]:
+    """Name, z and two-sided p-value of every weight (N,)."""
+    from scipy.special import erfc
 
-    def __init__(self, weights: dict[str, FloatArray], p: int) -> None:
-        self.weights = weights
-        n = len(weights)
-        self.squares = np.zeros(n)
-        self.trace = np.zeros(n)
-        self.trace2 = np.zeros(n)
-        self.parameters1 = np.zeros((n, p, p))
-        self.parameters2 = np.zeros((n, p, p))
-        self.crossed = np.zeros((n, p, p))
-
-    def add(self, own: ByFrame, h: FloatArray, e: FloatArray, rows: slice) -> None:
-        """Add some frames: h (p, 2, n) and e (2, n) with what is of the frames removed."""
-        frames, a = own.frames, own.orthonormal
-        flat = h.reshape(len(h), -1)
-        for i, values in enumerate(self.weights.values()):
-            w = values[rows]
-            self.squares[i] += float(np.sum(w * e**2))
-            self.parameters1[i] += (h * w).reshape(len(h), -1) @ flat.T
-            self.parameters2[i] += (h * w**2).reshape(len(h), -1) @ flat.T
-            awa, awh = products_by_frame(frames, a * w, a), products_by_frame(frames, a * w, h)
-            self.trace[i] += 2.0 * np.sum(w) - np.einsum("kaa->", awa)
-            # tr(W W) - 2 tr(P W W) + tr(P W P W) for the attitudes' part of P.
-            self.trace2[i] += 2.0 * np.sum(w**2) - 2.0 * np.sum((a * w) ** 2) + np.sum(awa**2)
-            self.crossed[i] += np.tensordot(awh, awh, ((0, 1), (0, 1)))
-
-    def tests(
-        self, matrix: FloatArray, inverse: FloatArray, rss: float, dof: int
-    ) -> list[tuple[str, float, float]]:
-        """Name, z and two-sided p-value of every weight."""
-        from scipy.special import erfc
-
-        found: list[tuple[str, float, float]] = []
-        # Effects with as many coefficients as there are pixels leave nothing to compare.
-        if dof < 1 or not rss > 0.0:
-            return found
-        for i, name in enumerate(self.weights):
-            by_h = inverse @ self.parameters1[i]
-            trace = self.trace[i] - np.trace(by_h)
-            trace2 = self.trace2[i] - 2.0 * np.trace(inverse @ self.parameters2[i])
-            trace2 += 2.0 * np.trace(inverse @ self.crossed[i]) + np.sum(by_h * by_h.T)
-            variance = 2.0 * (trace2 - trace**2 / dof) / (dof * (dof + 2.0))
-            if not variance > 0.0:
-                continue
-            z = float((self.squares[i] / rss - trace / dof) / np.sqrt(variance))
-            found.append((name, z, float(erfc(abs(z) / np.sqrt(2.0)))))
+    found: list[tuple[str, float, float]] = []
+    frames, a, h, e = freed.own.frames, freed.own.columns, freed.h, freed.e
+    dof, squares = freed.dof, e**2
+    # Effects with as many coefficients as there are pixels leave nothing to compare.
+    if dof < 1 or not squares.any():
         return found
+    flat = h.reshape(len(h), -1)
+    for name, w in weights.items():
+        aw, hw = a * w, h * w
+        awa, awh = products_by_frame(frames, aw, a), products_by_frame(frames, aw, h)
+        hwh = hw.reshape(len(h), -1) @ flat.T
+        trace = 2.0 * np.sum(w) - np.einsum("kaa->", awa) - np.trace(hwh)
+        # tr(W W) - 2 tr(P W W) + tr(P W P W), P being of frames and of what they share.
+        trace2 = 2.0 * np.sum(w**2) - 2.0 * np.sum(aw**2) - 2.0 * np.sum(hw**2)
+        trace2 += np.sum(awa**2) + 2.0 * np.sum(awh**2) + np.sum(hwh**2)
+        variance = 2.0 * (trace2 - trace**2 / dof) / (dof * (dof + 2.0))
+        if not variance > 0.0:
+            continue
+        z = float((np.sum(w * squares) / np.sum(squares) - trace / dof) / np.sqrt(variance))
+        found.append((name, z, float(erfc(abs(z) / np.sqrt(2.0)))))
+    return found
+
+
+def noise_by_frame(freed: Freed, shared: bool) -> tuple[float, float] | None:
+    """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few
+    frames.
+
+    With d_k degrees of freedom of the frames' sums of squares S_k, nu in all, the statistic is
+    T = nu log(S / nu) - sum d_k log(S_k / d_k). Shares of S are independent of S, so that mean
+    and variance of T follow exactly from those of logarithms of chi-squares; T is then taken as
+    gamma-distributed. Many coefficients of effects, where these are `shared` by frames, couple their sums: mean
+    and variance are then those of independent ones times what that does to them to first order.
+    """
+    from scipy.special import digamma, gammaincc, ndtri, polygamma
+
+    frames, h = freed.own.frames, freed.h
+    matrices = products_by_frame(frames, h, h)
+    squares = frames.sum(np.sum(freed.e**2, axis=0))
+    dof = freed.frame_dof - np.einsum("kaa->k", matrices)
+    nu = float(dof.sum())
+    if (
+        len(dof) < _LEAST_FRAMES
+        or nu < LEAST_DOF
+        or dof.min() < _LEAST_FRAME_DOF
+        or squares.min() <= 0.0
+    ):
+        return None
+    found = nu * np.log(squares.sum() / nu) - np.sum(dof * np.log(squares / dof))
+    mean = nu * (digamma(nu / 2) - np.log(nu / 2)) - np.sum(
+        dof * (digamma(dof / 2) - np.log(dof / 2))
+    )
+    variance = np.sum(dof**2 * polygamma(1, dof / 2)) - nu**2 * float(polygamma(1, nu / 2))
+    if shared:
+        by_mean, by_variance = _coupled(matrices, dof)
+        mean, variance = mean * by_mean, variance * by_variance
+    p = float(gammaincc(mean**2 / variance, found * mean / variance))
+    return float(-ndtri(np.clip(p, 1e-300, 1.0 - 1e-16))), p
+
+
+def _coupled(matrices: FloatArray, dof: FloatArray) -> tuple[float, float]:
+    """Factors on mean and variance of Bartlett's statistic where frames share what is fitted.
+
+    `matrices` (K, r, r): products over each frame of what is orthonormal over all. `dof` (K,):
+    degrees of freedom of the frames' sums of squares, whose covariance is twice G: T is near
+    ``s^T K s / 2`` with s their departures from `dof` and ``K = diag(1 / d) - 1 1^T / nu``.
+    """
+    among = np.einsum("kab,lab->kl", matrices, matrices)
+    among += np.diag(dof - np.einsum("kaa->k", matrices))
+    by = among / dof[:, None] - among.sum(axis=0) / dof.sum()
+    free = len(dof) - 1.0
+    return float(np.trace(by)) / free, float(np.sum(by * by.T)) / free

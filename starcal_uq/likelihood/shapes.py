@@ -84,9 +84,6 @@ class Shape:
     # Name and unit of each column's amplitude, where amplitudes mean something by themselves.
     labels: tuple[tuple[str, str], ...] = ()
     per_amplitude: tuple[float, ...] = ()  # Amplitude in that unit of a column as it stands
-    # ``View -> (n,)`` cell of every star, where the columns are shifts of those in one cell along
-    # each axis.
-    cell: Callable[[View], IntArray] | None = None
 
 
 def shapes(
@@ -509,33 +506,20 @@ def over_time(clock: FloatArray, called: str) -> Shape:
     )
 
 
-def cell_columns(cell: IntArray, n_cells: int) -> FloatArray:
-    """Shifts (2 c, 2, n) of the stars in each cell along each axis; `cell` (n,) tells where a star
-    is.
-    """
-    star = np.arange(len(cell))
-    found = np.zeros((n_cells, 2, 2, len(cell)))
-    found[cell, 0, 0, star] = found[cell, 1, 1, star] = 1.0
-    return found.reshape(2 * n_cells, 2, len(cell))
-
-
 def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
     longer = max(camera.width_px, camera.height_px)
     per_area = obs.n_stars / _STARS_PER_CELL * longer / min(camera.width_px, camera.height_px)
     cell = longer / int(np.clip(np.sqrt(per_area), 2, max_cells))
     nx, ny = (int(np.ceil(side / cell - 1e-9)) for side in (camera.width_px, camera.height_px))
 
-    def cell_of(view: View) -> IntArray:
+    def columns(view: View) -> FloatArray:
         x, y = view.part.frames.pixel - view.part.frames.in_pixels(view.state.e)
         column = np.clip(((x + 0.5) / cell).astype(np.int64), 0, nx - 1)
         row = np.clip(((y + 0.5) / cell).astype(np.int64), 0, ny - 1)
-        return np.asarray(row * nx + column)
+        own, star = row * nx + column, np.arange(len(x))
+        found = np.zeros((nx * ny, 2, 2, len(x)))
+        found[own, 0, 0, star] = found[own, 1, 1, star] = 1.0
+        return found.reshape(-1, 2, len(x))
 
     name = f"mean shift in {nx} × {ny} cells of the field"
-    return Shape(
-        name,
-        "field cells",
-        2 * nx * ny,
-        lambda view: cell_columns(cell_of(view), nx * ny),
-        cell=cell_of,
-    )
+    return Shape(name, "field cells", 2 * nx * ny, columns)

@@ -17,7 +17,7 @@ from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.camera.distortion import parameter_names, rivals
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
-from starcal_uq.diagnostics.shape_sums import _Columns
+from starcal_uq.diagnostics.shape_sums import ShapeSums
 from starcal_uq.diagnostics.verdict.estimate import misfit
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import View, shapes
@@ -60,26 +60,23 @@ def null():
 
 
 @pytest.mark.parametrize("stated", [False, True])
-def test_cells_are_summed_as_columns_would_be(stated):
-    obs = (
-        with_sigmas(observations("brown", n_frames=6))
-        if stated
-        else observations("brown", n_frames=6)
-    )
+def test_sums_are_products_of_columns_without_attitudes(stated):
+    obs = observations("brown", n_frames=6)
+    obs = with_sigmas(obs) if stated else obs
+    cal = sc.calibrate(obs, nominal(camera("brown")))
+    families = shapes(obs, cal.camera)
+    sums = ShapeSums(obs, cal, families)
     part = MarginalLikelihood(obs, "brown")
-    theta = camera("brown").theta
-    state, _ = part.profile(theta)
-    columns = _Columns.of(
-        shapes(obs, camera("brown")), View.of(part, state, theta, slice(0, obs.n_stars))
-    )
-    many, few = columns.all(), state.attitude
-    flat, by_star = many.reshape(len(many), -1), np.einsum("ixn,qxn->iqn", few, many)
-    for ours, theirs in (
-        (columns.inner(), flat @ flat.T),
-        (columns.across(few), flat @ few.reshape(3, -1).T),
-        (columns.by_frame(few), part.frames.sum(by_star)),
-    ):
-        assert np.allclose(ours, theirs, rtol=0.0, atol=1e-12 * np.max(np.abs(theirs)))
+    state, _ = part.profile(cal.theta)
+    view = View.of(part, state, cal.theta, slice(None))
+    many = np.concatenate([family.columns(view) for family in families])
+    part.frames.whiten(many)
+    h = part.derivatives(cal.theta, state)
+    columns = np.concatenate([h, state.e[None], many])
+    size = np.linalg.norm(columns, axis=(1, 2))
+    flat = part.project_out(state, columns).reshape(len(columns), -1) / size[:, None]
+    assert np.allclose(sums.gram / np.outer(size, size), flat @ flat.T, atol=1e-7)
+    assert np.allclose(sums.raw, np.sum(many**2, axis=(1, 2)))
 
 
 def test_false_alarms_are_nominal_after_refitting():

@@ -10,8 +10,8 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.records import from_plain
 from starcal_uq.core.status import Level
-from starcal_uq.diagnostics import shape_sums
 from starcal_uq.diagnostics.misfit import misfit_tests
+from starcal_uq.diagnostics.shape_sums import ShapeSums
 from starcal_uq.diagnostics.verdict.estimate import even_noise
 from starcal_uq.estimation.merging import merge
 from starcal_uq.estimation.noise_model import axis_noise
@@ -137,20 +137,15 @@ def test_shapes_are_whitened_as_their_residuals_are():
     """Sums over cells of the field are those of their columns."""
     obs, camera = given(observed(TURNED, 4))
     cal = sc.calibrate(obs, camera, effects="noise")
-    part = MarginalLikelihood(weighed(obs, cal), "brown", axes=True)
+    obs, families = weighed(obs, cal), shapes(obs, cal.camera)
+    part = MarginalLikelihood(obs, "brown", axes=True)
     state, _ = part.profile(cal.theta)
     view = View.of(part, state, cal.theta, slice(None))
-    columns = shape_sums._Columns.of(shapes(obs, cal.camera), view)
-    every = columns.all()
-    flat = every.reshape(len(every), -1)
-    np.testing.assert_allclose(
-        columns.inner(), flat @ flat.T, atol=1e-9 * np.abs(flat @ flat.T).max()
-    )
-    few = state.attitude
-    across = flat @ few.reshape(3, -1).T
-    np.testing.assert_allclose(columns.across(few), across, atol=1e-9 * np.abs(across).max())
-    by_frame = np.stack([part.frames.sum(np.sum(every * column, axis=1)) for column in few])
-    np.testing.assert_allclose(columns.by_frame(few), by_frame, atol=1e-9 * np.abs(by_frame).max())
+    cells = families[-1].columns(view)
+    part.frames.whiten(cells)
+    flat = part.project_out(state, cells).reshape(len(cells), -1)
+    found = ShapeSums(obs, cal, families).gram[-len(cells) :, -len(cells) :]
+    np.testing.assert_allclose(found, flat @ flat.T, atol=1e-9 * np.abs(flat @ flat.T).max())
 
 
 @pytest.mark.slow
