@@ -286,8 +286,8 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
     held = local_coefficients(held, exact, *own, theta, covariance, sigma)
     if held.zeniths is not None:
         place = held.at("zenith")
-        known = held.coefficients[place], held.covariance[place, place]
-        held = replace(held, air=found_air(held.zeniths, *known, rest.state.rotations[:, 2]))
+        air = held.coefficients[place], held.covariance[place, place]
+        held = replace(held, air=found_air(held.zeniths, *air, rest.state.rotations[:, 2]))
     stage = Stage(
         "effects",
         np.array([cal.theta, theta]),

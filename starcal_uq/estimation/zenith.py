@@ -218,7 +218,7 @@ def _settled(images: Images, start: Zeniths) -> Settled:
             damping *= 10.0
         step = np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), pull)
         trial = known.moved(step, images.boresights)
-    covariance = np.linalg.inv(matrix)
+    covariance = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     return Settled(known, known.mean + covariance @ pull, covariance)
 
 

@@ -160,7 +160,7 @@ def _moved(
 ) -> FloatArray:
     """The same by a move of the zeniths along this way (3, N), per rad."""
     length, slope = raising(np.sum(zenith * b, axis=0), air)
-    return way * length + zenith * (slope * np.sum(way * b, axis=0))
+    return np.asarray(way * length + zenith * (slope * np.sum(way * b, axis=0)))
 
 
 def frame_axes(obs: Observations) -> tuple[FloatArray, bool]:
