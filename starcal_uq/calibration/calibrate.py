@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Unpack, get_args
 
@@ -17,7 +17,7 @@ from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import RecursiveMethod, bounded
 from starcal_uq.core.tasks import one_thread, processors
-from starcal_uq.core.types import Progress
+from starcal_uq.core.types import FloatArray, Progress
 from starcal_uq.estimation.assemble import raise_unless_good
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.effects import with_effects, without_effects
@@ -29,7 +29,7 @@ from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
 from starcal_uq.estimation.ties import with_ties
 from starcal_uq.estimation.weighing import gains, with_weighing
-from starcal_uq.estimation.weights import weighed
+from starcal_uq.estimation.weights import by_noise_model, weighed
 from starcal_uq.likelihood import paths
 from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.observations.partitions import PartitionedObservations
@@ -125,8 +125,7 @@ def calibrate(
         Limit for each stage.
     effects : {"none", "auto"} or sequence of str
         Effects beyond the camera, by name or joined by commas; ``auto`` takes up those that the
-        data ask for, beside any that are named, and one of ``noise`` and ``tails`` at most
-        (`Calibration.effects`). Scales of ``axes``,
+        data ask for, beside any that are named (`Calibration.effects`). Scales of ``axes``,
         ``field``, ``frame``, ``zenith``, ``temperature``, ``time``, ``epoch``, ``star``, ``phase``
         and ``magnitude`` are estimated by restricted likelihood and marginalised in estimate,
         covariance and `compressed`. Two effects decide how much the stars count:
@@ -307,55 +306,101 @@ def _of_table(
 
 
 def _selected(obs: Observations, cal: Calibration, settings: EstimationSettings) -> Calibration:
-    """The calibration with the effects that the data ask for, noise or tails among them.
+    """The calibration with the effects that the data ask for, noise and tails among them.
 
     Where one of these gains more than the first effect that shifts stars, or enough beside all of
-    them, the others are selected again with it. Where either was asked for, the data do not choose.
+    them, the others are selected again with it, and then the other one is tried beside it. One of
+    them that gains too little beside the other is dropped.
     """
-    found = _with_all(obs, cal, settings)
-    assert found.effects is not None
-    if settings.noise or settings.tails:
-        return with_weighing(obs, found, settings.noise, settings.tails)
-    fitted, least = found.effects.fitted, found.effects.penalty_nat
-    gained = gains(obs, cal)
-    if fitted and max(gained.values()) < max(effect.gain_nat for effect in fitted):
-        # What effects of few images leave is uneven by itself: beside the others they have to gain
-        # less.
-        shared = [effect.name for effect in fitted if effect.name not in _OF_FEW_IMAGES]
-        beside = (
-            with_effects(weighed(obs, cal), cal, shared) if len(shared) < len(fitted) else found
-        )
-        gained = gains(without_effects(obs, beside), beside)
-        least = max([least, *(one.gain_nat for one in fitted if one.name not in shared)])
-    best, other = sorted(gained, key=gained.__getitem__, reverse=True)
-    if gained[best] > least:
+    found = with_weighing(obs, _with_all(obs, cal, settings), settings.noise, settings.tails)
+    asked, before = settings.names, cal
+    moved: dict[str, FloatArray] = {}
+    while True:
+        left, least = _gained(obs, before, found, settings)
+        best = max((name for name in left if name not in moved), key=left.__getitem__, default="")
+        if not best or left[best] <= least:
+            return _told(found, asked, left, moved)
         more = settings.changed(effects=[*settings.names, best])
-        again = fit_weighed(obs, cal.nominal, more)
-        if again.status.ok:
-            known = {name: cal.provenance[name] for name in ("fallback",) if name in cal.provenance}
-            again = replace(again, provenance=again.provenance.adding(**known))
-            again = _with_all(obs, again, more)
-            again = with_weighing(obs, again, more.noise, more.tails)
-            assert again.effects is not None
-            if again.effects.weighing[0].gain_nat > found.effects.penalty_nat:
-                return _told(again, found, (other, gained[other]))
-    refused = sorted((*found.effects.refused, *gained.items()), key=lambda one: -one[1])
-    return replace(found, effects=replace(found.effects, refused=tuple(refused)))
+        trial = _refitted(obs, cal, more)
+        weak = {} if trial is None else _weak(trial[1], asked)
+        if trial is None or best in weak:
+            return _told(found, asked, left | weak, moved)
+        if weak:
+            more = settings.changed(effects=[*asked, best])
+            trial = _refitted(obs, cal, more) or trial
+        moved[best] = np.abs(trial[1].theta - found.theta) / trial[1].sigmas
+        (before, found), settings = trial, more
 
 
-def _told(cal: Calibration, before: Calibration, other: tuple[str, float]) -> Calibration:
-    """The calibration with what noise or tails, which the data chose, have moved, and what the
-    other one would have gained.
+def _refitted(
+    obs: Observations, cal: Calibration, settings: EstimationSettings
+) -> tuple[Calibration, Calibration] | None:
+    """The calibration with other effects that weigh stars, before and beside those that shift them;
+    None where there is none.
+    """
+    again = fit_weighed(obs, cal.nominal, settings)
+    if not again.status.ok:
+        return None
+    known = {name: cal.provenance[name] for name in ("fallback",) if name in cal.provenance}
+    again = replace(again, provenance=again.provenance.adding(**known))
+    found = _with_all(obs, again, settings)
+    return again, with_weighing(obs, found, settings.noise, settings.tails)
+
+
+def _weak(cal: Calibration, asked: Sequence[str]) -> dict[str, float]:
+    """Gains of noise and tails that were not asked for, where these are too small beside the other
+    effects.
     """
     assert cal.effects is not None
-    moved = np.abs(cal.theta - before.theta) / cal.sigmas
-    worst = int(np.argmax(moved))
-    name, size = cal.parameter_names[worst], float(moved[worst])
-    (own,) = cal.effects.weighing
-    own = replace(own, moved_sigma=size, moved_name=name)
-    refused = tuple(sorted((*cal.effects.refused, other), key=lambda one: -one[1]))
-    asked = tuple(one for one in cal.effects.asked if one != own.name)
-    held = replace(cal.effects, weighing=(own,), refused=refused, asked=asked)
+    least = cal.effects.penalty_nat
+    gained = {one.name: one.gain_nat for one in cal.effects.weighing if one.name not in asked}
+    return {name: gain for name, gain in gained.items() if gain <= least}
+
+
+def _gained(
+    obs: Observations, before: Calibration, found: Calibration, settings: EstimationSettings
+) -> tuple[dict[str, float], float]:
+    """What noise and tails that are not in the settings would gain, before effects that shift stars
+    or else beside them, and what they have to.
+    """
+    assert found.effects is not None
+    if settings.tails:
+        before = with_tail_weights(by_noise_model(obs, before), before)
+    fitted, least = found.effects.fitted, found.effects.penalty_nat
+    gained = gains(obs, before, settings.noise, settings.tails)
+    if not (fitted and max(gained.values(), default=0.0) < max(one.gain_nat for one in fitted)):
+        return gained, least
+    # What effects of few images leave is uneven by itself: beside the others noise and tails have
+    # to gain more than these.
+    shared = [one.name for one in fitted if one.name not in _OF_FEW_IMAGES]
+    beside = found
+    if len(shared) < len(fitted):
+        beside = with_effects(weighed(obs, before), before, shared)
+        least = max([least, *(one.gain_nat for one in fitted if one.name not in shared)])
+    return gains(without_effects(obs, beside), beside, settings.noise, settings.tails), least
+
+
+def _told(
+    cal: Calibration,
+    asked: Sequence[str],
+    left: Mapping[str, float],
+    moved: Mapping[str, FloatArray],
+) -> Calibration:
+    """The calibration with what noise and tails that the data chose have moved, parameters (p,) in
+    their standard deviations, and with what those that are left would gain.
+    """
+    assert cal.effects is not None
+    weighing = []
+    for one in cal.effects.weighing:
+        sizes = moved.get(one.name)
+        if sizes is not None:
+            worst = int(np.argmax(sizes))
+            size, name = float(sizes[worst]), cal.parameter_names[worst]
+            one = replace(one, moved_sigma=size, moved_name=name)
+        weighing.append(one)
+    refused = tuple(sorted((*cal.effects.refused, *left.items()), key=lambda one: -one[1]))
+    asked = tuple(name for name in asked if name != "auto")
+    held = replace(cal.effects, weighing=tuple(weighing), refused=refused, asked=asked)
     return replace(cal, effects=held)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.noise_model import axes_p, star_squares, uneven_p
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.student import DEFAULT_DOF, DOF_RANGE
@@ -43,33 +44,47 @@ def log_density(squares: FloatArray, nu: float | None) -> float:
     return -float(minimize_scalar(cost, bounds=bounds, method="bounded").fun)
 
 
-def gains(obs: Observations, cal: Calibration) -> dict[str, float]:
-    """What noise that varies, and tails, would gain at an estimate with one noise, nat.
+def gains(obs: Observations, cal: Calibration, noise: bool, tails: bool) -> dict[str, float]:
+    """What noise that varies, and tails, would gain at an estimate, nat; those that it has already
+    are left out.
 
     Noise by radius, by magnitude, of each frame, and of each axis are tests of their own; the gain
     is that of a single scale with their joint probability. `obs`: the stars, freed of effects that
-    shift them.
+    shift them. Of an estimate with `tails` they have kept their weights.
     """
     from scipy.optimize import minimize_scalar
     from scipy.special import chdtri
 
-    frames = StarFrames.from_observations(obs)
+    frames = StarFrames.from_observations(weighed(obs, cal))
     likelihood = MarginalLikelihood(frames, cal.camera.distortion)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     squares, share = star_squares(likelihood, cal.theta)
-    freed = 2.0 * squares / share
-    tails = minimize_scalar(
-        lambda log_nu: -log_density(freed, float(np.exp(log_nu))),
-        bounds=np.log((DEFAULT_DOF, DOF_RANGE[1])),
-        method="bounded",
-        options={"xatol": 0.05},
-    )
-    p = [*uneven_p(obs, cal.camera, squares, share), axes_p(likelihood, cal.theta)]
-    chance = min(len(p) * min(p), 0.5)
-    return {
-        "noise": 0.5 * float(chdtri(1.0, 2.0 * chance)),
-        "tails": max(-float(tails.fun) - log_density(freed, None), 0.0),
-    }
+    freed, found = 2.0 * squares / share, {}
+    if not tails:
+        best = minimize_scalar(
+            lambda log_nu: -log_density(freed, float(np.exp(log_nu))),
+            bounds=np.log((DEFAULT_DOF, DOF_RANGE[1])),
+            method="bounded",
+            options={"xatol": 0.05},
+        )
+        found["tails"] = max(-float(best.fun) - log_density(freed, None), 0.0)
+    if not noise:
+        if tails:
+            squares = 0.5 * share * _as_gaussian(cal, share)
+        p = [*uneven_p(obs, cal.camera, squares, share), axes_p(likelihood, cal.theta)]
+        chance = min(len(p) * min(p), 0.5)
+        found["noise"] = 0.5 * float(chdtri(1.0, 2.0 * chance))
+    return found
+
+
+def _as_gaussian(cal: Calibration, share: FloatArray) -> FloatArray:
+    """Squares (N,) of two axes of Gaussian residuals that are as improbable as those of the stars,
+    whose tails are a Student t; `share` (N,) of the two is left by the fit.
+    """
+    assert cal.star_weights is not None and cal.provenance.tail_weights is not None
+    nu = float(cal.provenance.tail_weights["dof"])
+    squares = (nu + 2.0) / cal.star_weights - nu
+    return np.asarray(nu * np.log1p(2.0 * squares / (nu * share)))
 
 
 def with_weighing(obs: Observations, cal: Calibration, noise: bool, tails: bool) -> Calibration:

@@ -114,31 +114,54 @@ def heavy(rng):
     return c, 0.3 * rng.standard_normal((2, len(wrong))) * wrong
 
 
+def uneven_and_wrong(rng):
+    """Noise that is worse outside, and one star in twenty that is off by more than that."""
+    c = campaign(rng, n_frames=30, sigma_px=worse_outside)
+    wrong = rng.random(len(c.columns["x_px"])) < 0.05
+    return c, 0.6 * rng.standard_normal((2, len(wrong))) * wrong
+
+
 def clean(rng):
     return campaign(rng, n_frames=30), None
 
 
-def selected(made, seed):
+def selected(made, seed, effects="auto"):
     c, off = made(np.random.default_rng([seed, 92]))
     columns = {name: np.array(values) for name, values in c.columns.items()}
     if off is not None:
         columns["x_px"], columns["y_px"] = np.array([columns["x_px"], columns["y_px"]]) + off
     obs = sc.Observations(**columns, meta={"directions": "apparent"})
     camera = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
-    return c, sc.calibrate(obs, camera, effects="auto")
+    return c, sc.calibrate(obs, camera, effects=effects)
 
 
 @pytest.mark.parametrize(
-    ("made", "chosen"), [(clean, ()), (uneven_gaussian, ("noise",)), (heavy, ("tails",))]
+    ("made", "chosen"),
+    [
+        (clean, ()),
+        (uneven_gaussian, ("noise",)),
+        (heavy, ("tails",)),
+        (uneven_and_wrong, ("noise", "tails")),
+    ],
 )
-def test_auto_takes_up_noise_or_tails_where_the_data_ask_for_them(made, chosen):
+def test_auto_takes_up_noise_and_tails_where_the_data_ask_for_them(made, chosen):
     c, cal = selected(made, 1)
     assert cal.effects.names == chosen and cal.effects.asked == ()
     assert np.all(np.abs(cal.theta - c.theta) < 4.0 * cal.sigmas)
     refused = dict(cal.effects.refused)
-    assert {"noise", "tails"} - set(chosen) <= refused.keys()
+    assert {"noise", "tails"} - set(chosen) == {"noise", "tails"} & refused.keys()
     for effect in cal.effects.weighing:
         assert effect.gain_nat > 30.0 and effect.moved_name in cal.parameter_names
+
+
+@pytest.mark.slow
+def test_auto_adds_tails_to_noise_that_was_asked_for():
+    _, cal = selected(uneven_and_wrong, 2, "auto,noise")
+    assert cal.effects.names == ("noise", "tails") and cal.effects.asked == ("noise",)
+    noise, tails = cal.effects.weighing
+    assert not noise.moved_name and tails.moved_name and tails.gain_nat > 30.0
+    # The control: noise alone is enough where no star is wrong.
+    assert selected(uneven_gaussian, 2, "auto,noise")[1].effects.names == ("noise",)
 
 
 @pytest.mark.slow
@@ -152,4 +175,5 @@ def test_auto_takes_up_noise_and_tails_in_no_clean_campaign_and_in_all_others():
         assert cal.effects.names == ("noise",)
         z.append((cal.theta - c.theta) / cal.sigmas)
         assert selected(heavy, seed)[1].effects.names == ("tails",)
+        assert selected(uneven_and_wrong, seed)[1].effects.names == ("noise", "tails")
     assert np.mean(np.abs(np.array(z)) < 1.96) > 0.85

@@ -202,6 +202,9 @@ def test_what_a_run_was_made_with_is_no_remedy():
     tried = (Tried({"effects": "auto,noise"}, 1, 0),)
     fresh = Place("r", words, tried=tried).exact(asked)
     assert fresh.remedy == "starcal-uq run obs.csv camera.toml --effects auto,tails -o r --force"
+    # What the data chose is held as well.
+    held = dataclasses.replace(Place("r", words), held=("tails", "zenith")).exact(asked)
+    assert [one.arguments["effects"] for one in held.remedies if one.form != "call"] == ["noise"]
     # Effects are added to those that are given, or that `run` looks for by itself; no option at all
     # is something else.
     for given, wanted in (

@@ -8,7 +8,7 @@ warning means that they may be used by someone who has read it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from starcal_uq.core.display import Shown
@@ -167,11 +167,12 @@ def judge(
     if truth is not None and truth.parameter_names == cal.parameter_names:
         checks += [estimate.against_truth(cal, truth, post)]
     checks += requirements
+    held = () if cal.effects is None else cal.effects.names
+    place = place if place is None else replace(place, held=held)
     found = tuple(
         check if place is None else place.exact(check) for check in checks if check is not None
     )
     to_try, end = _way_on(found, place)
-    held = () if cal.effects is None else cal.effects.names
     return Verdict(found, _summary(found, post is not None, rests, held), to_try, end)
 
 

@@ -152,6 +152,7 @@ class Place:
     observations: bool = True  # Whether the folder holds observations
     tried: tuple[Tried, ...] = ()  # Runs that this one has replaced, the latest last
     partitioned: bool = False  # Whether the data are a folder of files
+    held: tuple[str, ...] = ()  # Effects of its calibration
 
     @property
     def made(self) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -191,10 +192,10 @@ class Place:
         if asked.get("site") == SITE:
             return Finding(Refusal.SITE_UNKNOWN)
         _, given = self.made
-        options = changed(given, asked, self.effects)
-        here = {"effects": self.effects} | given
-        if all(here.get(name) == options[name] for name in asked):
+        here = given | {"effects": joined_effects(given.get("effects", self.effects), self.held)}
+        if all(here.get(name) == value for name, value in changed(here, asked).items()):
             return Finding(Refusal.MADE_WITH, {"asked": asked})
+        options = changed(given, asked, self.effects)
         if any(options == one.options for one in self.tried):
             return Finding(Refusal.TRIED, {"asked": asked})
         settings = {"sampled": sampled_by_default(options)} | options
