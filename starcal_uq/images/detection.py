@@ -4,9 +4,7 @@ star.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -139,6 +137,7 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     """SExtractor's detections in the image filtered by the PSF, the brightest first."""
     with extra("images", "star images"):
         import sep
+    from scipy.ndimage import correlate1d
 
     half = int(np.clip(np.ceil(_KERNEL_HALF_SIGMAS * sigma), 1, _KERNEL_HALF_MAX))
     line = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
@@ -146,34 +145,24 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     left = np.sum(line**2) / line.sum() ** 2
     if frame.parity is not None:
         left *= _mosaic_noise(line)
-    filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
+    filtered = frame.counts
+    for axis in (0, 1):
+        filtered = correlate1d(filtered, line / line.sum(), axis, mode="constant")
     threshold = np.float32(options.threshold_sigma * left)
     # Whatever is found is among these, rounding included.
-    above = np.flatnonzero(filtered > np.float32(0.9999) * threshold * frame.noise)
-    n_above = len(above)
-
-    def extract(image: Any, noise: Any, levels: int) -> tuple[Any, Any]:
-        # sep prepares a list for all pixels that it may have to keep, which takes longer than a
-        # small image.
-        most = sep.get_extract_pixstack()
-        sep.set_extract_pixstack(min(most, n_above + _PIXELS_MORE, image.size + _PIXELS_MORE))
-        try:
-            found: tuple[Any, Any] = sep.extract(
-                image,
-                threshold,
-                err=noise,
-                minarea=options.min_pixels,
-                filter_kernel=None,
-                segmentation_map=True,
-                deblend_nthresh=levels,
-            )
-        finally:
-            sep.set_extract_pixstack(most)
-        return found
-
+    n_above = np.count_nonzero(filtered > np.float32(0.9999) * threshold * frame.noise)
+    # sep prepares a list for all pixels that it may have to keep, which takes longer than a small
+    # image.
+    most = sep.get_extract_pixstack()
+    sep.set_extract_pixstack(min(most, n_above + _PIXELS_MORE, filtered.size + _PIXELS_MORE))
     try:
-        objects, labels = _taken_apart(
-            filtered, frame.noise, *extract(filtered, frame.noise, 1), extract, above
+        objects, labels = sep.extract(
+            filtered,
+            threshold,
+            err=frame.noise,
+            minarea=options.min_pixels,
+            filter_kernel=None,
+            segmentation_map=True,
         )
     except Exception as error:  # sep raises bare exceptions when its buffers are full
         raise ImageError(
@@ -181,8 +170,10 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
             "or leave the image "
             "out."
         ) from error
+    finally:
+        sep.set_extract_pixstack(most)
     labels = labels.ravel()
-    inside = above[labels[above] != 0]
+    inside = np.flatnonzero(labels)
     objects["flux"] = np.bincount(
         labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1
     )[1:]
@@ -206,103 +197,6 @@ def _mosaic_noise(line: Any) -> float:
 
 # The list of pixels is longer than those above the threshold by so many.
 _PIXELS_MORE = 100
-# Brightness levels at which SExtractor looks for objects that fall apart.
-_LEVELS = 32
-
-
-def _taken_apart(
-    image: Any,
-    noise: Any,
-    objects: Any,
-    labels: Any,
-    extract: Callable[[Any, Any, int], tuple[Any, Any]],
-    above: IntArray,
-) -> tuple[Any, Any]:
-    """Objects and their map of numbers, zero but in pixels `above`, with those taken apart that
-    have several peaks.
-
-    No other can fall apart, and to look for it in all takes as long as all the rest.
-    """
-    with extra("images", "star images"):
-        import sep
-
-    height, width = image.shape
-    inside = above[labels.ravel()[above] != 0]
-    row, column = np.divmod(inside, width)
-    rows = [(row + step).clip(0, height - 1) * width for step in (-1, 0, 1)]
-    columns = [(column + step).clip(0, width - 1) for step in (-1, 0, 1)]
-    flat, highest = image.ravel(), np.ones(len(inside), dtype=np.bool_)
-    for first, second in product(rows, columns):
-        highest &= flat[inside] >= flat[first + second]
-    peaks = np.bincount(labels.ravel()[inside[highest]], minlength=len(objects) + 1)
-    kept = [objects]
-    n = len(objects)
-    for label in np.flatnonzero(peaks > 1):
-        whole = objects[label - 1]
-        box = slice(whole["ymin"], whole["ymax"] + 1), slice(whole["xmin"], whole["xmax"] + 1)
-        own = labels[box] == label
-        # A margin, so that no part is taken for cut off by the border of the image.
-        alone = np.zeros((own.shape[0] + 2, own.shape[1] + 2), dtype=np.float32)
-        np.copyto(alone[1:-1, 1:-1], image[box], where=own)
-        around = np.ones_like(alone)
-        around[1:-1, 1:-1] = noise[box]
-        parts, numbers = extract(alone, around, _LEVELS)
-        if len(parts) < 2:
-            continue
-        for axis, first in (("x", whole["xmin"] - 1), ("y", whole["ymin"] - 1)):
-            for name in (axis, f"{axis}min", f"{axis}max"):
-                parts[name] += first
-        ends = (
-            (parts["xmin"] == 0)
-            | (parts["ymin"] == 0)
-            | (parts["xmax"] == width - 1)
-            | (parts["ymax"] == height - 1)
-        )
-        parts["flag"][ends] |= sep.OBJ_TRUNC
-        numbers = numbers[1:-1, 1:-1]
-        labels[box][own] = np.where(numbers > 0, n + numbers, 0)[own]
-        objects["x"][label - 1] = np.nan
-        kept.append(parts)
-        n += len(parts)
-    return np.concatenate(kept), labels
-
-
-# Rows that are filtered together, what stays in the processor's caches, and numbers that one
-# product gives in a line.
-_ROWS, _BAND = 96, 24
-
-
-def _filtered(counts: Any, line: Any) -> Any:
-    """`counts` filtered by a kernel that is the product of a symmetric `line` with itself, with
-    zeros around.
-    """
-    (height, width), edge = counts.shape, len(line) // 2
-    whole = -(-width // _BAND) * _BAND
-    filtered = np.empty((height, width), dtype=np.float32)
-    padded = np.zeros((_ROWS + 2 * edge, whole + 2 * edge), dtype=np.float32)
-    rows = np.empty((len(padded), whole), dtype=np.float32)
-    # Sums along a line are products with a band matrix, of each piece with the edges of its
-    # neighbours.
-    band = np.zeros((_BAND, _BAND + 2 * edge), dtype=np.float32)
-    for k in range(_BAND):
-        band[k, k : k + len(line)] = line
-    across = np.ascontiguousarray(band.T)
-    pieces = np.lib.stride_tricks.sliding_window_view(padded, _BAND + 2 * edge, axis=1)[
-        :, ::_BAND
-    ].swapaxes(0, 1)
-    along = rows.reshape(len(padded), -1, _BAND).swapaxes(0, 1)
-    for first in range(0, height, _ROWS):
-        n = min(_ROWS, height - first)
-        low, high = max(first - edge, 0), min(first + n + edge, height)
-        inside = slice(low - first + edge, high - first + edge)
-        padded[: inside.start], padded[inside.stop :] = 0.0, 0.0
-        padded[inside, edge : edge + width] = counts[low:high]
-        np.matmul(pieces, across, out=along)
-        for row in range(0, n, _BAND):
-            m = min(_BAND, n - row)
-            out = filtered[first + row : first + row + m]
-            np.matmul(band[:m, : m + 2 * edge], rows[row : row + m + 2 * edge, :width], out=out)
-    return filtered
 
 
 def _without_blobs(objects: Any, sigma: float) -> tuple[Any, int]:

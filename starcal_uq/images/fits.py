@@ -90,33 +90,13 @@ def cut_stamps(frame: PreparedImage, x: FloatArray, y: FloatArray, half_px: int)
     x0, y0 = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
     variance = floats(frame.noise[y0.clip(0, height - 1), x0.clip(0, width - 1)]) ** 2
     x0, y0 = x0 - half_px, y0 - half_px
-    inside = (x0 >= 0) & (x0 <= width - size) & (y0 >= 0) & (y0 <= height - size)
-    stamp, good = np.zeros((len(x0), size, size)), np.ones((len(x0), size, size), dtype=np.bool_)
-
-    if inside.any():
-        # Squares inside the image are copied row by row, which is quicker than pixel by pixel.
-        corner = y0[inside], x0[inside]
-        for target, source in ((stamp, counts), (good, usable)):
-            if source is not None:
-                target[inside] = np.lib.stride_tricks.sliding_window_view(source, (size, size))[
-                    corner
-                ]
-    if not inside.all():
-        steps = np.arange(size)
-        columns, rows = x0[~inside, None] + steps, y0[~inside, None] + steps
-        at = (rows.clip(0, height - 1)[:, :, None], columns.clip(0, width - 1)[:, None, :])
-        part = ((columns >= 0) & (columns < width))[:, None, :] & ((rows >= 0) & (rows < height))[
-            :, :, None
-        ]
-        stamp[~inside], good[~inside] = counts[at], part if usable is None else part & usable[at]
-    fine = good
-    if parity is not None:
-        steps = np.arange(size)
-        at_x, at_y = (x0[:, None] + steps)[:, None, :], (y0[:, None] + steps)[:, :, None]
-        on_image = (at_x >= 0) & (at_x < width) & (at_y >= 0) & (at_y < height)
-        fine = good | (on_image & ((at_x + at_y) % 2 != parity))
-    if usable is not None or not inside.all():
-        stamp[~fine] = 0.0
+    steps = np.arange(size)
+    columns, rows = (x0[:, None] + steps)[:, None, :], (y0[:, None] + steps)[:, :, None]
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    at = rows.clip(0, height - 1), columns.clip(0, width - 1)
+    good = inside if usable is None else inside & usable[at]
+    fine = good if parity is None else good | (inside & ((columns + rows) % 2 != parity))
+    stamp = floats(np.where(fine, counts[at], 0.0))
     return Stamps(x0, y0, stamp, good, fine, variance, frame.counts_per_e)
 
 
@@ -129,41 +109,22 @@ def _profiles(
     Shape (n, 1 + derivatives, m) each; the first derivative is by the position, the second by the
     log width.
     """
+    from scipy.special import ndtr
+
     n, m = len(u), stamps.counts.shape[1]
     inverse = np.concatenate([1.0 / sigma] * 2)[:, None]
     z = np.arange(-0.5, m) - np.concatenate([u, v])[:, None]
     z *= inverse
     rows = np.empty((2 * n, 1 + derivatives, m))
-    density = np.exp(-0.5 * z * z)
-    density /= _SQRT_2PI
-    below = _below(z, density)
-    np.subtract(below[:, 1:], below[:, :-1], out=rows[:, 0])
+    rows[:, 0] = np.diff(ndtr(z))
     if derivatives:
+        density = np.exp(-0.5 * z * z) / _SQRT_2PI
         np.subtract(density[:, :-1], density[:, 1:], out=rows[:, 1])
         rows[:, 1] *= inverse
     if derivatives > 1:
         density *= z
         np.subtract(density[:, :-1], density[:, 1:], out=rows[:, 2])
     return rows[:n], rows[n:]
-
-
-def _below(z: FloatArray, density: FloatArray) -> FloatArray:
-    """Normal distribution function where its density is known, to 7.5e-8 (Abramowitz & Stegun
-    26.2.17).
-
-    No pixel is known so well, and SciPy's exact function takes longer to import than an image takes
-    to measure.
-    """
-    t = np.abs(z)
-    t *= 0.2316419
-    t += 1.0
-    np.reciprocal(t, out=t)
-    above = t * 1.330274429
-    for coefficient in (-1.821255978, 1.781477937, -0.356563782, 0.319381530):
-        above += coefficient
-        above *= t
-    above *= density
-    return np.where(z > 0.0, 1.0 - above, above)
 
 
 def _contracted(x: FloatArray, image: FloatArray, y: FloatArray) -> FloatArray:
@@ -274,7 +235,7 @@ def _settled(
         if free_sigma:
             gradient[:, 3] = flux * (first[:, 0, 2] + first[:, 2, 0])
         solution, determined = _solve(normal, gradient[:, :, None])
-        step = np.where(determined, solution[:, 0], 0.0)
+        step = np.where(determined, solution[:, :, 0].T, 0.0)
         done = np.einsum("in,ni->n", step, gradient) < _TOLERANCE_SIGMAS**2
         # Far from the solution the linear step overshoots.
         step[:2] /= np.maximum(np.hypot(step[0], step[1]) / (0.5 * sigma), 1.0)
@@ -379,42 +340,31 @@ def _ratio(top: FloatArray, bottom: FloatArray) -> FloatArray:
 
 
 def _solve(normal: FloatArray, right: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Solutions (p, q, n) for normal matrices (n, p, p) and right sides (n, p, q), and which are
-    determined.
+    """Solutions (n, p, q) for normal matrices (n, p, p) and right sides (n, p, q), and which are
+    determined, (n,).
 
-    By elimination in all of them at once; normal matrices need no exchange of rows. What the pivots
-    have lost says how nearly singular a matrix is, whatever the units.
+    The determinant over the product of the diagonal, which is 1 or less, says how nearly singular
+    a matrix is, whatever the units.
     """
-    p = normal.shape[1]
-    a = np.concatenate([normal, right], axis=2).transpose(1, 2, 0).copy()
-    left = np.ones(len(normal))
     with np.errstate(all="ignore"):
-        for k in range(p):
-            left *= a[k, k] / normal[:, k, k]
-            a[k, k + 1 :] /= a[k, k]
-            a[k + 1 :, k + 1 :] -= a[k + 1 :, k, None] * a[k, k + 1 :]
-        for k in range(p - 2, -1, -1):
-            a[k, p:] -= np.sum(a[k, k + 1 : p, None] * a[k + 1 :, p:], axis=0)
-    return a[:, p:], (left > 1e-9) & np.isfinite(a).all((0, 1))
+        left = np.linalg.det(normal) / np.prod(np.diagonal(normal, axis1=1, axis2=2), axis=1)
+    determined = (left > 1e-9) & np.isfinite(left)
+    p = normal.shape[1]
+    whole = np.where(determined[:, None, None], normal, np.eye(p))
+    return np.linalg.solve(whole, right), determined
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
     """Inverses (n, p, p), infinite where there is none."""
-    inverse, determined = _solve(normal, np.broadcast_to(np.eye(normal.shape[1]), normal.shape))
-    return np.where(determined, inverse, np.inf).transpose(2, 0, 1)
+    inverse, determined = _solve(normal, np.eye(normal.shape[1])[None])
+    return np.where(determined[:, None, None], inverse, np.inf)
 
 
 def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
     """Pairs (i, j), in both orders, of positions closer than `reach`."""
-    order = np.argsort(x, kind="stable")
-    along = x[order]
-    # Those behind each one along x that are near enough, and of them those that are near.
-    count = np.searchsorted(along, along + reach, side="right") - np.arange(1, len(x) + 1)
-    first = np.repeat(np.arange(len(x)), count)
-    second = np.arange(1, len(first) + 1) + first - np.repeat(np.cumsum(count) - count, count)
-    i, j = order[first], order[second]
-    near = np.hypot(x[i] - x[j], y[i] - y[j]) <= reach
-    pairs = np.column_stack([i[near], j[near]]).astype(np.int64)
+    from scipy.spatial import cKDTree
+
+    pairs: IntArray = cKDTree(np.column_stack([x, y])).query_pairs(reach, output_type="ndarray")
     return np.concatenate([pairs, pairs[:, ::-1]])
 
 
