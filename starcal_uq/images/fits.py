@@ -351,7 +351,7 @@ def _solve(normal: FloatArray, right: FloatArray) -> tuple[FloatArray, BoolArray
     determined = (left > 1e-9) & np.isfinite(left)
     p = normal.shape[1]
     whole = np.where(determined[:, None, None], normal, np.eye(p))
-    return np.linalg.solve(whole, right), determined
+    return floats(np.linalg.solve(whole, right)), determined
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
