@@ -50,12 +50,10 @@ def study_command(
 
 def _show(found: sc.studies.Study, page: Path | None) -> None:
     from starcal_uq.presentation.words.studies import study_advice, study_answer, study_tables
-    from starcal_uq.presentation.words.study_effects import effects_answer, effects_table
 
-    own = effects_table(found)
-    for table in (*study_tables(found), *(() if own is None else (own,))):
+    for table in study_tables(found):
         print_table(table)
-    for sentence in (*study_answer(found), *effects_answer(found), *study_advice(found)):
+    for sentence in (*study_answer(found), *study_advice(found)):
         say(sentence)
     for problem, n in found.problems.items():
         note(f"{n} of {found.n_cells} cells: {problem}")

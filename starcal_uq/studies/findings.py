@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations, compress
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -19,8 +19,7 @@ from starcal_uq.propagation.coupling import COUPLED
 if TYPE_CHECKING:
     import xarray as xr
 
-# An axis matters where it changes what a pair's coupling costs in sigma by this factor, and by more
-# than chance does.
+# An axis matters where it changes a sigma by this factor, and by more than chance does.
 MATTERS = 1.25
 # Probability with which chance alone passes for a change.
 _FALSE_ALARM = 1e-3
@@ -29,6 +28,8 @@ _FALSE_ALARM = 1e-3
 _MEDIAN, _EVEN = 1.25, 1.75
 # An axis of a Latin hypercube is cut into this many parts of equal number.
 _PARTS = 6
+# Largest squared correlation, so that its price stays finite.
+_CERTAIN = 1.0 - 1e-15
 
 Statistic = Literal["median", "min", "max", "mean", "count", "sem"]
 
@@ -60,76 +61,84 @@ class Curve:
         return int(np.argmin(self.median))
 
     @property
-    def factor(self) -> float:
-        """Largest over smallest median; infinite where the smallest is not above zero."""
-        least = float(self.median.min())
-        return float(self.median.max()) / least if least > 0.0 else np.inf
+    def matters(self) -> bool:
+        """Whether the axis changes the logarithm of a sigma by enough, and by more than chance."""
+        return self.change > max(float(np.log(MATTERS)), self.chance)
 
     @property
-    def exponent(self) -> float | None:
-        """Exponent of the power law between the ends of the axis; None where there is none."""
-        if isinstance(self.values[0], str):
-            return None
-        x, y = floats(self.values), self.median
-        if np.any(x <= 0.0) or np.any(y <= 0.0):
-            return None
-        slope = float(np.polyfit(np.log(x), np.log(y), 1)[0])
-        law = np.log(y) - slope * np.log(x)
-        return slope if float(np.ptp(law)) < 0.1 + 0.1 * float(np.ptp(np.log(y))) else None
+    def factor(self) -> float:
+        """Largest over smallest sigma, of the medians of its logarithm."""
+        return float(np.exp(np.ptp(self.median)))
+
+    @property
+    def exponent(self) -> float:
+        """Exponent of the power law that a sigma follows, by its logarithm; NaN where it follows
+        none.
+        """
+        # Magnitudes are logarithms themselves.
+        if isinstance(self.values[0], str) or min(self.values) <= 0.0 or self.axis == "max_mag":
+            return np.nan
+        x = np.log(floats(self.values))
+        slope = float(np.polyfit(x, self.median, 1)[0])
+        left = np.ptp(self.median - slope * x)
+        return slope if left < 0.1 + 0.1 * np.ptp(self.median) else np.nan
 
 
-@dataclass(frozen=True)
-class Lines:
-    """A number along one axis (n values), a line for every value of another one, `by`, where there
-    is one.
-
-    The other axes are `held` at values; median, least and most (lines, n) are over seeds.
-    """
-
-    along: str
-    values: tuple[Any, ...]
-    by: str | None
-    by_values: tuple[Any, ...]
-    held: AnyDict
-    median: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-@dataclass(frozen=True)
 class Pair:
-    """How two parameters are coupled over the sweep.
+    """How two parameters, or a parameter and the common rotation, are coupled over the sweep.
 
-    Correlations (median over seeds) where they are largest and smallest in size, and where that is.
-    `seeds` is their range over seeds at a place, the median over all places, 0 for a Latin
-    hypercube; `mean_size` their size, the mean over all places, 0 where a model lacks one of the
-    two. Along every axis, `sizes` are the size, and `costs` the logarithm of 1 / sqrt(1 - r^2),
-    what the coupling of this pair alone costs in sigma.
+    `grid` holds the correlations, median over seeds; `strongest` and `weakest` are those that are
+    largest and smallest in size, with their places as coordinates.
     """
 
-    names: tuple[str, str]
-    strongest: float
-    weakest: float
-    strongest_at: AnyDict
-    weakest_at: AnyDict
-    seeds: float
-    mean_size: float
-    sizes: tuple[Curve, ...]
-    costs: tuple[Curve, ...]
+    def __init__(self, names: tuple[str, str], correlation: FloatArray, sweep: Sweep) -> None:
+        self.names, self.correlation, self._sweep = names, correlation, sweep
+        self.grid = sweep.over(correlation)
+        self.size = abs(self.grid)
 
-    def decoupling(self) -> list[tuple[Curve, Curve]]:
-        """Size and cost along the axes that change the coupling, the strongest first."""
-        both = zip(self.sizes, self.costs, strict=True)
-        return sorted((p for p in both if matters(p[1])), key=lambda pair: -pair[1].change)
+    @property
+    def strongest(self) -> xr.DataArray:
+        """The largest correlation."""
+        return self.grid.isel(_first(self.size, self._sweep.axes))
+
+    @property
+    def weakest(self) -> xr.DataArray:
+        """The smallest correlation."""
+        return self.grid.isel(_first(-self.size, self._sweep.axes))
+
+    @property
+    def mean_size(self) -> float:
+        """Size, the mean over all places, 0 where a model lacks one of the two."""
+        return float(self.size.fillna(0.0).mean())
+
+    @property
+    def seeds(self) -> float:
+        """Range over seeds at a place, the median over all places; 0 for a Latin hypercube."""
+        if self._sweep.drawn:
+            return 0.0
+        most, least = (self._sweep.over(self.correlation, of) for of in ("max", "min"))
+        return float((most - least).median())
+
+    @cached_property
+    def costs(self) -> tuple[Curve, ...]:
+        """Along every axis, the logarithm of 1 / sqrt(1 - r^2): what the coupling of this pair
+        alone costs in sigma.
+        """
+        square = np.minimum(self.correlation**2, _CERTAIN)
+        return self._sweep.curves(-0.5 * np.log1p(-square))
+
+    def decoupling(self) -> list[Curve]:
+        """Costs along the axes that change the coupling, the strongest first."""
+        return sorted((cost for cost in self.costs if cost.matters), key=lambda cost: -cost.change)
 
 
-def matters(cost: Curve) -> bool:
-    """Whether an axis changes the logarithm of a sigma by enough, and by more than chance does."""
-    return cost.change > max(float(np.log(MATTERS)), cost.chance)
+def place_of(number: xr.DataArray) -> AnyDict:
+    """The values of the axes at one number of a grid."""
+    return {str(axis): value.item() for axis, value in number.coords.items()}
 
 
 class Sweep:
-    """The cells of a study by their place: every number as a dense array over the axes.
+    """The cells of a study by their place: every number as a grid over the axes.
 
     Of the swept axes, those in `latin` were drawn from a Latin hypercube.
     """
@@ -139,10 +148,9 @@ class Sweep:
         self.axes = tuple(axes)
         self.ok: BoolArray = np.asarray(data["status"].values == "ok")
         self.names: tuple[str, ...] = tuple(map(str, data["parameter"].values))
-        levels = [_levels(data[axis].values, axis in latin) for axis in self.axes]
-        self.values = {axis: values for axis, (_, values) in zip(self.axes, levels, strict=True)}
-        self.shape = tuple(len(values) for _, values in levels)
-        self._codes = [code for code, _ in levels]
+        levels = {axis: _levels(data[axis].values, axis in latin) for axis in self.axes}
+        self._codes = {axis: codes for axis, (codes, _) in levels.items()}
+        self.values = {axis: values for axis, (_, values) in levels.items()}
         # Axes that were drawn and not laid out: their cells are no lines, and are told apart along
         # one axis at a time.
         self.drawn = tuple(
@@ -153,35 +161,29 @@ class Sweep:
         self,
         numbers: FloatArray,
         statistic: Statistic = "median",
-        pooled: Sequence[str] = (),
-        cells: Any = True,
-    ) -> FloatArray:
-        """A statistic of a number (C,) of every cell, over seeds, as an array over the axes; NaN
-        where no cell has it.
+        dims: Sequence[str] | None = None,
+        at: AnyMapping | None = None,
+    ) -> xr.DataArray:
+        """A statistic of a number (C,) of every cell over seeds, as a grid over the axes; NaN where
+        no cell has it.
 
-        Axes `pooled` count as seeds; the array has one value for them. Of `cells` (C,), those that
-        are true count.
+        The grid is over `dims`, by default all axes. Other axes count as seeds, or are held `at`
+        values.
         """
         import pandas as pd
+        import xarray as xr
 
-        kept = [axis not in pooled for axis in self.axes]
-        shape = tuple(n if keep else 1 for keep, n in zip(kept, self.shape, strict=True))
-        good = self.ok & ~np.isnan(numbers) & cells
-        place = np.zeros(int(good.sum()), dtype=np.int64)
+        dims = self.axes if dims is None else dims
+        levels = {axis: list(self.values[axis]) for axis in dims}
+        shape = tuple(map(len, levels.values()))
+        cells = self.ok & self._cells(at or {})
+        place = np.zeros(int(cells.sum()), dtype=np.int64)
         if shape:
-            codes = [code[good] * keep for keep, code in zip(kept, self._codes, strict=True)]
-            place = np.ravel_multi_index(codes, shape)
-        found = pd.Series(numbers[good]).groupby(place).agg(statistic)
-        grid = np.full(math.prod(shape), np.nan)
-        grid[found.index.to_numpy()] = found.to_numpy()
-        return grid.reshape(shape)
-
-    def at(self, index: int) -> AnyDict:
-        """The values of the axes at a place, by its number in the flattened array."""
-        codes = np.unravel_index(index, self.shape) if self.axes else ()
-        return {
-            axis: self.values[axis][int(code)] for axis, code in zip(self.axes, codes, strict=True)
-        }
+            place = np.ravel_multi_index([self._codes[axis][cells] for axis in dims], shape)
+        found = pd.Series(numbers[cells]).groupby(place).agg(statistic)
+        grid = np.full(math.prod(shape), 0.0 if statistic == "count" else np.nan)
+        grid[found.index] = found
+        return xr.DataArray(grid.reshape(shape), levels, dims)
 
     def along(self, numbers: FloatArray, axis: str) -> Curve | None:
         """A number of every cell along an axis; None where fewer than two values of the axis have
@@ -190,42 +192,36 @@ class Sweep:
         Only what was found at all values of the axis is compared, so that missing cells do not pass
         for a change.
         """
-        pooled = tuple(other for other in self.drawn if other != axis)
-        lines = np.moveaxis(self.over(numbers, pooled=pooled), self.axes.index(axis), 0)
-        lines = lines.reshape(len(self.values[axis]), -1)
-        has = np.isfinite(lines).any(axis=1)
-        lines = lines[has]
-        if len(lines) < 2:
-            return None
-        known = np.isfinite(lines)
-        lines = lines[:, known.all(axis=0) if known.all(axis=0).any() else known.sum(axis=0) >= 2]
-        if lines.shape[1] == 0 or not np.isfinite(lines).any(axis=1).all():
+        import pandas as pd
+
+        dims = [axis, *(other for other in self.axes if other not in (axis, *self.drawn))]
+        grid = self.over(numbers, dims=dims)
+        lines = pd.DataFrame(grid.values.reshape(len(grid), -1), grid[axis].values)
+        lines = lines.dropna(how="all")
+        whole = lines.dropna(axis=1)
+        lines = whole if whole.size else lines.dropna(axis=1, thresh=2)
+        if len(lines) < 2 or lines.isna().all(axis=1).any():
             return None
         return Curve(
             axis,
-            tuple(compress(self.values[axis], np.atleast_1d(has))),
-            np.nanmedian(lines, axis=1),
-            float(np.median(np.nanmax(lines, axis=0) - np.nanmin(lines, axis=0))),
-            self._chance(numbers, pooled, len(lines)),
+            tuple(lines.index),
+            lines.median(axis=1).to_numpy(),
+            float((lines.max() - lines.min()).median()),
+            self._chance(numbers, dims, len(lines)),
         )
 
-    def seeds(self, numbers: FloatArray) -> float:
-        """Range over seeds at a place, the median over all places."""
-        spread = self.over(numbers, "max") - self.over(numbers, "min")
-        return float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
-
-    def _chance(self, numbers: FloatArray, pooled: Sequence[str], n_values: int) -> float:
+    def _chance(self, numbers: FloatArray, dims: Sequence[str], n_values: int) -> float:
         """Range of medians at so many places that chance exceeds once in a thousand times;
         Bonferroni over pairs.
         """
         from scipy.special import stdtrit
 
-        n = self.over(numbers, "count", pooled)
+        n = self.over(numbers, "count", dims).values
         repeated = n >= 2.0
         if not repeated.any():
             return 0.0
-        n, error = n[repeated], self.over(numbers, "sem", pooled)[repeated]
-        factor = _EVEN if pooled or self.drawn else np.where(n > 2.0, _MEDIAN, 1.0)
+        n, error = n[repeated], self.over(numbers, "sem", dims).values[repeated]
+        factor = _EVEN if self.drawn else np.where(n > 2.0, _MEDIAN, 1.0)
         p = 1.0 - _FALSE_ALARM / (n_values * (n_values - 1))
         quantile = float(stdtrit(float(np.sum(n - 1.0)), p))
         return float(np.sqrt(2.0 * np.mean((factor * error) ** 2))) * quantile
@@ -241,68 +237,44 @@ class Sweep:
         along: str,
         by: str | None = None,
         at: AnyMapping | None = None,
-    ) -> Lines:
-        """A number (C,) of every cell along an axis, a line for every value of another one, all
-        others held.
+    ) -> xr.Dataset:
+        """A number (C,) of every cell along an axis, for every value of another one, all others
+        held.
 
-        They are held `at` values, by default at the middle one of theirs (where most cells have
-        numbers); what was drawn from a Latin hypercube is not held at all. ValueError for a name
-        that is no axis, or a value that an axis does not have.
+        `median`, `low` and `high` (least and most) over seeds, dimensions `by` and `along`; where
+        the others are held is the attribute ``held``. They are held `at` values, by default at the
+        middle one of theirs (where most cells have numbers); what was drawn from a Latin hypercube
+        is not held at all. ValueError for a name that is no axis, or a value that an axis does not
+        have.
         """
+        import xarray as xr
+
         held = self.held(along, by, at)
-        cells = self._cells(held)
-        pooled = [axis for axis in self.axes if axis not in (along, by)]
-        turned = by is not None and self.axes.index(by) > self.axes.index(along)
-
-        def laid_out(numbers: FloatArray, statistic: Statistic = "median") -> FloatArray:
-            grid = self.over(numbers, statistic, pooled, cells)
-            grid = grid.squeeze(tuple(self.axes.index(axis) for axis in pooled))
-            return grid.T if turned else np.atleast_2d(grid)
-
-        # Values at which no cell has numbers are left out.
-        there = np.isfinite(laid_out(np.zeros(len(self.ok))))
-        rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
-        kept = np.ix_(rows, columns)
-        median, low, high = (laid_out(numbers, of)[kept] for of in ("median", "min", "max"))
-        values = tuple(self.values[along][i] for i in columns)
-        by_values = () if by is None else tuple(self.values[by][i] for i in rows)
-        return Lines(along, values, by, by_values, held, median, low, high)
+        dims = [along] if by is None else [by, along]
+        statistics: dict[str, Statistic] = {"median": "median", "low": "min", "high": "max"}
+        found = {
+            name: self.over(numbers, statistic, dims, held)
+            for name, statistic in statistics.items()
+        }
+        return xr.Dataset(found, attrs={"held": held})
 
     def held(self, along: str, by: str | None = None, at: AnyMapping | None = None) -> AnyDict:
         """Where the other axes are held."""
+        import xarray as xr
+
         for axis in filter(None, (along, by)):
             self.check(axis)
         given = {axis: value for axis, value in (at or {}).items() if axis not in (along, by)}
-        cells = self.ok & self._cells(given)
         named = (*self.drawn, along, by, *given)
-        free = [i for i, axis in enumerate(self.axes) if axis not in named]
-        if not free or not cells.any():
+        free = [axis for axis in self.axes if axis not in named]
+        n_cells = self.over(np.zeros(len(self.ok)), "count", free, given)
+        if not free:
             return given
         # The middle, unless cells are missing there.
-        places, counts = np.unique(
-            np.stack([self._codes[i][cells] for i in free]), axis=1, return_counts=True
-        )
-        middle = np.array([self.shape[i] // 2 for i in free])[:, None]
-        best = int(np.lexsort((np.abs(places - middle).sum(axis=0), -counts))[0])
-        chosen = {
-            axis: self.values[axis][code]
-            for axis, code in zip((self.axes[i] for i in free), places[:, best], strict=True)
-        }
-        return chosen | given
-
-    def pooled(
-        self,
-        numbers: FloatArray,
-        along: str,
-        at: AnyMapping | None = None,
-        statistic: Statistic = "median",
-    ) -> FloatArray:
-        """A statistic of a number at every value of an axis, over seeds and all axes that `at` does
-        not hold.
-        """
-        self.check(along)
-        others = [axis for axis in self.axes if axis != along]
-        return self.over(numbers, statistic, others, self._cells(at or {})).ravel()
+        for axis in free:
+            off = np.arange(n_cells.sizes[axis]) - n_cells.sizes[axis] // 2
+            n_cells = n_cells - 1e-3 * xr.DataArray(np.abs(off), dims=[axis])
+        return place_of(n_cells.isel(_first(n_cells, free))) | given
 
     def _cells(self, at: AnyMapping) -> BoolArray:
         """Cells (C,) at values of axes."""
@@ -314,7 +286,7 @@ class Sweep:
                 raise ValueError(
                     f"{axis} has no value {value!r}: use one of {', '.join(map(str, known))}."
                 )
-            cells &= self._codes[self.axes.index(axis)] == known.index(value)
+            cells &= self._codes[axis] == known.index(value)
         return cells
 
     def check(self, axis: str) -> None:
@@ -329,55 +301,51 @@ class Sweep:
         """Frame-dependent error of the calibration across the boresight, 1 sigma per axis, of every
         cell (arcsec).
         """
-        return self.cross("frame_error_arcsec")
+        return floats(cross(self.data["frame_error_arcsec"]).values)
 
     @cached_property
     def common_rotation(self) -> FloatArray:
         """Rotation common to all frames across the boresight, 1 sigma per axis, of every cell
         (arcsec).
         """
-        return self.cross("common_rotation_arcsec")
-
-    def cross(self, variable: str) -> FloatArray:
-        """Root mean square over pitch and yaw of a variable by axis, of every cell."""
-        return floats(cross(self.data[variable]).values)
+        return floats(cross(self.data["common_rotation_arcsec"]).values)
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
         """All pairs of parameters, those that are coupled most somewhere first."""
-        found = (self._pair(*names) for names in combinations(self.names, 2))
-        return tuple(sorted(filter(None, found), key=lambda pair: -abs(pair.strongest)))
+        return self._pairs("correlation", combinations(self.names, 2))
 
-    @property
+    @cached_property
     def coupled(self) -> tuple[Pair, ...]:
         """The pairs whose correlation exceeds `COUPLED` somewhere."""
         return tuple(pair for pair in self.pairs if abs(pair.strongest) >= COUPLED)
 
-    def _pair(self, first: str, second: str) -> Pair | None:
-        r = floats(self.data["correlation"].sel(parameter=first, parameter_2=second).values)
-        grid = self.over(r).ravel()
-        if not np.isfinite(grid).any():
-            return None
-        size = np.abs(grid)
-        most, least = int(np.nanargmax(size)), int(np.nanargmin(size))
-        cost = -0.5 * np.log1p(-np.minimum(r**2, 1.0 - 1e-15))
-        sizes, costs = self.curves(np.abs(r)), self.curves(cost)
-        return Pair(
-            (first, second),
-            float(grid[most]),
-            float(grid[least]),
-            self.at(most),
-            self.at(least),
-            0.0 if self.drawn else self.seeds(r),
-            float(np.nan_to_num(size).mean()),
-            sizes,
-            costs,
+    @cached_property
+    def turned(self) -> tuple[Pair, ...]:
+        """Parameters with an axis of the common rotation that they are coupled to everywhere."""
+        pairs = self._pairs("attitude_correlation", product(self.names, ATTITUDE))
+        return tuple(pair for pair in pairs if abs(pair.weakest) >= COUPLED)
+
+    def _pairs(self, variable: str, names: Any) -> tuple[Pair, ...]:
+        every = self.data[variable].transpose("parameter", ..., "cell")
+        found = (
+            Pair(
+                pair, floats(every.sel({"parameter": pair[0], every.dims[1]: pair[1]}).values), self
+            )
+            for pair in names
         )
+        known = [pair for pair in found if pair.grid.notnull().any()]
+        return tuple(sorted(known, key=lambda pair: -float(pair.size.max())))
 
     @cached_property
     def failures(self) -> tuple[tuple[str, int], ...]:
         """Why cells failed, and how many, the most frequent first."""
         return tuple(Counter(map(str, self.data["status"].values[~self.ok])).most_common())
+
+
+def _first(grid: xr.DataArray, dims: Sequence[str]) -> Mapping[Any, Any]:
+    """Indices of the largest number of a grid."""
+    return grid.argmax(list(dims)) if dims else {}
 
 
 def cross(errors: xr.DataArray) -> xr.DataArray:
@@ -392,11 +360,13 @@ def _levels(values: Any, drawn: bool) -> tuple[IntArray, tuple[Any, ...]]:
     """Number of the level of every cell, and the levels: values of the axis, or parts of those that
     were drawn.
     """
+    import pandas as pd
+
     array = np.asarray(values)
     if array.dtype.kind in "OUS":
         # Names keep the order in which they were given.
-        known = {name: code for code, name in enumerate(dict.fromkeys(map(str, array)))}
-        return np.array([known[str(name)] for name in array], dtype=np.int64), tuple(known)
+        codes, names = pd.factorize(array.astype(object))
+        return codes, tuple(map(str, names))
     numbers = array.astype(np.float64)
     distinct, codes = np.unique(numbers, return_inverse=True)
     if not drawn or len(distinct) <= _PARTS:

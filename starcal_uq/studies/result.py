@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import PARAMETERS
-from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.files import atomic_path, check_hdf5, new_folder, reading, write_netcdf
 from starcal_uq.core.manifest import read_manifest
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, PathLike, floats
+from starcal_uq.core.types import AnyMapping, BoolArray, FloatArray, PathLike, floats
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
 from starcal_uq.studies.findings import Statistic, Sweep, cross
@@ -265,7 +264,7 @@ class Study(Shown):
         return self._band(self.values(variable, **labels), along, at)
 
     def _band(self, numbers: FloatArray, along: str, at: AnyMapping | None) -> pd.DataFrame:
-        import pandas as pd
+        import xarray as xr
 
         names: dict[str, Statistic] = {
             "median": "median",
@@ -273,13 +272,15 @@ class Study(Shown):
             "high": "max",
             "n": "count",
         }
-        columns: AnyDict = {"value": self.sweep.values.get(along, ())}
         try:
-            for name, statistic in names.items():
-                columns[name] = self.sweep.pooled(numbers, along, at, statistic)
+            self.sweep.check(along)
+            found = {
+                name: self.sweep.over(numbers, statistic, [along], at)
+                for name, statistic in names.items()
+            }
         except ValueError as error:
             raise StudyError(str(error)) from None
-        return pd.DataFrame(columns)
+        return xr.Dataset(found).to_dataframe().rename_axis("value").reset_index()
 
     def needed(
         self, along: str, target_arcsec: float | None = None, *, at: AnyMapping | None = None
@@ -327,43 +328,26 @@ class Study(Shown):
         """One row per cell and parameter: the axes, what a cell has one number of, then the
         parameter's in its unit.
         """
-        import pandas as pd
+        import xarray as xr
 
-        data, names = self.data, self.parameter_names
-        cells, p = self.n_cells, len(names)
-        columns: AnyDict = {"cell": np.repeat(np.arange(cells), p)}
-        for name in (*self.definition.axes, "seed_index", "key", "status"):
-            columns[name] = np.repeat(data[name].values, p)
-        columns[_PARAMETER] = np.tile(np.array(names), cells)
-        columns["unit"] = np.tile(np.array([PARAMETERS[name].unit for name in names]), cells)
-        late: AnyDict = {}
-        for key, array in data.data_vars.items():
-            name = str(key)
-            dims, values = array.dims[1:], array.values
-            if name == "status" or _FACTOR in dims:
-                continue
-            if dims == ():
-                columns[name] = np.repeat(values, p)
-            elif dims == (_PARAMETER,):
-                late[name] = values.ravel()
-            elif dims == (_PARAMETER, _OTHER):
-                late |= {
-                    f"{name}_{other}": values[:, :, j].ravel() for j, other in enumerate(names)
-                }
-            elif dims == (_PARAMETER, _AXIS):
-                late |= {
-                    f"{name}_{axis}": values[:, :, j].ravel() for j, axis in enumerate(ATTITUDE)
-                }
-            elif dims in ((_AXIS,), (_SIMPLER,)):
-                labels = [str(v) for v in data[dims[0]].values]
-                columns |= {
-                    f"{name}_{label}": np.repeat(values[:, j], p) for j, label in enumerate(labels)
-                }
-            elif dims == (_SIMPLER, _PARAMETER):
-                late |= {
-                    f"{name}_{m}": values[:, j].ravel() for j, m in enumerate(data[_SIMPLER].values)
-                }
-        return pd.DataFrame(columns | late)
+        data = self.data
+        where = [*self.definition.axes, "seed_index", "key", "status"]
+        flat: dict[str, xr.DataArray] = {}
+        for key, array in data.drop_vars("status").data_vars.items():
+            beyond = [str(dim) for dim in array.dims if dim not in ("cell", _PARAMETER)]
+            if not beyond:
+                flat[str(key)] = array
+            elif len(beyond) == 1 and _FACTOR not in beyond:
+                for label in data[beyond[0]].values:
+                    flat[f"{key}_{label}"] = array.sel({beyond[0]: label}, drop=True)
+        units = [PARAMETERS[name].unit for name in self.parameter_names]
+        every = xr.Dataset(flat | {"unit": (_PARAMETER, units)}, {_PARAMETER: data[_PARAMETER]})
+        table = every.assign({name: data[name].variable for name in where}).to_dataframe(
+            dim_order=["cell", _PARAMETER]
+        )
+        own = [name for name, array in flat.items() if _PARAMETER in array.dims]
+        whole = [name for name in flat if name not in own]
+        return table.reset_index()[["cell", *where, _PARAMETER, "unit", *whole, *own]]
 
     def save(self, folder: PathLike) -> None:
         """Write ``study.nc`` and ``study.parquet`` into a folder, each all or nothing."""

@@ -64,6 +64,7 @@ def made_study(
     matrix = np.full((n, p, p), np.nan)
     weak = np.full((n, p), np.nan)
     variance = np.full(n, np.nan)
+    words = np.full(n, "", dtype=object)
     for i in np.flatnonzero(good):
         matrix[i] = np.eye(p)
         for (first, second), r in correlations(cells[i]).items():
@@ -71,6 +72,7 @@ def made_study(
             matrix[i, a, b] = matrix[i, b, a] = np.clip(r + jitter * rng.normal(), -0.9999, 0.9999)
         direction = weak_directions(matrix[i], NAMES)[0]
         weak[i], variance[i] = direction.weights, direction.variance
+        words[i] = direction.words
     sigma = scale[:, None] * SIGMAS
     inflation = np.full((n, p), np.nan)
     inflation[good] = np.diagonal(np.linalg.inv(matrix[good]), axis1=1, axis2=2)
@@ -90,6 +92,7 @@ def made_study(
         "condition_number": ("cell", np.where(good, 1.0, np.nan)),
         "weak_direction": (("cell", "parameter"), weak),
         "weak_variance": ("cell", variance),
+        "weak_words": ("cell", words.astype(str)),
         "attitude_correlation": (("cell", "parameter", "axis"), attitude),
         "common_rotation_arcsec": (("cell", "axis"), 10.0 * scale[:, None] * ones),
         "frame_error_arcsec": (("cell", "axis"), scale[:, None] * ones),

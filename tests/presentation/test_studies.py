@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 
 from starcal_uq.core.display import view_of
@@ -47,15 +46,14 @@ def decoupled() -> Study:
 
 def test_the_axis_that_decouples_is_named_with_its_numbers(decoupled: Study) -> None:
     text = study_text(decoupled)
-    assert "f–k1 most: −0.97 to −0.30" in text
-    assert "Correlations change with field of view. No coupling changes with number of" in text
+    assert "f–k1: −0.97 to −0.30. Correlations change with field of view." in text
     pairs, changes, medians = study_tables(decoupled)
     assert pairs.rows[0][0] == "f–k1" and "field of view 5°" in pairs.rows[0][2]
     assert changes.rows[0][:6] == ("f–k1", "field of view [°]", "0.97", "5", "0.30", "20")
     assert ("number of frames", "−0.50") in {(row[1], row[-1]) for row in changes.rows}
     assert len(medians.rows) == 6 and "1000" in [row[1] for row in medians.rows]
     answer = " ".join(study_answer(decoupled))
-    assert "The weakest direction is f against k1 in 6" in answer
+    assert "of the cells: f against k1: poorly determined" in answer
     assert "The target of 0.5 arcsec is met in 3 of 8 places" in answer
     assert "The target of 0.050 px for f is met in 3 of 8 places" in answer
     advice = " ".join(study_advice(decoupled))
@@ -77,9 +75,9 @@ def test_nothing_is_claimed_where_nothing_couples() -> None:
         },
         bias_arcsec=lambda cell: 9.0,
     )
-    assert study_text(study).startswith("No pair of parameters is coupled")
+    assert study_text(study).startswith("0 of 10 pairs of parameters are coupled")
     answer = " ".join(study_answer(study))
-    assert "direction is no combination of" in answer and "would do in 0 of 9" in answer
+    assert "No direction is much weaker" in answer and "would do in 0 of 9" in answer
     assert [table.title for table in study_tables(study)] == [
         "Medians over seeds and all other axes"
     ]
@@ -91,8 +89,8 @@ def test_a_coupling_that_only_seeds_change_has_no_remedy() -> None:
     study = made_study(
         {"fov_deg": FIELDS, "frames": FRAMES}, lambda cell: {("f", "k1"): -0.9}, jitter=0.03
     )
-    assert "No coupling changes with field of view and number of frames" in study_text(study)
-    assert "Nothing that was varied tells f–k1 apart" in " ".join(study_advice(study))
+    assert "Nothing that was varied changes them by much." in study_text(study)
+    assert "No choice in this sweep tells f–k1 apart" in " ".join(study_advice(study))
 
 
 def test_coverage_is_judged_with_its_bounds() -> None:
@@ -122,10 +120,11 @@ def test_figures_draw(decoupled: Study) -> None:
     wide = made_study(
         many, lambda cell: {}, size=lambda cell: 1.0 / np.sqrt(cell["frames"]), seeds=1
     )
-    contours = [artist for artist in wide.plot.map().collections if isinstance(artist, ContourSet)]
-    assert len(contours) == 1 and len(contours[0].levels) >= 3
+    drawn = wide.plot.map()
+    assert drawn.images[0].colorbar is not None and not drawn.texts
+    few = made_study({"fov_deg": FIELDS, "frames": FRAMES}, lambda cell: {}, seeds=1)
     assert (
-        "0.00" in wide.plot.map("correlation", parameter="f", parameter_2="k1").texts[0].get_text()
+        "0.00" in few.plot.map("correlation", parameter="f", parameter_2="k1").texts[0].get_text()
     )
     lines = decoupled.plot.correlation([("f", "k1")]).axes[0].get_lines()
     np.testing.assert_allclose(lines[1].get_ydata(), [0.97, 0.8, 0.3], atol=0.003)

@@ -9,11 +9,12 @@ import starcal_uq as sc
 from starcal_uq.core.errors import StudyError
 from starcal_uq.planning.effects import PlannedEffects
 from starcal_uq.planning.plan import plan
-from starcal_uq.presentation.words.study_effects import effects_answer, effects_table
+from starcal_uq.presentation.words.studies import study_tables
 from starcal_uq.studies.definition import StudyDefinition
 from starcal_uq.studies.result import Study
 from tests.helpers.scenes import camera
 
+SLOPE = ("df/dT [px/K]", "range of temperatures [K]")
 HELD = ("none", "temperature=0.2", "frame=0.1,temperature=0.2")
 OBSERVATION = {"max_mag": 6.0, "min_stars": 10, "sigma_px": 0.05}
 
@@ -64,17 +65,19 @@ def test_slopes_follow_the_range_and_the_frames(study: Study) -> None:
 
 
 def test_the_question_is_answered(study: Study) -> None:
-    table = effects_table(study)
-    assert table is not None and [row[0] for row in table.rows] == list(HELD)
-    assert table.rows[0][1:4] == ("× 1.00",) * 3
-    answer = effects_answer(study)
-    assert len(answer) == 3 and answer[0].startswith("Beside temperature=0.2, the sigma of f is")
-    assert "df/dT is known best to" in answer[-1]
-    assert "range of temperatures 40 K" in answer[-1].partition("worst")[0]
+    """The tables say what effects cost, and which range of temperatures tells df/dT."""
+    _, changes, medians = study_tables(study)
+    rows = [dict(zip(medians.heads, row, strict=True)) for row in medians.rows[: len(HELD)]]
+    assert [row["Value"] for row in rows] == list(HELD)
+    assert [row["df/dT [px/K]"] == "–" for row in rows] == [True, False, False]
+    assert float(rows[2]["Sigma f [px]"]) > 1.15 * float(rows[0]["Sigma f [px]"])
+    (slope,) = (row for row in changes.rows if row[:2] == SLOPE)
+    assert slope[3::2] == ("10", "40", "−1.00") and slope[6] == "4.0"
     # Control: a study that varies no effects says nothing of them.
     plain = tables(sweep={"frames": [100, 400]})
     other = sc.study(StudyDefinition.from_dict(plain), workers=0)
-    assert effects_table(other) is None and effects_answer(other) == []
+    for table in study_tables(other):
+        assert "df/dT" not in " ".join((*table.heads, *(row[0] for row in table.rows)))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 import pandas as pd
 
-from starcal_uq.studies.findings import Sweep, matters
+from starcal_uq.studies.findings import Sweep
 from tests.helpers.studies import made_study
 
 FIELDS, FRAMES = (5.0, 10.0, 20.0), (10, 100, 1000)
@@ -28,9 +28,9 @@ def test_medians_stand_at_their_places() -> None:
     expected = by_place.median().to_numpy().reshape(3, 3)
     np.testing.assert_allclose(study.sweep.over(r), expected, rtol=1e-12)
     lines = study.sweep.lines(r, "frames", "fov_deg")
-    np.testing.assert_allclose(lines.median, study.sweep.over(r))
+    np.testing.assert_allclose(lines["median"], study.sweep.over(r))
     held = study.sweep.lines(r, "frames", at={"fov_deg": 20.0})
-    np.testing.assert_allclose(held.median[0], study.sweep.over(r)[2])
+    np.testing.assert_allclose(held["median"], study.sweep.over(r)[2])
 
 
 def test_missing_cells_do_not_pass_for_a_change() -> None:
@@ -46,9 +46,9 @@ def test_missing_cells_do_not_pass_for_a_change() -> None:
     curve = study.sweep.along(size, "frames")
     assert curve is not None and curve.change < 0.01
     # Medians over whatever there is would have said otherwise.
-    assert np.ptp(study.sweep.over(size, pooled=["fov_deg"])) > 0.4
+    assert np.ptp(study.sweep.over(size, dims=["frames"]).values) > 0.4
     (pair,) = study.sweep.coupled
-    assert [size.axis for size, _ in pair.decoupling()] == ["fov_deg"]
+    assert [cost.axis for cost in pair.decoupling()] == ["fov_deg"]
 
 
 def test_chance_passes_for_a_change_once_in_a_thousand_times() -> None:
@@ -82,6 +82,6 @@ def test_a_hypercube_is_told_in_parts_that_are_judged_by_their_scatter() -> None
     definition = dataclasses.replace(study.definition, sweep={}, latin={}, latin_n=0)
     assert definition.axes == {}
     sweep = Sweep(data, ("fov_deg", "sigma_px"), ("fov_deg", "sigma_px"))
-    assert sweep.drawn == ("fov_deg", "sigma_px") and sweep.shape == (6, 6)
+    assert sweep.drawn == ("fov_deg", "sigma_px") and sweep.over(noise).shape == (6, 6)
     (pair,) = sweep.coupled
-    assert {cost.axis: matters(cost) for cost in pair.costs} == {"fov_deg": True, "sigma_px": False}
+    assert {cost.axis: cost.matters for cost in pair.costs} == {"fov_deg": True, "sigma_px": False}

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
     from starcal_uq.propagation.coupling import Coupling
 
+# A small map of so many parameters still shows their numbers.
+_MOST_NUMBERED = 5
+
 
 def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bool = False) -> Axes:
     """Heat map of the correlation matrix with its numbers.
@@ -36,7 +39,7 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
     if ax is None:
         side = 1.4 + 0.62 * len(names)
         ax = style.new_axes(side + 0.8, side)
-    image = _extended(ax, coupling) if extended else _heat_map(ax, coupling.correlation, names)
+    image = _extended(ax, coupling) if extended else heat_map(ax, coupling.correlation, names)
     style.label(ax, "With the boresight" if extended else "Camera parameters", pad=24)
     style.colour_bar(ax, image, "correlation")
     return ax
@@ -50,7 +53,7 @@ def plot_correlations(coupling: Coupling) -> Figure:
     figure = style.new_figure(width, q * cell + above + 0.1)
     left = style.place(figure, before, 0.1 + (q - p) * cell, p * cell, p * cell)
     right = style.place(figure, before + p * cell + between, 0.1, q * cell, q * cell)
-    _heat_map(left, coupling.correlation, coupling.parameter_names)
+    heat_map(left, coupling.correlation, coupling.parameter_names)
     image = _extended(right, coupling)
     style.label(left, "Camera parameters", pad=24)
     style.label(right, "With the constant attitude error they cause", pad=24)
@@ -77,27 +80,36 @@ def plot_couplings(coupling: Coupling, ax: Axes | None = None) -> Axes:
 
 
 def _extended(ax: Axes, coupling: Coupling) -> AxesImage:
-    image = _heat_map(ax, coupling.extended_correlation, coupling.extended_names)
+    image = heat_map(ax, coupling.extended_correlation, coupling.extended_names)
     split = len(coupling.parameter_names) - 0.5
     ax.axhline(split, color=style.INK, linewidth=1.2)
     ax.axvline(split, color=style.INK, linewidth=1.2)
     return image
 
 
-def _heat_map(ax: Axes, matrix: FloatArray, names: Sequence[str]) -> AxesImage:
+def heat_map(
+    ax: Axes, matrix: FloatArray, names: Sequence[str], *, small: bool = False
+) -> AxesImage:
+    """Correlations with their numbers, grey where there is none; a `small` map of many parameters
+    has colours alone.
+    """
     image = ax.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
-    style.dress(ax)
+    style.dress(ax).set_facecolor(style.LIGHT)
     ax.tick_params(top=True, labeltop=True, bottom=False, labelbottom=False)
+    size = style.TICK_SIZE if small else style.LABEL_SIZE
     for axis in (ax.xaxis, ax.yaxis):
-        axis.set_ticks(range(len(names)), list(map(symbol, names)), fontsize=style.LABEL_SIZE)
-    style.squares(ax, len(names), len(names), 1.6)
+        axis.set_ticks(range(len(names)), list(map(symbol, names)), fontsize=size)
+    style.squares(ax, len(names), len(names), 1.0 if small else 1.6)
     ax.tick_params(which="minor", top=False, bottom=False, left=False)
+    if small and len(names) > _MOST_NUMBERED:
+        return image
     for (row, column), value in np.ndenumerate(matrix):
         colour = "white" if abs(value) > 0.62 else style.INK
         weight = "bold" if row != column and abs(value) >= 0.7 else "normal"
-        text = correlation_text(value, row == column)
+        text = "" if np.isnan(value) else correlation_text(value, row == column)
+        look = {"color": colour, "weight": weight, "fontsize": size - 2.0 if small else size - 1.0}
         # Inside its cell: nothing for the layout to make room for.
-        style.in_cell(ax, text, row, column, color=colour, weight=weight, in_layout=False)
+        style.in_cell(ax, text, row, column, in_layout=False, **look)
     return image
 
 

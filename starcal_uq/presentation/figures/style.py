@@ -309,11 +309,11 @@ def about_zero(ax: Axes) -> None:
     legend(ax, loc="upper left", ncols=2, columnspacing=1.0, handletextpad=0.2)
 
 
-def key(text: str, colour: str, **keywords: Any) -> Line2D:
+def key(text: str, color: Any, **keywords: Any) -> Line2D:
     """An entry of a legend that stands for no artist."""
     from matplotlib.lines import Line2D
 
-    return Line2D([], [], color=colour, label=text, **keywords)
+    return Line2D([], [], color=color, label=text, **keywords)
 
 
 def legend_on_top(ax: Axes, **keywords: Any) -> None:

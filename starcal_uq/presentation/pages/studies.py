@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,8 @@ from starcal_uq.presentation.words.studies import (
     study_limits,
     study_tables,
     study_text,
-    summary_columns,
+    summary,
 )
-from starcal_uq.presentation.words.study_effects import effects_answer, effects_table
 from starcal_uq.studies.result import Study
 
 PAGE = "report.html"
@@ -62,8 +62,8 @@ _CAPTIONS = {
     "weakest": (
         "The weakest direction",
         "The combination of parameters, each in its own sigma, that is determined worst: its "
-        "parts, and above them its "
-        "variance over that of uncoupled parameters.",
+        "variance over that of uncoupled parameters, and the shares of the parameters that take "
+        "part.",
     ),
     "inflation": (
         "Sigmas and the price of coupling",
@@ -89,7 +89,7 @@ _CAPTIONS = {
         "Simulated cells whose 95 % interval holds the truth, with exact 95 % bounds of that part.",
     ),
 }
-_SIMULATED = " Crosses: the posterior's correlation, median and range over seeds."
+_SIMULATED = " Dashed: the posterior's correlation, median over seeds."
 
 
 def write_study(study: Study, folder: PathLike) -> Path:
@@ -132,30 +132,25 @@ def study_figures(study: Study) -> dict[str, bytes]:
 def render_study(study: Study, images: Mapping[str, bytes]) -> str:
     """The page; `images` are SVG by the names of `study_figures`."""
     definition, data = study.definition, study.data
-    band = (
-        "Bands: range over what else was drawn."
-        if study.sweep.drawn
-        else "Bands: range over seeds."
-    )
-    figures = []
-    for name in images:
-        title, caption = _CAPTIONS[name]
-        simulated = _SIMULATED if name == "correlation" and "posterior_correlation" in data else ""
-        figures.append(
-            {"name": name, "title": title, "caption": caption.format(band=band) + simulated}
-        )
-    failed = int((~study.sweep.ok).sum())
+    over = "what else was drawn" if study.sweep.drawn else "seeds"
+    band = f"Bands: range over {over}."
+    figures = [
+        {"name": name, "title": _CAPTIONS[name][0], "caption": _CAPTIONS[name][1].format(band=band)}
+        for name in images
+    ]
+    if "posterior_correlation" in data and figures:
+        figures[0]["caption"] += _SIMULATED
     context = {
         "title": definition.name,
         "question": definition.question,
         "created": data.attrs.get("created_utc", ""),
         "version": data.attrs.get("starcal_uq", ""),
         "verdict": study_text(study),
-        "answer": [*study_answer(study)[1:], *effects_answer(study)],
+        "answer": study_answer(study)[1:],
         "advice": study_advice(study),
         "limits": study_limits(study),
-        "failed": failed,
-        "tables": [*study_tables(study), *filter(None, [effects_table(study)])],
+        "failed": not study.ok.all(),
+        "tables": study_tables(study),
         "figures": figures,
         "cells": cells_table(study, _CELLS_SHOWN),
         "cells_words": (
@@ -170,25 +165,16 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
 
 def cells_table(study: Study, n: int) -> TextTable:
     """The first cells, one a row: where, and the numbers of the summary."""
-    sweep = study.sweep
-    columns = summary_columns(study) if sweep.ok.any() else []
-    rows = []
-    for cell in range(min(n, len(sweep.ok))):
-        where = [value_words(_plain(study.data[axis].values[cell])) for axis in sweep.axes]
-        numbers = [form(values[cell]) for _, values, form in columns]
-        status = str(study.data["status"].values[cell])
-        rows.append(
-            (*where, value_words(int(study.data["seed_index"].values[cell])), *numbers, status)
-        )
-    heads = (*map(axis_label, sweep.axes), "Seed", *(head for head, _, _ in columns), "Status")
-    marks = tuple("" if good else "warning" for good in sweep.ok[:n])
-    return TextTable(
-        heads, tuple(rows), "", "l" * len(sweep.axes) + "r" * (1 + len(columns)) + "l", marks
+    import pandas as pd
+
+    columns, forms = summary(study) if study.ok.any() else ({}, {})
+    data = study.data
+    where = {axis_label(axis): data[axis].values for axis in study.axes}
+    frame = {"Seed": data["seed_index"].values} | columns | {"Status": data["status"].values}
+    table = TextTable.of(
+        pd.DataFrame(where | frame).head(n), formats={**forms, **dict.fromkeys(where, value_words)}
     )
-
-
-def _plain(value: Any) -> Any:
-    return str(value) if isinstance(value, str) else float(value)
+    return replace(table, marks=tuple("" if good else "warning" for good in study.ok[:n]))
 
 
 def _provenance(study: Study) -> list[tuple[str, str]]:
