@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from benchmarks import ground
+from starcal_uq.core.status import Level
 
 # Independent bundle fit of the table (apparent directions, SNR >= 10, 242 stars): value and
 # standard error.
@@ -106,3 +108,32 @@ def test_refraction_is_found_without_site_and_times(camera, table):
     # Control: what knows no air is further away.
     plain = sc.calibrate(obs, camera)
     assert f - plain.theta[2] > 5.0 * plain.sigmas[2]
+
+
+@pytest.fixture(scope="module")
+def seen(camera, table):
+    """All frames at the time in the images' names, and no site."""
+    return ground.seen(table, camera, "2019-07-29T20:47:26")
+
+
+@pytest.mark.slow
+def test_each_frame_is_predicted_from_the_others(camera, seen):
+    chi2, dof, density = np.sum(ground.left_out(seen, camera, "auto"), axis=0)
+    assert abs(chi2 / dof - 1.0) < 0.25
+    # Control: a camera without effects calls air noise, so that its chi-square is right as well,
+    # but it predicts worse.
+    _, _, plain = np.sum(ground.left_out(seen, camera, "none"), axis=0)
+    assert density > plain + 50.0
+
+
+@pytest.mark.slow
+def test_attitudes_by_two_usable_models_agree_within_their_errors(camera, seen):
+    levels, found = ground.attitudes(seen, camera)
+    assert Level.FAIL not in levels
+    for rest, stated in found.values():
+        assert np.all(rest < 2.0 * stated)
+    # Control: a lens without distortion is not usable, and its attitudes are further away.
+    levels, found = ground.attitudes(seen, camera, (ground.MODELS[0], ("none", "none")))
+    assert levels[1] is Level.FAIL
+    rest, stated = found["effects"]
+    assert np.any(rest > 2.0 * stated)

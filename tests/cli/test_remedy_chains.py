@@ -77,7 +77,12 @@ def test_what_is_printed_for_real_data_is_followed_to_its_end(what, call, tmp_pa
         given = [data / "esa-tetra3", data / "esa_tetra3_camera.toml"]
     else:
         given = [data / "openstartracker"]
-    follow(call, ("run", *map(str, given), *SMALL), tmp_path)
+    steps = follow(call, ("run", *map(str, given), *SMALL), tmp_path)
+    # No site was given: usable at once, and the air that is assumed is stated.
+    assert steps[0].doubts[0] == steps[-1].doubts[0] == 0
+    if what in ("table", "images"):
+        checks = sc.Run(tmp_path / "run").verdict.checks
+        assert any("Refraction is estimated" in str(check) for check in checks)
 
 
 def test_errors_of_stars_that_no_catalogue_has_are_no_way_out():
