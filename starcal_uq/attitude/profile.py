@@ -201,14 +201,7 @@ def check_samples(
         raise AttitudeProfileError(
             f"{where}{word} {numbers[bad][0]} holds a value that is not finite; repair it."
         )
-    back = np.flatnonzero(np.diff(time_s) <= 0.0)
-    if back.size:
-        i = back[0] + 1
-        raise AttitudeProfileError(
-            f"{where}{word} {numbers[i]}: the time {time_s[i]:.9g} s does not come after "
-            f"{time_s[i - 1]:.9g} s; "
-            "sort the rows by time and remove repeated ones."
-        )
+    check_order(where, word, numbers, time_s)
     off = check_quaternions(where, word, numbers, q)
     uneven = int(np.sum(off > _UNIT))
     if not uneven:
@@ -218,6 +211,17 @@ def check_samples(
         f"{significant(off.max())} and "
         f"{'was' if uneven == 1 else 'were'} normalised.",
     )
+
+
+def check_order(where: str, word: str, numbers: IntArray, time_s: FloatArray) -> None:
+    """Refuse times that do not increase."""
+    back = np.flatnonzero(np.diff(time_s) <= 0.0)
+    if back.size:
+        i = back[0] + 1
+        raise AttitudeProfileError(
+            f"{where}{word} {numbers[i]}: the time {time_s[i]:.9g} s does not come after "
+            f"{time_s[i - 1]:.9g} s; sort the rows by time and remove repeated ones."
+        )
 
 
 def check_quaternions(where: str, word: str, numbers: IntArray, q: FloatArray) -> FloatArray:

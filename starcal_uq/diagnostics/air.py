@@ -25,7 +25,7 @@ from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import StarNoise, has_effects, images_beside, without_effects
 from starcal_uq.diagnostics.residuals import of_heard
-from starcal_uq.diagnostics.stars import StarTest, star_test
+from starcal_uq.diagnostics.stars import StarTest, own_noise, star_test
 from starcal_uq.estimation.noise_model import fit_noise
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.estimation.zenith import (
@@ -160,9 +160,7 @@ def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> StarNoi
     # Effects hold what stars bring along, where the data ask for that.
     if not found.tau_px > 0.0 or has_effects(cal):
         return None
-    # The estimate's noise holds both.
-    of_stars = found.tau_px**2 * float(np.mean(obs.sigma_or_one**-2.0))
-    own = float(np.sqrt(max(cal.sigma**2 - of_stars, 0.1 * cal.sigma**2)))
+    own = float(np.sqrt(own_noise(obs, cal.sigma**2, found.tau_px**2)))
     return StarNoise(found.tau_px, own, found.n_recurring)
 
 

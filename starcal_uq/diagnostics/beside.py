@@ -8,14 +8,14 @@ of effects have no prior, so that what is left is noise alone, however large the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
-from starcal_uq.camera.projection import project
 from starcal_uq.core.types import FloatArray, IntArray, floats
+from starcal_uq.estimation import effects
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.zenith import Images
 from starcal_uq.likelihood.effect_sums import Columns, EffectLikelihood
@@ -58,11 +58,11 @@ def with_effects_of(
     seen = None if obs.n_frames == whole.n_frames else obs
     held = cal.effects
     known = effects_of(whole, cal.camera, seen=seen, zeniths=held.zeniths, extent=held.extent)
-    effects = [known[own.name] for own in held.fitted if own.name in known]
+    found = [known[own.name] for own in held.fitted if own.name in known]
     frames = StarFrames.from_observations(obs, axes=True)
-    ratio = {effect.name: cal.effects.ratio(cal.sigma)[effect.name] for effect in effects}
+    ratio = {effect.name: held.ratio(cal.sigma)[effect.name] for effect in found}
     at = (cal.theta, rotations, cal.sigma)
-    return EffectLikelihood(frames, cal.camera.distortion, effects, ratio, *at)
+    return EffectLikelihood(frames, cal.camera.distortion, found, ratio, *at)
 
 
 class StarNoise(NamedTuple):
@@ -102,12 +102,7 @@ def without_effects(obs: Observations, cal: Calibration) -> Observations:
     """The table with its images where they would be without the effects of the calibration, as far
     as these are known; itself where there are none.
     """
-    if not has_effects(cal):
-        return obs
-    frames = StarFrames.from_observations(obs)
-    b = frames.rotated(quaternion_to_rotation(cal.quaternions))
-    x, y = project(cal.camera, b.T).T + cal.residuals_px.T
-    return replace(obs, x_px=x, y_px=y)
+    return effects.without_effects(obs, cal) if has_effects(cal) else obs
 
 
 def normals_beside(obs: Observations, cal: Calibration) -> FrameNormals:
@@ -157,12 +152,12 @@ class Freed:
         likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes)
         state, _ = likelihood.profile(cal.theta, rotations)
         frames, e = likelihood.frames, state.e
-        effects = effects_beside(obs, cal)
-        if any(effect.grouping == "star" for effect in effects):
+        held = effects_beside(obs, cal)
+        if any(effect.grouping == "star" for effect in held):
             exact = with_effects_of(obs, cal, rotations, obs)
             _, found = exact.conditioned(state, e[None])
             e = e - exact.shifts(state, exact.of_effect("star", found))[0]
-        linear = [effect for effect in effects if effect.grouping != "star"]
+        linear = [effect for effect in held if effect.grouping != "star"]
         columns = Columns.of(linear, likelihood, state, cal.theta, slice(None))
         of_frames, rank = by_frame(frames, columns.frame)
         basis = np.concatenate([likelihood.attitudes(state).orthonormal, of_frames])

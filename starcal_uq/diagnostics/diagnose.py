@@ -304,20 +304,12 @@ def diagnose(
     step(4, 4)
     settings = {"models": list(models), "n_starts": n_starts}
     return Diagnosis(
-        misfit=rest.misfit,
         predictive=predictive,
         jackknife=found,
         comparison=comparison,
-        starts=rest.starts,
         theta=tuple(theta.tolist()),
         provenance=provenance(seed, settings, whole.data_hash_of(obs)),
-        stars=rest.stars,
-        air=rest.air,
-        cameras=rest.cameras,
-        times=rest.times,
-        aberration=rest.aberration,
-        extended=rest.extended,
-        assessed=rest.assessed,
+        **vars(rest),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.misfit_test import LEAST_DOF
 from starcal_uq.likelihood.elimination import products_by_frame
-from starcal_uq.likelihood.shapes import run_clock
+from starcal_uq.likelihood.shapes import Covariates
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -22,20 +22,11 @@ _LEAST_FRAMES, _LEAST_FRAME_DOF = 3, 1.0
 
 
 def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:
-    """What the noise could change with: standardised values (N,) by name."""
-    radius2 = (obs.x_px - camera.x0_px) ** 2 + (obs.y_px - camera.y0_px) ** 2
-    candidates: dict[str, FloatArray] = {"radius": radius2}
-    if obs.mag is not None:
-        candidates["magnitude"] = obs.mag
-    clock, called = run_clock(obs)
-    if clock is not None:
-        candidates[called] = clock
-    found = {}
-    for name, values in candidates.items():
-        spread = float(np.nanstd(values))
-        if spread > 1e-9:
-            found[name] = np.nan_to_num((values - np.nanmean(values)) / spread)
-    return found
+    """What the noise could change with: values (N,) by name."""
+    known = Covariates.of(obs)
+    radius = np.hypot(obs.x_px - camera.x0_px, obs.y_px - camera.y0_px) / camera.corner_radius_px
+    found = {"radius": radius**2, "magnitude": known.magnitude, known.called: known.clock}
+    return {name: values for name, values in found.items() if values is not None}
 
 
 def noise_tests(freed: Freed, weights: dict[str, FloatArray]) -> list[tuple[str, float, float]]:

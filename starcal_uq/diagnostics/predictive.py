@@ -8,7 +8,7 @@ against them.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import has_effects, with_effects_of
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.effect_sums import EffectLikelihood
-from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
 from starcal_uq.observations.splits import frame_sample
 
@@ -125,34 +125,30 @@ def predictive_check(
     used = weighed(obs, cal)
     some, places = frame_sample(used, limit, seed)
     part = MarginalLikelihood(some, cal.camera.distortion, axes=True)
-    frames = part.frames
-    shared: EffectLikelihood | None = None
     state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[places]))
-    e, h = state.e, part.slopes(cal.theta, state)
-    # Residuals after effects, as they follow the parameters; replicates
-    # go the same way.
+    e, h = state.e, part.derivatives(cal.theta, state)
+    exact: EffectLikelihood | None = None
     if has_effects(cal):
-        shared = with_effects_of(some, cal, state.rotations, used)
+        exact = with_effects_of(some, cal, state.rotations, used)
         # Its images are less what effects are expected to do.
-        state, _ = shared.profile(cal.theta, shared.rotations)
-    if shared is not None:
-        columns, _ = shared.conditioned(state, np.concatenate([h, e[None]]))
-        h, e = columns[:-1], columns[-1]
+        state, _ = exact.profile(cal.theta, exact.rotations)
+
+    def left(columns: FloatArray) -> FloatArray:
+        """Residuals after attitudes and effects; replicates go the same way."""
+        if exact is None:
+            return part.project_out(state, columns)
+        return exact.conditioned(state, columns)[0]
+
+    columns = left(np.concatenate([h, e[None]]))
     theta, sigma = _draws(cal, post, n_draws, rng)
     summary = _Summary(part, cal)
     measured, replicated = [], []
-    turns, flat = _turns(part, state), h.reshape(len(h), -1)
     for shift, noise in zip(theta - cal.theta, sigma, strict=True):
-        measured.append(summary((e - (shift @ flat).reshape(e.shape)) / noise))
-        fresh = rng.standard_normal((1, 2, frames.n_stars))
-        if shared is None:
-            fresh = fresh.ravel()
-            fresh -= turns @ (turns.T @ fresh)
-            replicated.append(summary(fresh.reshape(e.shape)))
-        else:
-            replicated.append(
-                summary(shared.conditioned(state, fresh + shared.random_shifts(state, rng))[0][0])
-            )
+        measured.append(summary(np.tensordot(np.append(-shift, 1.0), columns, 1) / noise))
+        fresh = rng.standard_normal((1, *e.shape))
+        if exact is not None:
+            fresh += exact.random_shifts(state, rng)
+        replicated.append(summary(left(fresh)[0]))
     data, fake = np.array(measured), np.array(replicated)
     low, middle, high = np.quantile(fake, (0.025, 0.5, 0.975), axis=0)
     p = np.mean(fake >= data, axis=0)
@@ -164,23 +160,6 @@ def predictive_check(
         # Every frame's sum of squares went into the factor of its own noise.
         statistics = tuple(s for s in statistics if not s.name.startswith("worst frame"))
     return PredictiveCheck(statistics, len(sigma), some.n_frames, obs.n_frames)
-
-
-def _turns(part: MarginalLikelihood, state: Profile) -> Any:
-    """Orthonormal columns (2 N, 3 K) that span what rotations of the frames make of residuals (2,
-    N), sparse.
-    """
-    from scipy.sparse import csr_array
-
-    frames = part.frames
-    # Star by star and axis by axis.
-    values = part.attitudes(state).orthonormal.transpose(1, 2, 0)
-    columns = 3 * np.repeat(np.arange(frames.n_frames), frames.sizes)[:, None] + np.arange(3)
-    n = frames.n_stars
-    place = np.broadcast_to(columns, (2, n, 3)).ravel()
-    return csr_array(
-        (values.ravel(), place, 3 * np.arange(2 * n + 1)), shape=(2 * n, 3 * frames.n_frames)
-    )
 
 
 def _draws(

@@ -156,12 +156,8 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
     s = len(normals.scores)
     pull = normals.response.reshape(-1, len(unit)) @ inverse
     pulled = pull.T @ pull * found.tau2
-    # The images' own noise is what is left when the stars' errors are taken off.
     noise = normals.squares / normals.dof
-    own = max(
-        noise - found.tau2 * float(np.mean(obs.sigma_or_one**-2.0)),
-        0.1 * noise,
-    )
+    own = own_noise(obs, noise, found.tau2)
     steps = normals.left_out()
     spread = steps - steps.mean(axis=0)
     scores = normals.scores @ inverse
@@ -195,6 +191,14 @@ def _included(cal: Calibration) -> tuple[float, float]:
         return 0.0, 0.0
     # The interval is that of the logarithm.
     return own.scale_px, own.scale_px * float(np.log(own.high_px / own.low_px)) / (2.0 * 1.96)
+
+
+def own_noise(obs: Observations, variance: float, tau2: float) -> float:
+    """The images' own noise variance where stars bring errors of tau2, px squared, into what a
+    calibration takes for noise.
+    """
+    of_stars = tau2 * float(np.mean(obs.sigma_or_one**-2.0))
+    return max(variance - of_stars, 0.1 * variance)
 
 
 @dataclass(frozen=True)
@@ -281,14 +285,9 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
 def _traces(matrix: Any, absorbed: FloatArray) -> tuple[float, float, float, float]:
     """Traces of the first four powers of ``matrix - absorbed absorbed^T``."""
     if matrix.shape[0] <= _DENSE:
-        g = matrix.toarray() - absorbed @ absorbed.T
-        square = g @ g
-        return (
-            float(np.trace(g)),
-            float(np.trace(square)),
-            float(np.sum(square * g)),
-            float(np.sum(square**2)),
-        )
+        values = np.linalg.eigvalsh(matrix.toarray() - absorbed @ absorbed.T)
+        g1, g2, g3, g4 = np.sum(values ** np.arange(1, 5)[:, None], axis=1).tolist()
+        return g1, g2, g3, g4
     return _sparse_traces(matrix)
 
 
@@ -298,29 +297,20 @@ def _sparse_traces(matrix: Any) -> tuple[float, float, float, float]:
     The diagonal D and its products with the rest O are exact; tr(O^3), tr(D O^3) and tr(O^4), which
     are small, are means of x^T O^3 x and the like over random signs x (Hutchinson 1989).
     """
+    from scipy.sparse import diags_array
+
     d = matrix.diagonal()
-    rest = matrix.copy()
-    rest.setdiag(0.0)
-    squares = rest.copy()
-    squares.data **= 2
-    row = squares @ np.ones(len(d))
+    rest = matrix - diags_array(d)
+    squares = rest.power(2)
+    row = squares.sum(axis=1)
     x = np.random.default_rng(0).choice((-1.0, 1.0), (len(d), _PROBES))
     one = rest @ x
     two = rest @ one
     cube, mixed = np.sum(one * two) / _PROBES, np.sum((rest @ (d[:, None] * x)) * two) / _PROBES
-    fourth = (
-        np.sum(d**4)
-        + 4.0 * (d**2 @ row)
-        + 2.0 * (d @ (squares @ d))
-        + 4.0 * mixed
-        + np.sum(two**2) / _PROBES
-    )
-    return (
-        float(d.sum()),
-        float(d @ d + row.sum()),
-        float(np.sum(d**3) + 3.0 * (d @ row) + cube),
-        float(fourth),
-    )
+    third = np.sum(d**3) + 3.0 * (d @ row) + cube
+    fourth = np.sum(d**4) + 4.0 * (d**2 @ row) + 2.0 * (d @ (squares @ d)) + 4.0 * mixed
+    fourth += np.sum(two**2) / _PROBES
+    return float(d.sum()), float(d @ d + row.sum()), float(third), float(fourth)
 
 
 def _gamma_tail(z: float, skewness: float) -> float:

@@ -127,13 +127,11 @@ def axis_noise_beside(
         turned = frames.sum(np.einsum("in,jn->ijn", b, c))
         return inner, mixed, turned, c @ d.T
 
-    xx, yy, xy = products(0, 0), products(1, 1), products(0, 1)
+    xx, yy, xy, yx = products(0, 0), products(1, 1), products(0, 1), products(1, 0)
     taken = [float(np.einsum("iik->", part[0]) + np.trace(part[3])) for part in (xx, yy, xy)]
 
     def squared(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> float:
-        return float(
-            np.sum(one[0] * other[0]) + 2.0 * np.sum(one[1] * other[1]) + np.sum(one[3] * other[3])
-        )
+        return float(sum(np.sum(a * b) for a, b in zip(one, other, strict=True)))
 
     across = squared(xx, yy)
     free = np.array(
@@ -143,13 +141,7 @@ def axis_noise_beside(
         ]
     )
     variances = np.linalg.solve(free, np.sum(e**2, axis=1))
-    both_ways = float(
-        np.sum(xy[0] ** 2) + np.sum(xy[1] ** 2) + np.sum(xy[2] ** 2) + np.sum(xy[3] ** 2)
-    )
-    transposed = float(
-        np.sum(xy[0] * xy[0].swapaxes(0, 1)) + 2.0 * np.sum(xy[1] * xy[2]) + np.sum(xy[3] * xy[3].T)
-    )
-    dof = n - taken[0] - taken[1] + both_ways + transposed
+    dof = n - taken[0] - taken[1] + squared(xy, xy) + squared(xy, yx)
     if not (np.all(variances > 0.0) and dof > 0.0):
         return AxisNoise(0.0, np.inf, 0.0, np.inf)
     sigma = np.sqrt(variances)

@@ -198,11 +198,7 @@ class FrameNormals:
         A frame without which the parameters are not determined gives rows that are not finite.
         """
         rest = self.matrix - self.matrices
-        slope = self.slopes.sum(axis=0) - self.slopes
-        determined = np.linalg.cond(rest) < 1e14
-        steps = np.full(self.slopes.shape, np.nan)
-        steps[determined] = np.linalg.solve(rest[determined], slope[determined][..., None])[..., 0]
-        return steps, rest
+        return _steps(rest, self.slopes.sum(axis=0) - self.slopes), rest
 
 
 @dataclass(frozen=True)
@@ -262,10 +258,12 @@ class StarNormals:
         """Changes z (S, p) of the estimate without each star, not finite where the parameters hang
         on it.
         """
-        rest = self.matrix - self.matrices
-        determined = np.linalg.cond(rest) < 1e14
-        steps = np.full(self.slopes.shape, np.nan)
-        steps[determined] = np.linalg.solve(rest[determined], -self.slopes[determined][..., None])[
-            ..., 0
-        ]
-        return steps
+        return _steps(self.matrix - self.matrices, -self.slopes)
+
+
+def _steps(matrices: FloatArray, slopes: FloatArray) -> FloatArray:
+    """Solutions (n, p) of normal equations, NaN where these determine none."""
+    determined = np.linalg.cond(matrices) < 1e14
+    steps = np.full(slopes.shape, np.nan)
+    steps[determined] = np.linalg.solve(matrices[determined], slopes[determined, :, None])[..., 0]
+    return steps

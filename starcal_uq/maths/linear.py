@@ -51,13 +51,6 @@ def principal(
     return values[kept], vectors[:, kept]
 
 
-def truncated_inverse(matrix: FloatArray, least: float) -> FloatArray:
-    """Inverse (p, p) of a symmetric matrix over the `principal` directions."""
-    values, vectors = principal(matrix, least)
-    inverse: FloatArray = (vectors / values) @ vectors.T
-    return inverse
-
-
 def without_first(
     gram: FloatArray, p: int, least: float, unit: FloatArray
 ) -> tuple[FloatArray, int]:

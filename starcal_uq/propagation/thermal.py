@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.profile import read_columns
+from starcal_uq.attitude.profile import check_order, read_columns
 from starcal_uq.core.constants import ARCSEC, TOTAL_AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, CalibrationError
@@ -111,13 +111,7 @@ def _check(
         raise AttitudeProfileError(
             f"{where}{word} {numbers[bad[0]]}: the time is not finite; repair it."
         )
-    back = np.flatnonzero(np.diff(time_s) <= 0.0)
-    if back.size:
-        i = back[0] + 1
-        raise AttitudeProfileError(
-            f"{where}{word} {numbers[i]}: the time {time_s[i]:.9g} s does not come after "
-            f"{time_s[i - 1]:.9g} s; sort the rows by time and remove repeated ones."
-        )
+    check_order(where, word, numbers, time_s)
     odd = np.flatnonzero(~((warmth >= _COLDEST_C) & (warmth <= _HOTTEST_C)))
     if odd.size:
         i = odd[0]
