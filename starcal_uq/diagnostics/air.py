@@ -300,9 +300,15 @@ class _Air:
         self.seen_px = shift_px
         f_px, alike = self.f_px(shift_px), rest is self._alone
         amplitude, std = _density(settled)
-        found = replace(found, amplitude=amplitude, amplitude_std=std)
-        found = replace(found, is_air=not alike, like_others=alike)
-        return replace(found, f_px=f_px, f_sigma=f_px / float(self._cal.sigmas[2]))
+        return replace(
+            found,
+            amplitude=amplitude,
+            amplitude_std=std,
+            is_air=not alike,
+            like_others=alike,
+            f_px=f_px,
+            f_sigma=f_px / float(self._cal.sigmas[2]),
+        )
 
     def _own_shapes(self, rest: Images, which: slice = slice(None)) -> FloatArray:
         """What is left of scale and shape of each frame by itself, as orthonormal rows; `which` of

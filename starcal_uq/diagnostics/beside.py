@@ -17,13 +17,12 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation import effects
 from starcal_uq.estimation.normals import FrameNormals
-from starcal_uq.estimation.zenith import Images
+from starcal_uq.estimation.zenith import Images, orthonormal
 from starcal_uq.likelihood.effect_sums import Columns, EffectLikelihood
 from starcal_uq.likelihood.effects import Effect, effects_of, star_effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarModel
-from starcal_uq.maths.linear import principal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import one_of_each
 
@@ -166,9 +165,7 @@ class Freed:
         h = np.concatenate([likelihood.slopes(cal.theta, state), columns.run])
         scale = np.linalg.norm(h.reshape(len(h), -1), axis=1)
         h = own.removed_from(h / np.where(scale > 0.0, scale, 1.0)[:, None, None])
-        flat = h.reshape(len(h), -1)
-        values, vectors = principal(flat @ flat.T, _ABSORBED)
-        h = np.tensordot((vectors / np.sqrt(values)).T, h, axes=1)
+        h = orthonormal(h.reshape(len(h), -1), _ABSORBED).reshape(-1, *e.shape)
         e = own.removed_from(e[None])[0]
         e = e - np.tensordot(np.tensordot(h, e, axes=2), h, axes=1)
         return cls(own, h, np.asarray(e), floats(2.0 * frames.sizes - 3.0 - rank))

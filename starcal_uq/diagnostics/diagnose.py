@@ -334,31 +334,17 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     same = better = failed = 0
     largest = 0.0
     best: tuple[float, tuple[float, ...]] = (np.inf, ())
-    # Effects weigh an estimate that was found without them: that is what a start leads to.
-    weighed_again = has_effects(cal)
-    reached = cal.stages[-2] if weighed_again else None
-    reference, lowest = (
-        (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
-    )
-    obs = by_noise_model(obs, cal)
-    weighs = cal.tail_factors is not None or (has_effects(cal) and cal.noise_model is not None)
-    if reached is not None and weighs:
-        # Tails have another cost than the sum of squares that their weights leave; and beside
-        # effects, tails and noise are those of images that are freed of these.
-        obs = without_effects(obs, cal)
-        reference, lowest = _optimum(obs, cal, cal.nominal)
-    some, sigmas = _few(obs), cal.sigmas
-    if some is not obs:
-        sigmas = sigmas * np.sqrt(obs.n_stars / some.n_stars)
-        try:
-            optimum, lowest = _optimum(some, cal, cal.camera)
-        except StarcalError:
-            some, sigmas = obs, cal.sigmas
-        else:
-            # An estimate that is not the optimum of all is not near that of some, and every start
-            # finds a better one.
-            near = bool(np.max(np.abs(optimum - reference) / sigmas) < _NEAR_SIGMA)
-            reference, lowest = (optimum, lowest) if near else (reference, np.inf)
+    # Effects, and the tails and noise beside them, are those of images that are freed of them.
+    obs = without_effects(by_noise_model(obs, cal), cal)
+    some = _few(obs)
+    sigmas = cal.sigmas * np.sqrt(obs.n_stars / some.n_stars)
+    reference, lowest = cal.theta, cal.chi2
+    if some is not obs or has_effects(cal):
+        optimum, found = _optimum(some, cal, cal.camera)
+        # An estimate that is not the optimum of all is not near that of some, and every start
+        # finds a better one.
+        near = bool(np.max(np.abs(optimum - reference) / sigmas) < _NEAR_SIGMA)
+        reference, lowest = (optimum, found) if near else (reference, np.inf)
     for _ in range(n):
         shift = rng.standard_normal(3)
         start = nominal.replace(

@@ -161,9 +161,8 @@ class ShapeSums:
                 Amplitude(name, u, float(value), float(sigma))
                 for (name, u), value, sigma in zip(family.labels, best, errors, strict=True)
             )
-        largest, name = float(moved[worst]), self.names[worst]
-        test = replace(test, visible=visible, amplitudes=amplitudes)
-        return replace(test, moved_sigma=largest, moved_name=name, moved_std=error)
+        test = replace(test, visible=visible, amplitudes=amplitudes, moved_std=error)
+        return replace(test, moved_sigma=float(moved[worst]), moved_name=self.names[worst])
 
     def frame_by_frame(self) -> MisfitTest | None:
         """Does scale or shape change from frame to frame?"""

@@ -231,11 +231,12 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     used = _recurring(obs, numbers)
     if not used.any():
         return _Likeness(0, 0)
-    everything = StarFrames.from_observations(obs)
-    present = everything.sum(used.astype(np.float64)) > 0
-    frames = everything.select(used)
-    rotations = quaternion_to_rotation(cal.quaternions)[present]
-    stars = np.unique(numbers[used], return_inverse=True)[1]
+    obs = obs.select(used)
+    frames, stars = (
+        StarFrames.from_observations(obs),
+        np.unique(numbers[used], return_inverse=True)[1],
+    )
+    rotations = quaternion_to_rotation(cal.quaternions[np.isin(cal.frame_ids, obs.frame_ids)])
     sums = TermSums(star_term(stars, frames.r, float(cal.theta[2]), rigid=True))
     p, likelihood = len(cal.theta), MarginalLikelihood(frames, cal.camera.distortion)
     gram = sums.add_linearised(likelihood, cal.theta, cal.sigmas, rotations)
@@ -270,7 +271,7 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
         )
 
     sd = spread(max(tau2, 0.0))
-    unit = 1.0 if frames.weight is None else float(1.0 / np.sqrt(np.mean(frames.weight**2)))
+    unit = float(1.0 / np.sqrt(np.mean(obs.sigma_or_one**-2.0)))
     low, high = np.sqrt(max(tau2 - sd, 0.0)), np.sqrt(max(tau2, 0.0) + sd)
     return _Likeness(
         n_stars=sums.n_groups,
@@ -320,7 +321,5 @@ def _gamma_tail(z: float, skewness: float) -> float:
     if abs(skewness) < 1e-4:
         return float(0.5 * erfc(z / np.sqrt(2.0)))
     shape = 4.0 / skewness**2
-    x = shape + z * np.sqrt(shape) * np.sign(skewness)
-    if x <= 0.0:
-        return 1.0 if skewness > 0.0 else 0.0
+    x = max(shape + z * np.sqrt(shape) * np.sign(skewness), 0.0)
     return float(gammaincc(shape, x) if skewness > 0.0 else gammainc(shape, x))

@@ -283,15 +283,12 @@ def _proper_motion(obs: Observations) -> FloatArray:
 
 def _velocities(times: np.ndarray, days: FloatArray) -> FloatArray:
     """Velocity of the Earth (g, K, 3), km/s, so many days after some times."""
-    day, first, last = (
-        np.timedelta64(1, "D"),
-        *(np.datetime64(f"{year}-01-01") for year in (FIRST_YEAR, LAST_YEAR)),
-    )
-    start = max(times.min() - 200 * day, first)
-    known = np.arange(0.0, (min(times.max() + 200 * day, last) - start) / day)
-    table = earth_velocity_km_s(start + known.astype("timedelta64[D]"))
-    at = (times - start) / day + days[:, None]
-    return np.stack([np.interp(at, known, axis) for axis in table.T], axis=-1)
+    day, margin = np.timedelta64(1, "D"), np.timedelta64(200, "D")
+    first, last = (np.datetime64(f"{year}-01-01") for year in (FIRST_YEAR, LAST_YEAR))
+    known = np.arange(max(times.min() - margin, first), min(times.max() + margin, last), day)
+    at = (times - known[0]) / day + days[:, None]
+    table = earth_velocity_km_s(known)
+    return np.stack([np.interp(at, np.arange(len(known)), axis) for axis in table.T], axis=-1)
 
 
 def _other_hours(rest: Images, site: Site, times: StrArray) -> Iterator[_Moved]:
