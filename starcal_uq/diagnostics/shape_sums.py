@@ -51,47 +51,38 @@ class ShapeSums:
     def __init__(self, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> None:
         likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
         p, theta, effects = len(cal.theta), cal.theta, effects_beside(obs, cal)
-        self.families, self.p, self.dof = families, p, likelihood.dof - p
+        self.p, self.dof = p, likelihood.dof - p
         self.names, self.n_stars = cal.parameter_names, obs.n_stars
         self.noise_px = 1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2)))
         looked_for = [Effect(own.name, "run", own, np.ones(own.size)) for own in families]
-        size = sum(own.size for own in families)
         sums = EffectSums([*effects, *looked_for], theta, cal.sigma)
         frame = Effect("frame", "frame", frame_shapes(cal.camera), np.ones(3))
         held = any(effect.name == frame.name for effect in effects)
         of_frames = None if held else EffectSums([*effects, frame], theta, cal.sigma, apart=False)
-        # Squares of the columns before attitudes are removed, and degrees of freedom that scale and
-        # shape of every frame by itself take.
-        self.raw, self.block_rank, square = np.zeros(size), 0, 0.0
+        # Squares of the columns before attitudes are removed, their places, and degrees of freedom
+        # that scale and shape of every frame by itself take.
+        self.raw, self.places = np.zeros(1), sums.places
+        self.block_rank, square = 0, 0.0
         rotations = quaternion_to_rotation(cal.quaternions)
         for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
             h = part.derivatives(theta, state)
             fitted = part.project_out(state, np.concatenate([h, state.e[None]]))
             columns = sums.add(part, state, fitted, rows).raw
-            self.raw += np.sum(columns[len(columns) - size :] ** 2, axis=(1, 2))
+            self.raw = self.raw + np.sum(columns**2, axis=(1, 2))
             if of_frames is not None:
                 own = of_frames.add(part, state, fitted, rows).frame
                 self.block_rank += int(by_frame(part.frames, own)[1].sum())
                 square += float(np.sum(own**2))
         ratio = {} if cal.effects is None else cal.effects.ratio(cal.sigma)
-        # Products of parameters, residuals and columns of all families, attitudes removed, and what
-        # they would be without effects, where there are any.
-        self.gram = _without_effects(sums.solved(ratio), size)
-        self.before = _without_effects(sums.solved({}), size) if effects else None
+        # Products of parameters, residuals and columns of effects and of all families, attitudes
+        # removed, and what they would be without effects, where there are any.
+        self.gram = _without_effects(sums.solved(ratio))
+        self.before = _without_effects(sums.solved({})) if effects else None
         # What scale and shape of every frame explain of parameters and residuals
         self.blocks = np.zeros((p + 1, p + 1))
         if of_frames is not None:
             free = ratio | {frame.name: _FREE * 3.0 * obs.n_frames / square}
             self.blocks = self.gram[: p + 1, : p + 1] - of_frames.solved(free).gram
-
-    @cached_property
-    def places(self) -> dict[str, slice]:
-        """Columns of every family, from 0."""
-        ends = np.cumsum([0, *(family.size for family in self.families)]).tolist()
-        return {
-            family.name: slice(*ends)
-            for family, *ends in zip(self.families, ends[:-1], ends[1:], strict=True)
-        }
 
     @cached_property
     def alone(self) -> FloatArray:
@@ -198,11 +189,9 @@ class ShapeSums:
         )
 
 
-def _without_effects(solved: Solved, size: int) -> FloatArray:
-    """Products of the added columns and the last `size` ones of the run with what effects leave."""
+def _without_effects(solved: Solved) -> FloatArray:
+    """Products of the added columns and the run's that effects leave."""
     cross = np.concatenate([solved.cross, solved.own], axis=1)
     left = np.linalg.solve(solved.run_factor, solved.run_root[:, None] * cross)
     every = np.concatenate([np.concatenate([solved.outer, solved.cross.T], axis=1), cross])
-    q, found = len(solved.outer), every - left.T @ left
-    kept = np.r_[:q, len(found) - size : len(found)]
-    return np.asarray(found[np.ix_(kept, kept)])
+    return np.asarray(every - left.T @ left)

@@ -259,8 +259,9 @@ def found_air(
 ) -> FoundAir:
     """The air of coefficients (m,) with this covariance; `boresights` (K, 3) are along ICRS axes."""
     n = zeniths.sizes[0] // 2
-    moves = np.stack([covariance[[i, i, n + i, n + i], [i, n + i, i, n + i]] for i in range(n)])
-    worst = np.sqrt(np.linalg.eigvalsh(moves.reshape(n, 2, 2))[:, 1])
+    each = np.arange(n)
+    moves = covariance[: 2 * n, : 2 * n].reshape(2, n, 2, n)[:, each, :, each]
+    worst = np.sqrt(np.linalg.eigvalsh(moves)[:, 1])
     level = np.sum(zeniths.among_stars * boresights, axis=1)
     distances = np.degrees(np.arccos(np.clip(level, -1.0, 1.0)))
     found = FoundAir(

@@ -20,8 +20,9 @@ pairs at their word, for sigma as well.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse, unit_invers
 from starcal_uq.observations.frames import StarFrames
 
 Variability = Literal["auto", "expected", "empirical"]
+_Piece: TypeAlias = tuple[StarFrames, FloatArray, FloatArray, FloatArray, FloatArray]
 
 # Explicit pairs formed at once; with two dozen columns and their temporaries about 30 MB.
 _PAIRS_AT_ONCE = 20_000
@@ -202,6 +204,17 @@ def pair_covariance(
     return expected_godambe(objective, theta, float(np.sqrt(chi2 / max(residual_dof, 1))))
 
 
+def _pieces(objective: PairObjective, theta: FloatArray) -> Iterator[_Piece]:
+    """Some frames at a time, directions (3, n) of their stars and derivatives (p, 3, n), noise (n,)
+    relative to sigma, and the frame's sum of ``b b^T`` (3, 3, n).
+    """
+    for first, last in objective.frames.parts(_STARS_AT_ONCE):
+        part = objective.frames.part(first, last)
+        b, db = objective.directions(theta, part)
+        noise = np.ones(part.n_stars) if part.weight is None else 1.0 / part.weight
+        yield part, b, db, noise, part.spread(part.sum(b[:, None] * b[None]))
+
+
 def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) -> FloatArray:
     """Sandwich covariance (p, p) with the variability that centroid noise gives the score.
 
@@ -214,11 +227,7 @@ def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) 
     normal = objective.evaluate(theta)
     h, scale = unit_inverse(normal.matrix)
     v = np.zeros_like(normal.matrix)
-    for first, last in objective.frames.parts(_STARS_AT_ONCE):
-        part = objective.frames.part(first, last)
-        b, db = objective.directions(theta, part)
-        noise = np.ones(part.n_stars) if part.weight is None else 1.0 / part.weight
-        bb = part.spread(part.sum(b[:, None] * b[None]))
+    for part, b, db, noise, bb in _pieces(objective, theta):
         cross = part.spread(part.sum(b[None, :, None] * db[:, None]))
         turned = np.einsum("xyn,ayn->axn", bb, db) + np.einsum("axyn,yn->axn", cross, b)
         # A pixel moves b as the principal point does, the other way round.
@@ -234,11 +243,7 @@ def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) 
 def _pair_noise(objective: PairObjective, theta: FloatArray) -> float:
     """Root mean square standard deviation of a pair's difference of cosines at sigma = 1, rad."""
     total = 0.0
-    for first, last in objective.frames.parts(_STARS_AT_ONCE):
-        part = objective.frames.part(first, last)
-        b, db = objective.directions(theta, part)
-        noise = np.ones(part.n_stars) if part.weight is None else 1.0 / part.weight
-        bb = part.spread(part.sum(b[:, None] * b[None]))
+    for _, _, db, noise, bb in _pieces(objective, theta):
         # Sum over partners j of |P_i^T b_j|^2; a star with itself adds nothing, because b is a unit
         # vector.
         total += float(
