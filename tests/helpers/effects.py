@@ -75,17 +75,20 @@ def projected(theta: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array([x0 + u * stretch, y0 + v * stretch])
 
 
-def nearest_camera(theta: np.ndarray, shift: Displacement, size_px: int = 1024) -> np.ndarray:
+def nearest_camera(
+    theta: np.ndarray, shift: Displacement, size_px: int = 1024, *, axes: bool = False
+) -> np.ndarray:
     """Parameters (5,) of the camera that is nearest over the detector to one whose images are
-    shifted, a rotation free: what a smooth field leaves to the camera.
+    shifted, a rotation free: what a smooth field leaves to the camera. With `axes` (7,): stretch
+    and skew as well.
     """
-    return nearest(theta, shift, size_px)[0]
+    return nearest(theta, shift, size_px, axes=axes)[0]
 
 
 def nearest(
-    theta: np.ndarray, shift: Displacement, size_px: int = 1024
+    theta: np.ndarray, shift: Displacement, size_px: int = 1024, *, axes: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """That camera (5,), and the rotation vector (3,), arcsec, of its axes from the first one's."""
+    """That camera (5,) or (7,), and the rotation vector (3,), arcsec, of its axes from the first one's."""
     grid = np.linspace(0.0, size_px - 1.0, 41)
     xy = np.array(np.meshgrid(grid, grid)).reshape(2, -1)
     seen = xy - theta[:2, None]
@@ -101,10 +104,14 @@ def nearest(
     for axis in np.eye(3):
         turned = 1e-6 * np.cross(axis, b.T).T
         columns.append((projected(theta, b + turned) - projected(theta, b - turned)) / 2.0)
+    if axes:
+        nothing = np.zeros_like(seen[1])
+        columns += [np.array([nothing, seen[1]]), np.array([seen[1], nothing])]
     moved = shift(seen, xy, np.full(xy.shape[1], 4.0), 0)
-    matrix = np.array(columns).reshape(8, -1).T
+    matrix = np.array(columns).reshape(len(columns), -1).T
     found = np.linalg.lstsq(matrix, moved.ravel(), rcond=None)[0]
-    return theta + steps * found[:5], found[5:] * 1e-6 * 648000.0 / np.pi
+    camera = np.append(theta + steps * found[:5], found[8:])
+    return camera, found[5:8] * 1e-6 * 648000.0 / np.pi
 
 
 def stretched(size_px: float) -> Displacement:
