@@ -4,19 +4,24 @@ check of a forecast.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import count
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, floats
+from starcal_uq.core.types import AnyDict, FloatArray, floats
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.sweeps import plain, target_line, target_words
+from starcal_uq.presentation.figures.sweeps import (
+    plain,
+    small_multiples,
+    target_line,
+    target_words,
+)
 from starcal_uq.presentation.words.planning import level, need_words
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -30,22 +35,25 @@ _SCOPES = {
     "calibration": "calibration",
     "total": "calibration and centroid noise",
 }
-_CROSS = AXES[:2]
 _LINE: AnyDict = {"markersize": 4, "linewidth": 1.5}
-_SWEEPS = (
-    ("magnitude limit", "faintest magnitude", False),
-    ("noise", "centroid noise [px per axis]", True),
-    ("part of the detector", "part of the detector's area used", False),
-)
+_COLOURS = (style.ORANGE, style.GREEN, style.BLUE, style.PURPLE)
+# Points of a curve that still have markers.
+_MARKED = 20
+_SWEEPS = {
+    "magnitude limit": "faintest magnitude",
+    "noise": "centroid noise [px per axis]",
+    "part of the detector": "part of the detector's area used",
+    "distortion": "distortion at the corner [%]",
+}
 # What is drawn of a check, by column.
-_CHECKED = (
-    ("x0_px", "x₀", style.BLUE, "o"),
-    ("f_px", "f", style.ORANGE, "s"),
-    ("distortion_corner_px", "distortion", style.PURPLE, "^"),
-    ("common_pitch_arcsec", "common rotation, pitch", style.VERMILLION, "D"),
-    ("rest_pitch_arcsec", "rest, pitch", style.GREEN, "v"),
-    ("rest_roll_arcsec", "rest, roll", style.SKY, "P"),
-)
+_CHECKED = {
+    "x0_px": "x₀",
+    "f_px": "f",
+    "distortion_corner_px": "Distortion",
+    "common_pitch_arcsec": "Common rotation, pitch",
+    "rest_pitch_arcsec": "Rest, pitch",
+    "rest_roll_arcsec": "Rest, roll",
+}
 
 
 def plot_forecast(plan: Plan) -> Figure:
@@ -60,27 +68,41 @@ def plot_forecast(plan: Plan) -> Figure:
     panels = figure.subplots(2, 2)
     table = plan.to_dataframe()
     n = floats(table["n_frames"])
+    parts = {
+        "calibration, common rotation": "common",
+        "calibration, rest": "rest",
+        "centroid noise (NEA), every frame anew": "nea",
+    }
     for ax, axes, title in (
-        (panels[0, 0], _CROSS, "Across the boresight, per axis"),
-        (panels[0, 1], ("roll",), "About the boresight"),
+        (panels[0, 0], AXES[:2], "Across the boresight, per axis"),
+        (panels[0, 1], AXES[2:], "About the boresight"),
     ):
-        _attitude_panel(ax, table, n, axes)
+        squares = {
+            words: table[[f"{part}_{axis}_arcsec" for axis in axes]] ** 2
+            for words, part in parts.items()
+        }
+        _curves(ax, n, {words: np.sqrt(square.mean(axis=1)) for words, square in squares.items()})
         style.label(ax, title, "frames", "1 sigma [arcsec]")
     style.legend_above(figure, panels[0, 0].get_lines())
     _radius_panel(panels[1, 0], plan, n)
-    _parameter_panel(panels[1, 1], table, n)
+    sigmas = {
+        "principal point, per axis": np.hypot(table["x0_px"], table["y0_px"]) / np.sqrt(2.0),
+        "focal length": table["f_px"],
+    }
+    if "distortion_corner_px" in table:
+        sigmas["distortion, at the farthest corner"] = table["distortion_corner_px"]
+    _curves(panels[1, 1], n, sigmas)
+    style.legend(panels[1, 1], loc="lower left", bbox_to_anchor=(0.0, 0.0))
+    style.label(panels[1, 1], "Parameters", "frames", "1 sigma [px]")
     return figure
 
 
-def _attitude_panel(ax: Axes, table: pd.DataFrame, n: FloatArray, axes: tuple[str, ...]) -> None:
+def _curves(ax: Axes, x: FloatArray, curves: Mapping[str, Any]) -> None:
+    """Curves by their words, on logarithmic axes in plain numbers."""
     _logarithmic(ax)
-    for part, words, colour, marker in (
-        ("nea", "centroid noise (NEA), every frame anew", style.SKY, None),
-        ("common", "calibration, common rotation", style.ORANGE, "o"),
-        ("rest", "calibration, rest", style.GREEN, "s"),
-    ):
-        squares = (table[[f"{part}_{axis}_arcsec" for axis in axes]] ** 2).mean(axis=1)
-        ax.plot(n, np.sqrt(squares), color=colour, marker=marker, label=words, **_LINE)
+    markers = "os^D" if len(x) <= _MARKED else " " * len(curves)
+    for (words, values), colour, marker in zip(curves.items(), _COLOURS, markers, strict=False):
+        ax.plot(x, values, color=colour, marker=marker, label=words, **_LINE)
     _plain_ticks(ax)
 
 
@@ -120,24 +142,6 @@ def _diamond(ax: Axes, x: Any, y: Any, **look: Any) -> None:
     ax.plot(x, y, linestyle="", marker="D", color=style.VERMILLION, **look)
 
 
-def _parameter_panel(ax: Axes, table: pd.DataFrame, n: FloatArray) -> None:
-    _logarithmic(ax)
-    point = np.sqrt(0.5 * (table["x0_px"] ** 2 + table["y0_px"] ** 2))
-    shown = [
-        (point, "principal point, per axis", style.BLUE, "o"),
-        (table["f_px"], "focal length", style.ORANGE, "D"),
-    ]
-    if "distortion_corner_px" in table:
-        shown.append(
-            (table["distortion_corner_px"], "distortion, at the farthest corner", style.PURPLE, "^")
-        )
-    for values, words, colour, marker in shown:
-        ax.plot(n, values, color=colour, marker=marker, label=words, **_LINE)
-    _plain_ticks(ax)
-    style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 0.0))
-    style.label(ax, "Parameters", "frames", "1 sigma [px]")
-
-
 def _logarithmic(ax: Axes) -> None:
     style.dress(ax, grid=True)
     ax.set_xscale("log")
@@ -160,59 +164,51 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
     """
     if plan.sweeps is None:
         raise ValueError("this plan was made without sweeps: call plan with sweeps=True.")
+    import pandas as pd
+
     of_frames, found = plan.frames_needed is not None, plan.distortion
     column = "frames_needed" if of_frames else "radius_arcsec"
-    figure = style.new_figure(11.0, 3.6)
-    panels = figure.subplots(1, 3 + (found is not None), sharey=True)
     here = {"magnitude limit": plan.max_mag, "noise": plan.sigma_px, "part of the detector": 1.0}
+    rows = plan.sweeps[["sweep", "value", column]]
     if found is not None:
-        drawn = found.radius_after_arcsec
-        if of_frames:
-            drawn = found.frames[:, found.scopes.index(plan.scope)]
-        own = np.abs(found.percent - found.own_percent)
-        _changed(
-            panels[3],
-            *(found.percent, drawn),
-            *(np.arange(len(own)) == np.argmin(own), "distortion at the corner [%]"),
-        )
-    for ax, (name, words, logarithmic) in zip(panels[:3], _SWEEPS, strict=True):
-        rows = plan.sweeps[plan.sweeps["sweep"] == name]
-        if rows.empty:
-            ax.set_visible(False)
-            continue
-        x, y = rows[["value", column]].to_numpy(np.float64).T
-        if logarithmic:
+        frames = found.frames[:, found.scopes.index(plan.scope)]
+        drawn = frames if of_frames else found.radius_after_arcsec
+        changed = {"sweep": "distortion", "value": found.percent, column: drawn}
+        rows = pd.concat([rows, pd.DataFrame(changed)])
+        here["distortion"] = found.percent[np.argmin(np.abs(found.percent - found.own_percent))]
+    swept = [name for name in _SWEEPS if name in set(rows["sweep"])]
+    figure = style.new_figure(2.0 + 3.0 * len(swept), 3.6)
+    panels = figure.subplots(1, len(swept), sharey=True, squeeze=False)[0]
+    target = None if of_frames else plan.target_arcsec
+    for ax, name in zip(panels, swept, strict=True):
+        style.dress(ax, grid=True)
+        x, y = rows.loc[rows["sweep"] == name, ["value", column]].to_numpy(np.float64).T
+        ax.set_yscale("log")
+        if name == "noise":
             ax.set_xscale("log")
-        ax.set_xticks(x, [f"{value:.3g}" for value in x])
-        _changed(ax, x, y, np.isclose(x, here[name], rtol=1e-6), words)
-        if plan.target_arcsec is not None and not of_frames:
-            target_line(ax, plan.target_arcsec)
-    at = level(plan.confidence)
-    if of_frames:
-        title, words = f"Frames for {plan.target_arcsec:g} arcsec at {at}", "frames"
-    else:
+        ax.minorticks_off()
+        if name != "distortion":
+            ax.set_xticks(x, [f"{value:.3g}" for value in x])
+        good = np.isfinite(y)
+        ax.plot(x[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5)
+        beyond = np.full((~good).sum(), 0.97)
+        edge = ax.get_xaxis_transform()
+        ax.plot(x[~good], beyond, "^", color=style.GREY, markersize=6, transform=edge)
+        own = good & np.isclose(x, here[name], rtol=1e-6)
+        _diamond(ax, x[own], y[own], markersize=7)
+        style.label(ax, "", _SWEEPS[name])
+        if target is not None:
+            target_line(ax, target)
+    at, scope = level(plan.confidence), _SCOPES[plan.scope]
+    title, words = f"Frames for {plan.target_arcsec or 0:g} arcsec at {at}, {scope}", "frames"
+    if not of_frames:
         after = count(int(plan.sweeps["n_frames"].iloc[0]))
-        title, words = f"Two-axis error after {after} frames", f"error at {at} [arcsec]"
-    title += f", {_SCOPES[plan.scope]}"
-    if plan.target_arcsec is not None and not of_frames:
-        title += f"; line: target {plan.target_arcsec:g} arcsec"
+        line = "" if target is None else f"; line: target {target:g} arcsec"
+        title = f"Two-axis error after {after} frames, {scope}{line}"
+        words = f"error at {at} [arcsec]"
     style.label(panels[0], title, y=words)
     plain(panels[0].yaxis, fine=False)
     return figure
-
-
-def _changed(ax: Axes, x: FloatArray, y: FloatArray, own: BoolArray, words: str) -> None:
-    """What is needed with one thing changed; triangles where it is beyond all numbers."""
-    style.dress(ax, grid=True)
-    ax.set_yscale("log")
-    ax.minorticks_off()
-    good = np.isfinite(y)
-    ax.plot(x[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5)
-    edge = ax.get_xaxis_transform()
-    beyond = np.full((~good).sum(), 0.97)
-    ax.plot(x[~good], beyond, "^", color=style.GREY, markersize=6, transform=edge)
-    _diamond(ax, x[good & own], y[good & own], markersize=7)
-    style.label(ax, "", words)
 
 
 def plot_frame_choice(choice: FrameChoice) -> Figure:
@@ -234,16 +230,11 @@ def plot_frame_choice(choice: FrameChoice) -> Figure:
         left, "Boresights of the chosen frames", "right ascension [deg]", "declination [deg]"
     )
 
-    _logarithmic(right)
-    n = np.arange(1, len(table) + 1)
+    n = np.arange(1.0, len(table) + 1.0)
     # The first frames alone hardly determine the parameters.
     first = min(3, len(n) - 1)
-    for path, colour, width, words in (
-        (choice.random_path, style.GREY, 1.5, "random frames, mean"),
-        (choice.score_path, style.BLUE, 1.8, "chosen frames"),
-    ):
-        right.plot(n[first:], path[first:], color=colour, linewidth=width, label=words)
-    _plain_ticks(right)
+    paths = {"random frames, mean": choice.random_path, "chosen frames": choice.score_path}
+    _curves(right, n[first:], {words: path[first:] for words, path in paths.items()})
     style.legend(right, loc="upper right")
     if choice.criterion == "D":
         style.label(right, "Gain", "frames", "sigma per parameter, of the choice's")
@@ -256,44 +247,31 @@ def plot_forecast_check(check: ForecastCheck) -> Figure:
     """Stated sigmas over forecast sigmas with the 5 % band, and squared errors over their
     expectation.
 
-    Bars hold 95 % of chance: of the mean over the campaigns on the left, of the pooled squared
-    errors on the right.
+    Coloured bands hold 95 % of chance: of the mean over the campaigns, and, in the last panel, of
+    the pooled squared errors.
     """
-    figure = style.new_figure(11.0, 3.9)
-    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
-    n = floats(check.forecast.n_frames)
-    for ax in (left, right):
-        style.dress(ax, grid=True)
-        ax.set_xscale("log")
-    left.axhspan(0.95, 1.05, color=style.LIGHT, linewidth=0, zorder=0)
-    left.axhline(1.0, color=style.INK, linewidth=0.9)
-    bars = 1.96 * check.ratio_se
-    shown = [entry for entry in _CHECKED if entry[0] in check.forecast.names]
-    for i, (name, words, colour, marker) in enumerate(shown):
-        j = check.forecast.names.index(name)
-        at = n * 1.045 ** (i - 0.5 * (len(shown) - 1))
-        left.errorbar(
-            *(at, check.ratio[:, j], bars[:, j]),
-            color=colour,
-            marker=marker,
-            markersize=4,
-            linestyle="",
-            label=words,
-        )
-    reach = max(0.075, 1.1 * np.max(np.abs(check.ratio - 1.0) + bars))
-    left.set_ylim(1.0 - reach, 1.0 + 1.9 * reach)
-    style.legend(left, loc="upper right", ncols=3)
-    style.label(
-        left, f"Sigmas of {check.n_campaigns} campaigns each", "frames", "stated / forecast"
-    )
+    import xarray as xr
 
-    found, low, high = check.nees_ratio()
-    right.vlines(n, low, high, color=style.LIGHT, linewidth=9.0)
-    right.axhline(1.0, color=style.INK, linewidth=0.9)
-    right.plot(n, found, color=style.BLUE, marker="o", markersize=5, linestyle="")
-    style.label(right, "Squared errors of the parameters", "frames", "mean / expected")
-    for ax in (left, right):
-        ax.set_xticks(n, [count(int(value)) for value in n])
-        ax.minorticks_off()
-        ax.set_xlim(n[0] / 1.4, n[-1] * 1.4)
+    names, found = check.forecast.names, []
+    for name in _CHECKED:
+        if name in names:
+            ratio, bar = (each[:, names.index(name)] for each in (check.ratio, check.ratio_se))
+            found.append((_CHECKED[name], ratio, ratio - 1.96 * bar, ratio + 1.96 * bar))
+    titles, *numbers = zip(*found, ("Squared errors", *check.nees_ratio()), strict=True)
+    where = {"panel": list(titles), "frames": list(check.forecast.n_frames)}
+    data = xr.Dataset(
+        {
+            name: (("panel", "frames"), np.array(values))
+            for name, values in zip(("median", "low", "high"), numbers, strict=True)
+        },
+        where,
+    )
+    figure, panels = small_multiples(data, "frames", log=False)
+    for ax in panels:
+        ax.axhline(1.0, color=style.INK, linewidth=0.9)
+    for ax in panels[:-1]:
+        ax.axhspan(0.95, 1.05, color=style.LIGHT, linewidth=0, zorder=0)
+        ax.set_ylim(min(0.93, ax.get_ylim()[0]), max(1.07, ax.get_ylim()[1]))
+    style.label(panels[0], y="stated / forecast")
+    style.label(panels[-1], y="mean / expected")
     return figure

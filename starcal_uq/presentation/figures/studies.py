@@ -339,19 +339,17 @@ def plot_matrices(
     data = xr.concat([sweep.over(r, dims=dims, at=held) for r in entries], "entry")
     data = data.expand_dims(line=[""]) if by is None else data.rename({by: "line"})
     columns, rows = some(data.sizes[along], 5), some(data.sizes["line"], _MOST_PANELS)
-    figure = style.new_figure(11.0, 0.9 + 1.9 * len(rows))
-    panels = style.panels(figure, len(rows), len(columns), (0.95, 0.8, 0.58, 0.32), (0.12, 0.12))
-    axes = panels.subplots(sharex=True, sharey=True, squeeze=False)
+    figure = style.new_figure(11.0, 1.1 + 1.9 * len(rows))
+    axes = figure.subplots(len(rows), len(columns), sharex=True, sharey=True, squeeze=False)
     for (i, j), ax in np.ndenumerate(axes):
         one = data.isel({"line": rows[i], along: columns[j]})
         image = heat_map(ax, one.values.reshape(len(names), -1), names, small=True)
-        ax.tick_params(labeltop=i == 0, labelleft=j == 0)
-        style.label(ax, x=value_words(one[along].item()) if i == len(rows) - 1 else "")
-        style.label(ax, y=value_words(one["line"].item()) if j == 0 else "")
+        style.label(ax, x=value_words(one[along].item()), y=value_words(one["line"].item()))
+        ax.label_outer()
     look: AnyDict = {"fontsize": style.LABEL_SIZE, "color": style.INK}
-    figure.supxlabel(axis_label(along), y=0.01, **look)
-    figure.supylabel("" if by is None else axis_label(by), x=0.005, **look)
-    bar = figure.colorbar(image, cax=figure.add_axes((0.945, 0.2, 0.012, 0.6)))
+    figure.supxlabel(axis_label(along), **look)
+    figure.supylabel(axis_label(by) if by else "", **look)
+    bar = figure.colorbar(image, ax=axes, fraction=0.012, pad=0.01)
     style.dress_bar(bar, "correlation")
     return figure
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
-from starcal_uq.core.formatting import count, fixed, significant
+from starcal_uq.core.formatting import significant
 from starcal_uq.core.manifest import making
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.types import AnyDict, PathLike
@@ -31,6 +31,7 @@ from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.planning import (
     SCOPE_NAMES,
     check_text,
+    choice_table,
     choice_text,
     costs_sentence,
     costs_table,
@@ -58,21 +59,22 @@ _RECORDED = (
     "scope",
     "target_arcsec",
 )
-# Columns of the table, under their groups.
-_GROUPS = (
-    (
-        "Parameters",
-        (
-            ("x0_px", "x₀ [px]"),
-            ("y0_px", "y₀ [px]"),
-            ("f_px", "f [px]"),
-            ("f_mm", "f [mm]"),
-            ("distortion_corner_px", "Corner [px]"),
-        ),
-    ),
-    ("Common rotation [arcsec]", tuple((f"common_{axis}_arcsec", axis) for axis in AXES)),
-    ("Rest [arcsec]", tuple((f"rest_{axis}_arcsec", axis) for axis in AXES)),
-)
+# Heads of the columns of the forecast's table; those of sigmas of coefficients are left to the CSV.
+_HEADS = {
+    "n_frames": "Frames",
+    "x0_px": "x₀ [px]",
+    "y0_px": "y₀ [px]",
+    "f_px": "f [px]",
+    "f_mm": "f [mm]",
+    "distortion_corner_px": "Corner [px]",
+    **{f"common_{axis}_arcsec": f"Common rotation, {axis} [arcsec]" for axis in AXES},
+    **{f"rest_{axis}_arcsec": f"Rest, {axis} [arcsec]" for axis in AXES},
+    "radius_arcsec": "Two-axis error [arcsec]",
+    "radius_low_arcsec": "least of 90 %",
+    "radius_high_arcsec": "most of 90 %",
+    "radius_least_arcsec": "least distortion",
+    "radius_most_arcsec": "most distortion",
+}
 
 
 def write_plan(
@@ -166,31 +168,8 @@ def render_plan(
     context = _context(plan, images)
     context |= {"choice": None if choice is None else choice_text(choice)}
     context |= {"check": None if check is None else check_text(check)}
-    context |= {"frame_table": None if choice is None else _frame_table(choice)}
+    context |= {"frame_table": None if choice is None else choice_table(choice, _FRAMES_SHOWN)}
     return template_environment().get_template(_TEMPLATE).render(context) + "\n"
-
-
-def _frame_table(choice: FrameChoice) -> TextTable:
-    """The chosen frames, most valuable first."""
-    rows = tuple(
-        (
-            str(row["order"]),
-            *(fixed(row[name], 2) for name in ("ra_deg", "dec_deg")),
-            fixed(row["roll_deg"], 1),
-            str(row["n_stars"]),
-            significant(row["score"], 3),
-        )
-        for row in choice.to_dataframe().head(_FRAMES_SHOWN).to_dict("records")
-    )
-    heads = (
-        "Order",
-        "RA [deg]",
-        "Dec [deg]",
-        "Position angle of +Y [deg]",
-        "Stars",
-        "Criterion after it",
-    )
-    return TextTable(heads, rows, align="rrrrrr")
 
 
 def _needs_table(plan: Plan) -> TextTable:
@@ -215,13 +194,17 @@ def _needs_table(plan: Plan) -> TextTable:
     )
 
 
+def _forecast_table(plan: Plan) -> TextTable:
+    """The forecast by number of frames; the focal length once, in millimetres where the pitch is
+    known.
+    """
+    table = plan.to_dataframe().rename(columns=_HEADS)
+    left_out = "f [px]" if "f [mm]" in table else ""
+    columns = [head for head in _HEADS.values() if head in table and head != left_out]
+    return TextTable.of(table, columns=columns)
+
+
 def _context(plan: Plan, images: Mapping[str, bytes]) -> AnyDict:
-    table = plan.to_dataframe()
-    # The focal length once: in millimetres where the pitch is known.
-    table = table.drop(columns="f_px") if "f_mm" in table else table
-    groups = [(name, [pair for pair in columns if pair[0] in table]) for name, columns in _GROUPS]
-    shown = [pair for _, pairs in groups for pair in pairs]
-    edges = {pairs[0][0] for _, pairs in groups}
     return {
         "title": plan.camera.name or "Plan of a calibration",
         "created": plan.provenance.created_utc,
@@ -236,22 +219,7 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> AnyDict:
         "scope": SCOPE_NAMES[plan.scope],
         "target": None if plan.target_arcsec is None else f"{plan.target_arcsec:g} arcsec",
         "needs": _needs_table(plan),
-        "groups": [(name, len(pairs)) for name, pairs in groups],
-        "heads": [(head, column in edges) for column, head in shown],
-        "rows": [
-            {
-                "n": count(int(row["n_frames"])),
-                "cells": [(significant(row[column]), column in edges) for column, _ in shown],
-                "radius": significant(row["radius_arcsec"], 3),
-                "range": f"{significant(row['radius_low_arcsec'], 3)} to "
-                f"{significant(row['radius_high_arcsec'], 3)}",
-                "distortion": None
-                if plan.distortion is None
-                else f"{significant(row['radius_least_arcsec'], 3)} to "
-                f"{significant(row['radius_most_arcsec'], 3)}",
-            }
-            for row in table.to_dict("records")
-        ],
+        "forecast": _forecast_table(plan),
         "nea": [significant(value) for value in plan.nea_arcsec],
         "camera_rows": [
             (key, value) for key, value in plan.camera.to_dict().items() if key != "name"

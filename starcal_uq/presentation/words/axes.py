@@ -5,49 +5,22 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from starcal_uq.camera.distortion import PARAMETERS
+from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS
 from starcal_uq.core.formatting import count, fixed, join_words, pretty_unit
 from starcal_uq.core.types import AnyMapping
 from starcal_uq.studies.axes import AXES
 
-# An axis that is missing here goes by its own name.
-_NAMES = {
-    "fov_deg": "field of view",
-    "focal_mm": "focal length",
-    "pixels": "detector's width",
-    "pixel_um": "pixel pitch",
-    "x0_offset_px": "offset of the principal point in x",
-    "y0_offset_px": "offset of the principal point in y",
-    "distortion": "distortion model",
-    "distortion_px": "distortion at the corner",
-    "max_mag": "magnitude limit",
-    "stars": "number of stars per frame",
-    "frames": "number of frames",
-    "min_stars": "fewest stars of a frame",
-    "pointing": "pointing",
-    "sigma_px": "centroid noise",
-    "noise_per_mag": "growth of the noise per magnitude",
-    "noise_mag": "magnitude of the stated noise",
-    "noise_floor_px": "noise of bright stars",
-    "direction_mas": "errors of the stars' directions",
-    "prior": "prior",
-    "method": "method",
-    "likelihood": "likelihood",
-    "effects": "effects",
-    "temperature_range_c": "range of temperatures",
-    "nights": "nights",
-}
 # Units as they are printed, where that is not how they are written.
 _PRINTED = {"deg": "°", "um": "µm"}
 
 
 def axis_name(axis: str) -> str:
     """The axis in words, without its unit."""
-    return _NAMES.get(axis, axis)
+    return axis if axis in COEFFICIENTS else AXES[axis].words
 
 
 def _unit(axis: str) -> str:
-    unit = AXES[axis].unit if axis in AXES else ""
+    unit = AXES[axis].unit
     return _PRINTED.get(unit, pretty_unit(unit))
 
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent, plural, significant
-from starcal_uq.core.types import FloatArray
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.costs import EffectCosts
 from starcal_uq.planning.design import FrameChoice
@@ -24,13 +23,13 @@ SCOPE_NAMES = {
 }
 
 
-# Quantities that known rotations between frames tell.
-_TOLD_BY_TIES = (
-    ("x0_px", "x0", "px"),
-    ("y0_px", "y0", "px"),
-    ("common_pitch_arcsec", "the common rotation in pitch", "arcsec"),
-    ("common_yaw_arcsec", "in yaw", "arcsec"),
-)
+# Quantities that known rotations between frames tell, and their units.
+_TOLD_BY_TIES = {
+    "x0_px": ("x0", "px"),
+    "y0_px": ("y0", "px"),
+    "common_pitch_arcsec": ("the common rotation in pitch", "arcsec"),
+    "common_yaw_arcsec": ("in yaw", "arcsec"),
+}
 
 
 def frames(number: int | None) -> str:
@@ -113,23 +112,15 @@ def distortion_sentence(plan: Plan) -> str:
     open_words = f"The sheet leaves the distortion open ({span(found)} at the corner)."
     if np.max(radius) < LITTLE * np.min(radius):
         return f"{open_words} It hardly matters for the {SCOPE_NAMES[plan.scope]}."
-    worst = corner(found.percent[np.argmax(radius)])
-    point, focal = (_px_range(sigmas) for sigmas in (found.principal_point_px, found.focal_px))
+    point = found.principal_point_px
     return (
-        f"{open_words} The worst is {worst}. What decides is how well the principal point can be "
-        "told from a rotation "
-        f"of the camera: its sigma after {frames(AFTER_FRAMES)} is {point}, that of the focal "
-        f"length {focal}. A "
-        "rotation moves stars the more the further out they are; barrel distortion undoes that, "
-        "most nearly in an "
-        f"f-theta lens ({significant(abs(found.f_theta_percent))} %). If the lens is known "
-        "better, narrow the range "
-        "with --distortion-percent LOW HIGH, or give the coefficients."
+        f"{open_words} The worst is {corner(found.percent[np.argmax(radius)])}. What decides is how "
+        "well the principal point can be told from a rotation of the camera: its sigma after "
+        f"{frames(AFTER_FRAMES)} is {significant(point.min())} to {significant(point.max())} px. "
+        "Barrel distortion makes them alike, most nearly in an f-theta lens "
+        f"({significant(abs(found.f_theta_percent))} %). If the lens is known better, narrow the "
+        "range with --distortion-percent LOW HIGH, or give the coefficients."
     )
-
-
-def _px_range(sigmas: FloatArray) -> str:
-    return f"{significant(sigmas.min())} to {significant(sigmas.max())} px"
 
 
 def _needed(need: Need, target: str) -> str:
@@ -161,16 +152,14 @@ def _others(plan: Plan) -> str:
 
 
 def _largest(plan: Plan) -> str:
-    found = plan.forecast
-    common = max(found.of("common_pitch_arcsec")[-1], found.of("common_yaw_arcsec")[-1])
-    rest = max(found.of("rest_pitch_arcsec")[-1], found.of("rest_yaw_arcsec")[-1])
+    last = plan.to_dataframe().iloc[-1]
+    common, rest, noise = (
+        significant(last[f"{part}_pitch_arcsec"]) for part in ("common", "rest", "nea")
+    )
     return (
-        f"{frames(int(found.n_frames[-1]))} of {significant(plan.mean_stars, 3)} stars at "
-        f"{significant(plan.sigma_px)} px give a common rotation of {significant(common)} and a "
-        "rest of "
-        f"{significant(rest)} arcsec (1 sigma per axis across the boresight), beside centroid "
-        "noise of "
-        f"{significant(max(plan.nea_arcsec[:2]))} arcsec in every frame."
+        f"{frames(int(last['n_frames']))} of {significant(plan.mean_stars, 3)} stars at "
+        f"{significant(plan.sigma_px)} px give a common rotation of {common} and a rest of {rest} "
+        f"arcsec (1 sigma in pitch), beside centroid noise of {noise} arcsec in every frame."
     )
 
 
@@ -184,10 +173,10 @@ def ties_sentence(plan: Plan) -> str:
         what = f"A fixed mount that moves by {plan.ties.sigma_arcsec:g} arcsec"
     elif plan.ties.alignment_arcsec:
         what += f", in axes that are known to {plan.ties.alignment_arcsec:g} arcsec,"
+    before, after = plan.without_ties, plan.forecast
     changes = [
-        f"{name} from {significant(float(before))} to {significant(float(after))} {unit}"
-        for key, name, unit in _TOLD_BY_TIES
-        for before, after in [(plan.without_ties.of(key)[-1], plan.forecast.of(key)[-1])]
+        f"{name} from {significant(before.of(key)[-1])} to {significant(after.of(key)[-1])} {unit}"
+        for key, (name, unit) in _TOLD_BY_TIES.items()
     ]
     n = count(int(plan.forecast.n_frames[-1]))
     verb = "changes" if plan.ties.of_mount else "change"
@@ -207,54 +196,33 @@ def settings_sentence(plan: Plan) -> str:
 
 def choice_text(choice: FrameChoice) -> str:
     """What the choice is worth."""
-    parts = []
-    for name, part in (("common rotation", "common"), ("rest", "rest")):
-        cross = [choice.names.index(f"{part}_{axis}_arcsec") for axis in AXES[:2]]
-        random = np.sqrt(np.mean(choice.random[:, cross] ** 2, axis=1))
-        ratio = random / np.sqrt(np.mean(choice.after[cross] ** 2))
-        low, high = np.quantile(ratio, (0.05, 0.95))
-        parts.append(
-            f"a {name} smaller by a factor of {fixed(ratio.mean(), 2)} "
-            f"({fixed(low, 2)} to {fixed(high, 2)} for 90 % of random sets)"
-        )
     main = "rest" if choice.scope == "rest" else "common"
-    cross = [choice.names.index(f"{main}_{axis}_arcsec") for axis in AXES[:2]]
-    richest = fixed(
-        np.sqrt(np.mean(choice.richest[cross] ** 2) / np.mean(choice.after[cross] ** 2)), 2
-    )
-    aim = (
-        "the parameters as a whole"
-        if choice.criterion == "D"
-        else f"the {SCOPE_NAMES[choice.scope]}"
-    )
+    aim = "parameters as a whole" if choice.criterion == "D" else SCOPE_NAMES[choice.scope]
+    worth = choice.worth().set_index("quantity").loc[f"{main}_pitch_arcsec"]
+    low, mean, high = (fixed(worth[name], 2) for name in ("factor_low", "factor", "factor_high"))
+    richest = fixed(worth["richest"] / worth["chosen"], 2)
     return (
         f"{frames(len(choice.rotations))} of {count(choice.n_candidates)} candidates, chosen for "
-        f"{aim}, give "
-        f"{join_words(parts)} than as many random frames; the frames with most stars would give a "
-        f"{SCOPE_NAMES[main]} {richest} times as large."
+        f"the {aim}. As many random frames leave a {SCOPE_NAMES[main]} {mean} times as large in "
+        f"pitch ({low} to {high} for 90 % of random sets), the frames with most stars one "
+        f"{richest} times as large."
     )
 
 
 def check_text(check: ForecastCheck) -> str:
     """Whether forecast and simulation agree."""
-    outside = [
-        int(n) for n, bad in zip(check.forecast.n_frames, check.nees_rejected, strict=True) if bad
-    ]
-    g, q = np.unravel_index(int(np.argmax(np.abs(check.ratio - 1.0))), check.ratio.shape)
-    ratio = check.ratio[g, q] - 1.0
-    sign = "+" if ratio > 0.0 else MINUS
-    sentence = (
+    table = check.to_dataframe()
+    worst = table.loc[(table["ratio"] - 1.0).abs().idxmax()]
+    outside = np.array(check.forecast.n_frames)[check.nees_rejected]
+    errors = "what they should be"
+    if len(outside):
+        errors = f"not {errors} with {join_words([count(int(n)) for n in outside])} frames"
+    return (
         f"{count(check.n_campaigns)} simulated campaigns of each size: the sigmas they state "
-        "differ from the forecast "
-        f"by at most {sign}{percent(abs(ratio))} ({check.forecast.names[q]}, "
-        f"{plural(int(check.forecast.n_frames[g]), 'frame')}); "
+        f"differ from the forecast by at most {percent(check.largest_difference)} "
+        f"({worst['quantity']}, {plural(int(worst['n_frames']), 'frame')}); their squared errors "
+        f"are {errors}."
     )
-    if outside:
-        return sentence + (
-            "squared errors are not what they should be with "
-            f"{join_words([count(n) for n in outside])} frames."
-        )
-    return sentence + "their squared errors are what they should be."
 
 
 def plan_table(plan: Plan) -> TextTable:
@@ -275,30 +243,26 @@ def plan_table(plan: Plan) -> TextTable:
 
 def costs_table(costs: EffectCosts) -> TextTable:
     """What effects cost: the growth of what is known of the camera, and attitude errors."""
-    columns = {"x₀": ("x0_px", "y0_px"), "f": ("f_px",)}
-    if "distortion_corner_px" in costs.names:
-        columns["corner"] = ("distortion_corner_px",)
-    columns["common"] = _across("common")
-    rest = [costs.names.index(name) for name in _across("rest")]
-    rows = []
-    for i, model in enumerate(costs.models):
-        errors = (costs.sigma[i, rest], costs.camera_alone[i, rest])
-        rows.append(
-            (
-                model,
-                px if (px := costs.planned.scales.get(model)) is None else significant(px),
-                *(f"× {fixed(costs.growth(model, *names), 2)}" for names in columns.values()),
-                *(significant(np.sqrt(np.mean(error**2))) for error in errors),
-            )
-        )
-    heads = ("effects", "scale [px]", *columns, "rest [arcsec]", "camera alone aboard")
+    import pandas as pd
+
+    grown = {
+        "x₀": ("x0_px", "y0_px"),
+        "f": ("f_px",),
+        "corner": ("distortion_corner_px",),
+        "common": ("common_pitch_arcsec", "common_yaw_arcsec"),
+    }
+    known = {head: names for head, names in grown.items() if set(names) <= set(costs.names)}
+    rest = [costs.names.index(f"rest_{axis}_arcsec") for axis in AXES[:2]]
+    table = pd.DataFrame({"effects": costs.models})
+    table["scale [px]"] = table["effects"].map(costs.planned.scales)
+    for head, names in known.items():
+        table[head] = [costs.growth(model, *names) for model in costs.models]
+    table["rest [arcsec]"], table["camera alone aboard"] = (
+        np.sqrt(np.mean(sigma[:, rest] ** 2, axis=1)) for sigma in (costs.sigma, costs.camera_alone)
+    )
     title = f"What effects cost after {frames(costs.n_frames)}: growth of sigmas, and the rest"
-    cells = tuple(tuple(cell or "" for cell in row) for row in rows)
-    return TextTable(heads, cells, title, "lr" + "r" * (len(columns) + 2))
-
-
-def _across(part: str) -> tuple[str, ...]:
-    return tuple(f"{part}_{axis}_arcsec" for axis in AXES[:2])
+    forms = dict.fromkeys(known, lambda factor: f"× {fixed(factor, 2)}")
+    return TextTable.of(table, title, formats=forms, missing="")
 
 
 def costs_sentence(costs: EffectCosts) -> str:

@@ -7,6 +7,7 @@ along every axis.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.axes import axis_label, axis_name, place, value_words
-from starcal_uq.propagation.coupling import ALONE, COUPLED, PART
+from starcal_uq.propagation.coupling import COUPLED, PART
 from starcal_uq.studies.findings import Curve, Pair, place_of
 
 if TYPE_CHECKING:
@@ -92,17 +93,16 @@ def _span(values: Any, form: Callable[[float], str] = lambda value: significant(
 
 
 def _weakest(study: Study) -> str:
-    """The most common weakest direction, by the signs of the parameters that take part."""
-    weights = study.data["weak_direction"].values[study.ok]
-    signs = np.where(np.abs(weights) >= PART, np.sign(weights), 0.0)
-    # A direction and its opposite are the same.
-    lead = np.take_along_axis(signs, np.argmax(signs != 0.0, axis=1)[:, None], axis=1)
-    _, first, n = np.unique(lead * signs, axis=0, return_index=True, return_counts=True)
-    most = int(np.argmax(n))
-    if np.median(study.data["weak_variance"].values[study.ok]) < ALONE[1]:
-        return "No direction is much weaker than the parameters themselves."
-    words = str(study.data["weak_words"].values[study.ok][first[most]])
-    return f"The weakest direction in {percent(n[most] / len(signs))} of the cells: {words}."
+    """The parameters that most often make up the weakest direction, and its variance."""
+    parts = np.abs(study.data["weak_direction"].values[study.ok]) >= PART
+    kinds, n = np.unique(parts, axis=0, return_counts=True)
+    names = compress(study.parameter_names, kinds[np.argmax(n)])
+    variance = significant(np.median(study.data["weak_variance"].values[study.ok]))
+    return (
+        f"The weakest direction is one of {join_words(list(names))} in "
+        f"{percent(n.max() / len(parts))} of the cells, with {variance} times the variance of "
+        "uncoupled parameters (median)."
+    )
 
 
 def _targets(study: Study) -> list[str]:
@@ -202,7 +202,7 @@ def study_advice(study: Study) -> list[str]:
     """What a designer can do with the answer."""
     if not study.ok.any():
         return ["Nothing can be advised: see why the cells failed."]
-    return [*_apart(study), *_worth_most(study), *_cheapest(study)]
+    return [*_apart(study), *_cheapest(study)]
 
 
 def _apart(study: Study) -> list[str]:
@@ -224,32 +224,13 @@ def _apart(study: Study) -> list[str]:
 
 def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
     """Whether both sigmas are smaller where the pair is least coupled than where it is most."""
-    curves = [
-        study.sweep.along(study.values("sigma", parameter=name), cost.axis) for name in pair.names
-    ]
-    return cost.axis not in _GIVEN and all(
-        curve is not None
-        and curve.values == cost.values
-        and curve.median[cost.least] < curve.median[cost.most]
-        for curve in curves
-    )
-
-
-def _worth_most(study: Study) -> list[str]:
-    """The axis of numbers that changes the attitude error most."""
-    curves = [
-        curve
-        for curve in study.sweep.curves(np.log(study.sweep.frame_error))
-        if curve.matters and not isinstance(curve.values[0], str)
-    ]
-    if not curves:
-        return []
-    curve = max(curves, key=lambda curve: curve.factor)
-    low, high = (value_words(curve.values[i]) for i in (curve.most, curve.least))
-    return [
-        f"The {axis_name(curve.axis)} is worth most for the attitude error: a factor of "
-        f"{significant(curve.factor)} between {low} and {high}."
-    ]
+    known = np.isfinite(pair.correlation)
+    for name in pair.names:
+        sigma = np.where(known, study.values("sigma", parameter=name), np.nan)
+        curve = study.sweep.along(sigma, cost.axis)
+        if curve is None or curve.median[cost.least] >= curve.median[cost.most]:
+            return False
+    return cost.axis not in _GIVEN
 
 
 def _cheapest(study: Study) -> list[str]:
