@@ -140,8 +140,8 @@ def air_test(
         return found
     weighted = obs.weighted(model.sigma_px(obs), model.axes)
     if errors is not None:
-        own = errors.sigma * _rms(obs.sigma_px) / _rms(weighted.sigma_px)
-        errors = errors._replace(sigma=own)
+        squares = [float(np.mean(one.sigma_or_one**2)) for one in (obs, weighted)]
+        errors = errors._replace(sigma=errors.sigma * np.sqrt(squares[0] / squares[1]))
     again = _Air(weighted, cal, seed, errors)
     found = again.test()
     if found is None or np.isnan(found.f_px):
@@ -149,10 +149,6 @@ def air_test(
     # What the estimate took up of it is by the weights that it was made with.
     f_px = air.f_px(again.seen_px)
     return replace(found, f_px=f_px, f_sigma=f_px / float(cal.sigmas[2]))
-
-
-def _rms(sigma_px: FloatArray | None) -> float:
-    return 1.0 if sigma_px is None else float(np.sqrt(np.mean(sigma_px**2)))
 
 
 def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> StarNoise | None:

@@ -53,7 +53,7 @@ class ShapeSums:
         p, theta, effects = len(cal.theta), cal.theta, effects_beside(obs, cal)
         self.p, self.dof = p, likelihood.dof - p
         self.names, self.n_stars = cal.parameter_names, obs.n_stars
-        self.noise_px = 1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2)))
+        self.noise_px = float(np.sqrt(np.mean(obs.sigma_or_one**2)))
         looked_for = [Effect(own.name, "run", own, np.ones(own.size)) for own in families]
         sums = EffectSums([*effects, *looked_for], theta, cal.sigma)
         frame = Effect("frame", "frame", frame_shapes(cal.camera), np.ones(3))

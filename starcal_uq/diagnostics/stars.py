@@ -173,9 +173,7 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
         visible_px=found.visible,
         arcsec_per_px=ARCSEC / focal,
         formal_covariance=inverse * noise * unit,
-        model_covariance=(inverse * own + pulled) * unit
-        if found.tau2 > 0.0
-        else inverse * noise * unit,
+        model_covariance=(inverse * own + pulled) * unit,
         sandwich_covariance=scores.T @ scores * s / (s - 1.0) * unit,
         jackknife_covariance=spread.T @ spread * (s - 1.0) / s * unit,
         included_px=included[0],
@@ -262,7 +260,8 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     statistic = (float(pull @ pull) / total - m) / np.sqrt(variance)
     # Moments of e^T M e and e^T e where a star's error adds tau^2 to the noise s^2.
     tau2 = (float(pull @ pull) - m * total) / a2
-    noise = max((total - max(tau2, 0.0) * g1) / dof, 0.1 * total / dof)
+    size2 = max(tau2, 0.0)
+    noise = max((total - size2 * g1) / dof, 0.1 * total / dof)
 
     def spread(share: float) -> float:
         middle, last = g3 - 2.0 * m * g2 + m**2 * g1, g4 - 2.0 * m * g3 + m**2 * g2
@@ -270,14 +269,14 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
             np.sqrt(2.0 * (noise**2 * a2 + 2.0 * noise * share * middle + share**2 * last)) / a2
         )
 
-    sd = spread(max(tau2, 0.0))
+    sd = spread(size2)
     unit = float(1.0 / np.sqrt(np.mean(obs.sigma_or_one**-2.0)))
-    low, high = np.sqrt(max(tau2 - sd, 0.0)), np.sqrt(max(tau2, 0.0) + sd)
+    low, high = np.sqrt(max(tau2 - sd, 0.0)), np.sqrt(size2 + sd)
     return _Likeness(
         n_stars=sums.n_groups,
         n_images=frames.n_stars,
         p_value=_gamma_tail(statistic, skewness),
-        tau2=max(tau2, 0.0) * unit**2,
+        tau2=size2 * unit**2,
         tau_std=float(0.5 * (high - low)) * unit,
         visible=float(np.sqrt(_SEEN * spread(0.0))) * unit,
     )

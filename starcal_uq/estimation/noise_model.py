@@ -27,7 +27,7 @@ import numpy as np
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.stages import REFINEMENT_TOLERANCE, Search, refinement_stage
-from starcal_uq.likelihood.marginal import MarginalLikelihood
+from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 
@@ -56,13 +56,22 @@ def star_squares(
 
     `theta` (p,): estimate, px units.
     """
+    state, *held = _held(likelihood, theta)
+    leverage = sum(np.sum(columns**2, axis=(0, 1)) for columns in held)
+    return np.sum(state.e**2, axis=0), np.maximum(2.0 - leverage, 1e-6)
+
+
+def _held(
+    likelihood: MarginalLikelihood, theta: FloatArray
+) -> tuple[Profile, FloatArray, FloatArray]:
+    """The model at theta (p,), and orthonormal columns that the attitude of each frame (3, 2, N)
+    and all parameters (p, 2, N) span.
+    """
     state, _ = likelihood.profile(theta)
     h = likelihood.slopes(theta, state)
     flat = h.reshape(len(h), -1)
-    inverse = scaled_inverse(flat @ flat.T)
-    by_camera = np.einsum("pxn,pxn->n", h, np.tensordot(inverse, h, axes=1))
-    by_attitude = np.sum(likelihood.attitudes(state).orthonormal ** 2, axis=(0, 1))
-    return np.sum(state.e**2, axis=0), np.maximum(2.0 - by_camera - by_attitude, 1e-6)
+    camera = np.tensordot(scaled_cholesky(scaled_inverse(flat @ flat.T)).T, h, axes=1)
+    return state, likelihood.attitudes(state).orthonormal, camera
 
 
 class AxisNoise(NamedTuple):
@@ -99,12 +108,8 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     `likelihood`: of weights whose axes are alike.
     `theta` (p,): estimate, px units.
     """
-    state, _ = likelihood.profile(theta)
-    frames, h = likelihood.frames, likelihood.slopes(theta, state)
-    flat = h.reshape(len(h), -1)
-    camera = np.tensordot(scaled_cholesky(scaled_inverse(flat @ flat.T)).T, h, axes=1)
-    attitude = likelihood.attitudes(state).orthonormal
-    return axis_noise_beside(frames, attitude, camera, state.e, likelihood.dof)
+    state, *held = _held(likelihood, theta)
+    return axis_noise_beside(likelihood.frames, *held, state.e, likelihood.dof)
 
 
 def axis_noise_beside(
@@ -176,7 +181,7 @@ def fit_noise(
     found: _Round | None = None
     for turn in range(rounds):
         axes = None if found is None else found.model.axes
-        frames = replace(plain, weight=1.0 / (_stated(obs) * np.sqrt(variance)), axes=axes)
+        frames = replace(plain, weight=1.0 / (obs.sigma_or_one * np.sqrt(variance)), axes=axes)
         likelihood = MarginalLikelihood(frames, camera.distortion)
         if turn > 0:
             likelihood.use_rotations(likelihood.start_rotations(theta))
@@ -216,7 +221,7 @@ def fit_noise_of_tails(
     CalibrationError where it is not found at once.
     """
     obs, theta = obs.unweighted, camera.theta
-    plain, sigma_px = StarFrames.from_observations(obs), _stated(obs)
+    plain, sigma_px = StarFrames.from_observations(obs), obs.sigma_or_one
     found: _Round | None = None
     for _ in range(_ROUNDS):
         axes = None if found is None else found.model.axes
@@ -231,7 +236,7 @@ def fit_noise_of_tails(
         part, weight = obs.select(right), np.sqrt(again.weight[right])
         own = replace(frames.select(right), weight=weight / sigma_px[right])
         likelihood = MarginalLikelihood(own, camera.distortion)
-        variance = (sigma_px[right] / _stated(part)) ** 2
+        variance = (sigma_px[right] / part.sigma_or_one) ** 2
         last, before = found, sigma_px
         found = _round(part, camera.with_theta(theta), likelihood, variance, last, weight)
         sigma_px = found.model.sigma_px(obs)
@@ -274,7 +279,7 @@ def _round(
         else _fitted(stars, last.fit.terms, last.fit.frame_dof is not None)
     )
     variance = fit.variance(stars)
-    weight = 1.0 / (_stated(obs) * np.sqrt(variance))
+    weight = 1.0 / (obs.sigma_or_one * np.sqrt(variance))
     if precision is not None:
         weight = weight * precision
     alike = MarginalLikelihood(
@@ -289,11 +294,6 @@ def _settled(found: _Round, last: _Round | None, now: FloatArray, before: FloatA
     if last is None or abs(found.model.axis_ratio / last.model.axis_ratio - 1.0) >= _SETTLED:
         return False
     return bool(np.max(np.abs(now / before - 1.0)) < _SETTLED)
-
-
-def _stated(obs: Observations) -> FloatArray:
-    """Noise (N,) that the stars state; 1 where they do not."""
-    return obs.sigma_or_one
 
 
 def uneven_p(
@@ -340,9 +340,7 @@ def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: fl
     likelihood = MarginalLikelihood(obs, camera.distortion)
     state, _ = likelihood.profile(camera.theta)
     h = likelihood.slopes(camera.theta, state)
-    whitened = model.sigma_px(obs) * (
-        1.0 if likelihood.frames.weight is None else likelihood.frames.weight
-    )
+    whitened = model.sigma_px(obs) / obs.sigma_or_one
     turned = (
         h if model.axes is None else np.einsum("pxn,xy->pyn", h, np.linalg.cholesky(model.axes))
     )

@@ -87,14 +87,18 @@ class Zeniths:
     @cached_property
     def among_stars(self) -> FloatArray:
         """Zeniths of the frames (K, 3), ICRS axes."""
-        return np.asarray(np.einsum("kj,kjx->kx", self._by_frame(self.places), self.axes))
+        return self._ways[0]
+
+    @cached_property
+    def _ways(self) -> FloatArray:
+        """Zeniths of the frames, and their ways to the north and to the east (3, K, 3), ICRS axes."""
+        ways = np.stack([self.places, *tangents(self.places)])
+        ways = np.broadcast_to(ways, (3, *self.axes.shape[:2]))
+        return np.asarray(np.einsum("akj,kjx->akx", ways, self.axes))
 
     def seen_in(self, obs: Observations) -> Zeniths:
         """The same place below the frames of a table."""
         return replace(self, frame_ids=obs.frame_ids, axes=frame_axes(obs)[0])
-
-    def _by_frame(self, places: FloatArray) -> FloatArray:
-        return np.broadcast_to(places, (len(self.axes), 3))
 
     def moved(self, coefficients: FloatArray, boresights: FloatArray) -> Zeniths:
         """The zeniths that coefficients (m,) point to, at most so far away; where these prefer its
@@ -102,8 +106,7 @@ class Zeniths:
         """
         turn = coefficients[: self.sizes[0]].reshape(2, -1)
         turn = turn * np.minimum(1.0, _LONGEST_RAD / np.maximum(np.hypot(*turn), 1e-12))
-        north, east = tangents(self.places)
-        places = self.places + turn[0][:, None] * north + turn[1][:, None] * east
+        places = self.places + np.einsum("an,anx->nx", turn, np.stack(tangents(self.places)))
         choice = coefficients[self.sizes[0] : -1]
         if self.apiece:
             level = np.sum(places * boresights, axis=1)[:, None]
@@ -118,8 +121,6 @@ class Zeniths:
         number = np.minimum(number, len(self.frame_ids) - 1)
         known = self.frame_ids[number] == obs.frame
         member = number if self.apiece else np.zeros_like(number)
-        ways = np.stack([self._by_frame(way) for way in tangents(self.places)])
-        ways = np.einsum("akj,kjx->akx", ways, self.axes)
         moves, choices, _ = self.sizes
 
         def columns(view: View) -> FloatArray:
@@ -127,8 +128,7 @@ class Zeniths:
             rotations = np.repeat(state.rotations, frames.sizes, axis=0)
             constants = air_constants()
             zenith, *moving = (
-                np.einsum("nij,nj->in", rotations, vector[rows])
-                for vector in (self.among_stars, *ways)
+                np.einsum("nij,nj->in", rotations, vector[rows]) for vector in self._ways
             )
 
             def seen(moves: FloatArray) -> FloatArray:
