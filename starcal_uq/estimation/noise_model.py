@@ -108,8 +108,8 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     `likelihood`: of weights whose axes are alike.
     `theta` (p,): estimate, px units.
     """
-    state, *held = _held(likelihood, theta)
-    return axis_noise_beside(likelihood.frames, *held, state.e, likelihood.dof)
+    state, attitude, camera = _held(likelihood, theta)
+    return axis_noise_beside(likelihood.frames, attitude, camera, state.e, likelihood.dof)
 
 
 def axis_noise_beside(

@@ -87,7 +87,7 @@ class Zeniths:
     @cached_property
     def among_stars(self) -> FloatArray:
         """Zeniths of the frames (K, 3), ICRS axes."""
-        return self._ways[0]
+        return np.asarray(self._ways[0])
 
     @cached_property
     def _ways(self) -> FloatArray:
