@@ -53,7 +53,7 @@ def test_the_axis_that_decouples_is_named_with_its_numbers(decoupled: Study) -> 
     assert ("number of frames", "−0.50") in {(row[1], row[-1]) for row in changes.rows}
     assert len(medians.rows) == 6 and "1000" in [row[1] for row in medians.rows]
     answer = " ".join(study_answer(decoupled))
-    assert "one of f and k1 in 100 %" in answer and "with 1.8 times the variance" in answer
+    assert "one of f and k1 in 100" in answer and "with 1.8 times the variance" in answer
     assert "The target of 0.5 arcsec is met in 3 of 8 places" in answer
     assert "The target of 0.050 px for f is met in 3 of 8 places" in answer
     advice = " ".join(study_advice(decoupled))
