@@ -1,6 +1,6 @@
 """Star identification on random frames, beside tetra3rs on the same frames.
 
-    python benchmarks/identify.py [--frames 1000] [--seed 2004] [--engine tetra3rs]
+    python benchmarks/identify.py [--frames 1000] [--seed 2004]
 
 A frame is correct when at least four stars are identified and all of them rightly; wrong when a
 single one is not. Brightness is known to 0.2 mag; a false star has the magnitude of any star of the
@@ -24,7 +24,6 @@ from rich.table import Table
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.identification.engine import identify
-from starcal_uq.identification.proposers import ENGINES
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.sky.positions import unit_vectors
 
@@ -86,9 +85,7 @@ def score(correct: float, wrong: float, times: Any, failed: Any) -> Score:
     return Score(correct, wrong, float(np.median(times)), float(np.percentile(times, 95)), slow)
 
 
-def score_ours(
-    frames: list[Frame], stars: Any, nominal: sc.Camera, engine: Any = "pyramid"
-) -> Score:
+def score_ours(frames: list[Frame], stars: Any, nominal: sc.Camera) -> Score:
     """`identify`, each frame by itself."""
     n = [len(f.xy) for f in frames]
     xy = np.concatenate([f.xy for f in frames])
@@ -102,7 +99,7 @@ def score_ours(
         image=[""] * len(frames),
         time_utc=[None] * len(frames),
     )
-    found = identify(table, nominal, stars, engine=engine, share_camera=False, cache=False)
+    found = identify(table, nominal, stars, share_camera=False, cache=False)
     row = {
         (f, x): i
         for i, (f, x) in enumerate(zip(table.frame.tolist(), table.x_px.tolist(), strict=True))
@@ -179,9 +176,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2004)
     parser.add_argument("--fields", type=float, nargs="+", default=[8.0, 12.0, 20.0])
     parser.add_argument("--max-mag", type=float, default=6.0)
-    parser.add_argument(
-        "--engine", choices=ENGINES, default="pyramid", help="what proposes attitudes to starcal_uq"
-    )
     parser.add_argument("--no-rival", action="store_true")
     arguments = parser.parse_args()
     try:
@@ -220,7 +214,7 @@ def main() -> None:
                 stars, camera(fov, focal, shift), arguments.frames, arguments.seed, false, missing
             )
             few = np.mean([np.sum(f.star >= 0) < 4 for f in frames])
-            scores = {"starcal_uq": score_ours(frames, stars, camera(fov), arguments.engine)}
+            scores = {"starcal_uq": score_ours(frames, stars, camera(fov))}
             if database is not None:
                 scores["tetra3rs"] = score_tetra3rs(
                     frames, stars, camera(fov), database, focal != 1.0

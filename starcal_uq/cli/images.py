@@ -92,7 +92,7 @@ def identify_command(
     calibration: Path | None = None,
     focal_tolerance: float = 0.03,
     centre_tolerance: float | None = None,
-    engine: settings.Engine = "pyramid",
+    engine: str = "pyramid",
     *,
     place: PlaceSettings,
     force: bool = False,

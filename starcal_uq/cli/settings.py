@@ -128,7 +128,7 @@ class ImageSettings:
     focal_tolerance: float | None = None
     gain: float | None = None
     bayer: settings.Bayer | None = None
-    engine: settings.Engine | None = None
+    engine: str | None = None
 
 
 @dataclass(frozen=True)

