@@ -9,8 +9,6 @@ bound, and it has no pixel-phase error because the integration over pixels is in
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -164,7 +162,7 @@ def fit_stars(
         _add_others(others, stamps, state, pairs)
     px, py = _profiles(stamps, u, v, sigma, 1)
     _, weight = _weighted(stamps, flux, px[:, 0], py[:, 0], others)
-    covariance = _inverse(_normal(px, py, weight, flux))
+    covariance = _inverse(_normal(_derivatives(px, py, flux), weight))
     residual = stamps.counts if others is None else stamps.counts - others
     return StarFit(u + stamps.x0, v + stamps.y0, flux, covariance, sigma, weight, residual)
 
@@ -223,17 +221,9 @@ def _settled(
             _add_others(others, stamps, state, here)
             light = others if part is stamps else others[moving]
         rest, weight = _weighted(part, flux, px[:, 0], py[:, 0], light)
-        normal = _normal(px, py, weight, flux)
-        rest *= weight
-        first = _contracted(px, rest, py)
-        gradient = np.empty((len(moving), 3 + free_sigma))
-        gradient[:, 0], gradient[:, 1], gradient[:, 2] = (
-            flux * first[:, 0, 1],
-            flux * first[:, 1, 0],
-            first[:, 0, 0],
-        )
-        if free_sigma:
-            gradient[:, 3] = flux * (first[:, 0, 2] + first[:, 2, 0])
+        jacobian = _derivatives(px, py, flux)
+        normal = _normal(jacobian, weight)
+        gradient = np.einsum("npk,nk->np", jacobian, (rest * weight).reshape(len(rest), -1))
         solution, determined = _solve(normal, gradient[:, :, None])
         step = np.where(determined, solution[:, :, 0].T, 0.0)
         done = np.einsum("in,ni->n", step, gradient) < _TOLERANCE_SIGMAS**2
@@ -286,36 +276,23 @@ def _weighted(
     return rest, np.divide(stamps.good, bright, out=bright)
 
 
-# The derivatives by x, y, flux and log width as sums of products of a row along y and a row along
-# x, over the flux.
-_PRODUCTS = (((0, 1),), ((1, 0),), ((0, 0),), ((0, 2), (2, 0)))
+def _derivatives(px: FloatArray, py: FloatArray, flux: FloatArray) -> FloatArray:
+    """Derivatives (n, p, m * m) of the star images by x, y, flux and perhaps log width."""
+    f = flux[:, None]
+    found = [
+        _gaussian(f * px[:, 1], py[:, 0]),
+        _gaussian(f * px[:, 0], py[:, 1]),
+        _gaussian(px[:, 0], py[:, 0]),
+    ]
+    if px.shape[1] > 2:
+        found.append(_gaussian(f * px[:, 2], py[:, 0]) + _gaussian(f * px[:, 0], py[:, 2]))
+    return np.stack(found, axis=1).reshape(len(flux), len(found), -1)
 
 
-@lru_cache
-def _products(k: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Pairs of k rows along an axis, and the matrix from sums over their products to normal
-    matrices, flattened.
-    """
-    first, second = np.triu_indices(k)
-    place = np.zeros((k, k), dtype=np.int64)
-    place[first, second] = place[second, first] = np.arange(len(first))
-    matrix = np.zeros((len(first), len(first), k + 1, k + 1))
-    for i, j in np.ndindex(k + 1, k + 1):
-        for (a, b), (c, d) in product(_PRODUCTS[i], _PRODUCTS[j]):
-            matrix[place[a, c], place[b, d], i, j] += 1.0
-    return first, second, matrix.reshape(len(first) ** 2, -1)
-
-
-def _normal(px: FloatArray, py: FloatArray, weight: FloatArray, flux: FloatArray) -> FloatArray:
-    """Normal matrices (n, p, p) of x, y, flux and perhaps log width."""
-    n, k = px.shape[:2]
-    first, second, matrix = _products(k)
-    sums = _contracted(px[:, first] * px[:, second], weight, py[:, first] * py[:, second])
-    normal: FloatArray = (sums.reshape(n, len(first) ** 2) @ matrix).reshape(n, k + 1, k + 1)
-    factor = np.repeat(flux[:, None], k + 1, axis=1)
-    factor[:, 2] = 1.0
-    normal *= factor[:, :, None]
-    normal *= factor[:, None, :]
+def _normal(derivatives: FloatArray, weight: FloatArray) -> FloatArray:
+    """Normal matrices (n, p, p) of derivatives and weights (n, m, m)."""
+    weighted = derivatives * weight.reshape(len(weight), 1, -1)
+    normal: FloatArray = weighted @ derivatives.transpose(0, 2, 1)
     return normal
 
 
