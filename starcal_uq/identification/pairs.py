@@ -14,7 +14,6 @@ import os
 import sys
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.records import read_arrays
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, PathLike
+from starcal_uq.core.types import FloatArray, IntArray, PathLike
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -37,9 +36,6 @@ PATTERN_STARS = 18
 _MOST_PAIRS = 5_000_000
 # Steps of angle in the table of neighbours of a star, and of all of them.
 _STEPS, _ALL_STEPS = (8, 256), 1 << 22
-# Numbers of the table of cubes that says where no star is near, its least chord, and questions that
-# it is worth.
-_CUBES, _LEAST_CUBE, _MANY = 1 << 22, 2.0**-12, 5_000
 # Pairs whose angles are computed together.
 _AT_ONCE = 1 << 17
 # Part of the key of every cache file: to be raised when the content or its meaning changes.
@@ -93,27 +89,6 @@ class StarPairs:
             np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad
         )
         return question[inside], self.neighbour[row[inside]]
-
-    def near_place(self, directions: FloatArray, chord: float) -> tuple[IntArray, FloatArray]:
-        """Rows of the unit vectors (m, 3) that may have a pattern star within a chord, and how near
-        the nearest is.
-
-        For many of them a table of small cubes says where there is none, sooner than the tree.
-        """
-        place = np.arange(len(directions))
-        size = 2.0 ** (0.5 * np.ceil(2.0 * np.log2(max(chord, _LEAST_CUBE))))
-        if size in self._cubes or len(place) > _MANY:
-            if size not in self._cubes:
-                self._cubes[size] = _cubes_near(self.directions, size)
-            place = np.flatnonzero(self._cubes[size][_hash(directions * (1.0 / size))])
-        return place, self.tree.query(directions[place], distance_upper_bound=chord)[0]
-
-    @cached_property
-    def _cubes(self) -> dict[float, BoolArray]:
-        """For each size of cubes those, by hash, that a pattern star is in, or not farther from
-        than such a size.
-        """
-        return {}
 
     def ready(self) -> StarPairs:
         """The same, with what is derived made now, so that no frame waits for it."""
@@ -196,31 +171,6 @@ def find_star_pairs(
     first, second = np.ascontiguousarray(pairs.T)
     start = by_star.indptr.astype(np.int64)
     return StarPairs(star, chosen, first, second, angle, neighbour, angle[by_star.data // 2], start)
-
-
-def _cubes_near(directions: FloatArray, size: float) -> BoolArray:
-    """Which cubes, by hash, are not farther than their size from one of the directions (n, 3)."""
-    table = np.zeros(_CUBES, dtype=np.bool_)
-    inside = directions / size - np.floor(directions / size)
-    steps = (-1, 0, 1)
-    apart = [
-        [np.maximum(np.maximum(k - x, x - k - 1.0), 0.0) ** 2 for k in steps] for x in inside.T
-    ]
-    for i, j, k in product(range(3), repeat=3):
-        near = apart[0][i] + apart[1][j] + apart[2][k] <= 1.0 + 1e-6
-        table[_hash(directions[near] / size + (i - 1.0, j - 1.0, k - 1.0))] = True
-    return table
-
-
-def _hash(place: FloatArray) -> NDArray[np.int32]:
-    """A number below `_CUBES` of the unit cube that each place (m, 3) is in; that integers overflow
-    is meant.
-    """
-    x, y, z = np.floor(place).astype(np.int32).T
-    number: NDArray[np.int32] = (
-        x * np.int32(73856093) ^ y * np.int32(19349663) ^ z * np.int32(83492791)
-    )
-    return number & np.int32(_CUBES - 1)
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -261,9 +261,8 @@ def _supported(
     gate_px = SIGMAS * np.hypot(sigma[others], noise * (1.0 + 1.5 * reach / span))
     gate_px = gate_px + geometry.relative_bias(tolerance) * (reach + span)
     gate = gate_px / geometry.focal_px
-    place, distance = pairs.near_place(sky.reshape(-1, 3), float(gate.max()))
-    candidate, other = np.divmod(place, len(others))
-    support = np.bincount(candidate[distance < gate[other]], minlength=len(candidates))
+    distance, _ = pairs.tree.query(sky, distance_upper_bound=float(gate.max()))
+    support = np.count_nonzero(distance < gate, axis=1)
     best = np.argsort(-support, kind="stable")
     best = best[support[best] > 0][:_HANDED_ON]
     return [Hypothesis(rotation[m], float(scale[m])) for m in best]
