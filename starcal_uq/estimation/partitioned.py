@@ -47,7 +47,7 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.solvers import Normal, is_singular, levenberg_marquardt
 from starcal_uq.likelihood.sums import NormalSums, frame_sums, settled_sums, sum_of
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
-from starcal_uq.observations.checks import mixed_bits
+from starcal_uq.observations.checks import row_hashes
 from starcal_uq.observations.partitions import (
     Partition,
     PartitionedObservations,
@@ -88,7 +88,7 @@ def _look(
         return _Seen(sums, hashes, obs.frame_ids[:0], np.empty(0, dtype=np.uint64))
     # Equal pixels in any order of the stars have equal sums.
     with np.errstate(over="ignore"):
-        content = np.add.reduceat(mixed_bits(obs.x_px, obs.y_px), obs.frame_starts[:-1])
+        content = np.add.reduceat(row_hashes(obs.x_px, obs.y_px), obs.frame_starts[:-1])
     return _Seen(sums, hashes, obs.frame_ids, content)
 
 
