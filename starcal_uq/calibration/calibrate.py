@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Unpack, get_args
 
@@ -17,7 +17,7 @@ from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.settings import RecursiveMethod, bounded
 from starcal_uq.core.tasks import one_thread, processors
-from starcal_uq.core.types import FloatArray, Progress
+from starcal_uq.core.types import AnyDict, Progress
 from starcal_uq.estimation.assemble import raise_unless_good
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.effects import with_effects, without_effects
@@ -29,7 +29,7 @@ from starcal_uq.estimation.settings import METHODS as METHODS
 from starcal_uq.estimation.settings import EstimationOptions, EstimationSettings
 from starcal_uq.estimation.ties import with_ties
 from starcal_uq.estimation.weighing import gains, with_weighing
-from starcal_uq.estimation.weights import by_noise_model, weighed
+from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood import paths
 from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.observations.partitions import PartitionedObservations
@@ -301,122 +301,96 @@ def _of_table(
         return with_weighing(obs, calibration, settings.noise, settings.tails)
     if "auto" in settings.names:
         return _selected(obs, calibration, settings)
-    found = _with_all(obs, calibration, settings)
-    return with_weighing(obs, found, settings.noise, settings.tails)
+    return _with_all(obs, calibration, settings)
 
 
 def _selected(obs: Observations, cal: Calibration, settings: EstimationSettings) -> Calibration:
     """The calibration with the effects that the data ask for, noise and tails among them.
 
-    Where one of these gains more than the first effect that shifts stars, or enough beside all of
-    them, the others are selected again with it, and then the other one is tried beside it. One of
-    them that gains too little beside the other is dropped.
+    Where one of these gains more than each effect that shifts stars, or enough beside all of them,
+    these are selected again with it, and then the other one is tried beside it. One of them that
+    gains too little beside the other is dropped.
     """
-    found = with_weighing(obs, _with_all(obs, cal, settings), settings.noise, settings.tails)
-    asked, before = settings.names, cal
-    moved: dict[str, FloatArray] = {}
+    asked = tuple(name for name in settings.names if name != "auto")
+    found, moved = _with_all(obs, cal, settings), dict[str, AnyDict]()
     while True:
-        left, least = _gained(obs, before, found, settings)
+        left, least = _gained(obs, found, settings)
         best = max((name for name in left if name not in moved), key=left.__getitem__, default="")
         if not best or left[best] <= least:
-            return _told(found, asked, left, moved)
+            break
         more = settings.changed(effects=[*settings.names, best])
         trial = _refitted(obs, cal, more)
-        weak = {} if trial is None else _weak(trial[1], asked)
-        if trial is None or best in weak:
-            return _told(found, asked, left | weak, moved)
+        if trial is None or trial.effects is None:
+            break
+        gained = {one.name: one.gain_nat for one in trial.effects.weighing}
+        weak = [
+            name
+            for name in gained
+            if name not in asked and gained[name] <= trial.effects.penalty_nat
+        ]
+        if best in weak:
+            left |= {best: gained[best]}
+            break
         if weak:
-            more = settings.changed(effects=[*asked, best])
+            more = settings.changed(effects=["auto", *asked, best])
             trial = _refitted(obs, cal, more) or trial
-        moved[best] = np.abs(trial[1].theta - found.theta) / trial[1].sigmas
-        (before, found), settings = trial, more
+        sizes = np.abs(trial.theta - found.theta) / trial.sigmas
+        worst = int(np.argmax(sizes))
+        moved[best] = {"moved_sigma": float(sizes[worst]), "moved_name": cal.parameter_names[worst]}
+        found, settings = trial, more
+    assert found.effects is not None
+    refused = sorted((*found.effects.refused, *left.items()), key=lambda one: -one[1])
+    weighing = [replace(one, **moved.get(one.name, {})) for one in found.effects.weighing]
+    held = replace(found.effects, weighing=tuple(weighing), refused=tuple(refused), asked=asked)
+    return replace(found, effects=held)
 
 
 def _refitted(
     obs: Observations, cal: Calibration, settings: EstimationSettings
-) -> tuple[Calibration, Calibration] | None:
-    """The calibration with other effects that weigh stars, before and beside those that shift them;
-    None where there is none.
-    """
+) -> Calibration | None:
+    """The calibration with other effects that weigh stars; None where there is none."""
     again = fit_weighed(obs, cal.nominal, settings)
     if not again.status.ok:
         return None
-    known = {name: cal.provenance[name] for name in ("fallback",) if name in cal.provenance}
+    known = {name: value for name, value in cal.provenance.items() if name == "fallback"}
     again = replace(again, provenance=again.provenance.adding(**known))
-    found = _with_all(obs, again, settings)
-    return again, with_weighing(obs, found, settings.noise, settings.tails)
-
-
-def _weak(cal: Calibration, asked: Sequence[str]) -> dict[str, float]:
-    """Gains of noise and tails that were not asked for, where these are too small beside the other
-    effects.
-    """
-    assert cal.effects is not None
-    least = cal.effects.penalty_nat
-    gained = {one.name: one.gain_nat for one in cal.effects.weighing if one.name not in asked}
-    return {name: gain for name, gain in gained.items() if gain <= least}
+    return _with_all(obs, again, settings)
 
 
 def _gained(
-    obs: Observations, before: Calibration, found: Calibration, settings: EstimationSettings
+    obs: Observations, cal: Calibration, settings: EstimationSettings
 ) -> tuple[dict[str, float], float]:
-    """What noise and tails that are not in the settings would gain, before effects that shift stars
-    or else beside them, and what they have to.
-    """
-    assert found.effects is not None
-    if settings.tails:
-        before = with_tail_weights(by_noise_model(obs, before), before)
-    fitted, least = found.effects.fitted, found.effects.penalty_nat
-    gained = gains(obs, before, settings.noise, settings.tails)
-    if not (fitted and max(gained.values(), default=0.0) < max(one.gain_nat for one in fitted)):
-        return gained, least
-    # What effects of few images leave is uneven by itself: beside the others noise and tails have
-    # to gain more than these.
-    shared = [one.name for one in fitted if one.name not in _OF_FEW_IMAGES]
-    beside = found
-    if len(shared) < len(fitted):
-        beside = with_effects(weighed(obs, before), before, shared)
-        least = max([least, *(one.gain_nat for one in fitted if one.name not in shared)])
-    return gains(without_effects(obs, beside), beside, settings.noise, settings.tails), least
+    """What noise and tails that are not in the settings would gain, and what they have to: alone
+    where that is more than any effect that shifts stars has gained, else beside these.
 
-
-def _told(
-    cal: Calibration,
-    asked: Sequence[str],
-    left: Mapping[str, float],
-    moved: Mapping[str, FloatArray],
-) -> Calibration:
-    """The calibration with what noise and tails that the data chose have moved, parameters (p,) in
-    their standard deviations, and with what those that are left would gain.
+    What effects of few images leave is uneven by itself: beside the others noise and tails have to
+    gain more than these.
     """
     assert cal.effects is not None
-    weighing = []
-    for one in cal.effects.weighing:
-        sizes = moved.get(one.name)
-        if sizes is not None:
-            worst = int(np.argmax(sizes))
-            size, name = float(sizes[worst]), cal.parameter_names[worst]
-            one = replace(one, moved_sigma=size, moved_name=name)
-        weighing.append(one)
-    refused = tuple(sorted((*cal.effects.refused, *left.items()), key=lambda one: -one[1]))
-    asked = tuple(name for name in asked if name != "auto")
-    held = replace(cal.effects, weighing=tuple(weighing), refused=refused, asked=asked)
-    return replace(cal, effects=held)
+    fitted, least = cal.effects.fitted, cal.effects.penalty_nat
+    few = [one.gain_nat for one in fitted if one.name in _OF_FEW_IMAGES]
+    shared = [one.name for one in fitted if one.name not in _OF_FEW_IMAGES]
+    gained = gains(obs, cal, settings.noise, settings.tails)
+    if max(gained.values(), default=0.0) >= max((one.gain_nat for one in fitted), default=0.0):
+        return gained, least
+    if shared:
+        cal = with_effects(weighed(obs, cal), cal, shared) if few else cal
+        gained = gains(without_effects(obs, cal), cal, settings.noise, settings.tails)
+    return gained, max([least, *few])
 
 
 def _with_all(obs: Observations, cal: Calibration, settings: EstimationSettings) -> Calibration:
     """The calibration with effects that shift stars; others are found again beside these."""
     found = _with_shifts(obs, obs, cal, settings)
-    if not (found.effects and found.effects.fitted and (settings.noise or settings.tails)):
-        return found
-    # Noise and tails of a camera without its effects hold these, too.
-    again = fit_weighed(without_effects(obs, found), cal.nominal, settings)
-    if not again.status.ok:
-        return found
-    # It is still an estimate from the table as it is.
-    made_of = cal.provenance.data_sha256
-    again = replace(again, provenance=again.provenance.adding(data_sha256=made_of))
-    return _with_shifts(obs, without_effects(obs, found), again, settings)
+    if found.effects and found.effects.fitted and (settings.noise or settings.tails):
+        # Noise and tails of a camera without its effects hold these, too.
+        again = fit_weighed(without_effects(obs, found), cal.nominal, settings)
+        if again.status.ok:
+            # It is still an estimate from the table as it is.
+            made_of = cal.provenance.data_sha256
+            again = replace(again, provenance=again.provenance.adding(data_sha256=made_of))
+            found = _with_shifts(obs, without_effects(obs, found), again, settings)
+    return with_weighing(obs, found, settings.noise, settings.tails)
 
 
 def _with_shifts(

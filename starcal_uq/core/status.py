@@ -187,7 +187,7 @@ class Note(Enum):
     NOISE_LIKE_ARCSECONDS = auto()
     MODEL_IS_WRONG = auto()
     HEADLINE = auto()
-    NO_MODEL_EXPLAINS = auto()
+    NOT_USABLE = auto()
 
 
 @dataclass(frozen=True)

@@ -70,21 +70,14 @@ def gains(obs: Observations, cal: Calibration, noise: bool, tails: bool) -> dict
         found["tails"] = max(-float(best.fun) - log_density(freed, None), 0.0)
     if not noise:
         if tails:
-            squares = 0.5 * share * _as_gaussian(cal, share)
+            # Squares of Gaussian residuals that are as improbable as those of a Student t.
+            assert cal.star_weights is not None
+            nu = float(cal.provenance.student_t["dof"])
+            squares = nu * np.log((nu + 2.0) / (nu * cal.star_weights))
         p = [*uneven_p(obs, cal.camera, squares, share), axes_p(likelihood, cal.theta)]
         chance = min(len(p) * min(p), 0.5)
         found["noise"] = 0.5 * float(chdtri(1.0, 2.0 * chance))
     return found
-
-
-def _as_gaussian(cal: Calibration, share: FloatArray) -> FloatArray:
-    """Squares (N,) of two axes of Gaussian residuals that are as improbable as those of the stars,
-    whose tails are a Student t; `share` (N,) of the two is left by the fit.
-    """
-    assert cal.star_weights is not None and cal.provenance.tail_weights is not None
-    nu = float(cal.provenance.tail_weights["dof"])
-    squares = (nu + 2.0) / cal.star_weights - nu
-    return np.asarray(nu * np.log1p(2.0 * squares / (nu * share)))
 
 
 def with_weighing(obs: Observations, cal: Calibration, noise: bool, tails: bool) -> Calibration:

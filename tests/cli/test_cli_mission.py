@@ -191,7 +191,7 @@ def test_a_budget_is_a_further_result_whose_requirements_are_checks_of_the_run(
     assert "<b>Requirement &#39;R-1 impossible&#39;.</b>" in first_page
     assert "requirement &#39;R-1 impossible&#39; is violated" in first_page
     # What is violated is the mission's: the numbers of the camera stay what they are.
-    assert "Do not use these numbers" not in answer.results["verdict"].headline
+    assert "Not usable" not in answer.results["verdict"].headline
     assert answer.results["verdict"].headline.endswith("Open: requirement 'R-2 generous'.")
     # All of it belongs to the run, and goes with what it rests on.
     record = json.loads((run / "run.json").read_text())

@@ -55,7 +55,7 @@ def test_what_is_printed_without_effects_is_followed_to_its_end(name, call, tmp_
     else:
         # Where the times are not known no command can be copied, and no other is printed before
         # they are.
-        assert len(steps) == 1 and "times in UTC and the site" in steps[0].said
+        assert len(steps) == 1 and "would tell: the time of every frame in UTC" in steps[0].said
 
 
 @pytest.mark.slow

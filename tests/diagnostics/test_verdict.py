@@ -12,7 +12,8 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
-from starcal_uq.core.status import Check, Code, Level, Question
+from starcal_uq.core.remedy import calibrated
+from starcal_uq.core.status import Advice, Check, Code, Level, Order, Question
 from starcal_uq.diagnostics.diagnose import diagnose
 from starcal_uq.diagnostics.models import REJECT_P
 from starcal_uq.diagnostics.residuals import (
@@ -129,7 +130,59 @@ def test_bad_sampling_fails(run, name, changes):
     assert outcome(name, run.obs, run.cal, post).level is Level.FAIL
     verdict = judge(run.obs, run.cal, post)
     assert verdict.level is Level.FAIL
-    assert verdict.headline.startswith("Do not use")
+    assert verdict.headline.startswith("Not usable, because ")
+
+
+STRUCTURE = Check(
+    Code.UNEXPLAINED_STRUCTURE,
+    {"effects": ("field", "phase")},
+    Level.FAIL,
+    remedies=calibrated(effects="auto"),
+)
+REFRACTION = Check(
+    Code.CATALOGUE_DIRECTIONS, {}, Level.FAIL, remedies=calibrated("command", site="S", time="T")
+)
+STARS = Check(Code.ERRORS_OF_THE_STARS, {}, Level.FAIL, orders=(Order(Advice.WITHOUT_STAR_ERRORS),))
+SITE = {"latitude_deg": 52.0, "longitude_deg": 4.4}
+
+
+@pytest.mark.parametrize(
+    ("check", "words"),
+    [
+        (
+            STRUCTURE,
+            "unexplained structure failed; if nothing to try helps, these data would tell: the same "
+            "stars at other places of the detector and frames that are shifted by parts of a pixel.",
+        ),
+        (
+            REFRACTION,
+            "catalogue directions failed; if nothing to try helps, these data would tell: the time "
+            "of every frame in UTC and the site.",
+        ),
+        (
+            STARS,
+            "errors of the stars failed and no model here explains this; these data would tell: "
+            "directions from another catalogue.",
+        ),
+    ],
+)
+def test_what_is_not_usable_is_one_statement_with_the_data_that_would_tell(run, check, words):
+    verdict = judge(run.obs, run.cal, requirements=[check])
+    assert verdict.headline == f"Not usable, because {words}"
+    assert verdict.ended == (verdict.headline if check is STARS else "")
+    assert words in verdict.text
+    # The control: a warning asks for no data.
+    mild = judge(run.obs, run.cal, requirements=[dataclasses.replace(check, level=Level.WARN)])
+    assert "would tell" not in mild.headline
+
+
+def test_data_that_were_given_are_not_asked_for(run):
+    placed = run.obs.with_origin(site=SITE)
+    assert "would tell: the time" in judge(placed, run.cal, requirements=[REFRACTION]).headline
+    times = np.full(run.obs.n_stars, "2026-11-26T02:00:00")
+    timed = dataclasses.replace(placed, time_utc=times)
+    verdict = judge(timed, run.cal, requirements=[REFRACTION])
+    assert verdict.headline == "Not usable, because catalogue directions failed."
 
 
 def with_draws(post, change):

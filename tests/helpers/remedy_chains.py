@@ -187,15 +187,15 @@ def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
             assert conflict(named(asked)) is None, command
             assert asked not in [*(step.options for step in steps), options], command
             assert not {"UTC", "SITE", "OBS", "CAMERA"} & set(shlex.split(command)), command
-        end = re.search(r"No model here explains this[\s\S]*?(?=^Report:)", out, re.M)
-        said = " ".join(end[0].split()) if end else ""
+        whole = " ".join(out.split())
+        said = whole if "no model here explains this" in whole else ""
         doubts = counts.get("failed", 0), counts.get("gave", 0)
         # A failure that nothing is left to try against is said to be one, with the data that would
         # tell.
         assert bool(said) == (bool(doubts[0]) and not commands), (options, out[-1500:])
-        assert not said or ("usable: " in said and "not: " in said and "What would tell" in said), (
-            said
-        )
+        assert not said or all(
+            words in said for words in ("usable: ", "not: ", "Not usable, because ", "would tell: ")
+        ), said
         steps.append(Step(options, status, doubts, commands, said))
         for command in set(commands) - set(runs):
             status, _, err = call(shlex.split(command)[1:])

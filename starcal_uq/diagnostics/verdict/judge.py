@@ -7,8 +7,10 @@ warning means that they may be used by someone who has read it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import TYPE_CHECKING, ClassVar
 
 from starcal_uq.core.display import Shown
@@ -22,7 +24,6 @@ from starcal_uq.diagnostics.verdict.remedies import (
     MOST_COMMANDS,
     Place,
     by_cause,
-    first_cause,
 )
 from starcal_uq.estimation.weights import weighed
 
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
 
 VERSION = 1
+_WHOLE = re.compile(r"(?<![\w.])\d+(?![\w.])")
 
 
 @dataclass(frozen=True)
@@ -49,33 +51,31 @@ class Verdict(Shown):
         What follows from them.
     to_try : tuple of Remedy
         What to try, in this order; at most three.
-    end : Finding, optional
-        That no model here explains the data; None where something is left to try.
     """
 
     DOCUMENTED: ClassVar = ("level",)
     WRITTEN_AS: ClassVar = {
-        "summary": ("headline",),
+        "summary": ("headline", "ended"),
         "to_try": ("commands",),
-        "end": ("ended",),
     }
 
     checks: tuple[Check, ...]
     summary: Finding
     to_try: Remedies = ()
-    end: Finding | None = None
 
     @property
     def headline(self) -> str:
-        """The verdict in one sentence."""
+        """The verdict in one statement: usable, usable with these effects, or not usable, because
+        of these checks, and which data would tell.
+        """
         return self.summary.sentence
 
     @property
     def ended(self) -> str:
-        """That no model here explains the data, and which data would tell; empty where something is
-        left to try.
+        """The headline where no model here explains the data; empty where something is left to
+        try.
         """
-        return "" if self.end is None else self.end.sentence
+        return "" if self.summary.values.get("tried") is None else self.headline
 
     @property
     def level(self) -> Level:
@@ -169,16 +169,27 @@ def judge(
     checks += requirements
     held = () if cal.effects is None else cal.effects.names
     place = place if place is None else replace(place, held=held)
-    found = tuple(
-        check if place is None else place.exact(check) for check in checks if check is not None
-    )
-    to_try, end = _way_on(found, place)
-    return Verdict(found, _summary(found, post is not None, rests, held), to_try, end)
+    made = [check for check in checks if check is not None]
+    found = tuple(check if place is None else place.exact(check) for check in made)
+    required = [check for check in found if check.question is Question.REQUIRED]
+    others = [check for check in found if check.question is not Question.REQUIRED]
+    violated, failed = _phrases(required, Level.FAIL), _phrases(others, Level.FAIL)
+    facts: AnyDict = {"violated": violated, "unmet": _phrases(required, Level.WARN)}
+    facts["doubts"] = failed or _phrases(others, Level.WARN)
+    to_try, tried = _way_on(others, place)
+    if failed:
+        facts |= {"tried": tried, "data": _telling(made, obs)}
+        return Verdict(found, Finding(Note.NOT_USABLE, facts), to_try)
+    facts |= {"sampled": post is not None, "effects": held, "rests": None if violated else rests}
+    return Verdict(found, Finding(Note.HEADLINE, facts), to_try)
 
 
-def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[Remedies, Finding | None]:
-    """The remedies to try, those of the first cause first, or that there is none that helps."""
-    doubts = [check for check in checks if check.question is not Question.REQUIRED]
+def _way_on(
+    doubts: Sequence[Check], place: Place | None
+) -> tuple[Remedies, tuple[str, ...] | None]:
+    """The remedies to try, those of the first cause first; or what was tried, where none is left
+    against a failure.
+    """
     every: list[Remedy] = []
     for cause, some in by_cause(doubts).items():
         every += [one for check in some for one in check.remedies if one.form != "call"]
@@ -186,60 +197,43 @@ def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[Remedies, F
             # What comes after it in the order may be its consequence.
             break
     to_try = _largest(every)[:MOST_COMMANDS]
-    tried = () if place is None else place.tried
-    if worst(doubts) is not Level.FAIL or (
-        to_try and not (place is not None and place.exhausted(doubts))
-    ):
+    left = to_try and not (place is not None and place.exhausted(doubts))
+    if left or worst(doubts) is not Level.FAIL:
         return to_try, None
-    facts = {"tried": tuple(one.text for one in tried), "cause": first_cause(doubts)}
-    return (), Finding(Note.NO_MODEL_EXPLAINS, facts)
+    return (), () if place is None else tuple(one.text for one in place.tried)
 
 
 def _largest(remedies: Sequence[Remedy]) -> Remedies:
     """Remedies without repeats; of those that differ in whole numbers alone, such as steps, that
     with the largest.
     """
-    found: dict[str, Remedy] = {}
+    found: dict[str, tuple[list[int], Remedy]] = {}
     for remedy in remedies:
         steps = remedy.steps or (remedy,)
-        form = repr([(step.action, step.files, _texts(step.arguments)) for step in steps])
-        found[form] = max(found.get(form, remedy), remedy, key=_whole_numbers)
-    return tuple(found.values())
+        text = repr([(step.action, step.files, step.arguments) for step in steps])
+        here = [int(number) for number in _WHOLE.findall(text)], remedy
+        form = _WHOLE.sub("N", text)
+        found[form] = max(found.get(form, here), here, key=itemgetter(0))
+    return tuple(remedy for _, remedy in found.values())
 
 
-def _texts(arguments: AnyDict) -> AnyDict:
-    """The arguments with their whole numbers left open."""
-    return {name: "N" if str(value).isdigit() else value for name, value in arguments.items()}
+def _telling(checks: Iterable[Check], obs: Observations) -> tuple[str, ...]:
+    """Effects, options and advice that failed checks ask for, but for what the table was given.
 
-
-def _whole_numbers(remedy: Remedy) -> list[int]:
-    steps = remedy.steps or (remedy,)
-    values = [str(value) for step in steps for value in step.arguments.values()]
-    return [int(value) for value in values if value.isdigit()]
-
-
-def _summary(
-    checks: tuple[Check, ...], sampled: bool, rests: Finding | None, effects: tuple[str, ...]
-) -> Finding:
-    """What becomes of the requirements, whether the numbers can be used, with which effects, and
-    what f then rests on.
+    The checks have all the remedies that they were made with, also those that were tried.
     """
-    required = [check for check in checks if check.question is Question.REQUIRED]
-    others = [check for check in checks if check not in required]
-    level = worst(others)
-    doubts = [check for check in others if check.level is level and level is not Level.PASS]
-    facts = {
-        "violated": _phrases(check for check in required if check.level is Level.FAIL),
-        "unmet": _phrases(check for check in required if check.level is Level.WARN),
-        "level": level,
-        "doubts": _phrases(doubts),
-        "causes": tuple((cause, len(some)) for cause, some in by_cause(doubts).items()),
-        "sampled": sampled,
-        "effects": effects,
-        "rests": None if worst(checks) is Level.FAIL else rests,
-    }
-    return Finding(Note.HEADLINE, facts)
+    asked: set[str] = set()
+    for check in checks:
+        if check.level is Level.FAIL:
+            asked.update(check.values.get("effects", ()))
+            asked.update(order.code.name.lower() for order in check.orders)
+            asked.update(*((one.action, *one.arguments) for one in check.remedies))
+    if obs.timed:
+        asked.discard("time")
+    if obs.origin.site is not None:
+        asked -= {"site", "zenith", "give_the_directions"}
+    return tuple(sorted(asked))
 
 
-def _phrases(checks: Iterable[Check]) -> tuple[str, ...]:
-    return tuple(check.phrase for check in checks)
+def _phrases(checks: Iterable[Check], level: Level) -> tuple[str, ...]:
+    return tuple(check.phrase for check in checks if check.level is level)

@@ -121,9 +121,7 @@ def by_cause(checks: Sequence[Check]) -> dict[str, list[Check]]:
     """
     ranked = sorted((c for c in checks if c.level is not Level.PASS), key=lambda c: -c.level.rank)
     found = {cause: [check for check in ranked if cause_of(check) == cause] for cause in _ORDER}
-    present = sorted(
-        (cause for cause in _ORDER if found[cause]), key=lambda cause: -found[cause][0].level.rank
-    )
+    present = sorted(filter(found.get, _ORDER), key=lambda cause: -found[cause][0].level.rank)
     return {cause: found[cause] for cause in present}
 
 
@@ -252,8 +250,3 @@ def counted(checks: Sequence[Check]) -> tuple[int, int]:
     """How many checks failed, and how many gave a warning."""
     levels = [check.level for check in checks]
     return levels.count(Level.FAIL), levels.count(Level.WARN)
-
-
-def first_cause(checks: Sequence[Check]) -> str:
-    """What checks that did not pass point to first."""
-    return next(iter(by_cause(checks)), NUMERICS)

@@ -15,7 +15,7 @@ from starcal_uq.budgeting.result import by_contributor
 from starcal_uq.budgeting.rows import AXIS_LABELS, confidence_text
 from starcal_uq.core.constants import CROSS_BORESIGHT
 from starcal_uq.core.formatting import count, fixed, join_words, plural, significant
-from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.status import Check, Level, Note, Question, worst
 from starcal_uq.presentation.report.tables import parameter_rows
 from starcal_uq.presentation.sentences.budgeting import axis_label, bound
 from starcal_uq.presentation.sentences.propagation import two_figures
@@ -50,20 +50,12 @@ def uses(results: Results) -> tuple[list[str], list[str]]:
     """What of the run can be used, and what cannot or only with care; sentences."""
     verdict, error, budget = results.verdict, results.attitude, results.budget
     usable, unusable = [], []
-    violated, failed, warned = (
-        join_words(
-            [
-                check.phrase
-                for check in verdict.at(level)
-                if (check.question is Question.REQUIRED) == required
-            ]
-        )
-        for level, required in ((Level.FAIL, True), (Level.FAIL, False), (Level.WARN, False))
-    )
+    violated, doubts = (join_words(verdict.summary.values[one]) for one in ("violated", "doubts"))
+    failed = verdict.summary.code is Note.NOT_USABLE
     if violated:
         unusable.append(f"The sensor with this budget: {violated} is violated.")
     if failed:
-        unusable.append(f"Parameters, intervals and attitude error: {failed} failed.")
+        unusable.append(f"Parameters, intervals and attitude error: {doubts} failed.")
         if worst(verdict.of(Question.CONVERGED)) is Level.FAIL:
             usable.append("What tells the cause: residuals and checks.")
         else:
@@ -71,10 +63,10 @@ def uses(results: Results) -> tuple[list[str], list[str]]:
                 f"The errors {IF_MODEL_HOLDS}, as the least that they are; residuals and checks, "
                 "as clues."
             )
-    elif warned:
+    elif doubts:
         usable.append(
             "The parameters, their intervals and the attitude error, if you accept the "
-            f"warnings: {warned}."
+            f"warnings: {doubts}."
         )
     else:
         usable.append("The parameters, their σ and intervals: every check passed.")
@@ -355,7 +347,6 @@ def terminal_summary(results: Results) -> list[str]:
         before = before or (cause if checks[0].level is Level.FAIL else "")
     if results.verdict.ended:
         usable, unusable = uses(results)
-        lines += _wrapped(results.verdict.ended)
         lines += [line for sentence in usable for line in _wrapped(f"usable: {sentence}", "  ")]
         lines += [line for sentence in unusable for line in _wrapped(f"not: {sentence}", "  ")]
     for number, command in enumerate(results.verdict.commands):

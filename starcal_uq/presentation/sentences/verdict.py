@@ -5,50 +5,77 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from starcal_uq.core.findings import Finding
-from starcal_uq.core.formatting import join_words, plural
-from starcal_uq.core.status import Level, Note
-from starcal_uq.diagnostics.verdict.remedies import INPUT, LENS, NOISE, NUMERICS
+from starcal_uq.core.formatting import join_words
+from starcal_uq.core.status import Note
 from starcal_uq.presentation.sentences.table import entry
 
-# Checks that the headline names; of more it says how many there are.
-_NAMED = 2
-# Which data tell a cause from the others.
+# Data that the headline names.
+_TOLD = 3
+# Data that tell a cause from the others: effects that would be taken up, and options and advice of
+# checks, that ask for these.
 _TELLING = {
-    INPUT: (
-        "times in UTC and the site, or the statement that the camera was in space, for every frame"
+    "the time of every frame in UTC": "time",
+    "times from another clock": "correct_the_times",
+    "the site": "site zenith give_the_directions",
+    "directions from another catalogue": (
+        "star check_the_directions correct_the_epoch without_star_errors"
     ),
-    LENS: (
-        "frames of the same stars at other places of the detector, shifted and turned by 90 degrees"
-    ),
-    NOISE: (
-        "repeated exposures of one field, whose scatter is noise alone, with times and temperatures"
-    ),
-    NUMERICS: "more frames, spread over the sky",
+    "a record of which camera took which frame": "frames",
+    "identifications that were checked in the images": "screening",
+    "another measurement of the rotations between frames": "without_rotations",
+    "the same stars at other places of the detector": "model axes field count_the_pattern",
+    "frames that are shifted by parts of a pixel": "phase accept_the_phase",
+    "the same stars with other exposure times": "magnitude leave_out_magnitudes",
+    "frames at more temperatures": "temperature",
+    "frames from more nights": "epoch",
+    "repeated exposures of one field": "frame frames_apart",
+    "more frames, spread over the sky": "plan",
 }
+
+
+def _with_requirements(
+    violated: Sequence[str], sentences: Sequence[str], unmet: Sequence[str]
+) -> str:
+    first = [f"Violated: {join_words(violated)}."] if violated else []
+    last = [f"Open: {join_words(unmet)}."] if unmet else []
+    return " ".join([*first, *sentences, *last])
+
+
+@entry(Note.NOT_USABLE)
+def _not_usable(
+    violated: Sequence[str],
+    unmet: Sequence[str],
+    doubts: Sequence[str],
+    tried: Sequence[str] | None,
+    data: Sequence[str],
+) -> str:
+    """`tried` is None where something is left to try."""
+    told = [words for words, asked in _TELLING.items() if {*asked.split()} & {*data}]
+    nothing, condition = "", "if nothing to try helps, "
+    if tried is not None:
+        steps = f" (tried: {'; '.join(tried)})" if tried else ""
+        nothing, condition = f" and no model here explains this{steps}", ""
+        told = told or list(_TELLING)[-1:]
+    would = f"; {condition}these data would tell: {join_words(told[:_TOLD])}" if told else ""
+    sentence = f"Not usable, because {join_words(doubts)} failed{nothing}{would}."
+    return _with_requirements(violated, [sentence], unmet)
 
 
 @entry(Note.HEADLINE)
 def _headline(
     violated: Sequence[str],
     unmet: Sequence[str],
-    level: Level,
     doubts: Sequence[str],
-    causes: Sequence[tuple[str, int]],
     sampled: bool,
     rests: Finding | None,
     effects: Sequence[str] = (),
 ) -> str:
-    named = doubts
     held = f" with {'this effect' if len(effects) == 1 else 'these effects'}: {join_words(effects)}"
-    if len(doubts) > _NAMED:
-        named = [f"{plural(number, 'check')} of {cause}" for cause, number in causes]
-    sentences = [f"Violated: {join_words(violated)}."] if violated else []
-    if level is Level.FAIL:
-        sentences.append(f"Do not use these numbers: {join_words(named)} failed.")
-    elif level is Level.WARN:
+    sentences = []
+    if doubts:
         these = "this warning is" if len(doubts) == 1 else "these warnings are"
         sentences.append(
-            f"Converged; usable once {these} resolved or accepted: {join_words(named)}."
+            f"Converged; usable once {these} resolved or accepted: {join_words(doubts)}."
         )
         sentences += [f"The numbers are to be used{held}."] if effects else []
     elif not sampled:
@@ -61,11 +88,4 @@ def _headline(
     else:
         sentences.append("Converged, and every check passed: the stated uncertainties can be used.")
     sentences += [rests.sentence] if rests is not None else []
-    sentences += [f"Open: {join_words(unmet)}."] if unmet else []
-    return " ".join(sentences)
-
-
-@entry(Note.NO_MODEL_EXPLAINS)
-def _no_model_explains(tried: Sequence[str], cause: str) -> str:
-    steps = f" (tried: {'; '.join(tried)})" if tried else ""
-    return f"No model here explains this{steps}. What would tell: {_TELLING[cause]}."
+    return _with_requirements(violated, sentences, unmet)
