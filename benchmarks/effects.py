@@ -7,8 +7,8 @@ five times the size that gains twice what it has to, and all pairs at twice that
 One row a campaign: how often just the planted effects are chosen and how often one that is not
 there, how often the 95 % interval of the scale holds what was planted (where that is a standard
 deviation), and coverage of the camera's parameters by their 95 % intervals. Without an effect the
-camera is the one that is planted, with axes or a field the one that is nearest to it. `--pairs`
-plants two at once, and `--write` puts the table into the documentation.
+camera is the one that is planted, with axes, a field or a radial wave the one that is nearest to
+it. `--pairs` plants two at once, and `--write` puts the table into the documentation.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ from starcal_uq.estimation.effects import penalty
 from tests.helpers import effects as planted
 from tests.helpers.outside import Campaign, campaign
 
-KINDS = ("axes", "field", "frame", "temperature", "time", "epoch", "star", "phase", "magnitude")
+KINDS = (
+    *("axes", "field", "radial", "frame", "temperature"),
+    *("time", "epoch", "star", "phase", "magnitude"),
+)
 # Scales that are standard deviations of what is drawn anew in every campaign.
 DRAWN = ("frame", "star")
 FRAMES, STARS, NIGHTS = 30, 20, 3
@@ -72,7 +75,9 @@ def observed(seed: int, sizes: dict[str, float]) -> tuple[Campaign, sc.Observati
 def of_place(sizes: dict[str, float]) -> planted.Displacement:
     """Effects that keep their place in the field: they decide which camera is true."""
     return planted.together(
-        planted.stretched(sizes.get("axes", 0.0)), planted.bump(sizes.get("field", 0.0))
+        planted.stretched(sizes.get("axes", 0.0)),
+        planted.bump(sizes.get("field", 0.0)),
+        planted.radial_wave(sizes.get("radial", 0.0)),
     )
 
 

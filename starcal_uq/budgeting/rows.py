@@ -208,6 +208,10 @@ OF_EFFECTS = {
         *("field error", "FOV spatial", "mixed", "no", "gaussian"),
         "errors of the lens that keep their place in the field",
     ),
+    "radial": Expected(
+        *("radial error of the lens", "FOV spatial", "mixed", "no", "gaussian"),
+        "distortion along the radius beyond the model",
+    ),
     "frame": Expected(
         *("frame-to-frame error", "temporal noise (NEA)", "temporal", "no", "gaussian"),
         "scale and shears that every frame has by itself",

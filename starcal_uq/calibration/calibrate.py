@@ -126,9 +126,10 @@ def calibrate(
     effects : {"none", "auto"} or sequence of str
         Effects beyond the camera, by name or joined by commas; ``auto`` takes up those that the
         data ask for, beside any that are named (`Calibration.effects`). Scales of ``axes``,
-        ``field``, ``frame``, ``zenith``, ``temperature``, ``time``, ``epoch``, ``star``, ``phase``
-        and ``magnitude`` are estimated by restricted likelihood and marginalised in estimate,
-        covariance and `compressed`. Two effects decide how much the stars count:
+        ``field``, ``radial``, ``frame``, ``zenith``, ``temperature``, ``time``, ``epoch``,
+        ``star``, ``phase`` and ``magnitude`` are estimated by restricted likelihood and
+        marginalised in estimate, covariance and `compressed`. Two effects decide how much the stars
+        count:
 
         ``noise``: a variance that is fitted as a function of radius, magnitude, frame and axis, as
         far as the residuals ask for it (`Calibration.noise_model`). Everything that takes the

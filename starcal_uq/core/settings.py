@@ -52,6 +52,7 @@ MountKind = Literal["none", "fixed"]
 EffectName = Literal[
     "axes",
     "field",
+    "radial",
     "frame",
     "zenith",
     "temperature",

@@ -18,7 +18,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.settings import EffectName
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import (
     TIME_DEGREE,
@@ -30,6 +30,7 @@ from starcal_uq.likelihood.shapes import (
     frame_shapes,
     magnitude_shape,
     nights_of,
+    outwards,
     over_time,
     phase_shape,
     seconds_utc,
@@ -86,11 +87,8 @@ def effects_of(
     """
     known = Covariates.of(obs, seen, extent)
     corner = corner_unit(camera)
-    fixed = place_effects(camera)
-    found = [
-        *(fixed[name] for name in ("axes", "field") if name in fixed),
-        Effect("frame", "frame", frame_shapes(camera), np.ones(3)),
-    ]
+    found = list(place_effects(camera).values())
+    found.append(Effect("frame", "frame", frame_shapes(camera), np.ones(3)))
     if known.warmth is not None:
         found.append(_run("temperature", _moving("temperature", known.warmth[None]), corner))
     if known.clock is not None:
@@ -101,7 +99,6 @@ def effects_of(
     nights = None if seen is not None else _nights(obs, extent)
     if nights is not None:
         found.append(_run("epoch", _moving("epoch", nights), np.tile(corner, len(nights))))
-    found.append(fixed["phase"])
     if zeniths is not None:
         found.append(zenith_effect(obs if seen is None else seen, zeniths))
     if known.magnitude is not None:
@@ -180,38 +177,55 @@ def field_effect(camera: Camera) -> Effect:
     """
     half = np.array([camera.width_px, camera.height_px]) / 2.0
     i, j = np.array([(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]).T
-    size = 2 * len(i)
-    prior = (1.0 + i + j) ** -_SMOOTHNESS
-    prior = np.repeat(prior / np.sqrt(np.sum(prior**2)), 2)
 
-    def waves(xy: FloatArray) -> FloatArray:
-        """Products of the polynomials (size / 2, n) at pixels (2, n)."""
+    def raw(xy: FloatArray) -> FloatArray:
         from numpy.polynomial.legendre import legvander
 
         x, y = ((xy + 0.5) / half[:, None]) - 1.0
         along, across = legvander(x, _ORDER).T, legvander(y, _ORDER).T
-        return np.asarray(along[i] * across[j])
+        found = np.zeros((len(i), 2, 2, xy.shape[1]))
+        found[:, 0, 0] = found[:, 1, 1] = along[i] * across[j]
+        return found.reshape(-1, 2, xy.shape[1])
+
+    return _smooth("field", camera, raw, i + j)
+
+
+@lru_cache(maxsize=8)
+def radial_effect(camera: Camera) -> Effect:
+    """A smooth displacement along the radius: that of a lens which is a body of rotation.
+
+    It hardly turns frames about the boresight. A field, which knows no symmetry, has to leave open
+    whether it does.
+    """
 
     def raw(xy: FloatArray) -> FloatArray:
-        """Columns (size, 2, n) at pixels (2, n)."""
-        found = np.zeros((len(i), 2, 2, xy.shape[1]))
-        found[:, 0, 0] = found[:, 1, 1] = waves(xy)
-        return found.reshape(size, 2, -1)
+        uv = xy - camera.theta[:2, None]
+        return outwards(uv / camera.corner_radius_px, _ORDER + 1)
 
+    return _smooth("radial", camera, raw, np.arange(_ORDER + 1))
+
+
+def _smooth(
+    name: EffectName, camera: Camera, raw: Callable[[FloatArray], FloatArray], order: IntArray
+) -> Effect:
+    """Columns (c, 2, n) at pixels (2, n), less what the camera and a rotation do; smaller the
+    higher the orders (t,) of their terms are.
+    """
     unit, taken = _of_camera(camera, raw)
     removed = -taken.T / unit
+    prior: FloatArray = (1.0 + order) ** -_SMOOTHNESS
+    prior = np.repeat(prior / np.sqrt(np.sum(prior**2)), len(removed) // len(order))
 
     def columns(view: View) -> FloatArray:
         frames = view.part.frames
         turns = frames.in_pixels(view.state.attitude)
         held = np.concatenate([view.parameter_columns, turns])
-        found = (removed @ held.reshape(len(unit), -1)).reshape(-1, 2, 2, frames.n_stars)
-        seen = waves(frames.pixel - frames.in_pixels(view.state.e))
-        found[:, 0, 0] += seen
-        found[:, 1, 1] += seen
-        return np.asarray(found.reshape(size, 2, -1))
+        found = raw(frames.pixel - frames.in_pixels(view.state.e))
+        found += (removed @ held.reshape(len(unit), -1)).reshape(found.shape)
+        return found
 
-    return Effect("field", "run", Shape("smooth field", "field", size, columns), prior)
+    shape = Shape(f"smooth {name} shift", name, len(prior), columns)
+    return Effect(name, "run", shape, prior)
 
 
 def _of_camera(
@@ -247,7 +261,6 @@ def pixels_of(camera: Camera, xy: FloatArray) -> View:
 
 def place_effects(camera: Camera) -> dict[str, Effect]:
     """Effects of the place on the detector alone, by name."""
-    found = [field_effect(camera), _run("phase", _phase())]
-    if not get_model(camera.distortion).axes:
-        found.append(_run("axes", axes_shape(camera)))
+    found = [] if get_model(camera.distortion).axes else [_run("axes", axes_shape(camera))]
+    found += [field_effect(camera), radial_effect(camera), _run("phase", _phase())]
     return {effect.name: effect for effect in found}

@@ -38,10 +38,8 @@ _STARS_PER_CELL = 25.0
 MAX_CELLS = 8
 # Hours without a frame that separate two nights.
 _NIGHT_HOURS = 4.0
-# Coordinates of shapes that keep their place in the field, and those of the directions of one
-# frame.
+# Coordinates of shapes that keep their place in the field.
 IN_FIELD = ("radius", "azimuth", "field", "field cells")
-OVER_FIELD = (*IN_FIELD, "direction")
 FRAME_BY_FRAME = "scale and shape that change from frame to frame"
 _LEAST_SPREAD = 1e-9
 
@@ -423,17 +421,21 @@ def _focal_against(
     return Shape(name, against, 1, columns, (label,), (1.0 / spread,))
 
 
+def outwards(uv: FloatArray, size: int) -> FloatArray:
+    """Columns (size, 2, n) along the radius, at positions (2, n) in units of the largest one."""
+    from numpy.polynomial.chebyshev import chebvander
+
+    powers = chebvander(2.0 * np.hypot(*uv) - 1.0, size - 1).T
+    return np.asarray(powers[:, None] * uv)
+
+
 def _radius(camera: Camera) -> Shape:
     radius = camera.corner_radius_px
 
     def columns(view: View) -> FloatArray:
-        from numpy.polynomial.chebyshev import chebvander
-
-        rho = np.hypot(*view.uv) / radius
-        out = view.uv / radius
-        across = np.stack([-out[1], out[0]])
-        powers = chebvander(2.0 * rho - 1.0, _RADIAL_DEGREE - 1).T
-        return np.concatenate([powers[:, None] * out, powers[:_TWIST_DEGREE, None] * across])
+        out = outwards(view.uv / radius, _RADIAL_DEGREE)
+        across = out[:_TWIST_DEGREE, ::-1] * np.array([[-1.0], [1.0]])
+        return np.concatenate([out, across])
 
     return Shape("smooth pattern over radius", "radius", _RADIAL_DEGREE + _TWIST_DEGREE, columns)
 

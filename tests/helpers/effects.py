@@ -33,6 +33,16 @@ def bump(size_px: float, width_px: float = 180.0) -> Displacement:
     return shift
 
 
+def radial_wave(size_px: float) -> Displacement:
+    """One wave along the radius from the centre to the corners, alike all around."""
+
+    def shift(uv: np.ndarray, xy: np.ndarray, mag: np.ndarray, frame: int) -> np.ndarray:
+        radius = np.maximum(np.hypot(*uv), 1e-9)
+        return size_px * np.sin(2.0 * np.pi * radius / CORNER_PX) * uv / radius
+
+    return shift
+
+
 def smooth(rng: np.random.Generator, size_px: float, size: int = 1024) -> Displacement:
     """Waves over the field to order 8, smaller the shorter they are, of this standard deviation at
     its corners.

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 # Effects that bend directions: what keeps its place in the field, and a scale of each frame's own,
 # whose mean no frame shows.
-_BENDING = {"axes", "field", "frame", "zenith"}
+_BENDING = {"axes", "field", "radial", "frame", "zenith"}
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ ROBUST = calibrated("command", effects="tails")
 NOISE = calibrated(effects="noise")
 EFFECTS = calibrated(effects="auto")
 # Effects that bend directions where they keep their place in the field.
-_OF_THE_FIELD = {"axes", "field"}
+_OF_THE_FIELD = {"axes", "field", "radial"}
 
 
 def directions(

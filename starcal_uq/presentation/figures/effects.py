@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _COLOURS = (style.BLUE, style.VERMILLION, style.GREEN)
 _MARKERS = "osD"
-_MAPS = ("axes", "field")
+_MAPS = ("axes", "field", "radial")
 _COLUMNS, _WIDTH_IN, _HEIGHT_IN = 3, 3.9, 3.4
 _GRID, _ARROWS = 41, 9
 # Points above which each is drawn as a dot without its interval.
@@ -41,6 +41,7 @@ _LEAST_PX = 1e-4
 _TITLES = {
     "axes": "Shift by the axes",
     "field": "Shift by the field",
+    "radial": "Shift along the radius",
     "frame": "Frames: scale and shears",
     "temperature": "Change with the temperature",
     "time": "Change over the run",

@@ -13,6 +13,7 @@ from starcal_uq.presentation.tables import TextTable
 MEANINGS = {
     "axes": "Pixels that are not square, or skewed axes: stretch and skew, parameters of the camera.",
     "field": "The lens shifts images smoothly over the field, as no polynomial of the radius does.",
+    "radial": "The lens shifts images along the radius, alike all around.",
     "frame": "Every frame has a scale and two shears of its own: breathing, refraction, seeing.",
     "zenith": "Air raises stars towards a zenith that is estimated.",
     "temperature": "Focal length and principal point change with the temperature.",
