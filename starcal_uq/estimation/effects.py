@@ -56,7 +56,7 @@ from starcal_uq.likelihood.effect_sums import (
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
-from starcal_uq.likelihood.shapes import Extent, seconds_utc
+from starcal_uq.likelihood.shapes import Extent
 from starcal_uq.likelihood.zenith import Zeniths
 from starcal_uq.maths.linear import scaled_cholesky
 from starcal_uq.observations.splits import frame_sample
@@ -232,6 +232,7 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
     covariance, weights = _mixed(found, grams, nodes)
     theta = theta - 0.5 * found.compressed.whitening @ found.compressed.log_determinant_slope
     obs, extent, of_stars = stars.obs, stars.extent, stars_of(effects)
+    seen = Extent.of(obs) if extent is None else extent
     held = Effects(
         (),
         selecting,
@@ -240,8 +241,8 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
         *joint,
         node_grams=grams,
         node_log_weights=weights,
-        temperature_c=_moments(obs.temperature_c) if extent is None else extent.warmth,
-        time_s=_range(obs) if extent is None else extent.time_s,
+        temperature_c=seen.warmth,
+        time_s=seen.time_s,
         places=tuple((e.name, len(e.prior)) for e in _of_run(effects)),
         zeniths=zeniths if "zenith" in logs else None,
         extent=extent,
@@ -452,17 +453,6 @@ def shown_by(
     b = np.einsum("nij,nj->ni", turned, obs.directions_icrs)
     xy = project(camera, b) + residuals_px
     return replace(obs, x_px=xy[:, 0], y_px=xy[:, 1])
-
-
-def _moments(values: FloatArray | None) -> tuple[float, float]:
-    if values is None:
-        return np.nan, np.nan
-    return float(np.nanmean(values)), float(np.nanstd(values))
-
-
-def _range(obs: Observations) -> tuple[float, float]:
-    seconds = None if obs.time_utc is None else seconds_utc(obs.time_utc)
-    return (np.nan, np.nan) if seconds is None else (float(seconds.min()), float(seconds.max()))
 
 
 _Joint = tuple[FloatArray, FloatArray, FloatArray]
