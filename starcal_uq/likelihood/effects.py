@@ -213,7 +213,7 @@ def _smooth(
     """
     unit, taken = _of_camera(camera, raw)
     removed = -taken.T / unit
-    prior: FloatArray = (1.0 + order) ** -_SMOOTHNESS
+    prior = np.asarray((1.0 + order) ** -_SMOOTHNESS, dtype=np.float64)
     prior = np.repeat(prior / np.sqrt(np.sum(prior**2)), len(removed) // len(order))
 
     def columns(view: View) -> FloatArray:
