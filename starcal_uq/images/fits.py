@@ -223,7 +223,7 @@ def _settled(
         rest, weight = _weighted(part, flux, px[:, 0], py[:, 0], light)
         jacobian = _derivatives(px, py, flux)
         normal = _normal(jacobian, weight)
-        gradient = np.einsum("npk,nk->np", jacobian, (rest * weight).reshape(len(rest), -1))
+        gradient = np.einsum("npk,nk->np", jacobian, (rest * weight).reshape(-1, m * m))
         solution, determined = _solve(normal, gradient[:, :, None])
         step = np.where(determined, solution[:, :, 0].T, 0.0)
         done = np.einsum("in,ni->n", step, gradient) < _TOLERANCE_SIGMAS**2
@@ -286,12 +286,12 @@ def _derivatives(px: FloatArray, py: FloatArray, flux: FloatArray) -> FloatArray
     ]
     if px.shape[1] > 2:
         found.append(_gaussian(f * px[:, 2], py[:, 0]) + _gaussian(f * px[:, 0], py[:, 2]))
-    return np.stack(found, axis=1).reshape(len(flux), len(found), -1)
+    return np.stack(found, axis=1).reshape(len(flux), len(found), px.shape[2] ** 2)
 
 
 def _normal(derivatives: FloatArray, weight: FloatArray) -> FloatArray:
     """Normal matrices (n, p, p) of derivatives and weights (n, m, m)."""
-    weighted = derivatives * weight.reshape(len(weight), 1, -1)
+    weighted = derivatives * weight.reshape(len(weight), 1, derivatives.shape[2])
     normal: FloatArray = weighted @ derivatives.transpose(0, 2, 1)
     return normal
 
