@@ -55,8 +55,8 @@ class Verdict(Shown):
 
     DOCUMENTED: ClassVar = ("level",)
     WRITTEN_AS: ClassVar = {
-        "summary": ("headline", "ended"),
-        "to_try": ("commands",),
+        "summary": ("headline",),
+        "to_try": ("commands", "ended"),
     }
 
     checks: tuple[Check, ...]
