@@ -36,7 +36,7 @@ from starcal_uq.estimation.zenith import (
     of_one_place,
     orthonormal,
 )
-from starcal_uq.likelihood.effect_sums import EffectLikelihood
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.shapes import focal_drift, lens_shapes
 from starcal_uq.maths.linear import principal

@@ -18,7 +18,8 @@ from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation import effects
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.zenith import Images, orthonormal
-from starcal_uq.likelihood.effect_sums import Columns, EffectLikelihood
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
+from starcal_uq.likelihood.effect_sums import Columns
 from starcal_uq.likelihood.effects import Effect, effects_of, star_effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood

@@ -19,7 +19,7 @@ from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import has_effects, with_effects_of
 from starcal_uq.estimation.weights import weighed
-from starcal_uq.likelihood.effect_sums import EffectLikelihood
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
 from starcal_uq.observations.splits import frame_sample

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 _LEAST_DOF = 10
+_STARS_AT_ONCE = 20_000
 _ABSORBED = 1e-10
 # More stars than this, and what the parameters absorb of them is too little to be worth a dense
 # matrix.
@@ -237,7 +238,13 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     rotations = quaternion_to_rotation(cal.quaternions[np.isin(cal.frame_ids, obs.frame_ids)])
     sums = TermSums(star_term(stars, frames.r, float(cal.theta[2]), rigid=True))
     p, likelihood = len(cal.theta), MarginalLikelihood(frames, cal.camera.distortion)
-    gram = sums.add_linearised(likelihood, cal.theta, cal.sigmas, rotations)
+    gram = np.zeros((p + 1, p + 1))
+    for part, state, columns, rows in likelihood.linearised(
+        cal.theta, cal.sigmas, rotations, _STARS_AT_ONCE
+    ):
+        flat = columns.reshape(p + 1, -1)
+        gram += flat @ flat.T
+        sums.add(part, state, columns, rows)
     values, vectors = principal(gram[:p, :p], _ABSORBED, relative=True)
     root = vectors / np.sqrt(values)
     explained = root.T @ gram[:p, p]

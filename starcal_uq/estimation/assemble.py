@@ -14,7 +14,8 @@ from starcal_uq.camera.distortion import undistorted
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.result import Calibration, KeptFrames, check_camera
+from starcal_uq.estimation.kept import KeptFrames
+from starcal_uq.estimation.result import Calibration, check_camera
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.undetermined import (
     EXPLAINED,

@@ -1,7 +1,7 @@
 """Effects estimated: scales by restricted likelihood, selected forward, and marginalised.
 
 Selection, scales and nodes (`scales`) need sums over all stars alone, which `Stars` give: of a table
-in memory, or of partitions, file by file.
+in memory, or, as `partitioned_effects.FileStars`, of partitions, file by file.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from starcal_uq.core.settings import WEIGHING
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.local_effects import local_coefficients
-from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.scales import (
     Nodes,
     Restricted,
@@ -46,13 +45,8 @@ from starcal_uq.likelihood.compressed import (
     optimum,
     unit_covariance,
 )
-from starcal_uq.likelihood.effect_sums import (
-    Cross,
-    EffectLikelihood,
-    EffectSums,
-    pull_of,
-    stars_of,
-)
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
+from starcal_uq.likelihood.effect_sums import Cross, EffectSums, Products, pull_of, stars_of
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
@@ -65,7 +59,7 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
-_STARS_AT_ONCE = 1_500
+_STARS_AT_ONCE = 6_000
 # Frames of a sample that the zenith of all is looked for in.
 _FRAMES_OF_ZENITH = 100
 # Rounds in which the noise beside air is found; moves of the zeniths beside other effects, and the
@@ -75,12 +69,15 @@ _ROUNDS, _MOVES, _LEAST_GAIN = 3, 8, 0.02
 
 @dataclass(frozen=True)
 class Around:
-    """An estimate that sums are taken around: camera, parameters (p,) and their units, and noise."""
+    """An estimate that sums are taken around: camera, parameters (p,) and their units, and noise;
+    and where the likelihood is expanded around it, the whitening (p, p).
+    """
 
     camera: Camera
     theta: FloatArray
     scale: FloatArray
     sigma: float
+    whitening: FloatArray | None = None
 
     @classmethod
     def of(cls, cal: Calibration) -> Around:
@@ -88,32 +85,10 @@ class Around:
         return cls(cal.camera, cal.theta, cal.sigmas, cal.sigma)
 
 
-class Stars(Protocol):
-    """Sums over stars around an estimate, with the effects that these names have below zeniths."""
-
-    obs: Observations  # The table, or a sample of its frames
-    extent: Extent | None  # Of all frames, where the table is a sample
-    dof: int
-
-    def effects(self, zeniths: Zeniths | None) -> dict[str, Effect]:
-        """Every effect that the table allows, by name."""
-
-    def linear(self, names: Sequence[str], zeniths: Zeniths | None) -> EffectSums:
-        """Sums with the parameters, in their units, and the residuals."""
-
-    def expanded(
-        self,
-        names: Sequence[str],
-        zeniths: Zeniths | None,
-        theta: FloatArray,
-        whitening: FloatArray,
-        sigma: float,
-    ) -> tuple[GramSums, EffectSums]:
-        """Sums with the columns of the compressed likelihood around theta (p,)."""
-
-
-class TableStars:
-    """Stars of a table, or of a part of one that has this `extent`."""
+class Stars:
+    """Sums over the stars of a table around an estimate, with the effects that these names have
+    below zeniths; `extent` is that of all frames, where the table is a part or a sample of them.
+    """
 
     def __init__(
         self,
@@ -124,46 +99,47 @@ class TableStars:
     ) -> None:
         self.obs, self.around, self.extent = obs, around, extent
         self.likelihood = MarginalLikelihood(obs, around.camera.distortion, axes=True)
-        self.rotations, self.dof = rotations, self.likelihood.dof
+        if rotations is not None:
+            self.likelihood.use_rotations(rotations)
+        self.dof = self.likelihood.dof
         self._known: tuple[Zeniths | None, dict[str, Effect]] | None = None
 
     def effects(self, zeniths: Zeniths | None) -> dict[str, Effect]:
-        """As `Stars.effects`."""
+        """Every effect that the table allows, by name."""
         if self._known is None or self._known[0] is not zeniths:
             camera, extent = self.around.camera, self.extent
             found = effects_of(self.obs, camera, zeniths=zeniths, extent=extent)
             self._known = zeniths, found
         return self._known[1]
 
-    def _chosen(self, names: Sequence[str], zeniths: Zeniths | None) -> list[Effect]:
-        known = self.effects(zeniths)
-        return [known[name] for name in names]
-
-    def linear(self, names: Sequence[str], zeniths: Zeniths | None) -> EffectSums:
-        """As `Stars.linear`."""
-        at = self.around
-        sums = EffectSums(self._chosen(names, zeniths), at.theta, at.sigma, apart=False)
-        pieces = self.likelihood.pieces(at.theta, self.rotations, _STARS_AT_ONCE)
-        for part, state, rows in pieces:
-            h = part.derivatives(at.theta, state) * at.scale[:, None, None]
-            columns = part.project_out(state, np.concatenate([h, state.e[None]]))
-            sums.add(part, state, columns, rows)
-        return sums
-
-    def expanded(
+    def sums(
         self,
         names: Sequence[str],
         zeniths: Zeniths | None,
-        theta: FloatArray,
-        whitening: FloatArray,
-        sigma: float,
-    ) -> tuple[GramSums, EffectSums]:
-        """As `Stars.expanded`."""
-        if self.rotations is not None:
-            self.likelihood.use_rotations(self.rotations)
-        sums = EffectSums(self._chosen(names, zeniths), theta, sigma, 0, apart=False)
-        known = self.likelihood.sums(theta)
-        return expanded(self.likelihood, theta, whitening, known, sums.add), sums
+        at: Around,
+        *products: Products,
+    ) -> EffectSums:
+        """Sums around a point, of these products so far; residuals are the first column of an
+        expansion, else the last.
+        """
+        known, place = self.effects(zeniths), -1 if at.whitening is None else 0
+        sums = EffectSums([known[n] for n in names], at.theta, at.sigma, place, apart=False)
+        sums.parts.extend(products)
+        return sums
+
+    def made(
+        self, names: Sequence[str], zeniths: Zeniths | None, at: Around
+    ) -> tuple[GramSums | None, EffectSums]:
+        """Sums with the parameters, in their units, and the residuals; with a whitening, the columns
+        of the compressed likelihood, whose own sums come as well.
+        """
+        sums, likelihood = self.sums(names, zeniths, at), self.likelihood
+        if at.whitening is not None:
+            known = likelihood.sums(at.theta)
+            return expanded(likelihood, at.theta, at.whitening, known, sums.add), sums
+        for piece in likelihood.linearised(at.theta, at.scale, None, _STARS_AT_ONCE):
+            sums.add(*piece)
+        return None, sums
 
 
 def _whole(exact: EffectLikelihood, found: Cross) -> Cross:
@@ -192,7 +168,7 @@ def with_effects(
         For an effect that is unknown, or that the table does not allow.
     """
     rotations = quaternion_to_rotation(cal.quaternions)
-    return with_effects_of(TableStars(obs, Around.of(cal), rotations), cal, wanted)
+    return with_effects_of(Stars(obs, Around.of(cal), rotations), cal, wanted)
 
 
 def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Calibration:
@@ -226,7 +202,9 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
     _, solved, sigma = restricted.at(logs)
     nodes = nodes_around(restricted, logs, sigma)
     ahead, unit = parameters_at(solved, len(scale))
-    start = cal.theta + scale * ahead, unit * np.outer(scale, scale) * sigma**2, sigma
+    whitening = scaled_cholesky(unit * np.outer(scale, scale) * sigma**2)
+    ahead = cal.theta + scale * ahead
+    start = replace(stars.around, theta=ahead, sigma=sigma, whitening=whitening)
     found, grams, joint = _expanded(stars, start, effects, zeniths, nodes)
     sigma, theta = found.sigma, found.theta
     covariance, weights = _mixed(found, grams, nodes)
@@ -342,11 +320,6 @@ class Rest:
         """Best coefficients."""
         return _whole(self.exact, self.found)
 
-    def normals(self, theta: FloatArray, scale: FloatArray | None = None) -> FrameNormals:
-        """What each frame says about the parameters at theta (p,), in these units (p,) or px."""
-        scale = np.ones(len(theta)) if scale is None else scale
-        return FrameNormals.beside(self.exact, theta, (self.state, self.found), scale)
-
     def size(self, name: str) -> float:
         """Root mean square, px, of the shifts by an effect."""
         own = self.exact.shifts(self.state, self.exact.of_effect(name, self.coefficients))
@@ -379,7 +352,8 @@ class _Linearised:
         """Restricted likelihood of the scales of effects; `sigma` is about the noise beside those
         whose scale is known.
         """
-        sums, p, dof = self._stars.linear(names, zeniths), len(self._cal.theta), self._stars.dof
+        stars, p = self._stars, len(self._cal.theta)
+        sums, dof = stars.made(names, zeniths, stars.around)[1], stars.dof
         found = Restricted(sums, p, dof, self._cal.sigma if sigma is None else sigma)
         for _ in range(0 if sigma or not found.known else _ROUNDS):
             found = Restricted(sums, p, dof, found.at(found.known)[2])
@@ -460,7 +434,7 @@ _Joint = tuple[FloatArray, FloatArray, FloatArray]
 
 def _expanded(
     stars: Stars,
-    start: tuple[FloatArray, FloatArray, float],
+    start: Around,
     effects: Sequence[Effect],
     zeniths: Zeniths | None,
     nodes: Nodes,
@@ -468,18 +442,18 @@ def _expanded(
     """The compressed likelihood at the best scales around its optimum, Gram matrices of the nodes
     there, and coefficients of the run with their covariance and that of the parameters with them.
 
-    `start`: estimate (p,), covariance (p, p) and noise by the linearised likelihood.
+    `start`: the estimate by the linearised likelihood.
     """
-    theta, covariance, sigma = start
-    whitening, names = scaled_cholesky(covariance), [effect.name for effect in effects]
-    plain, sums = stars.expanded(names, zeniths, theta, whitening, sigma)
+    plain, sums = stars.made([effect.name for effect in effects], zeniths, start)
+    theta, whitening = start.theta, start.whitening
+    assert plain is not None and whitening is not None, "a start is expanded around"
     solved = [sums.solved(squares(logs)) for logs in nodes.logs]
     made = [
         replace(replace(plain, gram=own.gram).likelihood(theta, whitening), dof=stars.dof)
         for own in solved
     ]
     found = optimum(made[0])
-    theta, covariance, sigma = found.theta, found.covariance, found.sigma
+    theta, covariance = found.theta, found.covariance
     here, p = found.compressed, len(theta)
     grams = np.stack([moved(own, here.theta_hat, here.whitening).gram for own in made])
     # Coefficients follow the whitened parameters of the last expansion.
@@ -488,7 +462,7 @@ def _expanded(
     own, pull = found.sigma**2 * solved[0].run_covariance, pull_of(_of_run(effects))
     slope = here.log_determinant_slope - 2.0 * (pull @ follow) @ here.whitening
     found = replace(found, compressed=replace(here, log_determinant_slope=slope))
-    moved_by = theta - start[0] + covariance @ (pull @ follow)
+    moved_by = theta - start.theta + covariance @ (pull @ follow)
     joint = (
         run[:, 0] + follow @ moved_by + own @ pull,
         own + follow @ covariance @ follow.T,

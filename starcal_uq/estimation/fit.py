@@ -24,8 +24,9 @@ from starcal_uq.estimation.assemble import (
     noise_px,
     raise_unless_good,
 )
+from starcal_uq.estimation.kept import KeptFrames
 from starcal_uq.estimation.noise_model import Refit, fit_noise, fit_noise_of_tails
-from starcal_uq.estimation.result import Calibration, KeptFrames, check_camera
+from starcal_uq.estimation.result import Calibration, check_camera
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
 from starcal_uq.estimation.settings import EstimationSettings
 from starcal_uq.estimation.stages import (

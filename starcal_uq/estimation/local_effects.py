@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood.effect_sums import Cross, EffectLikelihood
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
+from starcal_uq.likelihood.effect_sums import Cross
 from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.likelihood.marginal import Profile
 

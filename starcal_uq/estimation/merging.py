@@ -28,7 +28,8 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.duplicates import check_duplicates, fingerprints_of
-from starcal_uq.estimation.result import Calibration, KeptFrames
+from starcal_uq.estimation.kept import KeptFrames
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import Optimum, combined, optimum, scaled, total
 from starcal_uq.likelihood.marginal import MarginalLikelihood

@@ -7,7 +7,6 @@ order, without another fit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -16,11 +15,10 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.residual_map import FrameScatter
-from starcal_uq.likelihood.effect_sums import Cross, EffectLikelihood
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.elimination import products_by_frame
-from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
-from starcal_uq.likelihood.sums import frame_normals
 from starcal_uq.likelihood.terms import TermSums, add_by_group
 from starcal_uq.maths.linear import without_first
 from starcal_uq.observations.frames import StarFrames
@@ -72,39 +70,34 @@ class FrameNormals:
         obs: Observations | StarFrames,
         model: str,
         theta: FloatArray,
-        start: FloatArray,
+        start: FloatArray | None = None,
         scale: FloatArray | None = None,
     ) -> FrameNormals:
         """Normal equations of a distortion model at theta (p,), attitudes searched from `start` (K,
-        3, 3).
+        3, 3) or QUEST's.
         """
-        frames = (
-            obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes=True)
-        )
-        gram, attitudes = frame_normals(frames, model, theta, start)
-        own = attitudes.log_determinant, attitudes.rotations, 2 * frames.sizes - 3
-        return cls.of(theta, gram, *own, scale)
+        likelihood = MarginalLikelihood(obs, model, axes=True)
+        gram, attitudes = likelihood.frame_normals(theta, start)
+        dof = 2 * likelihood.frames.sizes - 3
+        return cls.of(theta, gram, attitudes.log_determinant, attitudes.rotations, dof, scale)
 
     @classmethod
     def beside(
         cls,
         exact: EffectLikelihood,
         theta: FloatArray,
-        known: tuple[Profile, Cross] | None = None,
         scale: FloatArray | None = None,
     ) -> FrameNormals:
-        """Normal equations at theta (p,) beside effects; `known` are the model and coefficients there.
+        """Normal equations at theta (p,) beside effects.
 
         Those of frames are marginalised in each; those of the run and of stars, which frames share,
         are at their best.
         """
-        if known is None:
-            state, _ = exact.profile(theta, exact.rotations)
-            known = state, exact.conditioned(state, state.e[None])[1]
-        state, found = known
+        state, _ = exact.profile(theta, exact.rotations)
+        _, found = exact.conditioned(state, state.e[None])
         shared = exact.shifts(state, replace(found, frame=0.0 * found.frame))
         e = exact.project_out(state, state.e[None]) - shared
-        columns = np.concatenate([e, exact.slopes(theta, state)])
+        columns = np.concatenate([exact.slopes(theta, state), e])
         gram = products_by_frame(exact.frames, columns, columns)
         cross = products_by_frame(exact.frames, exact.columns.frame, columns)
         solved = exact.solved
@@ -112,15 +105,6 @@ class FrameNormals:
         gram -= np.swapaxes(left, 1, 2) @ left
         dof = 2 * exact.frames.sizes - 3
         return cls.of(theta, gram, state.log_determinant, state.rotations, dof, scale)
-
-    @classmethod
-    def joined(cls, parts: Sequence[FrameNormals]) -> FrameNormals:
-        """Those of all frames of several, in the same units."""
-        own = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("matrices", "slopes", "squares", "log_determinant", "rotations", "dof")
-        }
-        return replace(parts[0], **own)
 
     @classmethod
     def of(
@@ -132,15 +116,15 @@ class FrameNormals:
         dof: IntArray,
         scale: FloatArray | None = None,
     ) -> FrameNormals:
-        """Normal equations from the products (K, 1 + p, 1 + p) of residuals and parameters."""
-        matrix = gram[:, 1:, 1:]
+        """Normal equations from the products (K, p + 1, p + 1) of parameters and residuals."""
+        matrix = gram[:, :-1, :-1]
         scale = 1.0 / np.sqrt(np.einsum("kaa->a", matrix)) if scale is None else scale
         return cls(
             theta=theta,
             scale=scale,
             matrices=matrix * np.outer(scale, scale),
-            slopes=gram[:, 0, 1:] * scale,
-            squares=gram[:, 0, 0],
+            slopes=gram[:, -1, :-1] * scale,
+            squares=gram[:, -1, -1],
             log_determinant=log_determinant,
             rotations=rotations,
             dof=dof,
@@ -228,9 +212,10 @@ class StarNormals:
         start, gram = quaternion_to_rotation(cal.quaternions), np.zeros((p + 1, p + 1))
         s = sums.n_groups
         scores, slopes, matrices = np.zeros((s, p)), np.zeros((s, p)), np.zeros((s, p, p))
-        for part, state, rows in likelihood.pieces(cal.theta, start, _STARS_AT_ONCE):
-            h = part.slopes(cal.theta, state) * cal.sigmas[:, None, None]
-            flat = np.concatenate([h, state.e[None]]).reshape(p + 1, -1)
+        for part, state, columns, rows in likelihood.linearised(
+            cal.theta, cal.sigmas, start, _STARS_AT_ONCE
+        ):
+            h, flat = columns[:p], columns.reshape(p + 1, -1)
             gram += flat @ flat.T
             sums.add(part, state, h, rows)
             # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has

@@ -45,7 +45,7 @@ from starcal_uq.likelihood import paths
 from starcal_uq.likelihood.compressed import GramSums, gram_sums, optimum, settled
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.solvers import Normal, is_singular, levenberg_marquardt
-from starcal_uq.likelihood.sums import NormalSums, frame_sums, settled_sums, sum_of
+from starcal_uq.likelihood.sums import NormalSums, frame_sums, sum_of
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.checks import row_hashes
 from starcal_uq.observations.partitions import (
@@ -149,15 +149,13 @@ def _residuals(
     beside: Beside | None,
     part: Partition,
 ) -> _Residuals:
-    rests = [] if beside is None else beside.rests(part)
-    obs = reader.load(part) if beside is None else beside.cleared(rests)
+    obs, frames = (
+        (reader.load(part), None) if beside is None else beside.cleared(part, np.ones_like(theta))
+    )
     likelihood = MarginalLikelihood(obs, camera.distortion)
     whole, e = likelihood.frames, np.empty((2, obs.n_stars))
-    known = [rest.rotations for _, rest in rests]
-    start = np.concatenate(known) if known else likelihood.start_rotations(theta)
-    normal, attitudes = settled_sums(whole, camera.distortion, theta, start, e)
-    if rests:
-        frames = FrameNormals.joined([rest.normals(theta) for _, rest in rests])
+    normal, attitudes = likelihood.sums(theta, e)
+    if frames is not None:
         slopes, matrix = frames.slopes.sum(axis=0), frames.matrix
         normal = replace(normal, gradient=-slopes, matrix=matrix)
     stated = obs.sigma_or_one
@@ -205,13 +203,10 @@ def _scatter(
 ) -> FrameScatter:
     scale = 1.0 / np.sqrt(np.diag(whole.matrix))
     scaled = whole.matrix * np.outer(scale, scale), -whole.gradient * scale
-    if beside is not None:
-        own = [rest.normals(theta, scale) for _, rest in beside.rests(part)]
-        return FrameNormals.joined(own).scatter(scaled)
-    likelihood = MarginalLikelihood(reader.load(part), model)
-    frames = likelihood.frames
-    near = frame_sums(frames, model, theta, likelihood.start_rotations(theta))[1].at(theta)
-    return FrameNormals.around(frames, model, theta, near, scale).scatter(scaled)
+    obs, own = (reader.load(part), None) if beside is None else beside.cleared(part, scale)
+    if own is None:
+        own = FrameNormals.around(obs, model, theta, None, scale)
+    return own.scatter(scaled)
 
 
 def _stepped(

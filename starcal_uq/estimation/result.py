@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px, unproject
@@ -25,12 +24,13 @@ from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, w
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
+from starcal_uq.estimation.kept import KeptFrames
 from starcal_uq.estimation.prediction import PredictedCamera, displacement, predicted
 from starcal_uq.estimation.residual_map import PartitionSums
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.undetermined import remedy_of
 from starcal_uq.likelihood.compressed import CompressedLikelihood
-from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
+from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.likelihood.ties import FittedTies
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, is_positive
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from starcal_uq.likelihood.noise_model import NoiseModel
-    from starcal_uq.observations.frames import StarFrames
     from starcal_uq.observations.table import Observations
 
 # Fields whose arrays grow with the data or the iterations: they stand in an archive beside the
@@ -63,89 +62,37 @@ _APART = (
 )
 # Fields of the document, in the order in which it is read.
 _DOCUMENT = (
-    *(
-        "status",
-        "parameter_names",
-        "method",
-        "solver",
-        "sigma",
-        "sigma_std",
-        "sigma_name",
-        "chi2",
-        "dof",
-        "provenance",
-    ),
-    *(
-        "theta",
-        "covariance",
-        "information",
-        "rotation_per_theta",
-        "attitude_noise",
-        "pair_theta",
-        "pair_covariance",
-    ),
-    *(
-        "camera",
-        "nominal",
-        "stages",
-        "compressed",
-        "fingerprints",
-        "partitions",
-        "undetermined",
-        "effects",
-        "ties",
-    ),
+    "status",
+    "parameter_names",
+    "method",
+    "solver",
+    "sigma",
+    "sigma_std",
+    "sigma_name",
+    "chi2",
+    "dof",
+    "provenance",
+    "theta",
+    "covariance",
+    "information",
+    "rotation_per_theta",
+    "attitude_noise",
+    "pair_theta",
+    "pair_covariance",
+    "camera",
+    "nominal",
+    "stages",
+    "compressed",
+    "fingerprints",
+    "partitions",
+    "undetermined",
+    "effects",
+    "ties",
 )
 # Hash of the archive that belongs to the document.
 _ARCHIVE = "archive_sha256"
 # What the document says of a stage; its last estimate is there for readers.
 _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
-
-
-@dataclass(frozen=True)
-class KeptFrames:
-    """Frames of a calibration at its estimate: what it keeps of the data, star by star."""
-
-    frame_ids: IntArray  # (K,)
-    quaternions: FloatArray  # (K, 4): scalar-last R_cam_icrs
-    residuals_px: FloatArray  # (N, 2): observed minus predicted
-    fingerprints: Fingerprints | None
-    per_star: bool  # Whether the stars state their noise
-    data_hash: str | None
-
-    @classmethod
-    def of(
-        cls,
-        obs: Observations,
-        frames: StarFrames,
-        rotations: FloatArray,
-        whitened: FloatArray,
-        camera: Camera,
-    ) -> KeptFrames:
-        """All frames of a table: `rotations` (K, 3, 3), residuals `whitened` (2, N); the detector of
-        `camera`.
-        """
-        residuals = frames.in_pixels(whitened).T
-        return cls(
-            frame_ids=obs.frame_ids,
-            quaternions=rotation_to_quaternion(rotations),
-            residuals_px=residuals,
-            fingerprints=Fingerprints.of(obs, residuals, camera.centre_px),
-            per_star=frames.weight is not None,
-            data_hash=obs.data_hash,
-        )
-
-    @classmethod
-    def none(cls, per_star: bool, data_hash: str | None) -> KeptFrames:
-        """Nothing of a stream of frames."""
-        return cls(
-            frame_ids=np.zeros(0, dtype=np.int64),
-            quaternions=np.zeros((0, 4)),
-            residuals_px=np.zeros((0, 2)),
-            fingerprints=None,
-            per_star=per_star,
-            data_hash=data_hash,
-        )
 
 
 @dataclass(frozen=True)
@@ -606,28 +553,11 @@ class Calibration(Shown, Traced):
             stars = document.pop("star_errors", None)
             found = from_plain(cls, document, arrays)
             if stars is not None:
-                found = replace(found, effects=_of_stars(stars, found.compressed))
+                found = replace(found, effects=Effects.of_stars(stars, found.compressed))
             # What the data leave open has no information.
             if not is_positive(found.information, strictly=not found.undetermined):
                 raise ValueError("its information matrix is not positive definite")
             return found
-
-
-def _of_stars(stars: AnyDict, compressed: CompressedLikelihood) -> Effects:
-    """Errors of the stars of an earlier version, which had a record of their own, as an effect."""
-    tau, nothing = float(stars["tau_px"]), np.nan
-    factor = float(np.exp(1.96 * stars["tau_px_std"] / max(tau, 1e-12)))
-    own = FittedEffect("star", tau, tau / factor, tau * factor, nothing, nothing, nothing, "")
-    return Effects(
-        (own,),
-        False,
-        (),
-        0.0,
-        cross=np.zeros((len(compressed.theta_hat), 0)),
-        node_grams=compressed.gram[None],
-        node_log_weights=np.zeros(1),
-        stated_px=float(stars["stated_px"]),
-    )
 
 
 def _at(nominal: Camera, theta: FloatArray, sigma: float, dof: int, status: Status) -> AnyDict:

@@ -18,7 +18,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.compressed import compress
-from starcal_uq.likelihood.effect_sums import EffectLikelihood
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.ties import TiedLikelihood, Ties
 from starcal_uq.observations.frames import StarFrames

@@ -36,7 +36,7 @@ class Buffers:
 
     def __init__(self, p: int, n: int) -> None:
         self._columns = np.empty((4 + p) * 2 * n)
-        self._products = np.empty((4 + p) * (5 + p) // 2 * n)
+        self._products = np.empty(3 * (3 + p) * n)
         self._one, self._two = np.empty((4 + p) * n), np.empty((4 + p) * n)
         self.p = p
 
@@ -44,15 +44,14 @@ class Buffers:
         """A, e and H: (3 + 1 + p, 2, n)."""
         return self._columns[: (4 + self.p) * 2 * n].reshape(4 + self.p, 2, n)
 
-    def products(self, columns: FloatArray, depth: int) -> FloatArray:
-        """Products of the first rows (those of A) with themselves and the ones that follow, over
-        both axes: (.., n).
+    def products(self, columns: FloatArray) -> FloatArray:
+        """Products of the three rows of A with themselves and the ones that follow, over both axes:
+        (.., n).
         """
         rows, _, n = columns.shape
-        total = depth * rows - depth * (depth - 1) // 2
-        out = self._products[: total * n].reshape(total, n)
+        out = self._products[: 3 * (rows - 1) * n].reshape(3 * (rows - 1), n)
         first = 0
-        for i in range(depth):
+        for i in range(3):
             count = rows - i
             one, two = (buffer[: count * n].reshape(count, n) for buffer in (self._one, self._two))
             np.multiply(columns[i:, 0], columns[i, 0], out=one)
@@ -105,7 +104,7 @@ def normals(
     for block in blocks(frames, model_name, theta, rotations, residuals):
         flat, turn = block.columns.reshape(p + 4, -1), block.turn
         gram += flat[3:] @ flat[3:].T
-        packed[:, block.place], mixed[:, :, block.place] = unpacked(block.products(3), p + 4)
+        packed[:, block.place], mixed[:, :, block.place] = unpacked(block.products(), p + 4)
     inverse, determinant = inverse_symmetric(packed)
     solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
     gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
@@ -123,9 +122,9 @@ class Block(NamedTuple):
     turn: FloatArray
     buffers: Buffers
 
-    def products(self, depth: int) -> FloatArray:
+    def products(self) -> FloatArray:
         """Sums over the stars of each frame of `Buffers.products`."""
-        return self.part.sum(self.buffers.products(self.columns, depth))
+        return self.part.sum(self.buffers.products(self.columns))
 
 
 def blocks(

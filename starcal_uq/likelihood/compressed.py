@@ -196,18 +196,15 @@ def expanded(
     add: Callable[[MarginalLikelihood, Profile, FloatArray, slice], object],
 ) -> GramSums:
     """As `gram_sums`, with what else is summed over the columns of the expansion: `add` takes some
-    frames, the model there, the columns (q, 2, n) without their attitudes, and the rows of the
-    stars.
+    frames, the model there, the columns (q, 2, n), and the rows of the stars.
     """
-    frames, model_name = likelihood.frames, likelihood.model_name
     best = known[1].at(theta)
 
     def look(which: slice, columns: FloatArray) -> None:
-        own = MarginalLikelihood(frames.part(which.start, which.stop), model_name)
-        state, _ = own.profile(theta, best[which])
-        rows = slice(int(frames.starts[which.start]), int(frames.starts[which.stop]))
-        add(own, state, own.project_out(state, columns), rows)
+        own, state, rows = likelihood.piece(theta, best, which.start, which.stop)
+        add(own, state, columns, rows)
 
+    frames, model_name = likelihood.frames, likelihood.model_name
     return gram_sums(frames, model_name, theta, whitening, known, look)
 
 

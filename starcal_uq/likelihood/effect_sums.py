@@ -25,7 +25,7 @@ from starcal_uq.likelihood.effects import Effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.frame_products import FrameProducts
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
-from starcal_uq.likelihood.shapes import View
+from starcal_uq.likelihood.shapes import View, Waves
 from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.likelihood.terms import Eliminated, TermSums, add_by_group
 from starcal_uq.observations.frames import StarFrames
@@ -33,16 +33,14 @@ from starcal_uq.observations.frames import StarFrames
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Whitened columns of effects at some stars, and the turns of the frames, rad, that they hold.
-
-    Attitudes are projected out of those of frames; `raw` are the run's as they are.
+    """Whitened columns of effects at some stars, as they are where they are called raw, else with
+    the attitudes projected out.
     """
 
+    view: View
     attitudes: ByFrame
-    raw: FloatArray  # (m, 2, n)
-    frame: FloatArray  # (c, 2, n)
-    frame_turns: FloatArray  # (c, 3, K)
-    turning: FloatArray  # (m,): one where turns are the camera's, else zero
+    of_run: tuple[Effect, ...]
+    raw_frame: FloatArray  # (c, 2, n)
     star: FloatArray  # (s, 2, n), as they are
     groups: IntArray  # (n,): star of every image, from 0
     n_stars: int
@@ -57,32 +55,16 @@ class Columns:
         rows: slice,
     ) -> Columns:
         """The columns at these rows of the table, run, frame and star by themselves."""
-        view, attitudes = View.of(part, state, theta, rows), part.attitudes(state)
-        nothing = np.zeros((0, 2, part.frames.n_stars))
-
-        def of(grouping: str) -> FloatArray:
-            own = [e.columns.columns(view) for e in effects if e.grouping == grouping]
-            columns = own[0] if len(own) == 1 else np.concatenate([nothing, *own])
-            part.frames.whiten(columns)
-            return columns
-
-        frame = of("frame")
-        star, groups, n_stars = nothing, np.zeros(part.frames.n_stars, dtype=np.int64), 0
+        view = View.of(part, state, theta, rows)
+        of_run = tuple(effect for effect in effects if effect.grouping == "run")
+        of_frames = (e.columns.columns(view) for e in effects if e.grouping == "frame")
+        frame = _whitened(part.frames, *of_frames)
+        star, groups, n_stars = frame[:0], np.zeros(part.frames.n_stars, dtype=np.int64), 0
         stars = stars_of(effects)
         if stars is not None:
             star, groups = stars.term().columns(part, state, rows), stars.numbers[rows]
             n_stars = len(stars.images)
-        return cls(
-            attitudes,
-            of("run"),
-            attitudes.removed_from(frame) if len(frame) else frame,
-            attitudes.coefficients(frame),
-            # Air bends light: it does not turn the camera.
-            _repeated([not effect.known for effect in effects], effects),
-            star,
-            groups,
-            n_stars,
-        )
+        return cls(view, part.attitudes(state), of_run, frame, star, groups, n_stars)
 
     @property
     def frames(self) -> StarFrames:
@@ -90,9 +72,33 @@ class Columns:
         return self.attitudes.frames
 
     @cached_property
+    def raw(self) -> FloatArray:
+        """Columns (m, 2, n) of the run."""
+        return _whitened(self.frames, *(e.columns.columns(self.view) for e in self.of_run))
+
+    @cached_property
     def run(self) -> FloatArray:
-        """Columns (m, 2, n) of the run, attitudes projected out."""
+        """The same, attitudes projected out."""
         return self.attitudes.removed_from(self.raw) if len(self.raw) else self.raw
+
+    @cached_property
+    def frame(self) -> FloatArray:
+        """Columns (c, 2, n) of frames."""
+        raw = self.raw_frame
+        return self.attitudes.removed_from(raw) if len(raw) else raw
+
+    @property
+    def frame_turns(self) -> FloatArray:
+        """Turns (c, 3, K) of the frames, rad, that columns of frames hold."""
+        return self.attitudes.coefficients(self.raw_frame)
+
+    @property
+    def turning(self) -> FloatArray:
+        """One where turns by a column of the run (m,) are the camera's, else zero: air bends light
+        and does not turn the camera.
+        """
+        own = [np.full(len(effect.prior), 1.0 - effect.known) for effect in self.of_run]
+        return np.concatenate([np.zeros(0), *own])
 
     def cross(self, x: FloatArray) -> Cross:
         """Products with columns x (q, 2, n) whose attitudes are projected out."""
@@ -107,29 +113,64 @@ class Columns:
         )
 
     def products(self, added: FloatArray) -> Products:
-        """Products with added columns (q, 2, n) whose attitudes are projected out, and among
-        themselves.
+        """Products with added columns (q, 2, n) and among themselves, attitudes projected out.
+
+        They are taken of waves along x and y and of the other columns, of which those of the run are
+        made, but for rotations.
         """
-        m, c = len(self.raw), len(self.frame)
-        every = np.concatenate([self.raw, self.frame, added])
-        flat = every.reshape(len(every), 2 * self.frames.n_stars)
-        among = flat @ flat.T
-        # Nothing of the size of the many columns is written for what rotations make of them.
-        by_frame = np.concatenate([self.attitudes.columns, self.frame])
-        by_frame = products_by_frame(self.frames, by_frame, every)
+        frames, view = self.frames, self.view
+        shapes = [effect.columns.columns for effect in self.of_run]
+        smooth = next((shape for shape in shapes if isinstance(shape, Waves)), None)
+        waves, held = np.zeros((0, frames.n_stars)), self.star[:0]
+        if smooth is not None:
+            waves = smooth.along(view) * (1.0 if frames.weight is None else frames.weight)
+            # A wave of second order is what a shift of the camera leaves of a turn, many times.
+            held = self.attitudes.removed_from(_whitened(frames, view.parameter_columns))
+        plain = [_whitened(frames, shape(view)) for shape in shapes if shape is not smooth]
+        others = np.concatenate([held, *plain, self.frame, added])
+        w, place = 2 * len(waves), 2 * len(waves) + len(held)
+        size, made = w + len(others), []
+        for shape, effect in zip(shapes, self.of_run, strict=True):
+            own = np.eye(len(effect.prior), size, place)
+            if shape is smooth:
+                mixed = np.eye(2) if frames.whitening is None else frames.whitening.T
+                own[:, :w] = np.kron(np.eye(len(waves)), mixed)
+                own[:, w:] = 0.0
+                own[:, w : w + len(held)] = smooth.beside[:, : len(held)]
+            else:
+                place += len(own)
+            made.append(own)
+        factors = np.concatenate([*made, np.eye(size - place, size, place)])
+        local = np.concatenate([self.attitudes.columns, self.frame])
+        axes = [products_by_frame(frames, local[:, x : x + 1], waves[:, None]) for x in (0, 1)]
+        along = np.stack(axes, axis=3).reshape(frames.n_frames, len(local), w)
+        by_frame = np.concatenate([along, products_by_frame(frames, local, others)], axis=2)
         root = np.linalg.cholesky(np.moveaxis(self.attitudes.inverse, 2, 0))
-        turned = np.swapaxes(root, 1, 2) @ by_frame[:, :3, :m]
-        turned = turned.reshape(3 * self.frames.n_frames, m)
-        of_stars = np.zeros((0, len(every)))
+        turned = (np.swapaxes(root, 1, 2) @ by_frame[:, :3]).reshape(3 * frames.n_frames, size)
+        flat = others.reshape(len(others), 2 * frames.n_stars)
+        across = np.stack([waves @ others[:, x].T for x in (0, 1)], axis=1).reshape(w, len(others))
+        gram = np.block([[np.kron(waves @ waves.T, np.eye(2)), across], [across.T, flat @ flat.T]])
+        gram, frame = gram - turned.T @ turned, by_frame[:, 3:] @ factors.T
+        gram = factors @ gram @ factors.T
+        end = len(factors) - len(added)
+        m = end - len(self.frame)
+        of_stars = np.zeros((0, len(factors)))
         if self.n_stars:
-            of_stars = self.cross(np.concatenate([self.run, self.frame, added])).star
-        frame, end = by_frame[:, 3:], m + c
+            left = self.attitudes.removed_from(added)
+            of_stars = self.cross(np.concatenate([self.run, self.frame, left])).star
         return Products(
-            among[end:, end:],
-            Cross(among[:m, end:], frame[:, :, end:], of_stars[:, end:]),
-            Cross(among[:m, :m] - turned.T @ turned, frame[:, :, :end], of_stars[:, :end]),
+            gram[end:, end:],
+            Cross(gram[:m, end:], frame[:, :, end:], of_stars[:, end:]),
+            Cross(gram[:m, :m], frame[:, :, :end], of_stars[:, :end]),
             None,
         )
+
+
+def _whitened(frames: StarFrames, *columns: FloatArray) -> FloatArray:
+    """Columns (c, 2, n) in one array that is whitened."""
+    found = np.concatenate([np.zeros((0, 2, frames.n_stars)), *columns])
+    frames.whiten(found)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,15 +263,15 @@ class EffectSums:
         self,
         part: MarginalLikelihood,
         state: Profile,
-        projected: FloatArray,
+        added: FloatArray,
         rows: slice,
     ) -> Columns:
-        """Add frames, with columns (q, 2, n) whose attitudes are projected out."""
+        """Add frames, with columns (q, 2, n)."""
         columns = Columns.of(self.effects, part, state, self._theta, rows)
-        own = columns.products(projected)
+        own = columns.products(added)
         self.parts.append(own if self._apart else own.summed())
         if self.of_stars is not None:
-            self.of_stars.add(part, state, projected[:0], rows, columns.frame)
+            self.of_stars.add(part, state, added[:0], rows, columns.frame)
         return columns
 
     @cached_property
@@ -436,153 +477,6 @@ class Solved:
         return Cross(run, np.asarray(self.frame_vectors @ (root * half)), star)
 
 
-class EffectLikelihood(MarginalLikelihood):
-    """Exact likelihood with effects marginalised at given scales, in units of sigma.
-
-    Coefficients are linear over fractions of a pixel, and their columns and normal equations are
-    those at the estimate. What they are expected to be, `mean` (m,) of those of the run, is taken
-    off the images in `frames`; all others here are differences from that. Where those of the run are
-    `given`, from more frames than these, there is no difference.
-
-    `frames`: data, with any weights and axes of the noise. `ratio`: square of every effect's scale
-    in units of `sigma` squared. `theta` (p,): estimate, px units. `rotations` (K, 3, 3): attitudes
-    there.
-    """
-
-    def __init__(
-        self,
-        frames: StarFrames,
-        model_name: str,
-        effects: Sequence[Effect],
-        ratio: Mapping[str, float],
-        theta: FloatArray,
-        rotations: FloatArray,
-        sigma: float = 1.0,
-        given: FloatArray | None = None,
-    ) -> None:
-        super().__init__(frames, model_name)
-        state, _ = self.profile(theta, rotations)
-        self.effects = tuple(effect for effect in effects if effect.name in ratio)
-        run = [effect for effect in self.effects if effect.grouping == "run"]
-        self.mean, self.pull = expected(run, ratio) if given is None else given, pull_of(run)
-        if self.mean.any() or given is not None:
-            seen = Columns.of(self.effects, self, state, theta, slice(None))
-            shift = self.project_out(state, np.tensordot(self.mean, seen.raw, 1)[None])[0]
-            shift = frames.in_pixels(shift)
-            self.frames = replace(frames, pixel=np.ascontiguousarray(frames.pixel - shift))
-            state, _ = self.profile(theta, state.rotations)
-        self.use_rotations(state.rotations)
-        # What frames share may be known: products of its columns are not needed then.
-        free = [e for e in self.effects if given is None or e.grouping != "run"]
-        sums = EffectSums(free, theta, sigma)
-        nothing = np.zeros((0, 2, frames.n_stars))
-        self.columns = sums.add(self, state, nothing, slice(None))
-        self.solved = sums.solved(ratio)
-        if given is not None:
-            self.columns = replace(self.columns, raw=seen.raw, turning=seen.turning)
-            self.solved = self.solved.with_known(len(given))
-        self._frame_root = np.sqrt(sums.ratios(ratio, "frame"))
-
-    def conditioned(self, state: Profile, columns: FloatArray) -> tuple[FloatArray, Cross]:
-        """Columns (q, 2, N) less what attitudes and effects take of them, and the effects'
-        coefficients.
-        """
-        projected = self.project_out(state, columns)
-        found = self.solved.coefficients(self.columns.cross(projected))
-        return projected - self.shifts(state, found), found
-
-    def shifts(self, state: Profile, found: Cross) -> FloatArray:
-        """Whitened shifts (q, 2, N) by coefficients, without what rotations reproduce."""
-        member: IntArray = np.repeat(np.arange(self.frames.n_frames), self.frames.sizes)
-        raw = self.columns.raw
-        own = found.run.T @ raw.reshape(len(raw), 2 * self.frames.n_stars)
-        own = self.columns.attitudes.removed_from(own.reshape(-1, *raw.shape[1:]))
-        own += np.einsum("ncq,cxn->qxn", found.frame[member], self.columns.frame, optimize=True)
-        if self.columns.n_stars:
-            own += self.project_out(state, self._of_stars(found))
-        return np.asarray(own)
-
-    def _of_stars(self, found: Cross) -> FloatArray:
-        by_image = found.star.reshape(self.columns.n_stars, 2, -1)[self.columns.groups]
-        return np.asarray(np.einsum("niq,ixn->qxn", by_image, self.columns.star, optimize=True))
-
-    def turns(self, state: Profile, found: Cross) -> FloatArray:
-        """Rotation vectors (q, 3, K) of the frames that such shifts cause, rad."""
-        columns = self.columns
-        raw = np.tensordot((found.run * columns.turning[:, None]).T, columns.raw, 1)
-        own = columns.attitudes.coefficients(raw)
-        own += np.einsum("kcq,cik->qik", found.frame, self.columns.frame_turns)
-        if self.columns.n_stars:
-            own += self.attitude_response(state, self._of_stars(found))
-        return np.asarray(own)
-
-    def random_shifts(self, state: Profile, rng: np.random.Generator) -> FloatArray:
-        """Whitened shifts (1, 2, N) of all images by random coefficients, in units of sigma."""
-        solved, k = self.solved, self.frames.n_frames
-        run, frame = solved.run_root[:, None], self._frame_root[:, None]
-        star = np.zeros((self.columns.n_stars * len(self.columns.star), 1))
-        if solved.stars is not None:
-            star = np.sqrt(solved.stars.eliminated.ratio)[:, None]
-        drawn = Cross(
-            run * rng.standard_normal(run.shape),
-            frame * rng.standard_normal((k, *frame.shape)),
-            star * rng.standard_normal(star.shape),
-        )
-        return self.shifts(state, drawn)
-
-    def of_effect(self, name: str, found: Cross) -> Cross:
-        """The coefficients of one effect, those of the others zero."""
-        run, frame = (
-            np.concatenate(
-                [
-                    np.zeros(0),
-                    *(
-                        np.full(len(e.prior), float(e.name == name))
-                        for e in self.effects
-                        if e.grouping == grouping
-                    ),
-                ]
-            )
-            for grouping in ("run", "frame")
-        )
-        star = float(name == "star")
-        return Cross(found.run * run[:, None], found.frame * frame[:, None], found.star * star)
-
-    def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
-        rest, found = self.conditioned(state, columns)
-        q, solved = len(columns), self.solved
-        frame = np.moveaxis(found.frame, 2, 0)
-        parts = [rest.reshape(q, -1), _over(found.run.T, solved.run_root)]
-        # Scales of frames are alike; with none of them there are no coefficients.
-        parts.append(_over(frame, self._frame_root).reshape(q, frame[0].size if q else 0))
-        if solved.stars is not None:
-            parts.append(_over(found.star.T, np.sqrt(solved.stars.eliminated.ratio)))
-        return np.concatenate(parts, axis=1)
-
-    def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
-        state, cost = self.profile(theta, self._rotations)
-        if not np.isfinite(cost):
-            return -np.inf
-        left = self.whitened(state, state.e[None])
-        run = left[0, state.e.size : state.e.size + len(self.mean)] * self.solved.run_root
-        return float(
-            self.pull @ run
-            - 0.5 * np.sum(left**2) / sigma**2
-            - self.dof * np.log(sigma)
-            - 0.5 * np.sum(state.log_determinant)
-        )
-
-
-def _repeated(values: Sequence[Any], effects: Sequence[Effect]) -> FloatArray:
-    """Values of the effects for each coefficient of those of the run, (m,)."""
-    own = [
-        np.full(len(e.prior), v)
-        for v, e in zip(values, effects, strict=True)
-        if e.grouping == "run"
-    ]
-    return np.concatenate([np.zeros(0), *own])
-
-
 def expected(effects: Sequence[Effect], present: Mapping[str, Any]) -> FloatArray:
     """Expected coefficients (m,) of effects, zero of those that are not present."""
     own = [
@@ -596,8 +490,3 @@ def pull_of(effects: Sequence[Effect]) -> FloatArray:
     """Slopes (m,) of the log prior of the coefficients of effects beyond its Gaussian."""
     own = [0.0 * effect.prior if effect.pull is None else effect.pull for effect in effects]
     return np.concatenate([np.zeros(0), *own])
-
-
-def _over(values: FloatArray, root: FloatArray) -> FloatArray:
-    """Coefficients (..., c) in units of their standard deviations (c,); zero where these are."""
-    return np.divide(values, root, out=np.zeros_like(values), where=root > 0.0)

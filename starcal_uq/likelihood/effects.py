@@ -8,7 +8,7 @@ coefficients of one whose prior is known may have an expected value that is not 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
@@ -26,6 +26,7 @@ from starcal_uq.likelihood.shapes import (
     Extent,
     Shape,
     View,
+    Waves,
     axes_shape,
     frame_shapes,
     magnitude_shape,
@@ -49,6 +50,8 @@ _ORDER, _SMOOTHNESS = 8, 1.5
 _GRID = 24
 # Fewer stars than this that are seen twice do not tell their errors from noise.
 _FEWEST_STARS = 5
+# Stars whose many columns stay in the cache.
+_STARS_AT_ONCE = 1_500
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +131,31 @@ def zenith_effect(obs: Observations, zeniths: Zeniths) -> Effect:
     )
 
 
+def run_shifts(
+    likelihood: MarginalLikelihood,
+    effects: Sequence[tuple[Effect, FloatArray]],
+    theta: FloatArray,
+) -> FloatArray:
+    """Shifts (2, N), px, of images by effects of the run with their coefficients, at theta (p,).
+
+    Air bends light and does not turn the camera: attitudes keep what they reproduce of it.
+    """
+    found = np.zeros((2, likelihood.frames.n_stars))
+    for part, state, rows in likelihood.pieces(theta, None, _STARS_AT_ONCE):
+        view = View.of(part, state, theta, rows)
+        for effect, coefficients in effects:
+            columns = effect.columns.columns
+            if isinstance(columns, Waves):
+                shift = columns.shift(view, coefficients)
+            else:
+                shift = np.tensordot(coefficients, columns(view), 1)
+            if effect.known:
+                part.frames.whiten(shift)
+                shift = part.frames.in_pixels(part.project_out(state, shift[None])[0])
+            found[:, rows] += shift
+    return found
+
+
 def corner_unit(camera: Camera) -> FloatArray:
     """Changes (3,) of x0, y0 and f that move the corner of the field by one px."""
     return np.array([1.0, 1.0, float(camera.focal_px) / camera.corner_radius_px])
@@ -178,16 +206,18 @@ def field_effect(camera: Camera) -> Effect:
     half = np.array([camera.width_px, camera.height_px]) / 2.0
     i, j = np.array([(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]).T
 
-    def raw(xy: FloatArray) -> FloatArray:
+    def waves(xy: FloatArray) -> FloatArray:
         from numpy.polynomial.legendre import legvander
 
         x, y = ((xy + 0.5) / half[:, None]) - 1.0
         along, across = legvander(x, _ORDER).T, legvander(y, _ORDER).T
-        found = np.zeros((len(i), 2, 2, xy.shape[1]))
-        found[:, 0, 0] = found[:, 1, 1] = along[i] * across[j]
-        return found.reshape(-1, 2, xy.shape[1])
+        return np.concatenate([one * across[: _ORDER + 1 - k] for k, one in enumerate(along)])
 
-    return _smooth("field", camera, raw, i + j)
+    def raw(xy: FloatArray) -> FloatArray:
+        found = np.kron(waves(xy), np.eye(2)).reshape(-1, *xy.T.shape)
+        return np.asarray(found.swapaxes(1, 2), dtype=np.float64)
+
+    return _smooth("field", camera, raw, i + j, waves)
 
 
 @lru_cache(maxsize=8)
@@ -206,10 +236,14 @@ def radial_effect(camera: Camera) -> Effect:
 
 
 def _smooth(
-    name: EffectName, camera: Camera, raw: Callable[[FloatArray], FloatArray], order: IntArray
+    name: EffectName,
+    camera: Camera,
+    raw: Callable[[FloatArray], FloatArray],
+    order: IntArray,
+    waves: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Effect:
     """Columns (c, 2, n) at pixels (2, n), less what the camera and a rotation do; smaller the
-    higher the orders (t,) of their terms are.
+    higher the orders (t,) of their terms are. They may be `waves` (c / 2, n) along each axis.
     """
     unit, taken = _of_camera(camera, raw)
     removed = -taken.T / unit
@@ -224,7 +258,8 @@ def _smooth(
         found += (removed @ held.reshape(len(unit), -1)).reshape(found.shape)
         return found
 
-    shape = Shape(f"smooth {name} shift", name, len(prior), columns)
+    made = columns if waves is None else Waves(waves, removed)
+    shape = Shape(f"smooth {name} shift", name, len(prior), made)
     return Effect(name, "run", shape, prior)
 
 

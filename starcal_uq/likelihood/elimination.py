@@ -52,12 +52,15 @@ class ByFrame:
 
 
 def products_by_frame(frames: StarFrames, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Products (K, a, b) of columns (a, 2, N) and (b, 2, N) over the stars of each frame."""
+    """Products (K, a, b) of columns (a, x, N) and (b, x, N) over the stars of each frame, along x
+    axes.
+    """
     from scipy.sparse import csc_array
 
-    a, n = len(one), frames.n_stars
+    a, axes, n = one.shape
+    n *= axes
     place = a * np.repeat(np.arange(frames.n_frames), frames.sizes)[:, None] + np.arange(a)
-    entries = one.reshape(a, 2 * n).T.ravel(), np.tile(place.ravel(), 2)
-    blocks = csc_array((*entries, a * np.arange(2 * n + 1)), shape=(a * frames.n_frames, 2 * n))
-    found = blocks @ other.reshape(len(other), 2 * n).T
+    entries = one.reshape(a, n).T.ravel(), np.tile(place.ravel(), axes)
+    blocks = csc_array((*entries, a * np.arange(n + 1)), shape=(a * frames.n_frames, n))
+    found = blocks @ other.reshape(len(other), n).T
     return np.asarray(found.reshape(frames.n_frames, a, len(other)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from starcal_uq.core.display import Shown
-from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray, Shapes
 from starcal_uq.likelihood.compressed import CompressedLikelihood, optimum
 from starcal_uq.likelihood.effects import Effect, effects_of
 from starcal_uq.likelihood.shapes import Extent
@@ -155,6 +155,23 @@ class Effects(Shown):
         "stars": ("s", 2),
         "star_sigmas": ("s", 2),
     }
+
+    @classmethod
+    def of_stars(cls, stars: AnyDict, compressed: CompressedLikelihood) -> Effects:
+        """Errors of the stars of an earlier version, which had a record of their own, as an effect."""
+        tau, nothing = float(stars["tau_px"]), np.nan
+        factor = float(np.exp(1.96 * stars["tau_px_std"] / max(tau, 1e-12)))
+        own = FittedEffect("star", tau, tau / factor, tau * factor, nothing, nothing, nothing, "")
+        return cls(
+            (own,),
+            False,
+            (),
+            0.0,
+            cross=np.zeros((len(compressed.theta_hat), 0)),
+            node_grams=compressed.gram[None],
+            node_log_weights=np.zeros(1),
+            stated_px=float(stars["stated_px"]),
+        )
 
     @property
     def names(self) -> tuple[str, ...]:

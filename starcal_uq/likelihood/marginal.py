@@ -23,7 +23,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.arrays import BLOCK_STARS, attitudes
-from starcal_uq.likelihood.elimination import ByFrame
+from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.paths import path_of
 from starcal_uq.likelihood.solvers import Normal
 from starcal_uq.likelihood.sums import (
@@ -59,6 +59,8 @@ class Profile:
     attitude: FloatArray
     inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
     log_determinant: FloatArray  # (K,): log |A^T A|
+    # (p, 2, N): derivatives of the (whitened) prediction with respect to theta, where they are known
+    slopes: FloatArray | None = None
 
     def shifts(self, moves: FloatArray) -> FloatArray:
         """Whitened shifts (..., 2, N) of images by small moves (..., 3, N) of the stars, camera
@@ -159,10 +161,7 @@ class MarginalLikelihood:
             np.subtract(part.pixel, e, out=e)
             part.whiten(e)
             part.whiten(a)
-            products = np.stack(
-                [np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)]
-            )
-            inverse, determinant = inverse_symmetric(part.sum(products))
+            inverse, determinant = _inverse(part, a)
             slope = part.sum(np.sum(a * e[None], axis=1))
             step = np.einsum("ijk,jk->ik", inverse, slope)
             left = float(np.sum(e * e) - np.sum(step * slope))
@@ -263,11 +262,17 @@ class MarginalLikelihood:
         """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed
         attitudes.
         """
-        _, h, _ = forward_kernel(self.model_name, "first")(
-            self.frames.n_stars, theta, state.b, forward_root(self.model_name, theta, state.b)
-        )
+        return self.first(theta, state.b)[1] if state.slopes is None else state.slopes
+
+    def first(self, theta: FloatArray, b: FloatArray) -> list[FloatArray]:
+        """Pixels (2, N) and their whitened derivatives by theta (p, 2, N) and by the frame's rotation
+        (3, 2, N).
+        """
+        kernel, root = forward_kernel(self.model_name, "first"), forward_root
+        xy, h, a = kernel(self.frames.n_stars, theta, b, root(self.model_name, theta, b))
         self.frames.whiten(h)
-        return h
+        self.frames.whiten(a)
+        return [xy, h, a]
 
     def attitudes(self, state: Profile) -> ByFrame:
         """The frames' rotations, which are eliminated."""
@@ -287,19 +292,66 @@ class MarginalLikelihood:
         """`derivatives` (p, 2, N) without what a rotation of each frame can reproduce."""
         return self.project_out(state, self.derivatives(theta, state))
 
+    def linearised(
+        self,
+        theta: FloatArray,
+        scale: FloatArray,
+        rotations: FloatArray | None,
+        max_stars: int,
+    ) -> Iterator[tuple[MarginalLikelihood, Profile, FloatArray, slice]]:
+        """As `pieces`, with the columns (p + 1, 2, n) of the parameters in units of `scale` (p,) and
+        of the residuals, attitudes projected out.
+        """
+        for part, state, rows in self.pieces(theta, rotations, max_stars):
+            h = part.slopes(theta, state) * scale[:, None, None]
+            yield part, state, np.concatenate([h, state.e[None]]), rows
+
     def pieces(
         self, theta: FloatArray, rotations: FloatArray | None, max_stars: int
     ) -> Iterator[tuple[MarginalLikelihood, Profile, slice]]:
         """Some frames at a time: their likelihood, the model at theta (p,), and the rows of their
         stars.
 
-        Attitudes are searched from `rotations` (K, 3, 3) or QUEST's.
+        Attitudes are searched from `rotations` (K, 3, 3), or as those of `sums`.
         """
+        if rotations is None:
+            best = self.sums(theta)[1].at(theta)
+        else:
+            best = settled_sums(self.frames, self.model_name, theta, rotations)[1].at(theta)
         for first, last in self.frames.parts(max_stars):
-            part = MarginalLikelihood(self.frames.part(first, last), self.model_name)
-            state, _ = part.profile(theta, None if rotations is None else rotations[first:last])
-            rows = slice(int(self.frames.starts[first]), int(self.frames.starts[last]))
-            yield part, state, rows
+            yield self.piece(theta, best, first, last)
+
+    def piece(
+        self, theta: FloatArray, best: FloatArray, first: int, last: int
+    ) -> tuple[MarginalLikelihood, Profile, slice]:
+        """Frames from `first` up to `last`, as `pieces` gives them; `best` are the best attitudes (K,
+        3, 3) of all.
+        """
+        part = MarginalLikelihood(self.frames.part(first, last), self.model_name)
+        frames, rotations = part.frames, best[first:last]
+        b = frames.rotated(rotations)
+        xy, h, a = part.first(theta, b)
+        e = frames.pixel - xy
+        frames.whiten(e)
+        inverse, determinant = _inverse(frames, a)
+        state = Profile(rotations, b, e, a, inverse, np.log(determinant), h)
+        return part, state, slice(int(self.frames.starts[first]), int(self.frames.starts[last]))
+
+    def frame_normals(
+        self, theta: FloatArray, rotations: FloatArray | None = None
+    ) -> tuple[FloatArray, Attitudes]:
+        """Normal equations of every single frame at its best attitude, searched from `rotations` (K,
+        3, 3) or as those of `sums`.
+
+        Returns products (K, p + 1, p + 1) of H and e without what the frame's attitude can reproduce.
+        """
+        if rotations is not None:
+            self.use_rotations(rotations)
+        sums, known = self.sums(theta)
+        self.use_sums(sums, known)
+        pieces = self.linearised(theta, np.ones(len(theta)), None, BLOCK_STARS)
+        grams = [products_by_frame(part.frames, own, own) for part, _, own, _ in pieces]
+        return np.concatenate(grams), known
 
     def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
         """Turn columns (q, 2, N) into (q, m) with products by the covariance of the data, attitudes
@@ -338,3 +390,9 @@ class MarginalLikelihood:
         else:
             rotations = self.start_rotations(theta) if self._rotations is None else self._rotations
         return settled_sums(self.frames, self.model_name, theta, rotations, residuals, tolerance)
+
+
+def _inverse(frames: StarFrames, a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverse (3, 3, K) of A^T A of each frame for A (3, 2, N), and its determinant (K,)."""
+    products = [np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)]
+    return inverse_symmetric(frames.sum(np.stack(products)))

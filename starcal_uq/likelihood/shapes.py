@@ -71,6 +71,35 @@ class View:
 
 
 @dataclass(frozen=True)
+class Waves:
+    """Columns (2 w, 2, n) of w functions along each axis, with what parameters of the camera and
+    rotations do beside them.
+    """
+
+    functions: Callable[[FloatArray], FloatArray]  # (w, n) at pixels (2, n)
+    beside: FloatArray  # (2 w, p + 3): coefficients of the parameters and of a rotation
+
+    def along(self, view: View) -> FloatArray:
+        """The functions (w, n) at the stars."""
+        return self.functions(view.part.frames.pixel - view.part.frames.in_pixels(view.state.e))
+
+    def shift(self, view: View, coefficients: FloatArray) -> FloatArray:
+        """The shift (2, n) by coefficients (2 w,)."""
+        shift = np.tensordot(coefficients @ self.beside, self._held(view), 1)
+        return np.asarray(shift + coefficients.reshape(-1, 2).T @ self.along(view))
+
+    def __call__(self, view: View) -> FloatArray:
+        held, waves = self._held(view), self.along(view)
+        found = np.tensordot(self.beside, held, 1)
+        found.reshape(len(waves), 2, 2, -1)[:, (0, 1), (0, 1)] += waves[:, None]
+        return np.asarray(found)
+
+    def _held(self, view: View) -> FloatArray:
+        turns = view.part.frames.in_pixels(view.state.attitude)
+        return np.concatenate([view.parameter_columns, turns])
+
+
+@dataclass(frozen=True)
 class Shape:
     """A family of shapes that one test looks for."""
 
@@ -379,7 +408,7 @@ class _TermColumns:
             names = parameter_names(model_name)
             theta = np.array([own[name] if name in shared else 0.0 for name in names])
             richer = MarginalLikelihood(view.part.frames, model_name)
-            columns.append(richer.derivatives(theta, view.state)[3 + index])
+            columns.append(richer.first(theta, view.state.b)[1][3 + index])
         return view.part.frames.in_pixels(np.stack(columns))
 
 

@@ -36,10 +36,8 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood.arrays import blocks, unpacked
 from starcal_uq.likelihood.paths import sums_for
 from starcal_uq.likelihood.solvers import Normal
-from starcal_uq.maths.linear import inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
 
 T = TypeVar("T")
@@ -132,46 +130,6 @@ def frame_sums(
             n_frames=frames.n_frames,
         )
     return sums, Attitudes(theta, rotations, shift, response, inverse, volume)
-
-
-def frame_normals(
-    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray
-) -> tuple[FloatArray, Attitudes]:
-    """Normal equations of every single frame at its best attitude, searched from `rotations` (K, 3,
-    3).
-
-    Returns products (K, p + 1, p + 1) of e and H without what the frame's attitude can reproduce.
-    """
-    for _ in range(ATTITUDE_STEPS):
-        gram, attitudes = _frame_normals(frames, model_name, theta, rotations)
-        if not np.max(np.abs(attitudes.shift)) >= ATTITUDE_TOLERANCE_RAD:
-            break
-        rotations = attitudes.at(theta)
-    return gram, replace(attitudes, rotations=rotations)
-
-
-def _frame_normals(
-    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray
-) -> tuple[FloatArray, Attitudes]:
-    """The same at given attitudes, in one pass."""
-    p, k, turn = len(theta), frames.n_frames, np.zeros((3, len(theta)))
-    rows = p + 4
-    sums = np.empty((rows * (rows + 1) // 2, k))
-    with np.errstate(all="ignore"):
-        for block in blocks(frames, model_name, theta, rotations):
-            sums[:, block.place], turn = block.products(rows), block.turn
-        packed, mixed = unpacked(sums[: 3 * (rows - 1)], rows)
-        inverse, determinant = inverse_symmetric(packed)
-        solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
-        gram = np.empty((k, p + 1, p + 1))
-        i, j = np.triu_indices(p + 1)
-        gram[:, i, j] = gram[:, j, i] = (
-            sums[3 * (rows - 1) :] - np.einsum("cqk,cqk->qk", mixed[:, i], solved[:, j])
-        ).T
-        response = -solved[:, 1:] - turn[:, :, None]
-        return gram, Attitudes(
-            theta, rotations, solved[:, 0], response, inverse, np.log(determinant)
-        )
 
 
 def settled_sums(

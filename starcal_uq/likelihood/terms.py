@@ -32,7 +32,6 @@ _NO_RATIO = 1e-10
 _LARGEST, _THIN = 7000, 0.01
 # Share of entries from which a matrix is solved as a dense one.
 _FULL = 0.2
-_STARS_AT_ONCE = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,26 +99,6 @@ class TermSums:
         frame = self._frames + np.repeat(np.arange(part.frames.n_frames), part.frames.sizes)
         self._blocks.append((block, groups, frame))
         self._frames += part.frames.n_frames
-
-    def add_linearised(
-        self,
-        likelihood: MarginalLikelihood,
-        theta: FloatArray,
-        scale: FloatArray,
-        rotations: FloatArray | None,
-    ) -> FloatArray:
-        """Add all frames with the parameters in units of `scale` (p,) and the residuals; the Gram
-        matrix (p + 1, p + 1) of these comes back.
-        """
-        p = len(theta)
-        gram = np.zeros((p + 1, p + 1))
-        for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
-            h = part.derivatives(theta, state) * scale[:, None, None]
-            columns = part.project_out(state, np.concatenate([h, state.e[None]]))
-            flat = columns.reshape(p + 1, -1)
-            gram += flat @ flat.T
-            self.add(part, state, columns, rows)
-        return gram
 
     @cached_property
     def coupling(self) -> Any:

@@ -18,8 +18,8 @@ import numpy as np
 
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.types import FloatArray, IntArray, floats
+from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
-from starcal_uq.likelihood.sums import frame_normals
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.effects import JointMatrices, PlannedEffects, SeenEffects
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
@@ -224,9 +224,10 @@ def frame_matrices(
     """Information (M, p, p), attitude response (M, 3, p) and attitude noise (M, 3, 3) of noise-free
     frames.
     """
-    gram, attitudes = frame_normals(frames, camera.distortion, camera.theta, rotations)
+    likelihood = MarginalLikelihood(frames, camera.distortion)
+    gram, attitudes = likelihood.frame_normals(camera.theta, rotations)
     return (
-        gram[:, 1:, 1:],
+        gram[:, :-1, :-1],
         attitudes.response.transpose(2, 0, 1),
         attitudes.inverse.transpose(2, 0, 1),
     )

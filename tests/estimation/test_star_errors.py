@@ -12,7 +12,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import CalibrationError, SamplingError
-from starcal_uq.likelihood.effect_sums import EffectLikelihood
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.effects import star_effect
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarModel, sky_axes

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.likelihood.effect_sums import EffectLikelihood, EffectSums
+from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
+from starcal_uq.likelihood.effect_sums import EffectSums
 from starcal_uq.likelihood.effects import effects_of
 from starcal_uq.likelihood.frame_products import FrameProducts
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -22,10 +23,18 @@ def scene() -> tuple[sc.Observations, sc.Calibration]:
     return obs, sc.calibrate(obs, sheet(c))
 
 
-def dense(obs: sc.Observations, cal: sc.Calibration) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals and derivatives (p + 1, 2 N), all attitude columns (3 K, 2 N), and C rho C^T."""
+def dense(
+    obs: sc.Observations, cal: sc.Calibration, settled: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals and derivatives (p + 1, 2 N), all attitude columns (3 K, 2 N), and C rho C^T.
+
+    `settled`: at attitudes that are the best ones to rounding, which waves over a pixel tell from
+    those to a nanoradian.
+    """
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-    state, _ = likelihood.profile(cal.theta)
+    ((_, state, _),) = likelihood.pieces(cal.theta, None, obs.n_stars)
+    if not settled:
+        state, _ = likelihood.profile(cal.theta)
     frames = likelihood.frames
     h = likelihood.derivatives(cal.theta, state) * cal.sigmas[:, None, None]
     x = np.concatenate([state.e[None], h]).reshape(6, -1)
@@ -58,7 +67,7 @@ def test_sums_are_products_with_the_inverse_of_the_dense_covariance(
     scene: tuple[sc.Observations, sc.Calibration],
 ) -> None:
     obs, cal = scene
-    x, a, covariance = dense(obs, cal)
+    x, a, covariance = dense(obs, cal, True)
     inverse = np.linalg.inv(covariance)
     w = inverse - inverse @ a.T @ np.linalg.inv(a @ inverse @ a.T) @ a @ inverse
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
@@ -84,7 +93,7 @@ def test_the_exact_likelihood_is_that_of_the_dense_covariance(
     scene: tuple[sc.Observations, sc.Calibration],
 ) -> None:
     obs, cal = scene
-    x, a, covariance = dense(obs, cal)
+    x, a, covariance = dense(obs, cal, False)
     inverse = np.linalg.inv(covariance)
     w = inverse - inverse @ a.T @ np.linalg.inv(a @ inverse @ a.T) @ a @ inverse
     frames = StarFrames.from_observations(obs)

@@ -16,7 +16,7 @@ from starcal_uq.likelihood import arrays, paths
 from starcal_uq.likelihood.compressed import gram_sums
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
-from starcal_uq.likelihood.sums import Descent, frame_normals, frame_sums, settled_sums, sum_of
+from starcal_uq.likelihood.sums import Descent, frame_sums, settled_sums, sum_of
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import camera, observations, with_sigmas
@@ -96,7 +96,7 @@ def test_sums_of_single_frames_keep_their_digits_in_a_narrow_field(field_deg):
     likelihood = MarginalLikelihood(with_sigmas(sc.Observations(**c.columns)), "brown")
     frames = likelihood.frames
     _, attitudes = settled_sums(frames, "brown", c.theta, likelihood.start_rotations(c.theta))
-    gram, found = frame_normals(frames, "brown", c.theta, attitudes.rotations)
+    gram, found = likelihood.frame_normals(c.theta, attitudes.rotations)
     b = frames.rotated(attitudes.rotations)
     xy, h, a = forward_kernel("brown", "first")(frames.n_stars, c.theta, b, np.zeros(2))
     e = (frames.pixel - xy)[None]
@@ -104,7 +104,7 @@ def test_sums_of_single_frames_keep_their_digits_in_a_narrow_field(field_deg):
     for k, (first, last) in enumerate(zip(frames.starts[:-1], frames.starts[1:], strict=True)):
         rows = [
             (array[..., first:last] * frames.weight[first:last]).reshape(len(array), -1).T
-            for array in (a, e, h)
+            for array in (a, h, e)
         ]
         # Without differences of large numbers: what the orthogonal columns of the attitude leave.
         q, r = np.linalg.qr(rows[0])

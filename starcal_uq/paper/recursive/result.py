@@ -13,7 +13,8 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.result import Calibration, KeptFrames
+from starcal_uq.estimation.kept import KeptFrames
+from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood.compressed import CompressedLikelihood
 from starcal_uq.likelihood.solvers import is_singular
