@@ -69,7 +69,8 @@ def assert_equal(
 def small(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[sc.Observations, sc.Camera, PartitionedObservations]:
-    obs, camera = sensor(90)
+    # One clean campaign in about a hundred takes up an effect by chance; that of seed 5 does.
+    obs, camera = sensor(90, seed=6)
     return (
         obs,
         camera,
