@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
 from typing import Protocol
@@ -18,7 +18,6 @@ from typing import Protocol
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
@@ -51,7 +50,15 @@ from starcal_uq.identification.search import (
     field_geometry,
     flipped,
 )
-from starcal_uq.observations.origin import CentroidsOrigin
+from starcal_uq.identification.sheet import (
+    CENTRE,
+    LARGEST_CENTRE_PX,
+    CalibratedCamera,
+    bending,
+    calibrated_tolerance,
+    much_narrower,
+    sheet_of,
+)
 from starcal_uq.sky.catalogue import StarCatalogue
 
 # Where few frames are found, the others are tried with a lens this much worse.
@@ -63,8 +70,6 @@ _PROBES = 10
 _IN_VAIN = 3
 # So many frames of a camera say enough of it to narrow the search for the others.
 _AGREE = 3
-# A frame is searched again when a tolerance is smaller than this part of what it was.
-_BETTER = 0.7
 # Frames with fewer stars say nothing about the common camera.
 _CAMERA_STARS = 7
 # After a search at any focal length in vain, of frames with so many stars, the other frames get so
@@ -77,11 +82,6 @@ _SURE = -9.0
 # A lens that bends is worth a second look at all frames where it explains so many times the stars
 # of one, or where so many frames are missed.
 _MORE, _MISSED = 1.1, 0.1
-# Error of the principal point that is allowed for: a part of the detector's width, but not more
-# than so many pixels.
-_CENTRE, _LARGEST_CENTRE_PX = 0.02, 20.0
-# Where images do not say it: a focal length in detector widths to begin with.
-_ASSUMED_FOCAL = 5.0
 
 
 class StarsByDepth(Protocol):
@@ -105,15 +105,6 @@ class OneDepth:
 
     def for_level(self, n: int) -> StarCatalogue:
         return self.stars
-
-
-class CalibratedCamera(Protocol):
-    """A `Calibration` or a `Posterior`: a camera with the covariance of its parameters."""
-
-    @property
-    def camera(self) -> Camera: ...
-    @property
-    def covariance(self) -> FloatArray: ...
 
 
 @bounded
@@ -193,7 +184,7 @@ def identify(
     sheet, told = (camera, True) if camera is not None else sheet_of(centroids)
     catalogue = OneDepth(stars) if isinstance(stars, StarCatalogue) else stars
     if centre_tolerance_px is None:
-        centre_tolerance_px = min(_CENTRE * sheet.width_px, _LARGEST_CENTRE_PX)
+        centre_tolerance_px = min(CENTRE * sheet.width_px, LARGEST_CENTRE_PX)
     tolerance = CameraTolerance(focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
     if calibration is not None:
         sheet, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
@@ -300,7 +291,7 @@ class _Attempt:
         """
         other = copy(self)
         mirrored = self.parity == "mirrored"
-        largest = _bending(self.tolerance, self.camera, grown.bend_px)
+        largest = bending(self.tolerance, self.camera, grown.bend_px)
         other.camera = flipped(grown.camera) if mirrored else grown.camera
         other.nominal, other.tolerance = nominal, calibrated_tolerance(grown, largest)
         other.field = FrameTable(self.centroids, other.camera, mirrored)
@@ -461,9 +452,7 @@ class _Attempt:
         if self.share_camera and len(useful) > 1:
             second, again, shared = self._narrow(useful)
             # What was not found with a camera known as well is not looked for once more.
-            known = {
-                k for k, t in self._narrowed.items() if not _much_narrower(second.tolerance, t)
-            }
+            known = {k for k, t in self._narrowed.items() if not much_narrower(second.tolerance, t)}
             given_up = {k for k in known if results[k].match is None}
             results = [
                 f if k in given_up else second.again(again, k, f, shared)
@@ -478,28 +467,6 @@ class _Attempt:
         return identification(
             self.field, results, refined, nominal, self.stars, self.parity, self.centroids, optics
         )
-
-
-def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
-    """The camera as its images describe it, and whether they say its focal length; their size must
-    be stated.
-    """
-    said = CentroidsOrigin.of(getattr(centroids, "meta", {})).optics
-    if not said:
-        raise IdentificationError(
-            "the centroids do not say the size of their images: give a camera, or measure the "
-            "images again."
-        )
-    width, height = int(said["width_px"]), int(said["height_px"])
-    pixel, focal_mm, focal_px = said.get("pixel_um"), said.get("focal_mm"), said.get("focal_px")
-    if focal_px is None and pixel and focal_mm:
-        focal_px = 1000.0 * focal_mm / pixel
-    focal = focal_px if focal_px else _ASSUMED_FOCAL * width
-    centre = (width - 1) / 2.0, (height - 1) / 2.0
-    camera = Camera(
-        width, height, pixel, None, *centre, name="camera of the images", focal_px=focal
-    )
-    return camera, bool(focal_px)
 
 
 def _found_optics(
@@ -531,28 +498,12 @@ def _with(
         tolerance = replace(tolerance, focal=min(tolerance.focal, AGREEMENT))
     if told:
         return camera, tolerance
-    return camera, _bending(tolerance, sheet, optics.distortion_px)
-
-
-def _bending(tolerance: CameraTolerance, camera: Camera, bend_px: float) -> CameraTolerance:
-    """Tolerances for a lens that bends by this much at the corner, whatever the sheet states."""
-    return replace(
-        tolerance,
-        centre_px=max(tolerance.centre_px, _CENTRE * camera.width_px),
-        distortion_px=max(tolerance.distortion_px, 1.5 * abs(bend_px)),
-    )
+    return camera, bending(tolerance, sheet, optics.distortion_px)
 
 
 def _useful(results: Iterable[Found]) -> list[Match]:
     """Matches that say something about the common camera."""
     return [f.match for f in results if f.match is not None and len(f.match) >= _CAMERA_STARS]
-
-
-def _much_narrower(one: CameraTolerance, other: CameraTolerance) -> bool:
-    """Whether the camera is known so much better that a search may find what it did not find
-    before.
-    """
-    return any(a < _BETTER * b for a, b in zip(astuple(one), astuple(other), strict=True))
 
 
 def _relative(found: Found, shared: FloatArray) -> Found:
@@ -562,24 +513,6 @@ def _relative(found: Found, shared: FloatArray) -> Found:
     state = CameraState(m.state.rotation, m.state.shared + shared)
     return replace(
         found, match=replace(m, state=state, gradient=m.gradient + m.information @ shared)
-    )
-
-
-def calibrated_tolerance(
-    calibration: CalibratedCamera, largest: CameraTolerance
-) -> CameraTolerance:
-    """Four standard deviations of a calibration, at most the given tolerances."""
-    camera = calibration.camera
-    p = len(camera.parameter_names)
-    covariance = floats(calibration.covariance)[:p, :p]
-    sd = 4.0 * np.sqrt(np.diag(covariance))
-    orders = [c.order for c in get_model(camera.distortion).coefficients]
-    corner = camera.corner_radius_px ** np.array(orders, dtype=np.float64)
-    bend = 4.0 * float(np.sqrt(corner @ covariance[3:, 3:] @ corner)) if orders else 0.0
-    return CameraTolerance(
-        focal=min(max(float(sd[2]) / camera.focal_px, 1e-5), largest.focal),
-        centre_px=min(max(float(sd[0]), float(sd[1]), 0.05), largest.centre_px),
-        distortion_px=min(max(bend, 0.05), largest.distortion_px),
     )
 
 

@@ -22,9 +22,10 @@ from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, StrArray
 from starcal_uq.observations.checks import check_columns, raise_problems
 from starcal_uq.observations.columns import COLUMNS
-from starcal_uq.observations.files import astropy_table, read_table, write_table
+from starcal_uq.observations.files import read_table
 from starcal_uq.observations.origin import Sourced
 from starcal_uq.observations.rows import FrameRows, locked
+from starcal_uq.observations.written import astropy_table, write_table
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

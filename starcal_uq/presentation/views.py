@@ -36,7 +36,7 @@ from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
-from starcal_uq.planning.plan import Need, Plan
+from starcal_uq.planning.planned import Need, Plan
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.coupling import (

@@ -11,7 +11,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.files import reading
 from starcal_uq.core.remedy import RUN, SOME_IMAGES, Remedy
 from starcal_uq.estimation.result import Calibration
-from starcal_uq.identification.engine import sheet_of
+from starcal_uq.identification.sheet import sheet_of
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION, MATCHED

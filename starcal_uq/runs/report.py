@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from starcal_uq.comparison.result import CameraComparison
     from starcal_uq.core.settings import ReportFormat
     from starcal_uq.pipeline.inspection import Frames
-    from starcal_uq.planning.plan import Plan
+    from starcal_uq.planning.planned import Plan
     from starcal_uq.studies.result import Study
 
 

@@ -16,8 +16,9 @@ from starcal_uq.core.files import UNFINISHED, new_folder
 from starcal_uq.core.manifest import alone, making, read_manifest
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, PathLike, Progress
-from starcal_uq.observations.files import parquet_summary, write_partition
+from starcal_uq.observations.files import parquet_summary
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
+from starcal_uq.observations.written import write_partition
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, observed, simulated_meta
 
 if TYPE_CHECKING:

@@ -15,10 +15,11 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.identification.blind import codes_of, quads_of
-from starcal_uq.identification.engine import _Attempt, identify, sheet_of
+from starcal_uq.identification.engine import _Attempt, identify
 from starcal_uq.identification.match import Match
 from starcal_uq.identification.pairs import angle_between
 from starcal_uq.identification.search import NOT_SEARCHED, Search
+from starcal_uq.identification.sheet import sheet_of
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.images.image import Image

@@ -21,7 +21,7 @@ from starcal_uq.core.errors import IdentificationError, SettingError
 from starcal_uq.identification import match as matching
 from starcal_uq.identification import proposers, search
 from starcal_uq.identification.brightness import instrumental_mag, unlike_brightness
-from starcal_uq.identification.engine import calibrated_tolerance, identify
+from starcal_uq.identification.engine import identify
 from starcal_uq.identification.pairs import (
     angle_between,
     cached_star_pairs,
@@ -34,6 +34,7 @@ from starcal_uq.identification.pyramid import (
     mortari_order,
     remaining_order,
 )
+from starcal_uq.identification.sheet import calibrated_tolerance
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.sky.positions import ra_dec_deg, unit_vectors

@@ -30,7 +30,8 @@ from starcal_uq.planning.forecast import (
 )
 from starcal_uq.planning.information import FrameSet, look_at, random_frames
 from starcal_uq.planning.open_distortion import with_distortion
-from starcal_uq.planning.plan import Plan, plan
+from starcal_uq.planning.plan import plan
+from starcal_uq.planning.planned import Plan
 from starcal_uq.presentation.pages.planning import render_plan, write_plan
 from starcal_uq.presentation.words.planning import distortion_sentence
 from starcal_uq.presentation.words.planning import frames as frames_words

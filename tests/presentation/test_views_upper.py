@@ -25,7 +25,7 @@ from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.verdict.judge import Verdict, judge
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
-from starcal_uq.planning.plan import Need, Plan
+from starcal_uq.planning.planned import Need, Plan
 from starcal_uq.presentation.pages.write import write_page
 from starcal_uq.presentation.views import VIEWS
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError

@@ -156,7 +156,7 @@ def test_a_sample_of_the_frames_says_what_all_do(
     obs, cal = scene()
     post = gaussian_posterior(cal, n=500, scale=100.0)
     every = propagate(post, obs, n_draws=100, alignment=alignment)
-    monkeypatch.setattr("starcal_uq.propagation.propagate._SAMPLED_FRAMES", 30)
+    monkeypatch.setattr("starcal_uq.propagation.sampled._SAMPLED_FRAMES", 30)
     some = propagate(post, obs, n_draws=100, alignment=alignment)
     assert (every.n_sampled_frames, some.n_sampled_frames) == (obs.n_frames, 30)
     assert f"30 of {obs.n_frames} frames" in some.told_frames

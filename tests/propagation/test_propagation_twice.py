@@ -23,6 +23,7 @@ from starcal_uq.observations.splits import frame_sample
 from starcal_uq.observations.table import Observations
 from starcal_uq.presentation.sentences.propagation import two_figures
 from starcal_uq.propagation import propagate as propagating
+from starcal_uq.propagation import sampled as through
 from starcal_uq.propagation.alignment import random_sky
 from starcal_uq.propagation.attitude_error import (
     CONTRIBUTORS,
@@ -243,8 +244,8 @@ def test_all_of_an_attitude_error_is_that_of_a_second_make(
     monkeypatch: pytest.MonkeyPatch, stated: bool, alignment: str, limit: int
 ) -> None:
     monkeypatch.setattr(propagating, "_SAMPLES", SAMPLES)
-    monkeypatch.setattr(propagating, "_SAMPLED_FRAMES", limit)
-    monkeypatch.setattr(propagating, "_FEWEST_FRAMES", min(limit, 30))
+    monkeypatch.setattr(through, "_SAMPLED_FRAMES", limit)
+    monkeypatch.setattr(through, "_FEWEST_FRAMES", min(limit, 30))
     post = wide(sigma_name="sigma_scale" if stated else "sigma")
     obs, other = frames(1, (9, 7, 11, 8), stated), frames(2, (10, 8, 9, 7, 12), stated)
     align = obs if alignment == "observed" else other
@@ -273,14 +274,14 @@ def test_all_of_an_attitude_error_is_that_of_a_second_make(
 
 def test_how_many_frames_go_through_quest(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as hold 20,000 stars, between 30 and 300."""
-    monkeypatch.setattr(propagating, "frame_sample", lambda obs, limit, seed: (obs, limit))
+    monkeypatch.setattr(through, "frame_sample", lambda obs, limit, seed: (obs, limit))
     for n_frames, n_stars, limit in (
         (1_000, 10_000, 300),
         (1_000_000, 100_000_000, 200),
         (1_000_000, 100_000_001, 199),
         (1_000, 1_000_000, 30),
     ):
-        assert propagating._few(SimpleNamespace(n_frames=n_frames, n_stars=n_stars), 0)[1] == limit  # type: ignore[arg-type]
+        assert through._few(SimpleNamespace(n_frames=n_frames, n_stars=n_stars), 0)[1] == limit  # type: ignore[arg-type]
 
 
 def test_a_camera_without_error_leaves_noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from starcal_uq.planning.check import ForecastCheck
     from starcal_uq.planning.design import FrameChoice
-    from starcal_uq.planning.plan import Plan
+    from starcal_uq.planning.planned import Plan
 
 _SCOPES = {
     "common": "common rotation",

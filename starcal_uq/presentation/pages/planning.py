@@ -18,7 +18,7 @@ from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.costs import EffectCosts
 from starcal_uq.planning.design import FrameChoice
-from starcal_uq.planning.plan import Plan
+from starcal_uq.planning.planned import Plan
 from starcal_uq.presentation.figures.planning import (
     plot_forecast,
     plot_forecast_check,

@@ -9,7 +9,7 @@ from starcal_uq.budgeting.result import Budget
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.types import PathLike
 from starcal_uq.pipeline.inspection import Frames
-from starcal_uq.planning.plan import Plan
+from starcal_uq.planning.planned import Plan
 from starcal_uq.presentation.pages.budgeting import write_budget
 from starcal_uq.presentation.pages.comparison import write_comparison
 from starcal_uq.presentation.pages.gallery import write_frames

@@ -10,7 +10,7 @@ from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.costs import EffectCosts
 from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.open_distortion import AFTER_FRAMES, DistortionRange
-from starcal_uq.planning.plan import Need, Plan
+from starcal_uq.planning.planned import Need, Plan
 from starcal_uq.presentation.tables import TextTable
 
 # Radii that differ by less than this over the open distortion hardly matter.
