@@ -165,6 +165,15 @@ def check_effects(text: str | None) -> None:
         raise typer.BadParameter(str(error)) from None
 
 
+def _check_engine(name: str) -> None:
+    from starcal_uq.identification.proposers import offered_engine
+
+    try:
+        offered_engine(name)
+    except StarcalError as error:
+        raise typer.BadParameter(str(error)) from None
+
+
 def _check_planned(text: str) -> None:
     from starcal_uq.planning.effects import PlannedEffects
 
@@ -264,6 +273,7 @@ _CHECKS: Mapping[str, Callable[[Any], object]] = {
     "columns": parse_columns,
     "degrees of freedom": parse_dof,
     "effects": check_effects,
+    "engine": _check_engine,
     "frames": parse_frames,
     "labels": parse_labels,
     "names": check_names,

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from os import PathLike
 from typing import TypeAlias
 
 import numpy as np
 
 from starcal_uq.core.errors import IdentificationError
+from starcal_uq.core.files import shown
 from starcal_uq.core.types import FloatArray
 from starcal_uq.identification.pairs import StarPairs, prepared_star_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis, hypotheses
@@ -36,21 +37,32 @@ def prepare_engine(
     cache: bool,
     cache_dir: str | PathLike[str] | None,
 ) -> Proposer:
-    """The catalogue prepared for "pyramid", or for the engine that a package offers under this name
-    in `GROUP`: a function of stars, geometry and tolerance that gives a `Proposer`.
+    """The catalogue prepared for "pyramid", or for the engine that a package offers under this name:
+    a function of stars, geometry and tolerance that gives a `Proposer`.
 
     IdentificationError where no installed package offers it.
     """
-    if engine == "pyramid":
+    offered = offered_engine(engine)
+    if offered is None:
         pairs = prepare_pairs(stars, geometry, tolerance, cache, cache_dir)
         return partial(hypotheses, pairs.ready())
-    found = next(iter(entry_points(group=GROUP, name=engine)), None)
+    proposer: Proposer = offered.load()(stars, geometry, tolerance)
+    return proposer
+
+
+def offered_engine(name: str) -> EntryPoint | None:
+    """The entry point in `GROUP` of an engine of another package; None for "pyramid".
+
+    IdentificationError where no installed package offers it.
+    """
+    if name == "pyramid":
+        return None
+    found = next(iter(entry_points(group=GROUP, name=name)), None)
     if found is None:
         raise IdentificationError(
-            f"there is no engine {engine!r}: choose pyramid, or install a package that offers it."
+            f"there is no engine {shown(name)}: choose pyramid, or install a package that offers it."
         )
-    proposer: Proposer = found.load()(stars, geometry, tolerance)
-    return proposer
+    return found
 
 
 def prepare_pairs(

@@ -191,7 +191,8 @@ def test_closed_form_is_the_ratio_of_evidences(obs, cal):
     """
     from scipy.special import gammaln
 
-    normals = FrameNormals.at(obs.select_frames(range(12)), cal)
+    own = dataclasses.replace(cal, quaternions=cal.quaternions[:12])
+    normals = FrameNormals.at(obs.select_frames(range(12)), own)
 
     def log_evidence(kept):
         matrix, slope = normals.matrices[kept].sum(axis=0), normals.slopes[kept].sum(axis=0)
