@@ -171,8 +171,9 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
     here = {"magnitude limit": plan.max_mag, "noise": plan.sigma_px, "part of the detector": 1.0}
     rows = plan.sweeps[["sweep", "value", column]]
     if found is not None:
-        frames = found.frames[:, found.scopes.index(plan.scope)]
-        drawn = frames if of_frames else found.radius_after_arcsec
+        drawn = found.radius_after_arcsec
+        if of_frames:
+            drawn = found.frames[:, found.scopes.index(plan.scope)]
         changed = {"sweep": "distortion", "value": found.percent, column: drawn}
         rows = pd.concat([rows, pd.DataFrame(changed)])
         here["distortion"] = found.percent[np.argmin(np.abs(found.percent - found.own_percent))]
