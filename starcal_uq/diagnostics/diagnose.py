@@ -340,11 +340,15 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     sigmas = cal.sigmas * np.sqrt(obs.n_stars / some.n_stars)
     reference, lowest = cal.theta, cal.chi2
     if some is not obs or has_effects(cal):
-        optimum, found = _optimum(some, cal, cal.camera)
-        # An estimate that is not the optimum of all is not near that of some, and every start
-        # finds a better one.
-        near = bool(np.max(np.abs(optimum - reference) / sigmas) < _NEAR_SIGMA)
-        reference, lowest = (optimum, found) if near else (reference, np.inf)
+        try:
+            optimum, found = _optimum(some, cal, cal.camera)
+        except StarcalError:
+            some, sigmas = obs, cal.sigmas
+        else:
+            # An estimate that is not the optimum of all is not near that of some, and every start
+            # finds a better one.
+            near = bool(np.max(np.abs(optimum - reference) / sigmas) < _NEAR_SIGMA)
+            reference, lowest = (optimum, found) if near else (reference, np.inf)
     for _ in range(n):
         shift = rng.standard_normal(3)
         start = nominal.replace(

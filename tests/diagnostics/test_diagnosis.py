@@ -391,3 +391,20 @@ def test_real_stars_need_no_k2_and_show_the_phase_of_the_pixels(real_data, capsy
     raw = sc.load_observations(path, start)
     wrong = diagnose(raw, sc.calibrate(raw, start), models=(), n_starts=0).misfit
     assert next(t for t in wrong.tests if t.name == "scale and skew of the axes").p_holm < 1e-4
+
+
+def test_starts_are_compared_with_all_frames_where_some_have_no_optimum(obs, cal, monkeypatch):
+    from starcal_uq.diagnostics import diagnose as module
+
+    real = module._optimum
+
+    def failing(some, *others):
+        if some.n_frames < obs.n_frames:
+            raise sc.errors.CalibrationError("these frames have no optimum.")
+        return real(some, *others)
+
+    monkeypatch.setattr(module, "_few", lambda whole: whole.select_frames(range(10)))
+    assert multi_start(obs, cal, 2).n_frames == 10
+    monkeypatch.setattr(module, "_optimum", failing)
+    found = multi_start(obs, cal, 2)
+    assert (found.n_frames, found.same, found.failed) == (obs.n_frames, 2, 0)
