@@ -240,23 +240,33 @@ def _check_repeats(columns: AnyMapping, rows: IntArray) -> list[Problem]:
 
 def _repeats(*keys: Any) -> list[tuple[int, int]]:
     """(row, earlier row) for each row that agrees with an earlier one in all keys."""
-    import pandas as pd
-
     hashed = np.sort(row_hashes(*keys))
     if not np.any(hashed[1:] == hashed[:-1]):
         # The common case, at a tenth of the price.
         return []
+    import pandas as pd
+
     earlier = pd.Series(np.arange(len(hashed))).groupby(list(keys)).shift()
     return [(late, int(early)) for late, early in enumerate(earlier) if early >= 0.0]
 
 
 def row_hashes(*keys: Any) -> NDArray[np.uint64]:
-    """Numbers (N,) that are equal where all keys (N,) are, and hardly ever elsewhere."""
-    import pandas as pd
+    """Numbers (N,) that are equal where all keys (N,) are, and hardly ever elsewhere.
 
-    # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bits.
-    table = pd.DataFrame({place: key + 0 for place, key in enumerate(keys)})
-    return np.asarray(pd.util.hash_pandas_object(table, index=False), dtype=np.uint64)
+    Bits go through the finaliser of SplitMix64 (Steele, Lea & Flood 2014). The hashes of pandas
+    would load it with every table that is read.
+    """
+    mixed = np.zeros(len(keys[0]), dtype=np.uint64)
+    with np.errstate(over="ignore"):
+        for key in keys:
+            # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bits.
+            wide = np.asarray(key, dtype=np.int64 if key.dtype.kind in "biu" else np.float64) + 0
+            bits = np.ascontiguousarray(wide).view(np.uint64)
+            mixed = (mixed + np.uint64(0x9E3779B97F4A7C15)) ^ bits
+            mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            mixed ^= mixed >> np.uint64(31)
+    return mixed
 
 
 def raise_problems(source: str, word: str, numbers: IntArray, problems: Sequence[Problem]) -> None:
