@@ -23,7 +23,13 @@ import numpy as np
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.diagnostics.beside import StarNoise, has_effects, images_beside, without_effects
+from starcal_uq.diagnostics.beside import (
+    FRAMES,
+    StarNoise,
+    has_effects,
+    images_beside,
+    without_effects,
+)
 from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.stars import StarTest, own_noise, star_test
 from starcal_uq.estimation.noise_model import fit_noise
@@ -53,8 +59,8 @@ _THIN, _THICK = 0.64, 1.06
 # a share of what air explains that refraction by two constants may leave.
 _AIR_CHI2, _INEXACT = 10.8, 0.01
 _DRAWS = 4000
-# Frames that are looked at, and where each gets a zenith.
-_FRAMES, _FRAMES_APIECE = 200, 80
+# Frames that are looked at where each gets a zenith.
+_FRAMES_APIECE = 80
 # A share of a shape's square that is not there, where all of the rest is absorbed.
 _ABSORBED = 1e-8
 
@@ -167,7 +173,7 @@ class _Air:
         self, obs: Observations, cal: Calibration, seed: int, errors: StarNoise | None
     ) -> None:
         self._timed, self._seed = obs.timed, seed
-        most = _FRAMES if obs.timed else _FRAMES_APIECE
+        most = FRAMES if obs.timed else _FRAMES_APIECE
         # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is
         # without these.
         self._alone = alone = images_beside(obs, cal, seed, errors, most)

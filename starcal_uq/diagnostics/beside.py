@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
-_STARS = 4000
+# Images of some frames: most frames, and stars that they hold.
+FRAMES, _STARS = 200, 4000
 # Directions of which what is fitted already takes all but this share of the square are not there.
 _ABSORBED = 1e-8
 
@@ -78,7 +79,7 @@ def images_beside(
     cal: Calibration,
     seed: int,
     errors: StarNoise | None = None,
-    most: int = 200,
+    most: int = FRAMES,
 ) -> Images:
     """Images of some frames beside the effects of a calibration, or beside errors of stars."""
     chosen = one_of_each(

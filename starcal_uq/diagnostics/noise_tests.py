@@ -63,8 +63,8 @@ def noise_by_frame(freed: Freed, shared: bool) -> tuple[float, float] | None:
     With d_k degrees of freedom of the frames' sums of squares S_k, nu in all, the statistic is
     T = nu log(S / nu) - sum d_k log(S_k / d_k). Shares of S are independent of S, so that mean
     and variance of T follow exactly from those of logarithms of chi-squares; T is then taken as
-    gamma-distributed. Many coefficients of effects, where these are `shared` by frames, couple their sums: mean
-    and variance are then those of independent ones times what that does to them to first order.
+    gamma-distributed. Effects whose coefficients frames have in common (`shared`) couple their sums:
+    mean and variance are then those of independent sums times the change to first order.
     """
     from scipy.special import digamma, gammaincc, ndtri, polygamma
 

@@ -25,6 +25,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.diagnostics.beside import without_effects
+from starcal_uq.diagnostics.misfit_test import LEAST_DOF
 from starcal_uq.estimation.normals import StarNormals
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
-_LEAST_DOF = 10
 _STARS_AT_ONCE = 20_000
 _ABSORBED = 1e-10
 # More stars than this, and what the parameters absorb of them is too little to be worth a dense
@@ -253,7 +253,7 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     pull = sums.cross[:, p] - absorbed @ explained
     dof = 2 * frames.n_stars - 3 * frames.n_frames - len(values)
     nothing = _Likeness(sums.n_groups, frames.n_stars)
-    if dof < _LEAST_DOF:
+    if dof < LEAST_DOF:
         return nothing
     g1, g2, g3, g4 = _traces(sums.matrix, absorbed)
     # Of A = M - (g1 / dof) I on the residuals, M having the traces g: sums of powers of its

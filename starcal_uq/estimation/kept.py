@@ -1,4 +1,4 @@
-"""What a calibration keeps of its frames."""
+"""Frames of a calibration at its estimate."""
 
 from __future__ import annotations
 

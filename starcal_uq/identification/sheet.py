@@ -1,4 +1,4 @@
-"""What is known of a camera before its frames are identified, and how well."""
+"""The camera before its frames are identified, and its tolerances."""
 
 from __future__ import annotations
 

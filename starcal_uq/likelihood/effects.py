@@ -251,12 +251,7 @@ def _smooth(
     prior = np.repeat(prior / np.sqrt(np.sum(prior**2)), len(removed) // len(order))
 
     def columns(view: View) -> FloatArray:
-        frames = view.part.frames
-        turns = frames.in_pixels(view.state.attitude)
-        held = np.concatenate([view.parameter_columns, turns])
-        found = raw(frames.pixel - frames.in_pixels(view.state.e))
-        found += (removed @ held.reshape(len(unit), -1)).reshape(found.shape)
-        return found
+        return raw(view.predicted) + np.tensordot(removed, view.held, 1)
 
     made = columns if waves is None else Waves(waves, removed)
     shape = Shape(f"smooth {name} shift", name, len(prior), made)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -54,19 +55,29 @@ class View:
     parameter_columns: (
         FloatArray  # (p, 2, n): derivatives by the fitted parameters, not divided by the noise
     )
-    uv: FloatArray  # (2, n): predicted positions relative to the principal point, px
+    centre: FloatArray  # (2,): principal point, px
 
     @classmethod
     def of(cls, part: MarginalLikelihood, state: Profile, theta: FloatArray, rows: slice) -> View:
         """The stars of `part`, which are these rows of the table."""
-        frames = part.frames
-        predicted = frames.pixel - frames.in_pixels(state.e)
-        return cls(
-            rows,
-            part,
-            state,
-            frames.in_pixels(part.derivatives(theta, state)),
-            predicted - theta[:2, None],
+        parameter_columns = part.frames.in_pixels(part.derivatives(theta, state))
+        return cls(rows, part, state, parameter_columns, theta[:2])
+
+    @property
+    def predicted(self) -> FloatArray:
+        """Predicted positions (2, n), px."""
+        return np.asarray(self.part.frames.pixel - self.part.frames.in_pixels(self.state.e))
+
+    @cached_property
+    def uv(self) -> FloatArray:
+        """The same (2, n) relative to the principal point."""
+        return self.predicted - self.centre[:, None]
+
+    @property
+    def held(self) -> FloatArray:
+        """Columns (p + 3, 2, n), px, of the parameters and of a rotation."""
+        return np.concatenate(
+            [self.parameter_columns, self.part.frames.in_pixels(self.state.attitude)]
         )
 
 
@@ -81,22 +92,18 @@ class Waves:
 
     def along(self, view: View) -> FloatArray:
         """The functions (w, n) at the stars."""
-        return self.functions(view.part.frames.pixel - view.part.frames.in_pixels(view.state.e))
+        return self.functions(view.predicted)
 
     def shift(self, view: View, coefficients: FloatArray) -> FloatArray:
         """The shift (2, n) by coefficients (2 w,)."""
-        shift = np.tensordot(coefficients @ self.beside, self._held(view), 1)
+        shift = np.tensordot(coefficients @ self.beside, view.held, 1)
         return np.asarray(shift + coefficients.reshape(-1, 2).T @ self.along(view))
 
     def __call__(self, view: View) -> FloatArray:
-        held, waves = self._held(view), self.along(view)
-        found = np.tensordot(self.beside, held, 1)
+        waves = self.along(view)
+        found = np.tensordot(self.beside, view.held, 1)
         found.reshape(len(waves), 2, 2, -1)[:, (0, 1), (0, 1)] += waves[:, None]
         return np.asarray(found)
-
-    def _held(self, view: View) -> FloatArray:
-        turns = view.part.frames.in_pixels(view.state.attitude)
-        return np.concatenate([view.parameter_columns, turns])
 
 
 @dataclass(frozen=True)
@@ -489,7 +496,7 @@ def phase_shape(axis: int) -> Shape:
     def columns(view: View) -> FloatArray:
         # Whole pixels drop out of the waves, so the position on the detector stands for its
         # fraction.
-        centre = view.part.frames.pixel[axis] - view.part.frames.in_pixels(view.state.e)[axis]
+        centre = view.predicted[axis]
         waves = [
             f(2.0 * np.pi * h * centre) for h in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)
         ]
@@ -544,7 +551,7 @@ def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
     nx, ny = (int(np.ceil(side / cell - 1e-9)) for side in (camera.width_px, camera.height_px))
 
     def columns(view: View) -> FloatArray:
-        x, y = view.part.frames.pixel - view.part.frames.in_pixels(view.state.e)
+        x, y = view.predicted
         column = np.clip(((x + 0.5) / cell).astype(np.int64), 0, nx - 1)
         row = np.clip(((y + 0.5) / cell).astype(np.int64), 0, ny - 1)
         own, star = row * nx + column, np.arange(len(x))

@@ -1,4 +1,4 @@
-"""Draws of the camera through QUEST on some of the frames, and what of it first order lacks."""
+"""Draws of the camera through QUEST on some of the frames, and their difference from first order."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ _SAMPLED_FRAMES, _SAMPLED_STARS, _FEWEST_FRAMES = 300, 20_000, 30
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What draws through QUEST say, and what of it first order does not, on k of the frames
-    (`places`).
+    """Draws through QUEST on k of the frames (`places`), and their difference from first order.
 
     Variances beyond first order, rad^2, are those of the draws less those that the responses give
     for the same draws: of the common rotation and of the mean of the rest (3,), of the rest and of

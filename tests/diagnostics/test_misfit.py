@@ -108,8 +108,7 @@ def test_control_shapes_that_the_fit_absorbed_are_not_nominal():
     likelihood = MarginalLikelihood(obs, "brown")
     state, _ = likelihood.profile(cal.theta)
     h = likelihood.derivatives(cal.theta, state)
-    uv = likelihood.frames.pixel - state.e - cal.theta[:2, None]
-    view = View(slice(None), likelihood, state, h, uv)
+    view = View.of(likelihood, state, cal.theta, slice(None))
     naive, _ = np.linalg.qr(family.columns(view).reshape(family.size, -1).T)
     fitted = likelihood.project_out(state, h).reshape(len(h), -1)
     fitted, _ = np.linalg.qr((fitted / np.linalg.norm(fitted, axis=1, keepdims=True)).T)

@@ -138,8 +138,9 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
         {"name": name, "title": _CAPTIONS[name][0], "caption": _CAPTIONS[name][1].format(band=band)}
         for name in images
     ]
-    if "posterior_correlation" in data and figures:
-        figures[0]["caption"] += _SIMULATED
+    if "posterior_correlation" in data:
+        for figure in figures:
+            figure["caption"] += _SIMULATED if figure["name"] == "correlation" else ""
     context = {
         "title": definition.name,
         "question": definition.question,

@@ -223,14 +223,18 @@ def _apart(study: Study) -> list[str]:
 
 
 def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
-    """Whether both sigmas are smaller where the pair is least coupled than where it is most."""
+    """Whether a designer can choose the axis, and both sigmas are smaller where the pair is least
+    coupled than where it is most.
+    """
+    if cost.axis in _GIVEN:
+        return False
     known = np.isfinite(pair.correlation)
     for name in pair.names:
         sigma = np.where(known, study.values("sigma", parameter=name), np.nan)
         curve = study.sweep.along(sigma, cost.axis)
         if curve is None or curve.median[cost.least] >= curve.median[cost.most]:
             return False
-    return cost.axis not in _GIVEN
+    return True
 
 
 def _cheapest(study: Study) -> list[str]:
