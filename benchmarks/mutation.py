@@ -56,19 +56,15 @@ PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 # Files of the package, and the tests that answer for them.
 SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "likelihood": (
+        tuple(f"likelihood/{name}.py" for name in ("marginal", "sums", "compressed", "student")),
         (
-            "estimation/marginal.py",
-            "estimation/sums.py",
-            "estimation/compressed.py",
-            "estimation/student.py",
-        ),
-        tuple(
-            f"estimation/test_{name}.py" for name in ("likelihood", "sums", "student", "merging")
+            *(f"likelihood/test_{name}.py" for name in ("marginal", "sums", "student")),
+            "estimation/test_merging.py",
         ),
     ),
     "pairs": (
-        ("estimation/pairs.py", "estimation/composite.py"),
-        ("estimation/test_pairs.py", "estimation/test_pair_likelihood.py"),
+        ("likelihood/pairs.py", "likelihood/composite.py"),
+        ("likelihood/test_pairs.py", "likelihood/test_composite.py"),
     ),
     "attitude": (("attitude/*.py",), ("attitude",)),
     "propagation": (("propagation/*.py",), ("propagation",)),

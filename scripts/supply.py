@@ -42,10 +42,10 @@ TESTS = (
     *(
         "tests/sky/test_catalogue.py",
         "tests/likelihood/test_sums.py",
-        "tests/inference/test_arviz_compat.py",
+        "tests/inference/test_arviz.py",
     ),
     *(
-        "tests/inference/test_sampler.py",
+        "tests/inference/test_sample.py",
         "tests/budgeting/test_budget.py",
         "tests/runs/test_previous_files.py",
     ),

@@ -361,3 +361,87 @@ def test_only_the_command_line_spells_commands(root):
     assert {name: n for name, n in found.items() if n} == {"core/provenance.py": 1}
     # Control: the command line has them.
     assert len(files) > len(below) > 300
+
+
+# Files whose tests stand under another name: records, words and figures are seen in what shows
+# them, steps and small parts in what calls them. The list may only shrink.
+WITHOUT_NAMESAKE = {
+    "attitude": "earth",
+    "budgeting": "posterior result rows sampling shapes",
+    "calibration": "calibrate methods",
+    "camera": "distortion fields formats kernels opencv",
+    "cli": (
+        "answers app commands console images mission paper results run schema settings starters "
+        "statistics steps study"
+    ),
+    "comparison": "covariance result significance",
+    "core": "conflicts constants display documents facts findings remedy status times types",
+    "diagnostics": (
+        "explain jackknife misfit_test models noise_tests predictive residuals shape_sums"
+    ),
+    "estimation": (
+        "assemble consensus duplicates kept local_effects normals outliers partitioned_effects "
+        "residual_map result robust scales settings stages undetermined weights"
+    ),
+    "identification": (
+        "brightness engine growth match nearby outcome pairs proposers pyramid result search sheet"
+    ),
+    "images": (
+        "background detection extract fits fits_files optics pixel_phase pixels psf raw read"
+    ),
+    "inference": "derived exact named power_scaling surrogate target",
+    "likelihood": (
+        "arrays compressed effect_likelihood effect_sums elimination fitted_effects "
+        "frame_products ipopt loops/common loops/expansion loops/frames loops/unrolled "
+        "noise_model paths shapes star_errors zenith"
+    ),
+    "maths": "circular intervals linear ranks",
+    "observations": "checks columns files frames rows splits written",
+    "paper": (
+        "camera checks commands errors judgement published readings recursive/filter "
+        "recursive/folder recursive/frames recursive/innovations recursive/methods "
+        "recursive/result recursive/start recursive/state recursive/stream result show/figures "
+        "show/pages show/tables show/views statistics"
+    ),
+    "pipeline": "cameras displacement images record refine",
+    "planning": "check costs design effects forecast information open_distortion plan",
+    "presentation": (
+        "figures/budgeting figures/comparison figures/coupling figures/diagnostics "
+        "figures/effects figures/estimation figures/inference figures/planning "
+        "figures/propagation figures/scales figures/style figures/sweeps html pages/budgeting "
+        "pages/comparison pages/gallery pages/notebook pages/planning pages/printing "
+        "pages/write tables words/axes words/budgeting words/comparison words/diagnostics "
+        "words/effects words/estimation words/images words/inference words/inputs "
+        "words/planning words/propagation"
+    ),
+    "propagation": (
+        "attitude_error coupling field geometry onboard_error propagate sampled spectrum"
+    ),
+    "runs": (
+        "compare folder frames merge priors report steps/budgeting steps/estimate steps/images "
+        "steps/misfit steps/mission steps/pages steps/posterior stored"
+    ),
+    "simulation": "campaign contamination frames mission pointing psf sensor truth",
+    "sky": "cds gaia names neighbours positions refraction site tables",
+    "studies": "axes cells definition geometry result store study",
+}
+
+
+def test_tests_are_found_by_the_name_of_the_file():
+    """`tests/WING/test_FILE.py` or `test_FILE_ASPECT.py`, also by the name of the folder inside the
+    wing.
+    """
+    tests = {path.relative_to(ROOT / "tests").as_posix() for path in ROOT.glob("tests/*/test_*.py")}
+    missing, found = set(), set()
+    for wing in WINGS:
+        for path in (ROOT / "starcal_uq" / wing).rglob("[a-z]*.py"):
+            file = path.relative_to(ROOT / "starcal_uq" / wing).with_suffix("")
+            named = re.compile(rf"{wing}/test_({'|'.join(file.parts)})(_\w+)?\.py")
+            (found if any(map(named.fullmatch, tests)) else missing).add(
+                f"{wing}/{file.as_posix()}"
+            )
+    listed = {
+        f"{wing}/{file}" for wing, files in WITHOUT_NAMESAKE.items() for file in files.split()
+    }
+    assert missing <= listed, "write a test of this name"
+    assert not listed & found, "these have a test now: take them from the list"
