@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks import baseline
-from benchmarks.baseline_jobs import JOBS
+from verification import baseline
+from verification.baseline_jobs import JOBS
 
 DRAWING = "<svg><!-- focal length --><path d='M 1.5 2.5'/></svg>"
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from benchmarks import ground
 from starcal_uq.core.status import Level
+from verification import ground
 
 # Independent bundle fit of the table (apparent directions, SNR >= 10, 242 stars): value and
 # standard error.

@@ -535,7 +535,7 @@ def test_posteriors_are_compared_by_their_means() -> None:
 
 
 def test_tables_of_false_alarms_and_power(capsys: pytest.CaptureFixture[str]) -> None:
-    from benchmarks.comparison_power import main
+    from verification.comparison_power import main
 
     main(["--replicates", "2", "--power", "1", "--frames", "25"])
     lines = capsys.readouterr().out.splitlines()

@@ -22,7 +22,7 @@ from starcal_uq.core.files import (
     write_csv,
 )
 from starcal_uq.runs.folder import RunFolder
-from tests.helpers.mutants import _observations
+from tests.damage.samples import observations
 
 FORMULAS = ("=1+1", "=cmd|' /C calc'!A0", "+1+1", "-1+1", "@SUM(A1)", "\t=1", "\n=1", "'=1")
 
@@ -53,7 +53,7 @@ def test_no_table_that_is_written_begins_a_formula(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ["csv", "ecsv", "parquet"])
 def test_names_of_stars_come_back(tmp_path: Path, ending: str) -> None:
-    obs = _observations()
+    obs = observations()
     names = [f"{FORMULAS[i % 5]}{i}" if i % 2 else f"-{i}" for i in range(obs.n_stars)]
     odd = sc.Observations(**{**obs.columns, "star_id": names})
     odd.save(tmp_path / f"o.{ending}")

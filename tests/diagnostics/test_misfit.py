@@ -12,8 +12,6 @@ import pytest
 from scipy import stats
 
 import starcal_uq as sc
-from benchmarks import regimes
-from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.camera.distortion import parameter_names, rivals
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
@@ -25,6 +23,8 @@ from starcal_uq.maths.intervals import holm
 from starcal_uq.observations.frames import StarFrames
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import COEFFICIENTS, camera, nominal, observations, with_sigmas
+from verification import regimes
+from verification.misfit_power import SCENARIOS, main, power
 
 N_NULL = 100
 

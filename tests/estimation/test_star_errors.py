@@ -192,7 +192,7 @@ def test_other_models_are_compared_without_what_stars_bring_along(made):
 
 @pytest.mark.slow
 def test_coverage_is_nominal_with_the_option_and_not_without():
-    """Forty runs; `benchmarks/regimes.py` has 150 of each regime."""
+    """Forty runs; `verification/regimes.py` has 150 of each regime."""
     inside, without, squared = [], [], []
     for i in range(40):
         c, obs, camera = observed(500 + i)

@@ -1,9 +1,9 @@
 """What becomes of damaged files: the long campaign, by one command.
 
-    python benchmarks/damage.py [--text 100000] [--binary 10000] [--only NAME ...] [--processes 2]
+    python -m tests.damage.campaign [--text 100000] [--binary 10000] [--only NAME ...] [--processes 2]
     [--show] [--write]
 
-Every kind of file that the package reads (`tests/helpers/mutants.py`) is damaged, a seed each, and
+Every kind of file that the package reads (`tests/damage/samples.py`) is damaged, a seed each, and
 loaded: binary kinds that many times, and the kinds of text that one function reads that many times
 together. What was done is kept in `.bench/damage`, a file for every few thousand seeds: a campaign
 that is stopped goes on, and a larger one takes in a smaller one. A process may take 1 GB beyond
@@ -32,12 +32,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+from benchmarks.pages import put
+from tests.damage.judging import Bench, Outcome
+from tests.damage.samples import LAST, SAMPLES, Sample, write_samples
 
-from benchmarks.pages import put  # noqa: E402
-from tests.helpers.mutants import LAST, SAMPLES, Bench, Outcome, Sample, write_samples  # noqa: E402
-
+ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / ".bench" / "damage"
 PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 # A process takes seconds to load what it needs.
@@ -111,14 +110,23 @@ def tried(name: str, first: int, last: int, out: Path) -> dict[str, Any]:
 
 def _tried(name: str, first: int, last: int, out: Path, folder: Path) -> dict[str, Any]:
     (folder / "valid").symlink_to((out / "valid").resolve())
-    command = [sys.executable, __file__, "--work", str(folder), name, str(first), str(last)]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.damage.campaign",
+        "--work",
+        str(folder),
+        name,
+        str(first),
+        str(last),
+    ]
     environment = {
         **os.environ,
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
         "XDG_CACHE_HOME": str(out / "cache"),
     }
-    process = subprocess.run(command, env=environment, capture_output=True, text=True)
+    process = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=ROOT)
     if process.returncode == 0:
         done: dict[str, Any] = json.loads(process.stdout.splitlines()[-1])
         return done

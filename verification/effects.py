@@ -1,8 +1,8 @@
 """Effects planted by an independent simulator, chosen and estimated: each alone at one, two and
 five times the size that gains twice what it has to, and all pairs at twice that size.
 
-    python benchmarks/effects.py [--replicates 40] [--only field frame]
-    python benchmarks/effects.py --pairs --replicates 10 --write
+    python verification/effects.py [--replicates 40] [--only field frame]
+    python verification/effects.py --pairs --replicates 10 --write
 
 One row a campaign: how often just the planted effects are chosen and how often one that is not
 there, how often the 95 % interval of the scale holds what was planted (where that is a standard

@@ -7,9 +7,9 @@ array, every sentence that changed, and what vanished or appeared; its exit stat
 differs by more than the tolerance. ``PYTHONPATH`` decides which version is measured, because nothing
 of the package is imported here.
 
-    PYTHONPATH=BEFORE python benchmarks/baseline.py make /tmp/before
-    PYTHONPATH=AFTER python benchmarks/baseline.py make /tmp/after
-    python benchmarks/baseline.py compare /tmp/before /tmp/after
+    PYTHONPATH=BEFORE python verification/baseline.py make /tmp/before
+    PYTHONPATH=AFTER python verification/baseline.py make /tmp/after
+    python verification/baseline.py compare /tmp/before /tmp/after
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from benchmarks.baseline_facts import NUMBER, Cleaner, Facts, files, read  # noqa: E402
-from benchmarks.baseline_jobs import JOBS, Job  # noqa: E402
+from verification.baseline_facts import NUMBER, Cleaner, Facts, files, read  # noqa: E402
+from verification.baseline_jobs import JOBS, Job  # noqa: E402
 
 RECORD = "job.json"
 ENVIRONMENT = {

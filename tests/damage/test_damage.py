@@ -22,7 +22,10 @@ from hypothesis import strategies as st
 import starcal_uq as sc
 from starcal_uq.core import files
 from starcal_uq.core.errors import StarcalError
-from tests.helpers.mutants import SAMPLES, Bench, Sample
+from tests.damage.judging import Bench
+from tests.damage.samples import SAMPLES, Sample
+
+pytestmark = pytest.mark.slow
 
 BY_FILE = {sample.file: sample for sample in SAMPLES}
 # What reads files and is tested elsewhere: folders of runs, and what reads images by `read_image`.
@@ -234,14 +237,10 @@ ONCE = [
     ("camera.toml", lambda d: _CAMERA % b'"\\u0007"', "focal_mm is '\\\\x07'; write"),
     ("sensor.toml", lambda d: b"[sensor]\n" + b"1" * 5000 + b" = 2\n", r"key 1+\.\.\.1+"),
     ("calibration.npz", lambda d: b"", r"\(the file is empty\)" + CALIBRATE),
-    ("calibration.npz", lambda d: d[:3000], r"\(it is damaged or cut off\)" + CALIBRATE),
+    ("calibration.npz", lambda d: d[:3000], r"\(it is damaged or cut off\)"),
     ("calibration.npz", _flipped, CALIBRATE),
-    ("calibration.npz", lambda d: b"not an archive", r"\(it is damaged or cut off\)" + CALIBRATE),
-    (
-        "calibration.npz",
-        lambda d: _members(d, quaternions=None),
-        r"\(quaternions is missing\)" + CALIBRATE,
-    ),
+    ("calibration.npz", lambda d: b"not an archive", r"\(it is damaged or cut off\)"),
+    ("calibration.npz", lambda d: _members(d, quaternions=None), r"\(quaternions is missing\)"),
     (
         "calibration.npz",
         lambda d: _members(d, theta=_declared((10**12,))),
@@ -272,13 +271,9 @@ ONCE = [
         lambda d: _members(d, theta=_npy(np.ones(4))),
         r"\(theta has 4 entries where there should be 5\)",
     ),
-    ("calibration.json", lambda d: b"", r"\(the file is empty\)" + CALIBRATE),
-    ("calibration.json", lambda d: d[: len(d) // 2], r"\(line \d+ is no JSON\)" + CALIBRATE),
-    (
-        "calibration.json",
-        lambda d: _DEEP.encode(),
-        r"\(its values are nested too deeply\)" + CALIBRATE,
-    ),
+    ("calibration.json", lambda d: b"", r"\(the file is empty\)"),
+    ("calibration.json", lambda d: d[: len(d) // 2], r"\(line \d+ is no JSON\)"),
+    ("calibration.json", lambda d: _DEEP.encode(), r"\(its values are nested too deeply\)"),
     ("diagnosis.json", lambda d: _DEEP.encode(), "nested too deeply"),
     ("images.json", lambda d: b"[1, 2]", r"\(the document is \[1, 2\], not a table\)"),
     (
@@ -287,15 +282,11 @@ ONCE = [
         "which no file can hold",
     ),
     ("posterior.nc", _hdf5(_other_names), r"\(its priors are those of other parameters\)" + SAMPLE),
-    ("posterior.nc", lambda d: b"", r"\(the file is empty\)" + SAMPLE),
-    ("posterior.nc", lambda d: d[:-1000], r"\(it is cut off, or not of this version\)" + SAMPLE),
-    ("posterior.nc", _hdf5(_nan_draw), r"\(draws holds a value that is not finite\)" + SAMPLE),
-    ("posterior.nc", _flipped, r"\(its content was changed after it was written\)" + SAMPLE),
-    (
-        "posterior.nc",
-        _hdf5(_huge_draws),
-        r"\(it declares 8e\+12 bytes of content, far more",
-    ),
+    ("posterior.nc", lambda d: b"", r"\(the file is empty\)"),
+    ("posterior.nc", lambda d: d[:-1000], r"\(it is cut off, or not of this version\)"),
+    ("posterior.nc", _hdf5(_nan_draw), r"\(draws holds a value that is not finite\)"),
+    ("posterior.nc", _flipped, r"\(its content was changed after it was written\)"),
+    ("posterior.nc", _hdf5(_huge_draws), r"\(it declares 8e\+12 bytes of content, far more"),
     (
         "study.nc",
         _hdf5(lambda f: f.pop("status")),
@@ -311,11 +302,7 @@ ONCE = [
     (
         "study.toml",
         lambda d: re.sub(rb"seeds = .*", b"seeds = " + b"9" * 30, d),
-        (
-            r"section \[study\]: key seeds is 9+; write a whole number from 1 to 1000000, or a "
-            r"list "
-            r"of them\.$"
-        ),
+        r"key seeds is 9+; write a whole number",
     ),
     (
         "validation.npz",

@@ -1,6 +1,6 @@
 """How often the tests for misfit find what they are for, and how often they cry wolf.
 
-``python benchmarks/misfit_power.py`` simulates the sensor of Ye & Yang (2017) with one error of the
+``python verification/misfit_power.py`` simulates the sensor of Ye & Yang (2017) with one error of the
 model at a time, calibrates without knowing of it, tests the residuals, and prints the shares as a
 table.
 """
@@ -259,7 +259,9 @@ def table(rows: Sequence[Power]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python benchmarks/misfit_power.py", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python verification/misfit_power.py", description=__doc__
+    )
     parser.add_argument(
         "--replicates", type=int, default=100, help="replicates of each error (default 100)"
     )

@@ -1,7 +1,7 @@
 """Cameras of all kinds that nothing is known of, or something wrong: how many frames are
 identified, how many wrongly.
 
-    python benchmarks/unknown.py [--frames 10000] [--seed 1] [--part 0 2] [--show] [--write]
+    python verification/unknown.py [--frames 10000] [--seed 1] [--part 0 2] [--show] [--write]
 
 Every camera has its own field of view (4 to 80 degrees, evenly in its logarithm, and of every
 twentieth 1 to 4, where preparing a catalogue takes tens of seconds), detector (256 to 4096 px),

@@ -1,6 +1,6 @@
 """Do the tests notice when the mathematics is changed? Mutation testing by one command.
 
-    python benchmarks/mutation.py [--seed N] [--subject NAME ...] [--again] [--show] [--write]
+    python -m tests.damage.sources [--seed N] [--subject NAME ...] [--again] [--show] [--write]
 
 A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. A seed
 draws one of each function of a subject; a later seed leaves out what those before it draw, so its
@@ -17,7 +17,7 @@ function gets its changed code; what stands outside functions is imported anew.
 Not mutated, because no test should care: sentences, annotations, decorators, what follows
 ``raise``, sizes of blocks, seeds, and -1 where it stands for the last axis of two or for a size to
 be found. `likelihood/loops` is left out: its compiled code is cached by the file on the disk. Tests
-hold it equal to `estimation/sums`.
+hold it equal to `likelihood/arrays`.
 """
 
 from __future__ import annotations
@@ -49,23 +49,13 @@ from typing import Any
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / ".bench" / "mutation"
 PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 
 # Files of the package, and the tests that answer for them.
 SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "likelihood": (
-        tuple(f"likelihood/{name}.py" for name in ("marginal", "sums", "compressed", "student")),
-        (
-            *(f"likelihood/test_{name}.py" for name in ("marginal", "sums", "student")),
-            "estimation/test_merging.py",
-        ),
-    ),
-    "pairs": (
-        ("likelihood/pairs.py", "likelihood/composite.py"),
-        ("likelihood/test_pairs.py", "likelihood/test_composite.py"),
-    ),
+    "likelihood": (("likelihood/*.py",), ("likelihood",)),
     "attitude": (("attitude/*.py",), ("attitude",)),
     "propagation": (("propagation/*.py",), ("propagation",)),
     "budget": (("budgeting/*.py",), ("budgeting",)),

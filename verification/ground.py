@@ -1,6 +1,6 @@
 """Real frames without a site: each frame predicted from the others, and attitudes by two models.
 
-    python benchmarks/ground.py TABLE CAMERA [--time UTC]
+    python verification/ground.py TABLE CAMERA [--time UTC]
 
 Frame by frame: the camera and its effects are estimated from the other frames, and the stars of the
 one that is left out are predicted, without effects and with those that the data ask for. Chi-square

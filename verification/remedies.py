@@ -1,6 +1,6 @@
 """Planted misfits, and what is printed to try against each, followed literally to its end.
 
-    python benchmarks/remedies.py [--only WORD] [--seed 7] [--write]
+    python verification/remedies.py [--only WORD] [--seed 7] [--write]
 
 Each misfit is planted in a table of 24 frames of 20 stars (16 frames at one place on the ground for
 refraction), made by NumPy alone, and run by the command line. The first command that is printed to
@@ -69,9 +69,7 @@ def main() -> None:
                 lines.append(f"| {' | '.join(row(name, chain(name, arguments.seed)))} |")
                 print(lines[-1], flush=True)
     if arguments.write:
-        note = (
-            f"Made by `python benchmarks/remedies.py --seed {arguments.seed} --write`; do not edit."
-        )
+        note = f"Made by `python verification/remedies.py --seed {arguments.seed} --write`; do not edit."
         put(PAGE, "remedies", f"{note}\n\n" + "\n".join(lines))
 
 

@@ -1,7 +1,7 @@
 """How often comparisons of cameras raise false alarms, and what they see: whole campaigns,
 simulated and calibrated.
 
-    python benchmarks/comparison_power.py --replicates 200 --power 60 --frames 60
+    python verification/comparison_power.py --replicates 200 --power 60 --frames 60
 
 prints the tables of ``docs/explanation/comparison.md``. The sensor is that of Ye & Yang (2017) with
 0.05 px of noise.

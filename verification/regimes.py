@@ -1,7 +1,7 @@
 """Are the stated uncertainties right, regime by regime? The tables of the documentation are made by
 this command.
 
-    python benchmarks/regimes.py [--only NAME ...] [--runs N] [--seed 1] [--processes N] [--write]
+    python verification/regimes.py [--only NAME ...] [--runs N] [--seed 1] [--processes N] [--write]
     [--list]
 
 Every run simulates a campaign with `tests/helpers/outside.py` (NumPy alone, none of the package's
@@ -490,7 +490,7 @@ def write(name: str, rows: Sequence[Mapping[str, str]], seed: int) -> None:
     merged = {row["Regime"]: row for row in [*stored(name), *rows]}
     ordered = [merged[r.name] for r in REGIMES if r.name in merged]
     made = (
-        f"Made by `python benchmarks/regimes.py --seed {seed} --write`; do not "
+        f"Made by `python verification/regimes.py --seed {seed} --write`; do not "
         f"edit.{_together(ordered)}"
     )
     put(path, word, f"{made}\n\n{markdown(ordered)}")
@@ -521,7 +521,7 @@ def _together(rows: Sequence[Mapping[str, str]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Command line."""
     parser = argparse.ArgumentParser(
-        prog="python benchmarks/regimes.py", description=(__doc__ or "").split("\n")[0]
+        prog="python verification/regimes.py", description=(__doc__ or "").split("\n")[0]
     )
     parser.add_argument(
         "--only",
