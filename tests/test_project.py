@@ -375,7 +375,7 @@ WITHOUT_NAMESAKE = {
         "statistics steps study"
     ),
     "comparison": "covariance result significance",
-    "core": "conflicts constants display documents facts findings remedy status times types",
+    "core": "conflicts constants display documents errors facts findings remedy status times types",
     "diagnostics": (
         "explain jackknife misfit_test models noise_tests predictive residuals shape_sums"
     ),
