@@ -5,15 +5,34 @@ from __future__ import annotations
 import base64
 import io
 import re
+import textwrap
 from collections.abc import Iterable, Mapping
+from functools import cache
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from starcal_uq.core import formatting
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
+
+
+# Columns of lines in a terminal.
+WIDTH = 80
+
+
+def wrapped(text: str, indent: str = "") -> str:
+    """Text in lines of at most 80 columns, which begin with an indent; the others with more."""
+    return textwrap.fill(
+        re.sub("[ \n]+", " ", text),
+        WIDTH,
+        initial_indent=indent,
+        subsequent_indent=f"{indent}  ",
+        break_on_hyphens=False,
+    )
 
 
 def card(title: str, text: str, *tables: TextTable) -> str:
@@ -54,20 +73,41 @@ def on_page(table: TextTable, caption: str = "", kind: str = "") -> Markup:
     return Markup(f'<div class="scroll">{drawn}</div>')
 
 
+def page(template: str, made: Provenance, /, **known: Any) -> str:
+    """A page from its template, with the time and the version of what it shows."""
+    text = (
+        template_environment()
+        .get_template(template)
+        .render(known, created=made.created_utc, version=made.version)
+    )
+    return f"{text}\n"
+
+
+@cache
 def template_environment() -> Environment:
-    """Jinja's environment for the templates of the package: everything is escaped, and a missing
-    name is an error.
+    """Jinja's environment for the templates of the package: everything is escaped but text, and a
+    missing name is an error.
+
+    Templates know most functions of `starcal_uq.core.formatting`.
     """
     import jinja2
 
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("starcal_uq.presentation"),
-        autoescape=True,
+        autoescape=jinja2.select_autoescape(disabled_extensions=["txt.j2"], default=True),
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters |= {"symbol": symbol, "table": on_page, "picture": picture}
+    environment.filters |= {
+        "symbol": symbol,
+        "table": on_page,
+        "picture": picture,
+        "wrapped": wrapped,
+        "when": lambda utc: utc.replace("T", " ").replace("Z", " UTC"),
+    }
+    names = ("count", "fixed", "join_words", "percent", "plural", "significant")
+    environment.globals |= {name: getattr(formatting, name) for name in names}
     return environment
 
 

@@ -24,6 +24,7 @@ from starcal_uq.core.formatting import (
 )
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.verdict.estimate import truth_z
+from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.presentation.figures.scales import symbol as written
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable, with_units
@@ -355,3 +356,16 @@ def _round_table(record: ImageRecord, cal: Calibration) -> TextTable | None:
     rows.append(("Noise", significant(first.sigma, 3), significant(last.sigma, 3), "", unit))
     heads = ("", "Nominal camera", "Calibrated camera", "Change", "Unit")
     return TextTable(heads, tuple(rows), align="lrrrl")
+
+
+def derived_table(post: Posterior) -> TextTable:
+    """Convergence of what follows from the parameters."""
+    rows = []
+    for d in post.diagnostics.derived or derived_quantities(post):
+        mean = "0" if d.name.startswith("common") else fixed(d.mean, decimals_for(d.sd))
+        share = percent(d.mcse / d.sd if d.sd > 0.0 else 0.0)
+        ess = (count(int(d.ess_bulk)), count(int(d.ess_tail)))
+        name = d.name[0].upper() + d.name[1:]
+        rows.append((name, f"{mean} ± {significant(d.sd)}", d.unit, fixed(d.rhat, 4), *ess, share))
+    heads = ("", "Mean ± σ", "Unit", "R-hat", "ESS, bulk", "ESS, tail", "MCSE / σ")
+    return TextTable(heads, tuple(rows), align="lrlrrrr")
