@@ -21,7 +21,7 @@ PIP_INSTALL := -m pip install --quiet --disable-pip-version-check --constraint c
 PYTEST := -m pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder
 # What depends on the generation of ArviZ (0.23 with Python 3.11, 1 with 3.12 and newer) or on Python itself: sampling and
 # posteriors, run folders, the report, whole runs at the command line, and how the package is put together.
-OTHER_TESTS := tests/inference tests/runs tests/presentation/test_report.py tests/cli/test_cli.py tests/cli/test_schemas.py tests/test_project.py
+OTHER_TESTS := tests/inference tests/runs tests/presentation/test_report.py tests/cli/test_commands.py tests/cli/test_schemas.py tests/test_project.py
 
 # What is compiled once serves all processes of the tests, and the next run; `make clean` removes it.
 unexport PYTHONDONTWRITEBYTECODE

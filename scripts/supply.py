@@ -47,11 +47,11 @@ TESTS = (
     *(
         "tests/inference/test_sample.py",
         "tests/budgeting/test_budget.py",
-        "tests/runs/test_previous_files.py",
+        "tests/runs/test_stored_previous.py",
     ),
     *(
-        "tests/presentation/test_plots.py",
-        "tests/cli/test_cli.py",
+        "tests/presentation/test_figures.py",
+        "tests/cli/test_commands.py",
         "tests/cli/test_schemas.py",
         "tests/core/test_extras.py",
     ),

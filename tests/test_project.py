@@ -370,25 +370,19 @@ WITHOUT_NAMESAKE = {
     "budgeting": "posterior result rows sampling shapes",
     "calibration": "calibrate methods",
     "camera": "distortion fields formats kernels opencv",
-    "cli": (
-        "answers app commands console images mission paper results run schema settings starters "
-        "statistics steps study"
-    ),
+    "cli": "answers console results run schema settings starters",
     "comparison": "covariance result significance",
-    "core": "conflicts constants display documents errors facts findings remedy status times types",
-    "diagnostics": (
-        "explain jackknife misfit_test models noise_tests predictive residuals shape_sums"
+    "core": (
+        "conflicts constants display documents errors facts findings remedy status times types"
     ),
+    "diagnostics": "explain jackknife misfit_test models noise_tests predictive residuals shape_sums",
     "estimation": (
-        "assemble consensus duplicates kept local_effects normals outliers partitioned_effects "
-        "residual_map result robust scales settings stages undetermined weights"
+        "assemble consensus duplicates kept local_effects normals outliers "
+        "partitioned_effects residual_map result robust scales settings stages undetermined "
+        "weights"
     ),
-    "identification": (
-        "brightness engine growth match nearby outcome pairs proposers pyramid result search sheet"
-    ),
-    "images": (
-        "background detection extract fits fits_files optics pixel_phase pixels psf raw read"
-    ),
+    "identification": "brightness engine growth match nearby outcome pairs proposers pyramid result sheet",
+    "images": "background detection extract fits fits_files image optics pixel_phase pixels psf raw",
     "inference": "derived exact named power_scaling surrogate target",
     "likelihood": (
         "arrays compressed effect_likelihood effect_sums elimination fitted_effects "
@@ -398,32 +392,23 @@ WITHOUT_NAMESAKE = {
     "maths": "circular intervals linear ranks",
     "observations": "checks columns files frames rows splits written",
     "paper": (
-        "camera checks commands errors judgement published readings recursive/filter "
-        "recursive/folder recursive/frames recursive/innovations recursive/methods "
-        "recursive/result recursive/start recursive/state recursive/stream result show/figures "
+        "camera checks commands errors judgement published readings result show/figures "
         "show/pages show/tables show/views statistics"
     ),
-    "pipeline": "cameras displacement images record refine",
-    "planning": "check costs design effects forecast information open_distortion plan",
+    "pipeline": "cameras displacement images refine",
+    "planning": "check costs effects forecast information open_distortion",
     "presentation": (
-        "figures/budgeting figures/comparison figures/coupling figures/diagnostics "
-        "figures/effects figures/estimation figures/inference figures/planning "
-        "figures/propagation figures/scales figures/style figures/sweeps html pages/budgeting "
-        "pages/comparison pages/gallery pages/notebook pages/planning pages/printing "
-        "pages/write tables words/axes words/budgeting words/comparison words/diagnostics "
-        "words/effects words/estimation words/images words/inference words/inputs "
-        "words/planning words/propagation"
+        "html pages/budgeting pages/comparison pages/gallery pages/notebook pages/planning "
+        "pages/printing pages/studies pages/write tables"
     ),
-    "propagation": (
-        "attitude_error coupling field geometry onboard_error propagate sampled spectrum"
-    ),
+    "propagation": "attitude_error geometry onboard_error sampled",
     "runs": (
-        "compare folder frames merge priors report steps/budgeting steps/estimate steps/images "
-        "steps/misfit steps/mission steps/pages steps/posterior stored"
+        "compare frames merge priors report steps/budgeting steps/estimate steps/images "
+        "steps/misfit steps/mission steps/pages steps/posterior"
     ),
-    "simulation": "campaign contamination frames mission pointing psf sensor truth",
-    "sky": "cds gaia names neighbours positions refraction site tables",
-    "studies": "axes cells definition geometry result store study",
+    "simulation": "campaign contamination mission pointing psf sensor truth",
+    "sky": "cds gaia names neighbours positions refraction",
+    "studies": "axes cells definition geometry result store",
 }
 
 

@@ -343,26 +343,26 @@ COMMANDS = {
 }
 # These take long or files of their own; the tests that execute them stand beside them.
 ELSEWHERE = {
-    "calibrate OBS CAMERA --effects temperature": "tests/cli/test_effects.py",
-    "centroid": "tests/cli/test_cli_images.py",
-    "demo": "tests/cli/test_cli.py",
-    "diagnose RUN": "tests/cli/test_cli_statistics.py",
-    "diagnose RUN --force": "tests/cli/test_cli_statistics.py",
-    "inspect RUN": "tests/cli/test_cli_images.py",
-    "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
-    "propagate RUN --temperature-profile FILE": "tests/cli/test_effects.py",
-    "propagate RUN --temperature-profile FILE --force": "tests/cli/test_effects.py",
+    "calibrate OBS CAMERA --effects temperature": "tests/cli/test_steps_effects.py",
+    "centroid": "tests/cli/test_images.py",
+    "demo": "tests/cli/test_commands.py",
+    "diagnose RUN": "tests/cli/test_statistics.py",
+    "diagnose RUN --force": "tests/cli/test_statistics.py",
+    "inspect RUN": "tests/cli/test_images.py",
+    "propagate RUN --attitudes PROFILE": "tests/cli/test_mission.py",
+    "propagate RUN --temperature-profile FILE": "tests/cli/test_steps_effects.py",
+    "propagate RUN --temperature-profile FILE --force": "tests/cli/test_steps_effects.py",
     "report": "tests/presentation/test_report.py",
     "report RUN --format pdf": "tests/presentation/test_report.py",
     "report RUN --notebook": "tests/presentation/test_report.py",
     "schema": "tests/cli/test_schemas.py",
-    "reproduce": "tests/cli/test_cli_paper.py",
-    "run IMAGES... -o RUN": "tests/cli/test_cli_images.py",
-    "study STUDY.toml -o DIR": "tests/cli/test_cli_study.py",
-    "study": "tests/cli/test_cli_study.py",
-    "new study": "tests/cli/test_cli_study.py",
-    "validate CAMERA": "tests/cli/test_cli_statistics.py",
-    "--help": "tests/cli/test_cli.py",
+    "reproduce": "tests/cli/test_paper.py",
+    "run IMAGES... -o RUN": "tests/cli/test_images.py",
+    "study STUDY.toml -o DIR": "tests/cli/test_study.py",
+    "study": "tests/cli/test_study.py",
+    "new study": "tests/cli/test_study.py",
+    "validate CAMERA": "tests/cli/test_statistics.py",
+    "--help": "tests/cli/test_commands.py",
 }
 
 # Arguments that sentences advise, and a call with each.
@@ -426,7 +426,7 @@ def test_every_check_has_an_example():
                 name = getattr(call.func, "id", "")
                 if name == "Check" or (module == "inference.checks" and name in shared):
                     giving.add(f"{module}.{function.name}")
-    # Requirements of a budget have advice alone: tests/cli/test_cli_mission.py.
+    # Requirements of a budget have advice alone: tests/cli/test_mission.py.
     shared = {
         *(f"inference.checks.{name}" for name in shared),
         "budgeting.result._requirement_check",
@@ -495,7 +495,7 @@ def execute(small, cli, tmp_path):
 def test_every_check_has_a_sentence_a_remedy_and_a_place_in_the_documentation(
     small, remedies, root
 ):
-    # Requirements have the names and the words of a budget: tests/cli/test_cli_mission.py.
+    # Requirements have the names and the words of a budget: tests/cli/test_mission.py.
     assert small.codes == set(Code) - {Code.REQUIREMENT}
     rows = re.findall(r"^\| ([^|]*) \|", (root / DOCUMENTED).read_text(encoding="utf-8"), re.M)
     assert [code.value[0] for code in Code if code.value[0] not in rows] == []

@@ -277,7 +277,7 @@ def _write_tables(folder: Path) -> None:
     from astropy.table import Table
 
     from tests.helpers.plate_solver import write_gaia_records
-    from tests.sky.test_readers import HIPPARCOS
+    from tests.sky.test_tables import HIPPARCOS
 
     rng = np.random.default_rng(1)
     n = 12

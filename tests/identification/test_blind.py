@@ -26,7 +26,7 @@ from starcal_uq.images.image import Image
 from starcal_uq.images.optics import optics_of
 from starcal_uq.sky.catalogue import StarCatalogue
 from starcal_uq.sky.positions import unit_vectors
-from tests.identification.test_identification import (
+from tests.identification.test_search import (
     centroid_table,
     random_frames,
     square_camera,

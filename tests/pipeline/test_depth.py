@@ -14,7 +14,7 @@ from starcal_uq.identification import pyramid
 from starcal_uq.identification.blind import LEVELS, BlindSearch
 from starcal_uq.identification.engine import identify
 from starcal_uq.pipeline.depth import COUNTS, depth_for, identify_to_depth, stars_in_field
-from tests.identification.test_identification import random_frames, square_camera, wrong_rows
+from tests.identification.test_search import random_frames, square_camera, wrong_rows
 
 
 def test_counts_are_the_catalogue_s() -> None:

@@ -13,7 +13,7 @@ from starcal_uq.identification import match, pyramid
 from starcal_uq.identification.engine import identify
 from starcal_uq.identification.pairs import StarPairs, angle_between, find_star_pairs
 from starcal_uq.sky.catalogue import StarCatalogue
-from tests.identification.test_wide_fields import measured, noise_frames, wrong_and_right
+from tests.identification.test_search_wide_fields import measured, noise_frames, wrong_and_right
 from tests.identification.wide import Lens
 
 
