@@ -108,6 +108,7 @@ def template_environment() -> Environment:
     }
     names = ("count", "fixed", "join_words", "percent", "plural", "significant")
     environment.globals |= {name: getattr(formatting, name) for name in names}
+    environment.globals["TextTable"] = TextTable
     return environment
 
 

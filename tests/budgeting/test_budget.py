@@ -798,7 +798,6 @@ def test_a_notebook_shows_the_section(stated: Path) -> None:
 
 
 def test_the_report_gets_one_name(stated: Path) -> None:
-    assert budget_context(None) == {"budget": None}
     context = budget_context(made(stated))
     assert set(context) == {"budget"} and context["budget"]["violated"] is True
 

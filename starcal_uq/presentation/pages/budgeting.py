@@ -15,7 +15,7 @@ from starcal_uq.core.status import Level
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
-from starcal_uq.presentation.html import template_environment
+from starcal_uq.presentation.html import page, template_environment
 from starcal_uq.presentation.sentences.budgeting import NOT_RESOLVED, outcome_text
 from starcal_uq.presentation.tables import tex
 from starcal_uq.presentation.words.budgeting import headline, tables
@@ -43,20 +43,15 @@ _RED, _AMBER, _GREEN, _GROUND = "FFFDE6DB", "FFFDF1D6", "FFE3F4EE", "FFDFE4E9"
 
 def write_tex(budget: Budget, path: PathLike) -> None:
     """A document that compiles by itself, with booktabs tables to take out."""
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("starcal_uq.presentation"),
+    environment = template_environment().overlay(
         block_start_string="<%",
         block_end_string="%>",
         variable_start_string="<<",
         variable_end_string=">>",
         comment_start_string="<#",
         comment_end_string="#>",
-        trim_blocks=True,
-        lstrip_blocks=True,
+        autoescape=False,
         finalize=tex,
-        undefined=jinja2.StrictUndefined,
     )
     template = environment.get_template("budget.tex.j2")
     text = template.render(created=budget.provenance.created_utc, **tables(budget))
@@ -71,19 +66,14 @@ def section_html(budget: Budget) -> str:
 
 def write_html(budget: Budget, path: PathLike) -> None:
     """A page that needs no network and no other file."""
-    provenance = budget.provenance
-    text = (
-        template_environment()
-        .get_template("budget.html.j2")
-        .render(
-            **budget_context(budget),
-            images=_images(budget),
-            created=provenance.created_utc,
-            version=provenance.version,
-            data_sha256=provenance.data_sha256 or "",
-        )
+    text = page(
+        "budget.html.j2",
+        budget.provenance,
+        **budget_context(budget),
+        images=_images(budget),
+        data_sha256=budget.provenance.data_sha256 or "",
     )
-    atomic_write_text(path, text + "\n")
+    atomic_write_text(path, text)
 
 
 def write_xlsx(budget: Budget, path: PathLike) -> None:
@@ -225,11 +215,9 @@ def write_budget(budget: Budget, path: PathLike) -> Path:
     return Path(path)
 
 
-def budget_context(budget: Budget | None) -> AnyDict:
-    """What ``budget_section.html.j2`` shows beside the figure, under the name ``budget``; None
-    where there is none.
-    """
-    return {"budget": None if budget is None else tables(budget)}
+def budget_context(budget: Budget) -> AnyDict:
+    """What ``budget_section.html.j2`` shows beside the figure, under the name ``budget``."""
+    return {"budget": tables(budget)}
 
 
 def _images(budget: Budget) -> dict[str, bytes]:

@@ -9,30 +9,23 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_csv
-from starcal_uq.core.formatting import fixed, p_words, percent, plus_minus, pretty_unit, significant
+from starcal_uq.core.formatting import fixed, p_words, plus_minus, pretty_unit, significant
 from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.types import PathLike
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import svg_bytes
-from starcal_uq.presentation.html import template_environment
+from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.comparison import headline, rotation_words
 
-_LEVELS = {
-    "agree": "pass",
-    "parameters differ": "warning",
-    "maps differ": "fail",
-    "not tested": "warning",
+# Class and badge of the page.
+_VERDICTS = {
+    "agree": ("pass", "✓ agree"),
+    "parameters differ": ("warning", "! parameters differ"),
+    "maps differ": ("fail", "✗ differ"),
+    "not tested": ("warning", "! not tested"),
 }
-_BADGES = {
-    "agree": "✓ agree",
-    "parameters differ": "! parameters differ",
-    "maps differ": "✗ differ",
-    "not tested": "! not tested",
-}
-
-
 _PAGE = "comparison.html"
 
 
@@ -54,67 +47,20 @@ def write_comparison(comparison: CameraComparison, folder: PathLike) -> Path:
 
 def render_comparison(comparison: CameraComparison, image: bytes) -> str:
     """The page as one HTML document; `image` is the figure as SVG."""
-    environment = template_environment()
-    context = {
-        "found": comparison,
-        "level": _LEVELS[comparison.verdict],
-        "badge": _BADGES[comparison.verdict],
-        "headline": headline(comparison),
-        "rotation": rotation_words(comparison),
-        "false_alarms": percent(comparison.level, 1),
-        "map_table": _map_table(comparison),
-        "test_table": _test_table(comparison),
-        "parameter_table": _parameter_table(comparison),
-        "source_table": _source_table(comparison),
-        "images": {"difference": image},
-    }
-    return environment.get_template("comparison.html.j2").render(context) + "\n"
-
-
-def _map_table(found: CameraComparison) -> TextTable:
-    expected = significant(found.expected_rms_arcsec) if found.tested else "not known"
-    rows = (
-        (
-            "Root mean square over the detector",
-            significant(found.rms_arcsec),
-            significant(found.rms_px),
-            expected,
-        ),
-        ("Largest", significant(found.largest_arcsec), significant(found.largest_px), ""),
+    level, badge = _VERDICTS[comparison.verdict]
+    return page(
+        "comparison.html.j2",
+        comparison.provenance,
+        found=comparison,
+        level=level,
+        badge=badge,
+        headline=headline,
+        rotation_words=rotation_words,
+        p_words=p_words,
+        parameters=_parameter_table(comparison),
+        sources=_source_table(comparison),
+        images={"difference": image},
     )
-    return TextTable(("Length of the difference", "arcsec", "px", "Expected [arcsec]"), rows)
-
-
-def _test_table(found: CameraComparison) -> TextTable | None:
-    if not found.tested:
-        return None
-    error = f" (Monte Carlo, ±\N{NO-BREAK SPACE}{significant(found.p_worst_error, 1)})"
-    rows = (
-        (
-            "Map",
-            "Do the directions differ by more than they should, on average over the detector?",
-            (
-                f"{significant(found.rms_arcsec)} arcsec, {significant(found.expected_rms_arcsec)} "
-                "expected"
-            ),
-            p_words(found.p_map),
-        ),
-        (
-            "Parameters",
-            "Can the two be the same camera, every direction weighed by its own uncertainty?",
-            f"χ² = {significant(found.statistic, 3)} for {found.n_directions}",
-            p_words(found.p_parameters),
-        ),
-        (
-            "Worst place",
-            "Is the place that stands out most worse than the worst of so many by chance?",
-            f"{significant(found.worst_ratio)} times its 1 sigma at x = {found.worst_x_px:.0f} px, "
-            f"y = {found.worst_y_px:.0f} px",
-            p_words(found.p_worst) + error,
-        ),
-    )
-    shown = rows if np.isfinite(found.p_parameters) else rows[:1]
-    return TextTable(("Test", "Asks", "Found", "p-value"), shown, align="llll")
 
 
 def _parameter_table(found: CameraComparison) -> TextTable:

@@ -26,28 +26,11 @@ from starcal_uq.presentation.figures.planning import (
     plot_plan_sweeps,
 )
 from starcal_uq.presentation.figures.style import svg_bytes
-from starcal_uq.presentation.html import template_environment
+from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.planning import (
-    SCOPE_NAMES,
-    check_text,
-    choice_table,
-    choice_text,
-    costs_sentence,
-    costs_table,
-    distortion_sentence,
-    level,
-    need_words,
-    plan_text,
-    range_words,
-    settings_sentence,
-    span,
-    ties_sentence,
-)
+from starcal_uq.presentation.words import planning as words
 
 PAGE = "plan.html"
-_TEMPLATE = "plan.html.j2"
-_FRAMES_SHOWN = 30
 # Settings that the record has as they are.
 _RECORDED = (
     "sigma_px",
@@ -91,7 +74,7 @@ def write_plan(
     simulation, for the page and ``check.csv``.
     """
     images = plan_figures(plan, choice, check)
-    page = render_plan(plan, images, choice, check)
+    text = render_plan(plan, images, choice, check)
     tables = {
         "plan": plan.to_dataframe(),
         "sweeps": plan.sweeps,
@@ -108,19 +91,19 @@ def write_plan(
                 continue
             write_csv(table, path / f"{name}.csv")
         atomic_write_text(path / "plan.json", json.dumps(plan_record(plan), indent=1) + "\n")
-        atomic_write_text(path / PAGE, page)
+        atomic_write_text(path / PAGE, text)
     return Path(folder) / PAGE
 
 
 def plan_record(plan: Plan) -> AnyDict:
     """The plan as plain values: settings, what is needed, and the forecast by number of frames."""
     return {
-        "verdict": plan_text(plan),
+        "verdict": words.plan_text(plan),
         "camera": plan.camera.to_dict(),
         **{name: getattr(plan, name) for name in _RECORDED},
         "effects": None if plan.effects is None else _costs(plan.effects),
         "distortion": None if plan.distortion is None else _finite(to_plain(plan.distortion)),
-        "distortion_words": distortion_sentence(plan),
+        "distortion_words": words.distortion_sentence(plan),
         "needs": to_plain(plan.needs),
         # What a campaign does not determine is infinite.
         "forecast": _finite(plan.to_dataframe().to_dict("records")),
@@ -165,11 +148,18 @@ def render_plan(
     check: ForecastCheck | None = None,
 ) -> str:
     """The page; `images` are SVG by the names of `plan_figures`."""
-    context = _context(plan, images)
-    context |= {"choice": None if choice is None else choice_text(choice)}
-    context |= {"check": None if check is None else check_text(check)}
-    context |= {"frame_table": None if choice is None else choice_table(choice, _FRAMES_SHOWN)}
-    return template_environment().get_template(_TEMPLATE).render(context) + "\n"
+    return page(
+        "plan.html.j2",
+        plan.provenance,
+        plan=plan,
+        choice=choice,
+        check=check,
+        needs=_needs_table(plan),
+        forecast=_forecast_table(plan),
+        infinite=lambda values: not np.isfinite(values).all(),
+        words=words,
+        images=images,
+    )
 
 
 def _needs_table(plan: Plan) -> TextTable:
@@ -177,15 +167,15 @@ def _needs_table(plan: Plan) -> TextTable:
     spread = plan.distortion
     rows = tuple(
         (
-            SCOPE_NAMES[need.scope],
-            need_words(need, need.frames),
-            need_words(need, need.frames_surely),
-            *(() if spread is None else (range_words(*spread.frames_range(need.scope)),)),
+            words.SCOPE_NAMES[need.scope],
+            words.need_words(need, need.frames),
+            words.need_words(need, need.frames_surely),
+            *(() if spread is None else (words.range_words(*spread.frames_range(need.scope)),)),
             significant(need.floor_arcsec, 3) if need.floor_arcsec > 0.0 else "0",
         )
         for need in plan.needs
     )
-    over = () if spread is None else (f"Distortion of {span(spread)}",)
+    over = () if spread is None else (f"Distortion of {words.span(spread)}",)
     heads = ("Part of the error", "On average", "In 95 % of campaigns", *over, "Floor [arcsec]")
     return TextTable(
         heads,
@@ -202,32 +192,3 @@ def _forecast_table(plan: Plan) -> TextTable:
     left_out = "f [px]" if "f [mm]" in table else ""
     columns = [head for head in _HEADS.values() if head in table and head != left_out]
     return TextTable.of(table, columns=columns)
-
-
-def _context(plan: Plan, images: Mapping[str, bytes]) -> AnyDict:
-    return {
-        "title": plan.camera.name or "Plan of a calibration",
-        "created": plan.provenance.created_utc,
-        "version": plan.provenance.version,
-        "verdict": plan_text(plan),
-        "settings": " ".join(filter(None, (settings_sentence(plan), ties_sentence(plan)))),
-        "distortion_words": distortion_sentence(plan),
-        "distortion_span": "" if plan.distortion is None else span(plan.distortion),
-        "costs": None if plan.effects is None else costs_table(plan.effects),
-        "costs_words": "" if plan.effects is None else costs_sentence(plan.effects),
-        "level": level(plan.confidence),
-        "scope": SCOPE_NAMES[plan.scope],
-        "target": None if plan.target_arcsec is None else f"{plan.target_arcsec:g} arcsec",
-        "needs": _needs_table(plan),
-        "forecast": _forecast_table(plan),
-        "nea": [significant(value) for value in plan.nea_arcsec],
-        "camera_rows": [
-            (key, value) for key, value in plan.camera.to_dict().items() if key != "name"
-        ],
-        "unreached": plan.frames_needed is not None
-        and plan.sweeps is not None
-        and not bool(np.isfinite(plan.sweeps["frames_needed"]).all()),
-        "seed": plan.seed,
-        "provenance": plan.provenance.settings,
-        "images": images,
-    }

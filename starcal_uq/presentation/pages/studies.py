@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder
-from starcal_uq.core.formatting import count, plural
+from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.types import PathLike
 from starcal_uq.presentation.figures.studies import (
     plot_coverage,
@@ -24,72 +24,14 @@ from starcal_uq.presentation.figures.studies import (
     plot_weakest,
 )
 from starcal_uq.presentation.figures.style import svg_bytes
-from starcal_uq.presentation.html import template_environment
+from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words import studies as words
 from starcal_uq.presentation.words.axes import axis_label, value_words
-from starcal_uq.presentation.words.studies import (
-    study_advice,
-    study_answer,
-    study_limits,
-    study_tables,
-    study_text,
-    summary,
-)
 from starcal_uq.studies.result import Study
 
 PAGE = "report.html"
-_TEMPLATE = "study.html.j2"
 _CELLS_SHOWN = 60
-
-_CAPTIONS = {
-    "correlation": (
-        "What couples, and what changes it",
-        "Size of the correlation, on a scale that grows as its price in sigma does; a pair whose "
-        "entries err together "
-        "is marked alike, else opposite. {band}",
-    ),
-    "maps": (
-        "Over two axes",
-        "Medians over seeds. Left below: the error of the calibration that differs from frame to "
-        "frame, 1 sigma per "
-        "axis across the boresight; right below: the rotation common to all frames, which "
-        "alignment absorbs.",
-    ),
-    "matrices": (
-        "The whole matrix",
-        "Correlations of the parameters; grey where a model lacks one.",
-    ),
-    "weakest": (
-        "The weakest direction",
-        "The combination of parameters, each in its own sigma, that is determined worst: its "
-        "variance over that of uncoupled parameters, and the shares of the parameters that take "
-        "part.",
-    ),
-    "inflation": (
-        "Sigmas and the price of coupling",
-        (
-            "Full lines: all parameters unknown. Dashed: all others known. The gap is the price of "
-            "coupling. {band}"
-        ),
-    ),
-    "needed": (
-        "What a target takes",
-        "The error that differs from frame to frame, 1 sigma per axis across the boresight, and, "
-        "where there is a "
-        "target, the frames that it takes. {band}",
-    ),
-    "simpler": (
-        "Would a simpler model do?",
-        "Frame-dependent attitude error across the boresight that a simpler distortion model "
-        "would leave, beside that of the calibration (dashed). Where a full line lies below the "
-        "dashed one of its colour, the simpler model is rich enough.",
-    ),
-    "coverage": (
-        "Coverage",
-        "Simulated cells whose 95 % interval holds the truth, with exact 95 % bounds of that part.",
-    ),
-}
-_SIMULATED = " Dashed: the posterior's correlation, median over seeds."
 
 
 def write_study(study: Study, folder: PathLike) -> Path:
@@ -98,11 +40,11 @@ def write_study(study: Study, folder: PathLike) -> Path:
     """
     path = new_folder(folder)
     images = study_figures(study)
-    page = render_study(study, images)
+    text = render_study(study, images)
     figures = new_folder(path / "figures")
     for name, svg in images.items():
         atomic_write_bytes(figures / f"{name}.svg", svg)
-    atomic_write_text(path / PAGE, page)
+    atomic_write_text(path / PAGE, text)
     return path / PAGE
 
 
@@ -131,44 +73,24 @@ def study_figures(study: Study) -> dict[str, bytes]:
 
 def render_study(study: Study, images: Mapping[str, bytes]) -> str:
     """The page; `images` are SVG by the names of `study_figures`."""
-    definition, data = study.definition, study.data
-    over = "what else was drawn" if study.sweep.drawn else "seeds"
-    band = f"Bands: range over {over}."
-    figures = [
-        {"name": name, "title": _CAPTIONS[name][0], "caption": _CAPTIONS[name][1].format(band=band)}
-        for name in images
-    ]
-    if "posterior_correlation" in data:
-        for figure in figures:
-            figure["caption"] += _SIMULATED if figure["name"] == "correlation" else ""
-    context = {
-        "title": definition.name,
-        "question": definition.question,
-        "created": data.attrs.get("created_utc", ""),
-        "version": data.attrs.get("starcal_uq", ""),
-        "verdict": study_text(study),
-        "answer": study_answer(study)[1:],
-        "advice": study_advice(study),
-        "limits": study_limits(study),
-        "failed": not study.ok.all(),
-        "tables": study_tables(study),
-        "figures": figures,
-        "cells": cells_table(study, _CELLS_SHOWN),
-        "cells_words": (
-            f"{plural(min(_CELLS_SHOWN, len(study.sweep.ok)), 'cell')} of "
-            f"{count(len(study.sweep.ok))}"
-        ),
-        "provenance": _provenance(study),
-        "images": images,
-    }
-    return template_environment().get_template(_TEMPLATE).render(context) + "\n"
+    attrs = study.data.attrs
+    versions = {"starcal_uq": attrs.get("starcal_uq", "")}
+    return page(
+        "study.html.j2",
+        Provenance(created_utc=attrs.get("created_utc", ""), versions=versions),
+        study=study,
+        words=words,
+        cells=cells_table(study, _CELLS_SHOWN),
+        provenance=_provenance(study),
+        images=images,
+    )
 
 
 def cells_table(study: Study, n: int) -> TextTable:
     """The first cells, one a row: where, and the numbers of the summary."""
     import pandas as pd
 
-    columns, forms = summary(study) if study.ok.any() else ({}, {})
+    columns, forms = words.summary(study) if study.ok.any() else ({}, {})
     data = study.data
     where = {axis_label(axis): data[axis].values for axis in study.axes}
     frame = {"Seed": data["seed_index"].values} | columns | {"Status": data["status"].values}
