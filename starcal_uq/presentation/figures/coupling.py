@@ -48,23 +48,19 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
 def plot_correlations(coupling: Coupling) -> Figure:
     """Both matrices side by side: the camera parameters alone, and with the boresight."""
     p, q = len(coupling.parameter_names), len(coupling.extended_names)
-    width, before, between, after, above = 11.0, 0.45, 0.75, 1.2, 0.62
-    cell = (width - before - between - after) / (p + q)
-    figure = style.new_figure(width, q * cell + above + 0.1)
-    left = style.place(figure, before, 0.1 + (q - p) * cell, p * cell, p * cell)
-    right = style.place(figure, before + p * cell + between, 0.1, q * cell, q * cell)
+    figure = style.new_figure(11.0, 5.2)
+    left, right = figure.subplots(1, 2, width_ratios=(p, q))
     heat_map(left, coupling.correlation, coupling.parameter_names)
     image = _extended(right, coupling)
     style.label(left, "Camera parameters", pad=24)
     style.label(right, "With the constant attitude error they cause", pad=24)
-    bar = style.place(figure, width - after + 0.2, 0.1, 0.2, q * cell)
-    style.label_distance(style.colour_bar(right, image, "correlation", bar).ax, y_in=-0.75)
+    style.colour_bar(right, image, "correlation")
     return figure
 
 
 def plot_couplings(coupling: Coupling, ax: Axes | None = None) -> Axes:
     """How many times larger each sigma is because the other parameters are unknown too."""
-    ax = style.panel(ax, 4.6, 2.6, (0.4, 0.12, 0.5, 0.34), grid=True)
+    ax = style.panel(ax, 4.6, 2.6, grid=True)
     ratio = coupling.sigma_marginal / coupling.sigma_conditional
     rows = np.arange(len(ratio))
     ax.barh(rows, ratio, color=style.BLUE, height=0.62)

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.observations.table import Observations
 
-# Mean width of a letter of a tick label.
-_LETTER_IN = 0.065
-
 
 def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = ALPHA) -> Axes:
     """Corrected p-value of every test on a logarithmic axis; beyond the line is more than noise."""
@@ -106,20 +103,13 @@ def plot_comparison(models: ModelComparison, ax: Axes | None = None) -> Axes:
 
 def plot_diagnosis(diagnosis: Diagnosis) -> Figure:
     """Tests for misfit, jackknife and comparison of models side by side."""
-    width, height, bottom = 11.0, 5.4, 0.5
-    figure = style.new_figure(width, height)
-    names = 0.2 + _LETTER_IN * max((len(test.name) for test in diagnosis.misfit.tests), default=0)
-    plot_misfit(
-        diagnosis.misfit, style.place(figure, names, bottom, 5.7 - names, height - bottom - 0.12)
-    )
-    each = 0.5 * (height - bottom - 0.36 - 0.76)
+    figure = style.new_figure(11.0, 5.4)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1.0))
+    plot_misfit(diagnosis.misfit, figure.add_subplot(grid[:, 0]))
     if diagnosis.jackknife is not None:
-        upper = style.place(figure, 7.3, bottom + each + 0.76, width - 7.42, each)
-        style.label_distance(plot_jackknife(diagnosis.jackknife, upper), y_in=0.45)
+        plot_jackknife(diagnosis.jackknife, figure.add_subplot(grid[0, 1]))
     if diagnosis.comparison is not None:
-        lower = style.place(figure, 7.3, bottom, width - 7.42, each)
-        style.label_distance(plot_comparison(diagnosis.comparison, lower), x_in=0.27)
-    style.label_distance(figure.axes[0], x_in=0.27)
+        plot_comparison(diagnosis.comparison, figure.add_subplot(grid[1, 1]))
     return figure
 
 
@@ -150,7 +140,6 @@ def _plot_profile(ax: Axes, profile: Profile1D) -> None:
         )
     style.about_zero(ax)
     style.label(ax, profile.title, profile.label, "mean residual [px]")
-    style.label_distance(ax, x_in=0.25, y_in=0.67)
 
 
 _BAND = 0.95

@@ -60,12 +60,9 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
         lower.plot(iteration, error, color=style.BLUE, **_PATH)
         _error_axis(lower, float(np.abs(error).max()))
         style.label(lower, x="iteration")
-        style.label_distance(lower, x_in=0.23)
     what = "truth" if known else "final estimate"
     style.label(axes[0, 0], y="value")
     style.label(axes[1, 0], y=f"distance from {what}\n[final sigma]")
-    for ax in axes[:, 0]:
-        style.label_distance(ax, y_in=0.46)
     _key(figure, cal, what)
     return figure
 
@@ -133,15 +130,11 @@ def plot_residuals(cal: Calibration, obs: Observations) -> Figure:
             "loaded observations."
         )
     figure = style.new_figure(11.0, 4.1)
-    grid = style.panels(
-        figure, 1, 3, (0.62, 0.1, 0.72, 0.36), (0.8, 0.0), width_ratios=(1.12, 1.0, 0.95)
-    )
-    left, middle, right = (figure.add_subplot(grid[0, column]) for column in range(3))
-    plot_residual_map(cal, obs, left)
-    plot_residual_radius(cal, obs, middle)
-    plot_residual_histogram(cal, obs, right)
-    for ax, aside in ((left, 0.42), (middle, 0.58), (right, 0.42)):
-        style.label_distance(ax, x_in=0.27, y_in=aside)
+    panels = figure.subplots(1, 3, width_ratios=(1.12, 1.0, 0.95))
+    for plot, ax in zip(
+        (plot_residual_map, plot_residual_radius, plot_residual_histogram), panels, strict=True
+    ):
+        plot(cal, obs, ax)
     return figure
 
 

@@ -166,12 +166,10 @@ def _ticks(
     sparse(ax, y=row != column)
     if row == size - 1:
         style.label(ax, x=scales[column].label, size=style.TICK_SIZE)
-        style.label_distance(ax, x_in=0.25)
     else:
         ax.tick_params(labelbottom=False)
     if column == 0 and row > 0:
         style.label(ax, y=scales[row].label, size=style.TICK_SIZE)
-        style.label_distance(ax, y_in=0.52)
     else:
         ax.tick_params(labelleft=False)
 
@@ -240,8 +238,6 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
         lower.set_xlim(*ends)
         style.label(lower, x=scales[i].label, size=style.TICK_SIZE)
         sparse(lower, y=False)
-        for ax in (upper, lower):
-            style.label_distance(ax, x_in=0.25, y_in=0.08)
         if i == 0:
             style.label(upper, y="scale of\nthe prior")
             style.label(lower, y="scale of\nthe posterior")

@@ -34,10 +34,7 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
     Bars and their numbers are with the misfit found, lines across them if the model holds; open
     bars are not assessed.
     """
-    if ax is None:
-        ax = style.new_axes(7.2, 3.4, (0.66, 0.1, 0.72, 0.36))
-        style.label_distance(ax, x_in=0.24, y_in=0.46)
-    style.dress(ax, grid=True)
+    ax = style.panel(ax, 7.2, 3.4, grid=True)
     series = (
         ("centroid noise (NEA)", style.SKY, ""),
         ("calibration, common", style.ORANGE, "//"),
@@ -101,25 +98,13 @@ def plot_field_map(field: FieldMap) -> Figure:
     ellipses, enlarged from panel to panel by the factor that the key shows. A map of an earlier
     version has no ellipses.
     """
-    across = 3.76
-    down = across * float(np.ptp(field.y_px) / np.ptp(field.x_px))
-    figure = style.new_figure(11.0, 0.88 + down)
-    maps = (
-        (field.sigma_absolute_arcsec, field.covariance_absolute_arcsec2, "Absolute"),
-        (
-            field.sigma_compensated_arcsec,
-            field.covariance_compensated_arcsec2,
-            "Best constant rotation removed",
-        ),
-    )
-    for column, (sigma, covariance, title) in enumerate(maps):
-        left = 0.64 + 5.5 * column
-        ax, bar = (
-            style.place(figure, left + x, 0.5, wide, down)
-            for x, wide in ((0.0, across), (across + 0.14, 0.18))
-        )
-        _panel(ax, bar, field, sigma, covariance, title)
-        style.label_distance(ax, x_in=0.27, y_in=0.42)
+    shape = float(np.ptp(field.y_px) / np.ptp(field.x_px))
+    figure = style.new_figure(11.0, 0.88 + 3.76 * shape)
+    left, right = figure.subplots(1, 2)
+    _panel(left, field, field.sigma_absolute_arcsec, field.covariance_absolute_arcsec2, "Absolute")
+    title = "Best constant rotation removed"
+    known = field.covariance_compensated_arcsec2
+    _panel(right, field, field.sigma_compensated_arcsec, known, title)
     return figure
 
 
@@ -130,39 +115,24 @@ def plot_glance(
     away.
     """
     figure = style.new_figure(11.0, 3.3)
-    shape = cal.camera.height_px / cal.camera.width_px
-    wide, tall = min(2.15, 2.15 / shape), min(2.15, 2.15 * shape)
-    bars = plot_attitude(error, style.place(figure, 0.66, 0.75, 4.0, 2.15))
-    style.legend(
-        bars,
-        loc="lower left",
-        bbox_to_anchor=(-0.02, 1.0),
-        ncols=3,
-        columnspacing=0.8,
-        handlelength=1.2,
-    )
-    stars = plot_residual_map(cal, obs, style.place(figure, 5.3, 0.75, wide, tall))
-    ax, bar = (
-        style.place(figure, 8.15, 0.75, wide, tall),
-        style.place(figure, 8.25 + wide, 0.75, 0.14, tall),
-    )
-    _panel(ax, bar, field, field.sigma_compensated_arcsec, None, "Rest of directions [arcsec]")
-    bar.set_ylabel("")
+    bars, stars, rest = figure.subplots(1, 3, width_ratios=(1.2, 1.0, 1.15))
+    plot_attitude(error, bars)
+    style.legend_on_top(bars, columnspacing=0.8, handlelength=1.2)
+    plot_residual_map(cal, obs, stars)
+    _panel(rest, field, field.sigma_compensated_arcsec, None, "Rest of directions [arcsec]", "")
     # The page says what else there is to say.
     bars.set_xlabel(bars.get_xlabel().partition("\n")[0])
     style.label(stars, "Residuals", "x [px]")
-    for panel, aside in ((bars, 0.46), (stars, 0.42), (ax, 0.42)):
-        style.label_distance(panel, x_in=0.25, y_in=aside)
     return figure
 
 
 def _panel(
     ax: Axes,
-    own: Axes,
     field: FieldMap,
     values: FloatArray,
     covariance: FloatArray | None,
     title: str,
+    scale: str = "1 sigma per axis [arcsec]",
 ) -> None:
     style.dress(ax)
     x, y = field.x_px, field.y_px
@@ -175,8 +145,7 @@ def _panel(
         field.star_x_px[some], field.star_y_px[some], s=2.0, color="white", alpha=0.45, linewidths=0
     )
     style.detector(ax, x, y, title)
-    bar = style.colour_bar(ax, image, "1 sigma per axis [arcsec]", own)
-    ticks_at_levels(bar, levels)
+    ticks_at_levels(style.colour_bar(ax, image, scale), levels)
     if covariance is not None:
         _ellipses(ax, x, y, covariance)
 
@@ -288,8 +257,8 @@ def plot_thermal(error: ThermalError) -> Figure:
     boresight and about it, with one camera for all temperatures and with effects aboard.
     """
     figure = style.new_figure(7.2, 4.4)
-    above = style.dress(style.place(figure, 0.95, 3.1, 6.05, 1.0), grid=True)
-    below = style.dress(style.place(figure, 0.95, 0.5, 6.05, 2.0), grid=True)
+    panels = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 2.0))
+    above, below = (style.dress(ax, grid=True) for ax in panels)
     time, unit = error.profile.time_s, "s"
     if np.ptp(time) > _MINUTES * 60.0:
         time, unit = time / 60.0, "min"
@@ -313,10 +282,7 @@ def plot_thermal(error: ThermalError) -> Figure:
             (sizes[:, 2], style.ORANGE, "roll"),
         ):
             below.plot(time, values, look, color=colour, lw=1.4, label=f"{axis}, {aboard} aboard")
-    for ax in (above, below):
-        ax.set_xlim(time[0], time[-1])
-        style.label_distance(ax, x_in=0.24, y_in=0.4)
-    above.tick_params(axis="x", labelbottom=False)
+    below.set_xlim(time[0], time[-1])
     below.set_ylim(bottom=0.0)
     style.legend_on_top(below, columnspacing=1.4, ncols=2)
     style.label(below, "", f"time [{unit}]", "1 sigma after\nalignment [arcsec]")
@@ -364,8 +330,7 @@ _BAND_COLOURS = (
 def plot_distortion_curve(curve: DistortionCurve) -> Figure:
     """Mean radial displacement (left), and the bands around it in px and arcsec (right)."""
     figure = style.new_figure(10.4, 3.7)
-    grid = style.panels(figure, 1, 2, (0.72, 0.78, 0.5, 0.34), (1.0, 0.0))
-    left, right = (figure.add_subplot(grid[0, column]) for column in range(2))
+    left, right = figure.subplots(1, 2)
     for ax in (left, right):
         style.dress(ax, grid=True)
         ax.set_xlim(0.0, curve.radius_px[-1])
@@ -386,13 +351,12 @@ def plot_distortion_curve(curve: DistortionCurve) -> Figure:
         if len(curve.azimuth_deg) == 1
         else f", azimuth {curve.azimuth_deg[widest]:g}° (the widest)"
     )
-    for ax, title, y, aside in (
-        (left, "Distortion", "radial displacement [px]", 0.5),
-        (right, f"Its uncertainty{where}", "minus the mean [px]", 0.66),
+    for ax, title, y in (
+        (left, "Distortion", "radial displacement [px]"),
+        (right, f"Its uncertainty{where}", "minus the mean [px]"),
     ):
         ax.axhline(0.0, color=style.INK, linewidth=0.8)
         style.label(ax, title, "distance from the principal point [px]", y)
-        style.label_distance(ax, x_in=0.27, y_in=aside)
     return figure
 
 

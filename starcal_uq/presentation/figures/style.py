@@ -92,36 +92,8 @@ def panels(
     )
 
 
-def place(
-    figure: Figure, left_in: float, bottom_in: float, width_in: float, height_in: float
-) -> Axes:
-    """A panel of known place in inches, as `panels` are."""
-    figure.set_layout_engine("none")
-    width, height = figure.get_size_inches()
-    return figure.add_axes(
-        (left_in / width, bottom_in / height, width_in / width, height_in / height)
-    )
-
-
-def label_distance(ax: Axes, *, x_in: float | None = None, y_in: float | None = None) -> None:
-    """Begin the axis labels so many inches below and to the left of a panel whose place is
-    fixed.
-    """
-    figure = figure_of(ax)
-    # The shape of a panel of equal scales, which is smaller than its place.
-    ax.apply_aspect()
-    width, height = figure.get_size_inches() * ax.get_position().size
-    if x_in is not None:
-        ax.xaxis.set_label_coords(0.5, -x_in / height)
-    if y_in is not None:
-        ax.yaxis.set_label_coords(-y_in / width, 0.5)
-
-
-def new_axes(
-    width_in: float, height_in: float, margins_in: tuple[float, float, float, float] | None = None
-) -> Axes:
-    """One dressed panel on a figure of its own, with margins (left, right, bottom, top) in inches
-    where they are known.
+def new_axes(width_in: float, height_in: float) -> Axes:
+    """One dressed panel on a figure of its own.
 
     In a notebook the figure is handed to pyplot, because only then does the notebook show it below
     the cell although the caller holds the Axes; elsewhere pyplot is left alone.
@@ -134,22 +106,18 @@ def new_axes(
         )
     else:
         figure = new_figure(width_in, height_in)
-    if margins_in is None:
-        return dress(figure.add_subplot())
-    left, right, bottom, top = margins_in
-    return dress(place(figure, left, bottom, width_in - left - right, height_in - bottom - top))
+    return dress(figure.add_subplot())
 
 
 def panel(
     ax: Axes | None,
     width_in: float,
     height_in: float,
-    margins_in: tuple[float, float, float, float] | None = None,
     *,
     grid: bool = False,
 ) -> Axes:
     """The panel that is given, dressed, or one on a figure of its own."""
-    return dress(new_axes(width_in, height_in, margins_in) if ax is None else ax, grid=grid)
+    return dress(new_axes(width_in, height_in) if ax is None else ax, grid=grid)
 
 
 def dress(ax: Axes, *, grid: bool = False) -> Axes:
@@ -333,10 +301,9 @@ def legend_above(figure: Figure, handles: Any, **keywords: Any) -> None:
     figure.legend(handles=handles, **{"loc": "outside upper center", **options, **keywords})
 
 
-def colour_bar(ax: Axes, image: Any, text: str, own: Axes | None = None) -> Any:
-    """A colour bar of one panel, on a panel of its own where there is one."""
-    where: AnyDict = {"cax": own} if own is not None else {"ax": ax, "fraction": 0.046, "pad": 0.03}
-    bar = ax.figure.colorbar(image, **where)
+def colour_bar(ax: Axes, image: Any, text: str) -> Any:
+    """A colour bar of one panel."""
+    bar = ax.figure.colorbar(image, ax=ax, fraction=0.046, pad=0.03)
     dress_bar(bar, text)
     return bar
 

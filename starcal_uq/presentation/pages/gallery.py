@@ -7,19 +7,16 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterable
 from functools import cache
-from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.errors import ImageError, MissingExtraError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_text
-from starcal_uq.core.formatting import MINUS, count, fixed, plural, significant
-from starcal_uq.core.provenance import NAME, installed_version
+from starcal_uq.core.provenance import NAME, Provenance, installed_version
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.pipeline.inspection import (
@@ -31,13 +28,11 @@ from starcal_uq.pipeline.inspection import (
     InspectedFrame,
 )
 from starcal_uq.presentation.figures.scales import round_below
-from starcal_uq.presentation.html import template_environment
+from starcal_uq.presentation.html import page, template_environment
 from starcal_uq.presentation.words.images import frames_text, next_step, outcome_words
 from starcal_uq.sky.names import short_name
 
 if TYPE_CHECKING:
-    from markupsafe import Markup
-
     from starcal_uq.camera.camera import Camera
 
 # Width of a picture: sharp on a telephone and half a desk, or on the whole of one.
@@ -48,8 +43,6 @@ _BLACK, _SPAN, _BEND = 0.2, 4.0, 0.06
 _BLUR_PX = 0.7
 # Widths of the image that a typical residual's arrow is long.
 _ARROW = 0.02
-# So many marks of a kind have words of their own; beyond, they are one line.
-_TOLD = 400
 _NAMED = 4
 # A notebook shows at most so many frames.
 _NOTEBOOK = 24
@@ -80,19 +73,23 @@ def gallery(frames: Frames) -> str:
     """The frames as a piece of a page, with its legend and style; it needs no script and no other
     file.
     """
-    shown = list(frames)
-    factor = _factor(frames)
+    squares = frames.residuals_px**2
+    typical = float(np.sqrt(np.median(squares.sum(axis=1)))) if len(squares) else 0.0
     context = {
-        "cards": [_card(frame, frames, factor) for frame in shown],
-        "legend": [(key, _symbol(key), words) for key, _, words in _LEGEND],
+        "frames": frames,
+        "shown": [_card(frame, frames) for frame in frames],
+        "legend": _LEGEND,
         "intro": frames_text(frames),
-        "factor": count(round(factor)) if factor >= 1.0 else significant(factor),
-        "radius": significant(_radius(frames) / factor, 1),
-        "arrows": bool(len(frames.residuals_px)),
+        # How much residuals are enlarged: 1, 2 or 5 times a power of ten, for all frames alike.
+        "factor": round_below(_ARROW * frames.camera.width_px / max(typical, 1e-6)),
+        # Of a circle, px of the image.
+        "radius": frames.camera.width_px / (150.0 if frames.large else 90.0),
+        "outline": _outline,
+        "short_name": short_name,
+        "isfinite": np.isfinite,
+        "FAINTER": FAINTER,
+        "turned": lambda degrees: (np.sin(np.radians(degrees)), -np.cos(np.radians(degrees))),
         "inspect": Remedy("inspect", (frames.run,)).command,
-        "without": sum(frame.path is None for frame in shown),
-        "large": frames.large,
-        "partial": len(frames) < (frames.n_run or len(frames)),
     }
     return template_environment().get_template("gallery.html.j2").render(context)
 
@@ -104,16 +101,9 @@ def frames_html(frames: Frames) -> str:
 
 def write_frames(frames: Frames, to: PathLike) -> Path:
     """Write the frames as one HTML file."""
-    page = template_environment().get_template("frames.html.j2")
-    atomic_write_text(
-        to,
-        page.render(
-            title=f"Frames of {Path(frames.run).name}",
-            gallery=_markup(gallery(frames)),
-            version=_version(),
-        )
-        + "\n",
-    )
+    made = Provenance(versions={NAME: installed_version(NAME)})
+    title = f"Frames of {Path(frames.run).name}"
+    atomic_write_text(to, page("frames.html.j2", made, title=title, gallery=gallery(frames)))
     return Path(to)
 
 
@@ -162,102 +152,27 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
     return out.getvalue()
 
 
-def _card(frame: InspectedFrame, frames: Frames, factor: float) -> AnyDict:
-    row = frame.row
-    counts = (
-        [(key, _symbol(key), kind, frame.n(kind)) for key, kind, _ in _LEGEND]
-        if frame.solved
-        else []
-    )
-    return {
-        "name": row.image,
-        "number": row.frame,
-        "badge": "pass" if frame.n(IDENTIFIED) else "warning",
+def _card(frame: InspectedFrame, frames: Frames) -> AnyDict:
+    """What is told of a frame, its picture, and its marks by their names in the page."""
+    detections, stars = frame.detections, frame.stars
+    reasons = detections.loc[detections["reason"] != "", ["kind", "reason"]].value_counts()
+    kinds = {key: detections[detections["kind"] == kind] for key, kind, _ in _LEGEND[:3]}
+    card: AnyDict = {
+        "frame": frame,
         "outcome": outcome_words(frame),
-        "drawing": _drawing(frame, frames, factor),
-        "facts": list(_facts(frame)),
-        "counts": counts,
-        "reasons": _reasons(frame),
+        "marks": {"e": stars, **kinds, "m": stars[stars["missed"]]},
+        "named": kinds["i"].nsmallest(_NAMED, "mag"),
+        "reasons": [(reason, n) for (_, reason), n in reasons.items()],
         "step": next_step(frame, frames),
-        "missing": ""
-        if frame.path is not None
-        else "The image is not where it was; its stars are drawn without it.",
-    }
-
-
-def _facts(frame: InspectedFrame) -> Iterable[tuple[str, str]]:
-    if frame.solved:
-        yield "RA", f"{fixed(frame.ra_deg, 4)}°"
-        yield "Dec", f"{'+' if frame.dec_deg >= 0 else MINUS}{fixed(abs(frame.dec_deg), 4)}°"
-        yield "Roll", f"{fixed(frame.roll_deg, 2)}°"
-    if frame.n(IDENTIFIED):
-        yield "Residual, rms", f"{significant(frame.rms_px)} px per axis"
-        yield "Stars", count(frame.n(IDENTIFIED))
-    else:
-        yield "Detections", count(len(frame.detections))
-    if np.isfinite(frame.limit_mag):
-        yield "Limit", f"G {'≥ ' if frame.at_least else ''}{fixed(frame.limit_mag, 1)}"
-    if np.isfinite(frame.seconds):
-        yield "Identified in" if frame.solved else "Searched for", f"{significant(frame.seconds)} s"
-    yield (
-        "Time",
-        f"{frame.row.time_utc.replace('T', ' ')[:19]} UTC" if frame.row.time_utc else "not known",
-    )
-
-
-def _reasons(frame: InspectedFrame) -> str:
-    """Why detections were rejected, with their numbers."""
-    found = frame.detections.loc[
-        frame.detections["reason"] != "", ["kind", "reason"]
-    ].value_counts()
-    parts = [f"{count(int(n))} {str(reason).replace('_', ' ')}" for (_, reason), n in found.items()]
-    return f"Rejected: {'; '.join(parts)}." if parts else ""
-
-
-def _factor(frames: Frames) -> float:
-    """How much residuals are enlarged: 1, 2 or 5 times a power of ten, for all frames alike."""
-    squares = frames.residuals_px**2
-    typical = float(np.sqrt(np.median(squares.sum(axis=1)))) if len(squares) else 0.0
-    wanted = _ARROW * frames.camera.width_px / max(typical, 1e-6)
-    return round_below(wanted)
-
-
-def _radius(frames: Frames) -> float:
-    """Radius of a circle, px of the image."""
-    return frames.camera.width_px / (150.0 if frames.large else 90.0)
-
-
-def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> AnyDict:
-    """The picture with its marks, in px of the image."""
-    r = _radius(frames)
-    drawn: AnyDict = {
-        "width": frame.width_px,
-        "height": frame.height_px,
-        "words": f"{frame.row.image}: {outcome_words(frame)}, {_told(frame)}",
     }
     if frame.path is not None:
         widest = _LARGE_PX if frames.large else _WIDTH_PX
         try:
             data = picture(frame.path, widest, frames.camera, flat=frame.solved)
-            drawn["jpeg"] = base64.b64encode(data).decode("ascii")
+            card["jpeg"] = base64.b64encode(data).decode("ascii")
         except (ImageError, MissingExtraError) as error:
-            drawn["error"] = str(error)
-    detections, stars = frame.detections, frame.stars
-    by_key: AnyDict = {"e": stars}
-    by_key |= {key: detections[detections["kind"] == kind] for key, kind, _ in _LEGEND[:3]}
-    by_key["m"] = stars[stars["missed"]]
-    found = by_key["i"]
-    parts = [_marks(key, by_key[key], r) for key in "eulmi"]
-    parts += [_arrows(found, factor), _names(found, r, frame.width_px)]
-    if frame.solved:
-        parts.append(_compass(frame, r))
-    return drawn | {"marks": _markup("".join(parts))}
-
-
-def _told(frame: InspectedFrame) -> str:
-    if not frame.solved:
-        return plural(len(frame.detections), "detection")
-    return ", ".join(f"{count(frame.n(kind))} {kind}" for _, kind, _ in _LEGEND)
+            card["error"] = str(error)
+    return card
 
 
 @cache
@@ -266,99 +181,3 @@ def _outline(key: str, r: float) -> str:
     rests on colour alone.
     """
     return re.sub(r"-?[\d.]+", lambda number: f"{r * float(number[0]):.1f}", _SHAPES[key])
-
-
-def _shape(key: str, x: float, y: float, r: float) -> str:
-    return f"M{x:.1f} {y:.1f}{_outline(key, r)}"
-
-
-def _symbol(key: str) -> Markup:
-    path = f'<path class="{key}" d="{_shape(key, 0.0, 0.0, 6.0)}"/>'
-    return _markup(f'<svg class="key" viewBox="-8 -8 16 16" aria-hidden="true">{path}</svg>')
-
-
-def _marks(key: str, table: Any, r: float) -> str:
-    """All marks of a kind; those that can be few have their words, which browsers show beside the
-    pointer.
-    """
-    # Stars that nobody has searched for do not need to catch the eye.
-    size = (
-        np.where(table["reason"] == FAINTER, 0.6 * r, r) if key == "u" else np.full(len(table), r)
-    )
-    paths = [
-        _shape(key, x, y, s) for x, y, s in zip(table["x_px"], table["y_px"], size, strict=True)
-    ]
-    if not paths:
-        return ""
-    if key in "eu" or len(paths) > _TOLD:
-        return f'<path class="{key}" d="{"".join(paths)}"/>'
-    told = (
-        f"<path d={path!r}><title>{escape(_words(key, row))}</title></path>"
-        for path, row in zip(paths, table.itertuples(), strict=True)
-    )
-    return f'<g class="{key}">{"".join(told)}</g>'
-
-
-def _words(key: str, row: Any) -> str:
-    said = f"{row.star_id or 'star'}, G {row.mag:.2f}"
-    if key == "i":
-        return f"{said}, residual {row.dx_px:+.3f}, {row.dy_px:+.3f} px".replace("-", MINUS)
-    return f"{said}, {'missed' if key == 'm' else row.reason}"
-
-
-def _arrows(table: Any, factor: float) -> str:
-    """Residuals, enlarged, from the detections outwards."""
-    lines = []
-    for row in table.itertuples():
-        dx, dy = factor * row.dx_px, factor * row.dy_px
-        tip = f"M{row.x_px + dx:.1f} {row.y_px + dy:.1f}"
-        # The barbs point back, 20 degrees to either side.
-        barbs = (
-            (-0.23 * dx + side * 0.085 * dy, -0.23 * dy - side * 0.085 * dx) for side in (1.0, -1.0)
-        )
-        head = "".join(f"{tip}l{bx:.1f} {by:.1f}" for bx, by in barbs)
-        lines.append(f"M{row.x_px:.1f} {row.y_px:.1f}l{dx:.1f} {dy:.1f}{head}")
-    return f'<path class="r" d="{"".join(lines)}"/>' if lines else ""
-
-
-def _names(table: Any, r: float, width: int) -> str:
-    """The brightest stars by name."""
-    texts = []
-    for row in table.nsmallest(_NAMED, "mag").itertuples() if len(table) else ():
-        side, anchor = (
-            (-1.3 * r, ' text-anchor="end"') if row.x_px > 0.75 * width else (1.3 * r, "")
-        )
-        # Not above the picture.
-        place = (
-            f'x="{row.x_px + side:.1f}" '
-            f'y="{row.y_px + (-r if row.y_px > 5.0 * r else 3.5 * r):.1f}"'
-        )
-        texts.append(f"<text {place}{anchor}>{escape(short_name(row.star_id, row.mag))}</text>")
-    return "".join(texts)
-
-
-def _compass(frame: InspectedFrame, r: float) -> str:
-    """North and east."""
-    length = 4.0 * r
-    x, y = frame.width_px - 2.4 * length, frame.height_px - 2.4 * length
-    north = np.radians(frame.north)
-    east = north + (-0.5 if frame.east_is_left else 0.5) * np.pi
-    parts = []
-    for name, angle in (("N", north), ("E", east)):
-        dx, dy = np.sin(angle), -np.cos(angle)
-        parts.append(f'<path class="c" d="M{x:.1f} {y:.1f}l{length * dx:.1f} {length * dy:.1f}"/>')
-        parts.append(
-            f'<text class="middle" x="{x + 1.5 * length * dx:.1f}" '
-            f'y="{y + 1.5 * length * dy + r:.1f}">{name}</text>'
-        )
-    return "".join(parts)
-
-
-def _markup(html: str) -> Markup:
-    from markupsafe import Markup
-
-    return Markup(html)
-
-
-def _version() -> str:
-    return installed_version(NAME) or ""

@@ -69,43 +69,38 @@ def draw_gallery(frames: Frames) -> dict[str, bytes]:
 
 def _figure(results: Results, name: str) -> Any:
     """One figure; None where the results lack what it shows."""
-    cal, obs, truth = results.calibration, results.observations, results.truth
-    if (
-        name == "glance"
-        and results.attitude is not None
-        and results.field_map is not None
-        and len(cal.residuals_px)
-    ):
-        return plot_glance(results.attitude, cal, obs, results.field_map)
-    if name == "residuals":
-        return plot_residuals(cal, obs)
-    if name == "residual_profiles":
-        return plot_residual_profiles(cal, obs)
-    if name == "effects" and cal.effects is not None and cal.effects.fitted:
-        return plot_effects(cal, obs)
-    if name == "convergence":
-        return plot_convergence(cal, truth)
-    if name == "misfit" and results.diagnosis is not None:
-        return plot_diagnosis(results.diagnosis)
-    if name == "corner" and results.posterior is not None:
-        return plot_corner(results.posterior, cal, truth)
-    if name == "prior_posterior" and results.posterior is not None:
-        return plot_prior_posterior(results.posterior, truth)
-    if name == "correlation" and results.coupling is not None:
-        return plot_correlations(results.coupling)
-    if name == "price_of_coupling" and results.coupling is not None:
-        return figure_of(plot_couplings(results.coupling))
-    if name == "attitude" and results.attitude is not None:
-        return figure_of(plot_attitude(results.attitude))
-    if name == "thermal" and results.attitude is not None and results.attitude.thermal is not None:
-        return plot_thermal(results.attitude.thermal)
-    if name == "field_map" and results.field_map is not None:
-        return plot_field_map(results.field_map)
-    if name == "distortion_curve" and results.distortion_curve is not None:
-        return plot_distortion_curve(results.distortion_curve)
-    if name == "budget" and results.budget is not None:
-        return plot_budget(results.budget)
-    return None
+    plot, needed = _PLOTS[name]
+    shown = {what: getattr(results, what) for what in needed.split()}
+    if any(part is None for what, part in shown.items() if what != "truth"):
+        return None
+    drawn = plot(*shown.values())
+    return None if drawn is None else figure_of(drawn)
+
+
+# What draws each figure, and what of the results it takes; the truth may be missing.
+_PLOTS: dict[str, tuple[Callable[..., Any], str]] = {
+    "glance": (
+        lambda error, cal, *of: plot_glance(error, cal, *of) if len(cal.residuals_px) else None,
+        "attitude calibration observations field_map",
+    ),
+    "residuals": (plot_residuals, "calibration observations"),
+    "residual_profiles": (plot_residual_profiles, "calibration observations"),
+    "effects": (
+        lambda cal, obs: plot_effects(cal, obs) if cal.effects and cal.effects.fitted else None,
+        "calibration observations",
+    ),
+    "convergence": (plot_convergence, "calibration truth"),
+    "misfit": (plot_diagnosis, "diagnosis"),
+    "corner": (plot_corner, "posterior calibration truth"),
+    "prior_posterior": (plot_prior_posterior, "posterior truth"),
+    "correlation": (plot_correlations, "coupling"),
+    "price_of_coupling": (plot_couplings, "coupling"),
+    "attitude": (plot_attitude, "attitude"),
+    "thermal": (lambda error: error.thermal and plot_thermal(error.thermal), "attitude"),
+    "field_map": (plot_field_map, "field_map"),
+    "distortion_curve": (plot_distortion_curve, "distortion_curve"),
+    "budget": (plot_budget, "budget"),
+}
 
 
 class Ahead:
