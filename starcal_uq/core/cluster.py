@@ -2,20 +2,20 @@
 order for any of them.
 
 Whatever is added up is added in one fixed tree, so that neither the number of processes nor the
-order in which they finish moves a bit. A process that dies takes its work with it, which Dask gives
-to another.
+order in which they finish moves a bit. Where a worker of a cluster dies, Dask gives its work to
+another.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError, Executor
 from contextlib import contextmanager
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from starcal_uq.core.errors import ClusterError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.tasks import interrupt_between_steps, processors
+from starcal_uq.core.tasks import Numbered, processes, processors, spread
 from starcal_uq.core.types import Progress
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ T = TypeVar("T")
 # machine.
 Scheduler: TypeAlias = "str | Client | None"
 
-# Results that are added up at once; a worker holds so many.
+# Results that are added up at once.
 _FAN_IN = 16
 _CONNECT_S = 20
 # A file system that fails for a moment is asked again.
@@ -35,10 +35,10 @@ _RETRIES = 2
 
 
 class Cluster:
-    """Processes that work; without a client, this one alone."""
+    """Processes that work, behind an executor; without one, this process alone."""
 
-    def __init__(self, client: Client | None = None) -> None:
-        self._client = client
+    def __init__(self, executor: Executor | None = None) -> None:
+        self._executor = executor
 
     def map(
         self,
@@ -46,40 +46,23 @@ class Cluster:
         items: Sequence[Item],
         *,
         progress: Progress | None = None,
-        keep: Callable[[int, T], None] | None = None,
+        keep: Callable[[T], None] | None = None,
     ) -> list[T]:
         """Results of a picklable function, in the order of the items.
 
-        `keep` is called with the place of each item and its result as soon as it is there, in any
-        order.
+        `keep` is called with each result as soon as it is there, in any order.
         """
         results: dict[int, T] = {}
 
-        def take(place: int, result: T) -> None:
-            results[place] = result
-            if keep is not None:
-                keep(place, result)
+        def take(some: Numbered[T]) -> None:
+            results.update(some)
+            for _, result in some:
+                if keep is not None:
+                    keep(result)
             if progress is not None:
                 progress(len(results), len(items))
 
-        if self._client is None:
-            with interrupt_between_steps() as check:
-                for place, item in enumerate(items):
-                    take(place, function(item))
-                    check()
-        else:
-            from distributed import as_completed
-
-            with _explained():
-                futures = self._client.map(function, items, pure=False, retries=_RETRIES)
-                places = {future.key: place for place, future in enumerate(futures)}
-                try:
-                    for future, result in as_completed(futures, with_results=True):
-                        take(places[future.key], result)
-                except KeyboardInterrupt:
-                    for future in futures:
-                        future.cancel()
-                    raise
+        spread(function, items, take, self._executor)
         return [results[place] for place in range(len(items))]
 
     def reduce(
@@ -90,27 +73,35 @@ class Cluster:
         *,
         progress: Progress | None = None,
     ) -> T:
-        """Sum of the results of a picklable function; `add` sums some of them, in their order."""
-        if self._client is None:
-            level = self.map(function, items, progress=progress)
-            while len(level) > 1:
-                level = [add(level[i : i + _FAN_IN]) for i in range(0, len(level), _FAN_IN)]
-            return level[0]
-        with _explained():
-            futures = first = self._client.map(function, items, pure=False, retries=_RETRIES)
-            while len(futures) > 1:
-                futures = [
-                    self._client.submit(add, futures[i : i + _FAN_IN], pure=False)
-                    for i in range(0, len(futures), _FAN_IN)
-                ]
-            if progress is not None:
-                from distributed import as_completed
+        """Sum of the results of a picklable function; `add` sums some of them, in their order.
 
-                for done, _ in enumerate(as_completed(first), 1):
-                    progress(done, len(items))
-            del first
-            total: T = futures[0].result()
-            return total
+        Sums move up the tree as soon as they are whole, so that few are held at a time.
+        """
+        held: dict[tuple[int, int], dict[int, T]] = {}
+        total: list[T] = []
+        done = 0
+
+        def put(result: T, place: int, size: int) -> None:
+            if size == 1:
+                total.append(result)
+                return
+            group, within = divmod(place, _FAN_IN)
+            some = held.setdefault((size, group), {})
+            some[within] = result
+            if len(some) == min(_FAN_IN, size - group * _FAN_IN):
+                del held[size, group]
+                put(add([some[i] for i in sorted(some)]), group, -(-size // _FAN_IN))
+
+        def take(some: Numbered[T]) -> None:
+            nonlocal done
+            for place, result in some:
+                put(result, place, len(items))
+            done += len(some)
+            if progress is not None:
+                progress(done, len(items))
+
+        spread(function, items, take, self._executor)
+        return total[0]
 
 
 @contextmanager
@@ -120,60 +111,42 @@ def cluster(
     """Processes to work with, which end with the block unless they are somebody else's.
 
     Those of a Dask scheduler (its address, or a client of one), or `workers` of this machine: as
-    many as processors by default (one without Dask); 0 or 1 stays in this one. `caller` is the
-    function that users call, for messages.
+    many as processors by default; 0 or 1 stays in this one. `caller` is the function that users
+    call, for messages.
     """
     if scheduler is None:
-        if workers is None:  # the results are the same, and one process needs no Dask
-            workers = processors() if find_spec("distributed") else 1
-        if workers <= 1:
-            yield Cluster()
-            return
-        import logging
+        workers = processors() if workers is None else workers
+        with processes(workers if workers > 1 else 0, caller) as executor:
+            yield Cluster(executor)
+        return
+    with extra("cluster", "Dask schedulers", "leave the scheduler out"):
+        from distributed import Client
 
-        with extra("cluster", "several processes over one set of files", "use workers=0"):
-            from distributed import Client, LocalCluster
+    if not isinstance(scheduler, str):
+        with _explained():
+            yield Cluster(_executor(scheduler))
+        return
+    try:
+        client = Client(scheduler, timeout=_CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise ClusterError(
+            f"{scheduler}: no Dask scheduler answers there; start one with `dask scheduler` "
+            "and workers with "
+            f"`dask worker {scheduler}`, or leave the scheduler out."
+        ) from error
+    with client, _explained():
+        yield Cluster(_executor(client))
 
-        # What its log warns of, such as a slow end, is Dask's to mend. Its page of numbers takes
-        # whatever port is free.
-        try:
-            local = LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                dashboard_address="127.0.0.1:0",
-                silence_logs=logging.ERROR,
-            )
-        except RuntimeError as error:
-            raise ClusterError(
-                f"processes cannot be started ({str(error).splitlines()[0]}): in a script, call "
-                f"{caller or 'this'} "
-                'below `if __name__ == "__main__":`, or use workers=0.'
-            ) from error
-        with local, Client(local) as client:
-            yield Cluster(client)
-    elif isinstance(scheduler, str):
-        with extra("cluster", "Dask schedulers", "leave the scheduler out"):
-            from distributed import Client
 
-        try:
-            client = Client(scheduler, timeout=_CONNECT_S)
-        except (OSError, ValueError) as error:
-            raise ClusterError(
-                f"{scheduler}: no Dask scheduler answers there; start one with `dask scheduler` "
-                "and workers with "
-                f"`dask worker {scheduler}`, or leave the scheduler out."
-            ) from error
-        with client:
-            yield Cluster(client)
-    else:
-        yield Cluster(scheduler)
+def _executor(client: Client) -> Executor:
+    executor: Executor = client.get_executor(pure=False, retries=_RETRIES)
+    return executor
 
 
 @contextmanager
 def _explained() -> Iterator[None]:
     """Say what a user can do where Dask gives up."""
     from distributed import KilledWorker
-    from distributed.client import FutureCancelledError
 
     try:
         yield
@@ -182,7 +155,7 @@ def _explained() -> Iterator[None]:
             "several Dask workers died over the same part of the work: give them more memory, or "
             "smaller partitions."
         ) from error
-    except FutureCancelledError as error:
+    except CancelledError as error:
         raise ClusterError(
             "the Dask scheduler lost the work: look at its log, and start the command again."
         ) from error

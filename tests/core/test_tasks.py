@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.errors import ClusterError
 from starcal_uq.core.tasks import run_tasks
 from tests.helpers.tasks import numbered
 
@@ -73,7 +73,7 @@ def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path: Path, root: Pat
 
 
 def test_a_local_function_cannot_go_to_workers() -> None:
-    with pytest.raises(SamplingError, match="top level, or use workers=0"):
+    with pytest.raises(ClusterError, match="top level, or use workers=0"):
         run_tasks(lambda index: index, 20, caller="f", chunk=2, workers=2)
 
 

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from starcal_uq.core import beside
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.report import drawing
 
 
 @contextmanager
@@ -25,5 +25,5 @@ def without_painting() -> Iterator[None]:
             style, "painted", lambda _figure, _dpi: np.full((1, 1, 3), 255, dtype=np.uint8)
         )
         # Another process would paint.
-        patch.setattr(beside, "processors", lambda: 1)
+        patch.setattr(drawing, "processors", lambda: 1)
         yield

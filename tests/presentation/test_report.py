@@ -5,11 +5,16 @@ nothing.
 from __future__ import annotations
 
 import dataclasses
+import math
+import os
 import re
 import shlex
 import shutil
+import signal
 import sys
+import time
 from html.parser import HTMLParser
+from multiprocessing import active_children
 
 import numpy as np
 import pytest
@@ -410,6 +415,25 @@ def test_figures_drawn_ahead_by_another_process_are_the_same(full):
     if processors() > 1:
         assert drawn == draw_figures(results, names)
     assert {path.stem for path in full.figures.iterdir()} <= set(FIGURES)
+
+
+def test_another_process_that_fails_or_is_killed_is_no_obstacle(monkeypatch):
+    monkeypatch.setattr("starcal_uq.presentation.report.drawing.processors", lambda: 2)
+    with pytest.raises(ZeroDivisionError), Ahead() as ahead:
+        failed, after, there = (
+            ahead.begin(math.factorial, n) if n else ahead.begin(os.getpid) for n in (-1, 4, 0)
+        )
+        process = there()
+        assert (failed(), after()) == (None, 24) and process != os.getpid()
+        os.kill(process, signal.SIGTERM)
+        while ahead.begin(math.factorial, 5)() is not None:
+            time.sleep(0.01)
+        assert ahead.figures() == {}
+        1 / 0  # noqa: B018
+    assert process not in [child.pid for child in active_children()]
+    monkeypatch.setattr("starcal_uq.presentation.report.drawing.processors", lambda: 1)
+    with Ahead() as ahead:
+        assert ahead.begin(math.factorial, 5)() is None
 
 
 def test_a_report_takes_figures_that_are_drawn(run, monkeypatch):

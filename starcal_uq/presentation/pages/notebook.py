@@ -9,12 +9,12 @@ import sys
 import threading
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.temporary import TemporaryFolder
 from starcal_uq.core.types import Progress
 
 # File of the run that a part needs, heading, sentence, and cells.
@@ -144,7 +144,7 @@ def executed(
         made.append(cell)
     kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
     notebook = make.new_notebook(cells=made, metadata=kernel)
-    with TemporaryFolder() as own:
+    with TemporaryDirectory(ignore_cleanup_errors=True) as own:
         # The kernel draws inline, whatever this process draws with.
         env = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"} | {
             "IPYTHONDIR": own

@@ -9,10 +9,10 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from starcal_uq.core.errors import MissingExtraError, RunFolderError
-from starcal_uq.core.temporary import TemporaryFolder
 
 # By these names browsers that print without a window are found, the plainest first.
 _NAMES = (
@@ -68,7 +68,7 @@ def browsers() -> Iterator[str]:
 def _printed(browser: str, page: Path) -> tuple[bytes, str]:
     """What a browser makes of a page, and what went wrong if that is nothing."""
     name = Path(browser).name
-    with TemporaryFolder() as folder:
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         to = Path(folder, "page.pdf")
         # Nothing on the page asks for the network; nor should the browser itself.
         options = [

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Collection
+from concurrent.futures import BrokenExecutor, Future
+from contextlib import ExitStack, suppress
 from functools import partial
+from multiprocessing import active_children
 from typing import Any, TypeVar
 
-from starcal_uq.core.beside import Beside
+from starcal_uq.core.tasks import processes, processors, submit
 from starcal_uq.core.types import Progress
 from starcal_uq.pipeline.inspection import Frames
 from starcal_uq.presentation.figures.budgeting import plot_budget
@@ -105,41 +108,56 @@ _PLOTS: dict[str, tuple[Callable[..., Any], str]] = {
 
 class Ahead:
     """Another process that draws the figures of a report while what comes after them is computed; a
-    context.
+    context, at whose end it is gone.
+
+    It never is the only way to a result: where it failed, or there is a single processor, the
+    caller does the work.
     """
 
     def __init__(self) -> None:
-        self._beside = Beside()
+        self._end, self._drawn = ExitStack(), list[Callable[[], Any]]()
 
     def __enter__(self) -> Ahead:
-        self._beside.__enter__()
+        self._pool = self._end.enter_context(processes(int(processors() > 1), "run"))
+        others = set(active_children())
         # What drawing needs takes a second to load.
-        self._beside.call(_load)
+        self.begin(_load)
+        for process in set(active_children()) - others:
+            self._end.callback(process.kill)
         return self
 
-    def __exit__(self, *error: object) -> None:
-        self._beside.__exit__(*error)
+    def __exit__(self, *_: object) -> None:
+        self._end.close()
 
     def begin(self, function: Callable[..., T], *arguments: Any) -> Callable[[], T | None]:
         """Begin something else that can be done meanwhile; what waits for its result, None if it
         failed.
         """
-        return partial(self._beside.result, self._beside.call(function, *arguments))
+        with suppress(BrokenExecutor):
+            if self._pool is not None:
+                return partial(_result, submit(self._pool, function, *arguments))
+        return lambda: None
 
     def draw(self, results: Results, names: Collection[str]) -> None:
         """Begin to draw the figures of these names, as far as the results allow them."""
-        self._beside.call(draw_figures, results, names)
+        self._drawn.append(self.begin(draw_figures, results, names))
 
     def draw_frames(self, frames: Frames) -> None:
         """Begin to draw the frames that the report shows."""
-        self._beside.call(draw_gallery, frames)
+        self._drawn.append(self.begin(draw_gallery, frames))
 
     def figures(self) -> dict[str, bytes]:
         """What was drawn, by name; a figure that was drawn twice as it was drawn last."""
         drawn: dict[str, bytes] = {}
-        for some in self._beside.results():
-            drawn |= some if isinstance(some, dict) else {}
+        for some in self._drawn:
+            drawn |= some() or {}
         return drawn
+
+
+def _result(future: Future[T]) -> T | None:
+    with suppress(Exception):
+        return future.result()
+    return None
 
 
 def _load() -> None:
