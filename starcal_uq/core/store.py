@@ -4,14 +4,15 @@ they depend on.
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
 import os
+import pickle
 import secrets
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -119,9 +120,9 @@ def write_part(table: pa.Table, path: Path) -> None:
 class Kept:
     """Results of numbered tasks in the folder of a command that is not finished.
 
-    Those that depend on something else than is wanted now are not found, and a part that cannot be
-    read is passed over. `identity` is all that the tasks depend on but their number: a record, or
-    what a record may hold; `kinds` are the named tuples and dataclasses that results are, or hold.
+    Those that depend on something else than is wanted now are not found, and what cannot be read is
+    passed over. `identity` is all that the tasks depend on but their number: a record, or what a
+    record may hold; `kinds` are the named tuples and dataclasses that results are, or hold.
     """
 
     def __init__(self, folder: PathLike, identity: object, kinds: Sequence[type] = ()) -> None:
@@ -129,8 +130,8 @@ class Kept:
 
         told = to_plain([identity, installed_versions()])
         self._identity = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
-        self._kinds = {kind.__name__: kind for kind in kinds}
-        schema = pa.schema([("key", pa.string()), ("result", pa.string())])
+        self._kinds = {(kind.__module__, kind.__name__): kind for kind in kinds}
+        schema = pa.schema([("key", pa.string()), ("result", pa.binary())])
 
         def read(path: Path) -> pa.Table:
             try:
@@ -148,59 +149,39 @@ class Kept:
     def results(self, n_tasks: int) -> dict[int, Any]:
         """Results that are there, by the numbers of their tasks."""
         table = self._store.table()
-        found = dict(zip(table["key"].to_pylist(), table["result"].to_pylist(), strict=True))
-        numbers = [number for number in range(n_tasks) if self._key(number) in found]
-        return {number: self._value(json.loads(found[self._key(number)])) for number in numbers}
+        stored = dict(zip(table["key"].to_pylist(), table["result"].to_pylist(), strict=True))
+        found = {}
+        for number in range(n_tasks):
+            with suppress(KeyError, pickle.UnpicklingError):
+                found[number] = _Reader(stored[self._key(number)], self._kinds).load()
+        return found
 
     def keep(self, results: Sequence[tuple[int, Any]]) -> None:
         """Add results."""
         self._store.append(
-            [{"key": self._key(n), "result": json.dumps(_plain(value))} for n, value in results]
-        )
-
-    def _value(self, plain: Any) -> Any:
-        if not isinstance(plain, dict):
-            return plain
-        ((kind, content),) = plain.items()
-        if kind == "array":
-            dtype, shape, data = content
-            return (
-                np.frombuffer(base64.b64decode(data), dtype=np.dtype(dtype)).reshape(shape).copy()
-            )
-        if kind == "bytes":
-            return base64.b64decode(content)
-        if kind == "dict":
-            return {self._value(key): self._value(value) for key, value in content}
-        items = [self._value(item) for item in content]
-        return (
-            items
-            if kind == "list"
-            else tuple(items)
-            if kind == "tuple"
-            else self._kinds[kind](*items)
+            [{"key": self._key(n), "result": pickle.dumps(value)} for n, value in results]
         )
 
 
-def _plain(value: Any) -> Any:
-    """A result for JSON: every bit of its numbers, and of what kind its parts are."""
-    if isinstance(value, np.ndarray):
-        return {"array": [value.dtype.str, value.shape, base64.b64encode(value.tobytes()).decode()]}
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, bytes):
-        return {"bytes": base64.b64encode(value).decode()}
-    if isinstance(value, dict):
-        return {"dict": [[_plain(key), _plain(item)] for key, item in value.items()]}
-    if is_dataclass(value):
-        return {
-            type(value).__name__: [
-                _plain(getattr(value, field.name)) for field in fields(value) if field.init
-            ]
-        }
-    if isinstance(value, list | tuple):
-        kind = type(value).__name__
-        return {kind: [_plain(item) for item in value]}
-    return value
+class _Reader(pickle.Unpickler):
+    """Reads plain values, arrays, and records of some kinds: whoever wrote the file, it can name
+    nothing else.
+    """
+
+    _ARRAYS = ("_frombuffer", "_reconstruct", "dtype", "ndarray", "scalar")
+
+    def __init__(self, content: bytes, kinds: Mapping[tuple[str, str], type]) -> None:
+        super().__init__(BytesIO(content))
+        self._kinds = kinds
+
+    def find_class(self, module: str, name: str) -> Any:
+        """A kind of record, or what NumPy makes arrays by; UnpicklingError for all else."""
+        if module.partition(".")[0] == "numpy" and name in self._ARRAYS:
+            return super().find_class(module, name)
+        try:
+            return self._kinds[module, name]
+        except KeyError:
+            raise pickle.UnpicklingError(f"{module}.{name} is no result") from None
 
 
 def finished(folder: PathLike) -> None:

@@ -91,3 +91,10 @@ def test_a_damaged_part_is_made_again(tmp_path: Path) -> None:
     for content in (b"", part.read_bytes()[:-30]):
         part.write_bytes(content)
         assert Kept(tmp_path, [], (Found,)).results(1) == {}
+
+
+def test_a_part_that_names_other_code_is_passed_over(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, [], (Found,))
+    kept.keep([(0, result(0)), (1, Path("elsewhere")), (2, print)])
+    assert list(Kept(tmp_path, [], (Found,)).results(3)) == [0]
+    assert list(Kept(tmp_path, []).results(3)) == []
