@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import say, show_calibration
-from starcal_uq.cli.options import (
-    parse_columns,
-)
+from starcal_uq.cli.options import parse_columns
+from starcal_uq.cli.settings import RecursionSettings
 from starcal_uq.core import settings
 
 
@@ -17,12 +17,8 @@ def filter_command(
     observations: Path,
     camera: Path,
     out: Path,
+    recursion: RecursionSettings,
     method: settings.RecursiveMethod = "griffith",
-    parameters: settings.Filtered = "all",
-    pair_covariance: settings.PairCovariance = "full",
-    forgetting: float = 1.0,
-    process_noise: float | None = None,
-    sigma: float | None = None,
     column: list[str] | None = None,
     force: bool = False,
 ) -> Answer:
@@ -32,13 +28,9 @@ def filter_command(
     from starcal_uq.paper.recursive.folder import filter_run
     from starcal_uq.runs.folder import HISTORY
 
-    options = sc.paper.RecursionOptions(
-        pair_covariance=pair_covariance,
-        parameters="optics" if method == "samaan" else parameters,
-        forgetting=forgetting,
-        process_noise=process_noise,
-        sigma_px=sigma,
-    )
+    options = sc.paper.RecursionOptions(**vars(recursion))
+    if method == "samaan":
+        options = replace(options, parameters="optics")
     calibration = filter_run(
         observations,
         sc.Camera.load(camera),

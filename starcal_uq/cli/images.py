@@ -10,10 +10,14 @@ from typing import TYPE_CHECKING
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import note, print_table, progress_bar, say, tell, warn_undeclared
-from starcal_uq.cli.options import (
-    check_same_sensor,
+from starcal_uq.cli.options import check_same_sensor
+from starcal_uq.cli.settings import (
+    DetectionSettings,
+    IdentificationSettings,
+    ImageSettings,
+    PlaceSettings,
+    SkySettings,
 )
-from starcal_uq.cli.settings import ImageSettings, PlaceSettings, SkySettings
 from starcal_uq.core import settings
 from starcal_uq.core.files import UNFINISHED, ensure_new, table_ending
 from starcal_uq.core.formatting import plural
@@ -30,14 +34,8 @@ if TYPE_CHECKING:
 def centroid_command(
     images: list[Path],
     out: Path,
+    detection: DetectionSettings,
     camera: Path | None = None,
-    gain: float | None = None,
-    read_noise: float | None = None,
-    saturation: float | None = None,
-    threshold: float = 5.0,
-    psf_sigma: float | None = None,
-    max_stars: int | None = None,
-    pixel_phase: bool = True,
     time: str | None = None,
     bayer: settings.Bayer | None = None,
     workers: int | None = None,
@@ -61,13 +59,7 @@ def centroid_command(
         found = sc.images.extract_centroids(
             images,
             camera=sensor,
-            gain_e_per_count=gain,
-            read_noise_e=read_noise,
-            saturation=saturation,
-            threshold_sigma=threshold,
-            psf_sigma_px=psf_sigma,
-            max_stars=max_stars,
-            correct_pixel_phase=pixel_phase,
+            **vars(detection),
             bayer=bayer,
             workers=workers,
             progress=progress,
@@ -90,10 +82,8 @@ def identify_command(
     max_mag: float | None = None,
     epoch: float | None = None,
     calibration: Path | None = None,
-    focal_tolerance: float = 0.03,
-    centre_tolerance: float | None = None,
-    engine: str = "pyramid",
     *,
+    identification: IdentificationSettings,
     place: PlaceSettings,
     force: bool = False,
 ) -> Answer:
@@ -124,12 +114,7 @@ def identify_command(
             nominal,
             max_mag=max_mag,
             epoch=epoch,
-            identification={
-                "engine": engine,
-                "focal_tolerance": focal_tolerance,
-                "centre_tolerance_px": centre_tolerance,
-                "progress": progress,
-            },
+            identification={**vars(identification), "progress": progress},
             known=known,
             lenient=True,
             tell=tell,

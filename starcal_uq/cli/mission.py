@@ -10,9 +10,13 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import STYLES, note, print_table, progress_bar, say, tell
-from starcal_uq.cli.options import (
-    check_same_sensor,
-    parse_labels,
+from starcal_uq.cli.options import check_same_sensor, parse_labels
+from starcal_uq.cli.settings import (
+    CampaignSettings,
+    ChoiceSettings,
+    EffectSettings,
+    ForecastSettings,
+    TieSettings,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
@@ -160,27 +164,12 @@ def compare_command(
 
 def plan_command(
     camera: Path,
-    target: float | None = None,
-    confidence: float = 0.997,
-    scope: settings.Scope = "common",
-    sigma: float | None = None,
-    max_mag: float = 6.0,
-    min_stars: int = 10,
-    frames: list[int] | None = None,
-    choose: int | None = None,
-    criterion: settings.Criterion = "A",
-    after: Path | None = None,
-    distortion_percent: tuple[float, float] | None = None,
-    relative_attitudes_arcsec: float | None = None,
-    relative_alignment_arcsec: float = 0.0,
-    mount_sigma_arcsec: float | None = None,
-    effects: str | None = None,
-    temperature_range: float = 20.0,
-    nights: int = 3,
-    check: int | None = None,
+    forecast: ForecastSettings,
+    campaign: CampaignSettings,
+    choices: ChoiceSettings,
+    rotations: TieSettings,
+    expected: EffectSettings,
     out: Path | None = None,
-    epoch: float = 2026.9,
-    seed: int = 0,
     force: bool = False,
 ) -> Answer:
     """What a calibration of this camera will give, and the frames it needs, before any data."""
@@ -189,19 +178,22 @@ def plan_command(
     from starcal_uq.presentation.pages.write import write_page
 
     check_output(out, "plan", force)
+    after, choose, check = campaign.after, choices.choose, choices.check
     if after is not None and check is not None:
         raise typer.BadParameter(
             "--check simulates campaigns from nothing: leave it out with --after."
         )
-    ties = _planned_ties(relative_attitudes_arcsec, relative_alignment_arcsec, mount_sigma_arcsec)
+    ties = _planned_ties(rotations)
     if ties is not None and (choose is not None or check is not None):
         raise typer.BadParameter(
             "--choose and --check know no rotations between frames: leave them out, or leave out "
             "--relative-attitudes-arcsec and --mount-sigma-arcsec."
         )
     planned = None
-    if effects is not None:
-        planned = PlannedEffects.parsed(effects, temperature_range, nights)
+    if expected.effects is not None:
+        planned = PlannedEffects.parsed(
+            expected.effects, expected.temperature_range, expected.nights
+        )
         if choose is not None or check is not None:
             raise typer.BadParameter(
                 "--choose and --check plan calibrations without effects: leave them out."
@@ -211,28 +203,24 @@ def plan_command(
     if after is not None:
         known, noise = _known(after, sheet, camera)
         sheet = known.camera
-    used = noise if sigma is None else sigma
+    used = noise if campaign.sigma is None else campaign.sigma
     # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
-    deep = sc.load_catalogue(max_mag=min(max_mag + 1.0, KEYS["magnitude"].high), epoch=epoch)
-    stars = deep.select(deep.mag <= max_mag)
-    sizes = tuple(frames or N_FRAMES)
+    deepest = min(forecast.max_mag + 1.0, KEYS["magnitude"].high)
+    deep = sc.load_catalogue(max_mag=deepest, epoch=campaign.epoch)
+    stars = deep.select(deep.mag <= forecast.max_mag)
+    common: AnyDict = {"min_stars": forecast.min_stars, "seed": forecast.seed}
+    sizes = tuple(campaign.frames or N_FRAMES)
     with progress_bar("points of the sweeps") as progress:
         found = sc.plan(
             sheet,
             deep,
             sigma_px=used,
             n_frames=sizes,
-            min_stars=min_stars,
-            max_mag=max_mag,
-            target_arcsec=target,
-            confidence=confidence,
-            scope=scope,
             after=known,
-            distortion_percent=distortion_percent,
             ties=ties,
             effects=planned,
-            seed=seed,
             progress=progress,
+            **vars(forecast),
         )
     choice = simulated = None
     if choose is not None:
@@ -241,50 +229,46 @@ def plan_command(
             stars,
             n_frames=choose,
             sigma_px=used,
-            min_stars=min_stars,
-            criterion=criterion,
-            scope="calibration" if scope == "total" else scope,
+            criterion=choices.criterion,
+            scope="calibration" if forecast.scope == "total" else forecast.scope,
             after=known,
-            seed=seed,
+            **common,
         )
     if check is not None:
         with progress_bar("simulated campaigns") as progress:
             simulated = sc.planning.check_forecast(
                 sheet,
                 stars,
-                sigma_px=0.05 if sigma is None else sigma,
+                sigma_px=0.05 if campaign.sigma is None else campaign.sigma,
                 n_frames=sizes,
-                min_stars=min_stars,
                 n_campaigns=check,
-                seed=seed,
                 progress=progress,
+                **common,
             )
     page = None if out is None else write_page(found, out, choice=choice, check=simulated)
     notes = _show_plan(found, choice, simulated)
     if page is not None:
         say(f"Page: {page.resolve()}")
     results = {"page": page, "plan": found, "choice": choice, "check": simulated, "notes": notes}
-    return Answer(results, int(target is not None and found.frames_needed is None))
+    return Answer(results, int(forecast.target_arcsec is not None and found.frames_needed is None))
 
 
-def _planned_ties(
-    chain_arcsec: float | None, alignment_arcsec: float, mount_arcsec: float | None
-) -> PlannedTies | None:
+def _planned_ties(rotations: TieSettings) -> PlannedTies | None:
     """Rotations that will be known, of a chain or of a fixed mount."""
-    if chain_arcsec is not None and mount_arcsec is not None:
+    chain, mount = rotations.relative_attitudes_arcsec, rotations.mount_sigma_arcsec
+    alignment = rotations.relative_alignment_arcsec
+    if chain is not None and mount is not None:
         raise typer.BadParameter(
             "--relative-attitudes-arcsec and --mount-sigma-arcsec exclude each other: leave one of "
             "them out."
         )
-    if chain_arcsec is None and alignment_arcsec:
+    if chain is None and alignment:
         raise typer.BadParameter(
             "--relative-alignment-arcsec needs --relative-attitudes-arcsec: give both, or leave it "
             "out."
         )
-    sigma = mount_arcsec if chain_arcsec is None else chain_arcsec
-    if sigma is None:
-        return None
-    return sc.planning.PlannedTies(sigma, alignment_arcsec, mount_arcsec is not None)
+    sigma = mount if chain is None else chain
+    return None if sigma is None else sc.planning.PlannedTies(sigma, alignment, mount is not None)
 
 
 def _show_plan(

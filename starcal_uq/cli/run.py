@@ -27,6 +27,7 @@ from starcal_uq.cli.mission import tell_violations
 from starcal_uq.cli.settings import (
     EstimationSettings,
     ImageSettings,
+    PropagationSettings,
     SamplingSettings,
     SkySettings,
     command_of,
@@ -39,11 +40,9 @@ from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.conflicts import conflict
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.settings import OnboardModel
 from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.toml import read_section
-from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.files import READ
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ def demo(
             tell("Calibrating from f = 72 mm and the detector's centre ...")
             run.calibrate(obs, sc.paper.paper_start())
         show_calibration(run.calibration, truth)
-        _after_calibration(run, ahead, SamplingSettings(seed=seed))
+        _after_calibration(run, ahead, SamplingSettings(seed=seed), PropagationSettings())
     return _conclude(run)
 
 
@@ -94,11 +93,7 @@ def run_command(
     sky: SkySettings,
     images: ImageSettings,
     sampling: SamplingSettings,
-    draws: int = 300,
-    alignment: str = "random",
-    alignment_frames: int | None = None,
-    onboard: OnboardModel = "model",
-    temperature_profile: Path | None = None,
+    propagation: PropagationSettings,
     budget: Path | None = None,
     force: bool = False,
 ) -> Answer:
@@ -112,8 +107,8 @@ def run_command(
     if budget is not None:
         # A mistake in it should not show after the work.
         sc.budgeting.load_budget_file(budget)
-    if temperature_profile is not None:
-        sc.propagation.load_temperature_profile(temperature_profile)
+    if (profile := propagation.temperature_profile) is not None:
+        sc.propagation.load_temperature_profile(profile)
         _refuse_profile(estimation.effects)
     if sampling.priors is not None:
         read_section(sampling.priors, "priors", PriorError, alone=False)
@@ -136,27 +131,22 @@ def run_command(
         raise typer.BadParameter(
             "a table of stars needs the nominal camera (TOML) after it; only images do without."
         )
-    aligning: AnyDict = {
-        "alignment": alignment,
-        "alignment_frames": alignment_frames,
-        "onboard": onboard,
-    }
-    asked = settings_of(estimation, sky, sampling, partitioned=folder, **aligning)
+    asked = settings_of(estimation, sky, sampling, propagation, partitioned=folder)
     refuse_conflicts(asked)
     if estimation.effects is None:
         selecting = replace(estimation, effects="auto")
-        asked = settings_of(selecting, sky, sampling, partitioned=folder, **aligning)
+        asked = settings_of(selecting, sky, sampling, propagation, partitioned=folder)
         estimation = selecting if conflict(asked) is None else estimation
     settings = {
         "estimation": estimation,
         "sky": sky,
         "images": images,
         "sampling": sampling,
-        "draws": draws,
+        "propagation": propagation,
+        "budget": budget,
     }
     files = {f"input {number}": path for number, path in enumerate(inputs)}
     files |= {} if camera is None else {"camera": camera}
-    settings |= aligning | {"budget": budget, "temperature_profile": temperature_profile}
     command = command_of("run", settings, files)
     with run.making(command, force=force, words=typed_words(sys.argv[1:])), Ahead() as ahead:
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
@@ -165,13 +155,10 @@ def run_command(
             _calibrate(run, inputs, camera, from_images, estimation, undetermined, sky, images)
         show_calibration(run.calibration, run.truth)
         warn_air(run.observations, run.calibration)
-        if temperature_profile is not None and not _follows_temperature(run):
-            note(
-                f"The data ask for no effect of the temperature: {temperature_profile} is left out."
-            )
-            temperature_profile = None
-        aligning["temperature_profile"] = temperature_profile
-        _after_calibration(run, ahead, sampling, draws, budget, **aligning)
+        if profile is not None and not _follows_temperature(run):
+            note(f"The data ask for no effect of the temperature: {profile} is left out.")
+            propagation = replace(propagation, temperature_profile=None)
+        _after_calibration(run, ahead, sampling, propagation, budget)
     return _conclude(run)
 
 
@@ -285,9 +272,8 @@ def _after_calibration(
     run: Run,
     ahead: Ahead,
     sampling: SamplingSettings,
-    draws: int = 300,
+    propagation: PropagationSettings,
     budget: Path | None = None,
-    **aligning: Any,
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
     from starcal_uq.diagnostics.diagnose import diagnose_apart
@@ -317,7 +303,7 @@ def _after_calibration(
     if not run.did("coupling"):
         run.couple()
     if not run.did("propagate"):
-        run.propagate(n_draws=draws, seed=sampling.seed, **aligning)
+        run.propagate(seed=sampling.seed, **vars(propagation))
     ahead.draw(run.results, AFTER_PROPAGATION)
     if not run.did("diagnose"):
         with progress_bar("diagnosis") as progress:

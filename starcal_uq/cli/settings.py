@@ -166,6 +166,146 @@ class SamplingSettings:
         )
 
 
+@dataclass(frozen=True)
+class PropagationSettings:
+    """How draws are carried to attitudes."""
+
+    n_draws: int = 300
+    alignment: str = "random"
+    alignment_frames: int | None = None
+    onboard: settings.OnboardModel = "model"
+    temperature_profile: Path | None = None
+
+
+@dataclass(frozen=True)
+class MissionSettings:
+    """Frames that the mission will see."""
+
+    max_mag: float = 6.0
+    epoch: float = 2026.9
+    n_frames: int = 1000
+    min_stars: int | None = None
+    rate_hz: float | None = None
+    scalar: settings.Scalar | None = None
+    sense: settings.Sense = "icrs_to_camera"
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """How stars are found in images."""
+
+    gain_e_per_count: float | None = None
+    read_noise_e: float | None = None
+    saturation: float | None = None
+    threshold_sigma: float = 5.0
+    psf_sigma_px: float | None = None
+    max_stars: int | None = None
+    correct_pixel_phase: bool = True
+
+
+@dataclass(frozen=True)
+class IdentificationSettings:
+    """How stars are identified."""
+
+    focal_tolerance: float = 0.03
+    centre_tolerance_px: float | None = None
+    engine: str = "pyramid"
+
+
+@dataclass(frozen=True)
+class SimulationSettings:
+    """What is simulated."""
+
+    n_frames: int = 1000
+    sigma_px: float = 0.05
+    min_stars: int = 10
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class PartitionSettings:
+    """A folder in place of one table."""
+
+    partition_frames: int | None = None
+    scheduler: str | None = None
+    workers: int | None = None
+
+
+@dataclass(frozen=True)
+class ValidationSettings:
+    """What is simulated and calibrated."""
+
+    n_replicates: int = 1000
+    n_frames: int = 50
+    min_stars: int = 10
+    sigma_px: float = 0.05
+    max_mag: float = 6.0
+    truth: settings.Truth = "fixed"
+    workers: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class RecursionSettings:
+    """What is estimated, and how."""
+
+    parameters: settings.Filtered = "all"
+    pair_covariance: settings.PairCovariance = "full"
+    forgetting: float = 1.0
+    process_noise: float | None = None
+    sigma_px: float | None = None
+
+
+@dataclass(frozen=True)
+class ForecastSettings:
+    """What is asked of the calibration."""
+
+    target_arcsec: float | None = None
+    confidence: float = 0.997
+    scope: settings.Scope = "common"
+    max_mag: float = 6.0
+    min_stars: int = 10
+    distortion_percent: tuple[float, float] | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class CampaignSettings:
+    """What the campaign will be."""
+
+    sigma: float | None = None
+    frames: list[int] | None = None
+    after: Path | None = None
+    epoch: float = 2026.9
+
+
+@dataclass(frozen=True)
+class TieSettings:
+    """Rotations between frames that will be known."""
+
+    relative_attitudes_arcsec: float | None = None
+    relative_alignment_arcsec: float = 0.0
+    mount_sigma_arcsec: float | None = None
+
+
+@dataclass(frozen=True)
+class EffectSettings:
+    """Effects that the calibration will hold."""
+
+    effects: str | None = None
+    temperature_range: float = 20.0
+    nights: int = 3
+
+
+@dataclass(frozen=True)
+class ChoiceSettings:
+    """What is made beside the forecast."""
+
+    choose: int | None = None
+    criterion: settings.Criterion = "A"
+    check: int | None = None
+
+
 def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> None:
     """An option that would be ignored is a mistake of the user's that should show."""
     if images:
@@ -190,16 +330,16 @@ def settings_of(
     estimation: EstimationSettings,
     sky: SkySettings,
     sampling: SamplingSettings | None = None,
+    propagation: PropagationSettings | None = None,
     *,
     partitioned: bool = False,
-    **aligning: Any,
 ) -> AnyDict:
     """Options of one call by the names that `starcal_uq.core.conflicts` has for them."""
     settings = {
         **vars(estimation),
         **vars(sky),
         **estimation.options(),
-        **aligning,
+        **({} if propagation is None else vars(propagation)),
         "partitioned": partitioned,
     }
     if sampling is not None:

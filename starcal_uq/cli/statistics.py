@@ -8,6 +8,7 @@ from pathlib import Path
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import note, print_table, progress_bar, say, show_calibration
+from starcal_uq.cli.settings import ValidationSettings
 from starcal_uq.core import settings
 from starcal_uq.core.files import atomic_write_bytes, write_csv
 from starcal_uq.core.manifest import making
@@ -15,15 +16,8 @@ from starcal_uq.core.manifest import making
 
 def validate_command(
     camera: Path,
+    study: ValidationSettings,
     out: Path | None = None,
-    replicates: int = 1000,
-    frames: int = 50,
-    min_stars: int = 10,
-    sigma: float = 0.05,
-    max_mag: float = 6.0,
-    truth: settings.Truth = "fixed",
-    workers: int | None = None,
-    seed: int = 0,
     force: bool = False,
 ) -> Answer:
     """Show that the intervals are right for this sensor and this volume of data, by
@@ -41,19 +35,7 @@ def validate_command(
         else making(out, "validate", "validation.npz", force=force) as stage
     ):
         with progress_bar("replicates") as progress:
-            found = sc.validate(
-                sensor,
-                n_replicates=replicates,
-                n_frames=frames,
-                min_stars=min_stars,
-                sigma_px=sigma,
-                max_mag=max_mag,
-                seed=seed,
-                workers=workers,
-                truth=truth,
-                progress=progress,
-                keep=out,
-            )
+            found = sc.validate(sensor, **vars(study), progress=progress, keep=out)
         if found.interrupted:
             raise KeyboardInterrupt
         table = found.to_dataframe()

@@ -35,7 +35,11 @@ from starcal_uq.cli.options import (
 )
 from starcal_uq.cli.settings import (
     EstimationSettings,
+    MissionSettings,
+    PartitionSettings,
+    PropagationSettings,
     SamplingSettings,
+    SimulationSettings,
     SkySettings,
     refuse_conflicts,
     settings_of,
@@ -81,24 +85,19 @@ def load_table(
 def simulate_command(
     camera: Path,
     out: Path,
-    frames: int = 1000,
-    sigma: float = 0.05,
+    simulation: SimulationSettings,
+    partitions: PartitionSettings,
     max_mag: float = 6.0,
-    min_stars: int = 10,
     epoch: float = 2026.9,
     images: Path | None = None,
     sensor: Path | None = None,
-    partition_frames: int | None = None,
-    scheduler: str | None = None,
-    workers: int | None = None,
-    seed: int = 0,
     force: bool = False,
 ) -> Answer:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor
     saw them.
     """
-    if partition_frames is None:
-        if not (scheduler is None and workers is None):
+    if partitions.partition_frames is None:
+        if not (partitions.scheduler is None and partitions.workers is None):
             raise typer.BadParameter(
                 "--scheduler and --workers make a folder: give --partition-frames as well."
             )
@@ -111,52 +110,36 @@ def simulate_command(
             "--sensor describes the detector of images: give --images DIR as well."
         )
     stars, truth = sc.load_catalogue(max_mag=max_mag, epoch=epoch), sc.Camera.load(camera)
-    if partition_frames is not None:
+    wanted = vars(simulation)
+    paths: list[Path] = []
+    if partitions.partition_frames is not None:
         with progress_bar("files") as progress:
             made = sc.simulation.simulate_partitions(
-                stars,
-                truth,
-                out,
-                n_frames=frames,
-                partition_frames=partition_frames,
-                min_stars=min_stars,
-                sigma_px=sigma,
-                seed=seed,
-                force=force,
-                scheduler=scheduler,
-                workers=workers,
-                progress=progress,
+                stars, truth, out, **wanted, **vars(partitions), force=force, progress=progress
             )
-        say(f"{made.n_stars} stars in {frames} frames, {len(made.parts)} files: {out}")
-        sizes = {"n_stars": made.n_stars, "n_frames": frames, "n_files": len(made.parts)}
-        return Answer({"table": out, **sizes, "images": None, "n_images": 0})
-    obs = sc.simulate(stars, truth, n_frames=frames, min_stars=min_stars, sigma_px=sigma, seed=seed)
-    paths: list[Path] = []
-    if images is not None:
-        with progress_bar("images") as progress:
-            paths = sc.simulation.render_frames(
-                stars,
-                truth,
-                images,
-                n_frames=frames,
-                min_stars=min_stars,
-                sensor=sc.simulation.Sensor()
-                if sensor is None
-                else sc.simulation.Sensor.load(sensor),
-                seed=seed,
-                sigma_px=sigma,
-                force=force,
-                progress=progress,
-            )
-        say(f"{len(paths)} images: {images}")
-    obs.save(out, force=force)
-    say(f"{obs.n_stars} stars in {obs.n_frames} frames: {out}")
+        sizes = {
+            "n_stars": made.n_stars,
+            "n_frames": simulation.n_frames,
+            "n_files": len(made.parts),
+        }
+        say(f"{made.n_stars} stars in {simulation.n_frames} frames, {len(made.parts)} files: {out}")
+    else:
+        obs = sc.simulate(stars, truth, **wanted)
+        if images is not None:
+            detector = {} if sensor is None else {"sensor": sc.simulation.Sensor.load(sensor)}
+            with progress_bar("images") as progress:
+                paths = sc.simulation.render_frames(
+                    stars, truth, images, **wanted, **detector, force=force, progress=progress
+                )
+            say(f"{len(paths)} images: {images}")
+        obs.save(out, force=force)
+        sizes = {"n_stars": obs.n_stars, "n_frames": obs.n_frames, "n_files": 1}
+        say(f"{obs.n_stars} stars in {obs.n_frames} frames: {out}")
     if out.suffix.lower() == ".csv":
         say(
             "CSV holds no metadata: say --directions apparent when you calibrate it (.ecsv and "
             ".parquet know)."
         )
-    sizes = {"n_stars": obs.n_stars, "n_frames": obs.n_frames, "n_files": 1}
     return Answer({"table": out, **sizes, "images": images, "n_images": len(paths)})
 
 
@@ -227,19 +210,9 @@ def coupling_command(run: Path, force: bool = False) -> Answer:
 
 def propagate_command(
     run: Path,
+    mission: MissionSettings,
+    propagation: PropagationSettings,
     attitudes: str = "observed",
-    max_mag: float = 6.0,
-    epoch: float = 2026.9,
-    frames: int = 1000,
-    min_stars: int | None = None,
-    rate: float | None = None,
-    scalar: settings.Scalar | None = None,
-    sense: settings.Sense = "icrs_to_camera",
-    alignment: str = "random",
-    alignment_frames: int | None = None,
-    onboard: settings.OnboardModel = "model",
-    temperature_profile: Path | None = None,
-    draws: int = 300,
     seed: int = 0,
     force: bool = False,
 ) -> Answer:
@@ -248,38 +221,21 @@ def propagate_command(
     """
     sky = None
     if attitudes != "observed":
-        sky = sc.runs.MissionSky(
-            profile=None if attitudes == "random" else Path(attitudes),
-            max_mag=max_mag,
-            epoch=epoch,
-            n_frames=frames,
-            min_stars=min_stars,
-            rate_hz=rate,
-            scalar=scalar,
-            sense=sense,
-        )
-    if sky is None and (rate is not None or scalar is not None):
+        profile = None if attitudes == "random" else Path(attitudes)
+        sky = sc.runs.MissionSky(profile, **vars(mission))
+    elif mission.rate_hz is not None or mission.scalar is not None:
         raise typer.BadParameter(
             "--rate and --scalar belong to an attitude profile: give --attitudes FILE."
         )
-
     error, _, spectrum = sc.Run(run, tell=note).propagate(
-        n_draws=draws,
-        seed=seed,
-        sky=sky,
-        alignment=alignment,
-        alignment_frames=alignment_frames,
-        onboard=onboard,
-        temperature_profile=temperature_profile,
-        force=force,
+        sky=sky, **vars(propagation), seed=seed, force=force
     )
     show_attitude(error)
     say(error.text)
-    if spectrum is not None:
-        say(spectrum.text)
-    return Answer(
-        {"run": run, "attitude": error, "spectrum": None if spectrum is None else spectrum.text}
-    )
+    words = None if spectrum is None else spectrum.text
+    if words is not None:
+        say(words)
+    return Answer({"run": run, "attitude": error, "spectrum": words})
 
 
 def report_command(

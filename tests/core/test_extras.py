@@ -74,11 +74,6 @@ NEEDS: dict[str, tuple[str, str, Callable[[Path], Any]]] = {
         lambda _: on_processes(scheduler="tcp://127.0.0.1:1"),
     ),
     "executed notebooks": ("ipykernel", "notebook", partial(executed, iter([]))),
-    "several processes over one set of files": (
-        "distributed",
-        "cluster",
-        lambda _: on_processes(workers=2),
-    ),
 }
 
 
@@ -100,11 +95,11 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(
 
 
 def test_what_needs_no_extra_does_not_ask_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes are taken by default where Dask is there; without it, this one does the work."""
+    """Processes of this machine need no Dask."""
     hide(monkeypatch, "distributed")
     hide(monkeypatch, "astropy")
     assert sc.example_data("esa").observations.n_frames == 8  # an ECSV table
-    with cluster() as here:
+    with cluster(workers=2, caller="a test") as here:
         assert here.map(abs, [-1, 2]) == [1, 2]
 
 
