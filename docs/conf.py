@@ -83,7 +83,9 @@ def write_gallery(_app: object) -> None:
 
 def write_schemas(_app: object) -> None:
     """Write the page of the documents that commands print with `--json`, from their declaration."""
-    from starcal_uq.cli.schemas import SCHEMAS, keys
+    from json_keys import keys
+
+    from starcal_uq.cli.schemas import SCHEMAS
 
     lines: list[str] = []
     for name, (version, part) in SCHEMAS.items():

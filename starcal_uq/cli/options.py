@@ -7,7 +7,9 @@ import re
 import stat
 import tomllib
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from importlib.resources import files
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
@@ -151,36 +153,25 @@ def parse_dof(text: str | None) -> float | Literal["free"] | None:
     return student.parse_dof(value, typer.BadParameter)
 
 
+def _known_to(reader: str) -> Callable[[str], None]:
+    """A check that a text is one which a function of the package ("module:name") reads."""
+
+    def check(text: str) -> None:
+        module, _, name = reader.partition(":")
+        try:
+            attrgetter(name)(import_module(f"starcal_uq.{module}"))(text)
+        except StarcalError as error:
+            raise typer.BadParameter(str(error).removeprefix("The time ")) from None
+
+    return check
+
+
 def check_effects(text: str | None) -> None:
     """Refuse what is neither ``auto`` nor ``none`` nor names of effects with commas."""
-    from starcal_uq.core.settings import effect_names
-
-    if text is None:
-        return
-    if not _is_name(text):
+    if text is not None and not _is_name(text):
         raise typer.BadParameter(f"{shown(text)} is no list of effects, such as field,frame.")
-    try:
-        effect_names(text)
-    except StarcalError as error:
-        raise typer.BadParameter(str(error)) from None
-
-
-def _check_engine(name: str) -> None:
-    from starcal_uq.identification.proposers import offered_engine
-
-    try:
-        offered_engine(name)
-    except StarcalError as error:
-        raise typer.BadParameter(str(error)) from None
-
-
-def _check_planned(text: str) -> None:
-    from starcal_uq.planning.effects import PlannedEffects
-
-    try:
-        PlannedEffects.parsed(text)
-    except StarcalError as error:
-        raise typer.BadParameter(str(error)) from None
+    if text is not None:
+        _known_to("core.settings:effect_names")(text)
 
 
 def parse_frames(text: str | None) -> list[tuple[int, int]] | None:
@@ -209,15 +200,6 @@ def parse_labels(text: str | None) -> tuple[str, str] | None:
             f"{shown(text)} is not two different short names such as cold,hot."
         )
     return first, second
-
-
-def _check_time(text: str) -> None:
-    from starcal_uq.core.times import utc_text
-
-    try:
-        utc_text(text)
-    except StarcalError as error:
-        raise typer.BadParameter(str(error).removeprefix("The time ")) from None
 
 
 def _is_name(text: str) -> bool:
@@ -273,14 +255,14 @@ _CHECKS: Mapping[str, Callable[[Any], object]] = {
     "columns": parse_columns,
     "degrees of freedom": parse_dof,
     "effects": check_effects,
-    "engine": _check_engine,
+    "engine": _known_to("identification.proposers:offered_engine"),
     "frames": parse_frames,
     "labels": parse_labels,
     "names": check_names,
-    "planned effects": _check_planned,
+    "planned effects": _known_to("planning.effects:PlannedEffects.parsed"),
     "schema": _check_schema,
     "start": parse_start,
-    "time": _check_time,
+    "time": _known_to("core.times:utc_text"),
     "velocity": parse_velocity,
     "word or file": check_word_or_file,
 }

@@ -6,9 +6,8 @@ What the documents hold is declared in ``documents.toml``.
 
 from __future__ import annotations
 
-import json
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.resources import files
@@ -82,37 +81,3 @@ def _gather(part: Part, parts: dict[str, Part]) -> None:
         if name not in parts:
             parts[name] = find(name)
             _gather(parts[name], parts)
-
-
-def keys(name: str) -> Iterator[tuple[str, str, str, str]]:
-    """Every key of a document with its type, unit and meaning; ``a[].b`` is b of every object in
-    the list a.
-    """
-    schema = json_schema(name)
-    yield from _keys(schema, schema.get("$defs", {}), "")
-
-
-def _keys(place: AnyDict, parts: AnyDict, above: str) -> Iterator[tuple[str, str, str, str]]:
-    for name, content in place["properties"].items():
-        kind, inner = type_words(content), referred(content)
-        yield f"{above}{name}", kind, content.get("unit", ""), content.get("description", "")
-        if inner:
-            several = "[]" if kind.startswith("list") else ""
-            yield from _keys(parts[inner], parts, f"{above}{name}{several}.")
-
-
-def type_words(content: AnyDict) -> str:
-    """The type of a key in words."""
-    if "const" in content:
-        return json.dumps(content["const"])
-    if "anyOf" in content:
-        return " or ".join(map(type_words, content["anyOf"]))
-    kind = content.get("type", "object")
-    if kind == "array":
-        return f"list of {_several(content['items'])}"
-    values = content.get("additionalProperties")
-    return f"object of {_several(values)}" if isinstance(values, dict) else str(kind)
-
-
-def _several(content: AnyDict) -> str:
-    return type_words(content).replace(" or ", "s or ") + "s"

@@ -47,6 +47,7 @@ from starcal_uq.cli.settings import (
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new, table_ending
+from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -110,7 +111,7 @@ def simulate_command(
             "--sensor describes the detector of images: give --images DIR as well."
         )
     stars, truth = sc.load_catalogue(max_mag=max_mag, epoch=epoch), sc.Camera.load(camera)
-    wanted = vars(simulation)
+    wanted: AnyDict = vars(simulation)
     paths: list[Path] = []
     if partitions.partition_frames is not None:
         with progress_bar("files") as progress:
@@ -126,10 +127,11 @@ def simulate_command(
     else:
         obs = sc.simulate(stars, truth, **wanted)
         if images is not None:
-            detector = {} if sensor is None else {"sensor": sc.simulation.Sensor.load(sensor)}
+            if sensor is not None:
+                wanted = wanted | {"sensor": sc.simulation.Sensor.load(sensor)}
             with progress_bar("images") as progress:
                 paths = sc.simulation.render_frames(
-                    stars, truth, images, **wanted, **detector, force=force, progress=progress
+                    stars, truth, images, **wanted, force=force, progress=progress
                 )
             say(f"{len(paths)} images: {images}")
         obs.save(out, force=force)

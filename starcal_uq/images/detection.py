@@ -46,7 +46,30 @@ _START_STEP_PX = 0.05
 
 @dataclass(frozen=True)
 class DetectionOptions:
-    """Options of `starcal_uq.images.extract.extract_centroids`, which describes them."""
+    """How stars are found: options of `starcal_uq.images.extract.extract_centroids`.
+
+    Attributes
+    ----------
+    gain_e_per_count : float, optional
+        Electrons per count; by default what the file says. Without it, it is read off the noise of
+        the background where that is bright and uneven enough, for `sigma_px` only. Where it is not,
+        the photon noise of the stars themselves is left away, so that `sigma_px` of bright stars
+        comes out too small. A message says which.
+    read_noise_e : float, optional
+        Read noise, electrons per pixel: a floor for the measured noise (needs the gain).
+    saturation : float, optional
+        Counts at and above which a pixel is saturated; by default what the file says, or the full
+        scale of its integers. Saturated pixels are not used.
+    threshold_sigma : float
+        Detection threshold in the image filtered by the PSF, in standard deviations of that image.
+    min_pixels : int
+        Pixels above the threshold that a star needs, in the filtered image.
+    psf_sigma_px : float, optional
+        Width of the star images before integration over pixels; by default it is measured in each
+        image.
+    max_stars : int, optional
+        Keep at most so many stars per frame, the brightest.
+    """
 
     gain_e_per_count: float | None = None
     read_noise_e: float | None = None

@@ -51,18 +51,12 @@ def extract_centroids(
     images: Source | Iterable[Source],
     *,
     camera: Camera | None = None,
-    gain_e_per_count: float | None = None,
-    read_noise_e: float | None = None,
-    saturation: float | None = None,
-    threshold_sigma: float = 5.0,
-    min_pixels: int = 1,
-    psf_sigma_px: float | None = None,
-    max_stars: int | None = None,
     correct_pixel_phase: bool = True,
     bayer: Bayer | None = None,
     workers: int | None = 0,
     progress: Progress | None = None,
     keep: PathLike | None = None,
+    **options: Any,
 ) -> Centroids:
     """Find the stars in images and measure their positions with covariances.
 
@@ -74,25 +68,6 @@ def extract_centroids(
         folder that are none are named in `messages`.
     camera
         If given, every image must be the size of its detector.
-    gain_e_per_count
-        Electrons per count; by default what the file says. Without it, it is read off the noise of
-        the background where that is bright and uneven enough, for `sigma_px` only. Where it is not,
-        the photon noise of the stars themselves is left away, so that `sigma_px` of bright stars
-        comes out too small. A message says which.
-    read_noise_e
-        Read noise, electrons per pixel: a floor for the measured noise (needs the gain).
-    saturation
-        Counts at and above which a pixel is saturated; by default what the file says, or the full
-        scale of its integers. Saturated pixels are not used.
-    threshold_sigma
-        Detection threshold in the image filtered by the PSF, in standard deviations of that image.
-    min_pixels
-        Pixels above the threshold that a star needs, in the filtered image.
-    psf_sigma_px
-        Width of the star images before integration over pixels; by default it is measured in each
-        image.
-    max_stars
-        Keep at most so many stars per frame, the brightest.
     correct_pixel_phase
         Centroids of undersampled star images that are no Gaussians are drawn to the centres of the
         pixels. Where the places of many stars show it (4 standard deviations), it is taken out, and
@@ -112,6 +87,8 @@ def extract_centroids(
         Folder in which the stars of a hundred files and more are kept as they are measured; a later
         call with the same files and options goes on from them (`starcal_uq.core.store.finished`
         removes them).
+    **options
+        Those of `DetectionOptions`, such as ``threshold_sigma``.
 
     Returns
     -------
@@ -126,22 +103,14 @@ def extract_centroids(
         If processes cannot be used.
     """
     sources, messages = _sources(images)
-    options = DetectionOptions(
-        gain_e_per_count=gain_e_per_count,
-        read_noise_e=read_noise_e,
-        saturation=saturation,
-        threshold_sigma=float(threshold_sigma),
-        min_pixels=int(min_pixels),
-        psf_sigma_px=psf_sigma_px,
-        max_stars=max_stars,
-    )
-    task = _Measure(sources, camera, options, bayer)
+    detection = DetectionOptions(**options)
+    task = _Measure(sources, camera, detection, bayer)
     if workers is None:
         workers = processors() if len(sources) >= _WORTH_PROCESSES else 0
     kept = None
     if keep is not None and len(sources) >= _WORTH_PROCESSES:
         kept = Kept(
-            keep, ["centroids", _files(sources), camera, options, bayer], (_Frame, FrameStars)
+            keep, ["centroids", _files(sources), camera, detection, bayer], (_Frame, FrameStars)
         )
     table = _Table(messages=messages)
     frames, interrupted = run_tasks(
@@ -157,7 +126,7 @@ def extract_centroids(
         raise KeyboardInterrupt
     for found in frames:
         table.add(found)
-    return table.centroids(options, correct_pixel_phase)
+    return table.centroids(detection, correct_pixel_phase)
 
 
 def _files(sources: Sequence[Source]) -> list[list[str | int]]:

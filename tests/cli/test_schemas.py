@@ -16,6 +16,7 @@ import pytest
 import typer
 
 import starcal_uq as sc
+from docs._ext.json_keys import keys, type_words
 from starcal_uq.cli import schemas
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.commands import GROUPS, app
@@ -60,7 +61,7 @@ RECORDED = Path(__file__).with_name("schemas.txt")
 
 
 def _line(schema):
-    types = {key: schemas.type_words(content) for key, content in schema["properties"].items()}
+    types = {key: type_words(content) for key, content in schema["properties"].items()}
     return ", ".join(
         f"{key} {words}" for key, words in types.items() if key not in ("schema", "version")
     )
@@ -83,7 +84,7 @@ def test_every_command_has_a_schema_and_is_tried():
 def test_schemas_are_schemas_and_say_what_every_key_is(name):
     schema = schemas.json_schema(name)
     jsonschema.Draft202012Validator.check_schema(schema)
-    found = list(schemas.keys(name))
+    found = list(keys(name))
     assert [key for key, *_ in found][:3] == ["schema", "version", "exit_status"]
     unsaid = [key for key, kind, _, text in found if not text or kind == "Any"]
     assert not unsaid, unsaid

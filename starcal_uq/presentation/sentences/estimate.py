@@ -136,11 +136,10 @@ def _misfit(
     n_tests: int,
     p_least: float,
     tests: Sequence[tuple[str, float, float]] = (),
-    effect_on: str = "",
-    effect_sigma: float = 0.0,
     moved: str = "",
     error_times: float = 1.0,
     effects: Sequence[str] = (),
+    **effect: Any,
 ) -> Told:
     value = f"{p_words(p_value)}, corrected for {plural(n_tests, 'test')}"
     bound = f"p ≥ {p_least:g}"
@@ -157,7 +156,7 @@ def _misfit(
     more = f" and {plural(further, 'other test')}" if further > 0 else ""
     sentence = (
         f"The residuals hold more than noise: {join_words(words)}{more}. "
-        f"{effect_sentence(effect_on, effect_sigma)}"
+        f"{effect_sentence(**effect)}"
     )
     if moved:
         sentence += (
@@ -300,19 +299,16 @@ def _stars(
 def _models_sentence(
     fitted: str,
     best: str,
-    difference_nat: float = 0.0,
-    difference_se_nat: float = 0.0,
     better: str | None = None,
     simplest: str = "",
     not_needed: Sequence[str] = (),
     others: Sequence[str] = (),
-    common_arcsec: float = 0.0,
-    rest_arcsec: float = 0.0,
+    **size: float,
 ) -> str:
     if better is not None:
         first = (
             f"The model {fitted!r} predicts left-out frames worse than {best!r} by "
-            f"{fixed(-difference_nat, 1)} ± {fixed(difference_se_nat, 1)} nat: use {better!r}."
+            f"{fixed(-size['difference_nat'], 1)} ± {fixed(size['difference_se_nat'], 1)} nat: use {better!r}."
         )
     elif simplest:
         verb = "is" if len(not_needed) == 1 else "are"
@@ -326,8 +322,8 @@ def _models_sentence(
         return f"{first} All other models are rejected."
     return (
         f"{first} Under the other models that the data do not reject ({join_words(others)}), "
-        f"attitudes across the boresight would move by up to {significant(common_arcsec)} arcsec "
-        f"in common and {significant(rest_arcsec)} arcsec (rms) frame by frame."
+        f"attitudes across the boresight would move by up to {significant(size['common_arcsec'])} "
+        f"arcsec in common and {significant(size['rest_arcsec'])} arcsec (rms) frame by frame."
     )
 
 
@@ -349,7 +345,11 @@ def _comparison(
     effect_sigma: float = 0.0,
     **others: Any,
 ) -> Told:
-    sentence = _models_sentence(fitted, best, difference_nat, difference_se_nat, **others)
+    size: dict[str, Any] = {
+        "difference_nat": difference_nat,
+        "difference_se_nat": difference_se_nat,
+    }
+    sentence = _models_sentence(fitted, best, **size, **others)
     value = (
         f"{fixed(difference_nat, 1)} ± {fixed(difference_se_nat, 1)} nat from {best!r}"
         if difference_nat
