@@ -19,7 +19,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,8 +38,6 @@ if TYPE_CHECKING:
 TEMPORARY = re.compile(r"\.[0-9a-f]{16}\.tmp")
 # Where a command keeps what it has not finished, and a step of a run its files; gone at their end.
 UNFINISHED, STEP = ".unfinished", ".step"
-# Files that are flushed at the same time: a disk that writes one has the others in the same breath.
-_FLUSHERS = 16
 
 
 def ensure_new(path: PathLike, force: bool = False) -> None:
@@ -125,60 +122,19 @@ def atomic_path(path: PathLike, *, durable: bool = True) -> Iterator[Path]:
     temporary = target.parent / f".{secrets.token_hex(8)}.tmp{target.suffix}"
     try:
         yield temporary
-        later = _LATER.get()
-        if durable and later is None:
-            _flush(temporary)
+        if durable:
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
         os.replace(temporary, target)
-        if durable and later is not None:
-            later.append(target)
     except OSError as error:
-        raise _unwritten(path, error) from error
+        raise RunFolderError(
+            f"{path}: cannot be written ({error.strerror or error}); check the permissions of the "
+            "folder and the free space."
+        ) from error
     finally:
         # Asked first: in a folder that may not be searched, unlink would raise and hide the reason.
         if os.path.lexists(temporary):
             temporary.unlink()
-
-
-def _unwritten(path: PathLike, error: OSError) -> RunFolderError:
-    reason = error.strerror or str(error)
-    return RunFolderError(
-        f"{path}: cannot be written ({reason}); check the permissions of the folder and the free "
-        "space."
-    )
-
-
-def _flush(path: Path) -> None:
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())
-
-
-# Files that are to be on the disk at the end of the present `flushed_together`.
-_LATER: ContextVar[list[Path] | None] = ContextVar("_LATER", default=None)
-
-
-@contextmanager
-def flushed_together() -> Iterator[None]:
-    """What this block writes by `atomic_path` is on the disk when it ends: flushed all at once, the
-    disk waits once.
-
-    For files that count only afterwards. RunFolderError if the system refuses it.
-    """
-    from concurrent.futures import ThreadPoolExecutor
-
-    later: list[Path] = []
-    token = _LATER.set(later)
-    try:
-        yield
-    finally:
-        _LATER.reset(token)
-    with ThreadPoolExecutor(_FLUSHERS) as pool:
-        for path, flushed in [
-            (path, pool.submit(_flush, path)) for path in dict.fromkeys(later) if path.exists()
-        ]:
-            try:
-                flushed.result()
-            except OSError as error:
-                raise _unwritten(path, error) from error
 
 
 def flush_folder(path: PathLike) -> None:

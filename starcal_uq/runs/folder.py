@@ -19,7 +19,7 @@ from typing import Any
 
 from starcal_uq.core.conflicts import parsed
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import STEP, as_plain, check_new_folder, flushed_together, new_folder
+from starcal_uq.core.files import STEP, as_plain, check_new_folder, new_folder
 from starcal_uq.core.manifest import (
     MANIFEST,
     NEW,
@@ -303,8 +303,7 @@ class RunFolder:
         if step == "calibrate":
             self._check_new()
         with self.writing(), staged(self.path) as stage:
-            with flushed_together():
-                yield RunFolder(stage)
+            yield RunFolder(stage)
             # A file of another step that this one has changed stays a file of that step.
             made = {
                 name: entry_of(path, old.files[name].step if name in old.files else step)
