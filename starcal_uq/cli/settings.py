@@ -21,7 +21,7 @@ from starcal_uq.cli.options import (
     parse_start,
 )
 from starcal_uq.core import settings
-from starcal_uq.core.conflicts import conflict, is_given, sampled_by_default, typed
+from starcal_uq.core.conflicts import refusal, sampled_by_default
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -353,22 +353,9 @@ def refuse_conflicts(settings: AnyDict) -> None:
     """Refuse options that cannot be given together, before anything is done, in the words of the
     command line.
     """
-    rule = conflict(settings)
-    if rule is None:
-        return
-    given, other = typed(rule.name, rule.value(settings)), settings.get(rule.other)
-    if rule.other == "partitioned":
-        words = f"needs a folder of partitions: leave {given} out." if True in rule.allowed else ""
-        raise typer.BadParameter(
-            f"{given} {words or f'needs one table, and no folder: leave {given} out.'}"
-        )
-    if not is_given(other):
-        raise typer.BadParameter(
-            f"{given} needs {typed(rule.other, rule.allowed[0])}: give both, or leave {given} out."
-        )
-    raise typer.BadParameter(
-        f"{given} and {typed(rule.other, other)} exclude each other: leave one of them out."
-    )
+    words = refusal(settings)
+    if words is not None:
+        raise typer.BadParameter(words)
 
 
 def typed_words(arguments: Sequence[str]) -> list[str]:

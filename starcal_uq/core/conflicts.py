@@ -4,7 +4,7 @@ checks.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -204,32 +204,32 @@ def conflict(settings: Mapping[str, object]) -> Rule | None:
     return next((rule for rule in RULES if rule.broken(settings)), None)
 
 
-def refuse_conflicts(**settings: object) -> None:
-    """CalibrationError, in the words of Python, where arguments cannot be given together."""
+def refusal(
+    settings: Mapping[str, object], spell: Callable[[str, object], str] = typed
+) -> str | None:
+    """What is wrong with settings that cannot be given together, each spelt by a function; None
+    where nothing is.
+    """
     rule = conflict(settings)
     if rule is None:
-        return
-    value = rule.value(settings)
-    given = f"{rule.name}={value!r}" if isinstance(value, str | int | float) else rule.name
-    if rule.other == "partitioned" and True in rule.allowed:
-        needed = (
-            "needs partitioned observations (sc.observations.open_partitions, a folder of "
-            "Parquet files): leave"
-        )
-        raise CalibrationError(f"{given} {needed} it out.")
+        return None
+    given, other = spell(rule.name, rule.value(settings)), settings.get(rule.other)
     if rule.other == "partitioned":
-        raise CalibrationError(
-            f"{given} and partitioned observations exclude each other: leave it out, or "
-            "calibrate the frames of "
-            "`obs.sample()` with it."
-        )
-    if rule.other == "effects":
-        raise CalibrationError(
-            f"{given} and effects={settings.get('effects')!r} exclude each other: leave one of "
-            "them out."
-        )
-    wanted = " or ".join(repr(allowed) for allowed in rule.allowed if allowed is not None)
-    raise CalibrationError(
-        f"{given} needs {rule.other}={wanted}, and {rule.other} is {settings.get(rule.other)!r}: "
-        "change one of them."
-    )
+        kind = "a folder of partitions" if True in rule.allowed else "one table, and no folder"
+        return f"{given} needs {kind}: leave {given} out."
+    wanted = [] if rule.other == "effects" else [v for v in rule.allowed if v is not None]
+    if wanted:
+        needed = " or ".join(spell(rule.other, value) for value in wanted)
+        return f"{given} needs {needed}: give both, or leave {given} out."
+    return f"{given} and {spell(rule.other, other)} exclude each other: leave one of them out."
+
+
+def refuse_conflicts(**settings: object) -> None:
+    """CalibrationError, in the words of Python, where arguments cannot be given together."""
+    words = refusal(settings, _argument)
+    if words is not None:
+        raise CalibrationError(words)
+
+
+def _argument(name: str, value: object) -> str:
+    return f"{name}={value!r}" if isinstance(value, str | int | float) else name
