@@ -76,9 +76,7 @@ def test_order_and_sense_of_quaternions_are_stated_or_refused(tmp_path: Path) ->
         {"time_s": profile.time_s, **{f"q{i}": q[:, (i + 3) % 4] for i in range(4)}}
     )
     path = write(numbered, tmp_path / "numbered.csv")
-    with pytest.raises(
-        AttitudeProfileError, match="do not say which is the scalar part; name them qx, qy, qz, qw"
-    ):
+    with pytest.raises(AttitudeProfileError, match="do not say which is the scalar part; name"):
         load_attitude_profile(path)
     np.testing.assert_allclose(
         load_attitude_profile(path, scalar="first").quaternions, q, atol=1e-15
@@ -185,14 +183,7 @@ def broken(frame: pd.DataFrame, change: str) -> pd.DataFrame:
         ("length", r"line 7: the quaternion has the length 1\.0015, not 1"),
         ("nan", r"line 7: qz is '', not a number"),
         ("text", r"line 7: qz is 'north', not a number"),
-        (
-            "column",
-            (
-                r"column qz is missing; give qx, qy, qz, qw beside time_s or time_utc \(the file "
-                r"has "
-                r"time_s, qx"
-            ),
-        ),
+        ("column", "column qz is missing; give qx, qy, qz, qw beside time_s or time_utc \\(the"),
         ("time", r"column time_s or time_utc is missing"),
         ("short", r"holds 1 attitude; give at least two"),
         ("empty", r"holds no rows"),
@@ -262,9 +253,7 @@ def test_instants_with_few_stars_are_left_out_and_counted() -> None:
     assert 0 < skipped == 601 - frames.n_frames
     assert f"{skipped} instants with fewer than 4 stars left out" in frames.meta["frames"]
     np.testing.assert_array_equal(profile.time_s[frames.frame_ids], frames.meta["frame_times_s"])
-    with pytest.raises(
-        CatalogueError, match="none of the 601 attitudes of the profile shows 90 stars"
-    ):
+    with pytest.raises(CatalogueError, match="none of the 601 attitudes of the profile shows 90"):
         profile_frames(stars, camera(), profile, min_stars=90)
     with pytest.raises(ValueError, match="min_stars is 1: give a whole number from 2"):
         profile_frames(stars, camera(), profile, min_stars=1)

@@ -126,9 +126,7 @@ def test_agrees_with_scipy_also_at_half_turns(sigma_rad: float) -> None:
 
 
 def test_eigenvector_before_it_is_polished() -> None:
-    """One step of Newton would mend a wrong entry of the adjugate; whichever row is largest, it
-    needs none.
-    """
+    """One step of Newton would mend a wrong entry of the adjugate."""
     # At the identity and at half turns about an axis, one row alone is not zero.
     rotations = np.concatenate(
         ([np.eye(3)], half_turns(), random_rotations(200, np.random.default_rng(5)))
@@ -253,9 +251,7 @@ def test_two_stars_close_together_have_an_honest_covariance() -> None:
 
 @pytest.mark.parametrize("scene", ["two stars", "stars on a line", "cluster off the axis"])
 def test_nearly_collinear_stars_have_an_honest_covariance(scene: str) -> None:
-    """Ill-conditioned, not degenerate: roll, or a turn about the cluster, is known worse by orders
-    of magnitude.
-    """
+    """Ill-conditioned, not degenerate."""
     rng = np.random.default_rng(24)
     along, across = {
         "two stars": (np.array([0.0, 2e-4]), np.array([0.0, 1e-4])),
@@ -352,9 +348,7 @@ def test_wrong_arguments_are_named() -> None:
 
 
 def test_takes_a_fraction_of_as_many_decompositions() -> None:
-    """A quarter of what NumPy takes to decompose as many 3 x 3 matrices, with which the other way
-    begins.
-    """
+    """A quarter of what NumPy takes to decompose as many 3 x 3 matrices."""
     b, r, starts, _ = frames([12] * 20_000, 12.0, 1e-5, seed=22)
     matrices = np.random.default_rng(0).random((20_000, 3, 3))
     assert (

@@ -1,6 +1,4 @@
-"""Quantiles and combination rules of the error budget, against closed forms and against independent
-sampling.
-"""
+"""Quantiles and combination rules of the error budget."""
 
 from __future__ import annotations
 
@@ -13,21 +11,17 @@ from scipy import stats
 
 from starcal_uq.budgeting.file import Requirement
 from starcal_uq.budgeting.result import Outcome
-from starcal_uq.budgeting.rows import DISTRIBUTIONS, GAUSSIAN_997, Contributor, confidence_text
+from starcal_uq.budgeting.rows import GAUSSIAN_997, Contributor
 from starcal_uq.budgeting.sampling import draw, one_of_many
 from starcal_uq.budgeting.shapes import (
-    deviates,
     half_width,
-    mixture_spread,
     one_axis_factor,
-    two_axis_radius,
 )
 from starcal_uq.budgeting.totals import (
     Total,
     _heaviest,
     _meeting,
     covariance,
-    grouped_sigma,
     total,
     totals,
 )
@@ -59,190 +53,6 @@ def combined(
 ) -> Total:
     options = {"scope": "before alignment", "interpretation": "mixed", **changes}
     return total(rows, draw(rows, 200_000, 3), axis=axis, confidence=confidence, **options)  # type: ignore[arg-type]
-
-
-def test_two_axis_quantiles_are_not_those_of_one_axis() -> None:
-    assert one_axis_factor(0.9973) == pytest.approx(3.0, abs=1e-4)
-    for confidence, expected in ((0.95, 2.448), (0.997, 3.409), (0.9973, 3.439)):
-        assert two_axis_radius(confidence, 1.0, 1.0) == pytest.approx(expected, abs=5e-4)
-        assert two_axis_radius(confidence, 1.0, 1.0) == pytest.approx(
-            stats.rayleigh.ppf(confidence), rel=1e-10
-        )
-        # Negative control: the factor of one axis holds less.
-        held = stats.rayleigh.cdf(one_axis_factor(confidence))
-        assert held < confidence - 0.005
-
-
-def test_unequal_axes_are_exact() -> None:
-    assert two_axis_radius(0.997, 2.0, 0.0) == pytest.approx(2.0 * one_axis_factor(0.997), rel=1e-9)
-    assert two_axis_radius(0.997, 0.0, 0.0) == 0.0
-    rng = np.random.default_rng(1)
-    size = np.hypot(3.0 * rng.standard_normal(1_000_000), rng.standard_normal(1_000_000))
-    held = np.mean(size < two_axis_radius(0.95, 3.0, 1.0))
-    assert held == pytest.approx(0.95, abs=4.0 * math.sqrt(0.95 * 0.05 / 1e6))
-    # Negative control: the quantile of equal axes of the same mean square is off by many standard
-    # errors.
-    wrong = np.mean(size < two_axis_radius(0.95, math.sqrt(5.0), math.sqrt(5.0)))
-    assert abs(wrong - 0.95) > 20.0 * math.sqrt(0.95 * 0.05 / 1e6)
-
-
-@pytest.mark.parametrize("name", DISTRIBUTIONS)
-def test_deviates_have_unit_moments_and_the_stated_half_width(name: str) -> None:
-    rng = np.random.default_rng(2)
-    sampled = deviates(name, rng.random(400_000), rng.standard_normal(400_000), GAUSSIAN_997)
-    if name == "constant":
-        assert not sampled.any()
-        return
-    assert sampled.mean() == pytest.approx(0.0, abs=0.01)
-    assert sampled.std() == pytest.approx(1.0, abs=0.005)
-    reference = {
-        "gaussian": stats.norm(),
-        "uniform": stats.uniform(-math.sqrt(3.0), 2.0 * math.sqrt(3.0)),
-        "arcsine": stats.arcsine(-math.sqrt(2.0), 2.0 * math.sqrt(2.0)),
-        "rayleigh": stats.rayleigh(
-            -stats.rayleigh.mean() / stats.rayleigh.std(), 1.0 / stats.rayleigh.std()
-        ),
-    }
-    assert stats.kstest(sampled[:20_000], reference[name].cdf).pvalue > 1e-3
-    # Negative control: another shape of the same moments is told apart.
-    other = "uniform" if name != "uniform" else "gaussian"
-    assert stats.kstest(sampled[:20_000], reference[other].cdf).pvalue < 1e-6
-    if name in ("uniform", "arcsine"):
-        assert np.abs(sampled).max() <= half_width(name, 0.997) + 1e-12
-    elif name == "gaussian":
-        assert np.mean(np.abs(sampled) < half_width(name, 0.997)) == pytest.approx(0.997, abs=5e-4)
-
-
-@pytest.mark.parametrize("tail", [2.5, GAUSSIAN_997, 3.2, 3.9, 4.55])
-def test_a_sigma_that_varies_keeps_variance_and_reaches_the_stated_tail(tail: float) -> None:
-    rng = np.random.default_rng(4)
-    sampled = deviates("gaussian", rng.random(1_000_000), rng.standard_normal(1_000_000), tail)
-    assert sampled.std() == pytest.approx(1.0, abs=0.006)
-    reached = max(tail, GAUSSIAN_997)
-    assert np.mean(np.abs(sampled) > reached) == pytest.approx(0.003, abs=3e-4)
-    assert half_width("gaussian", 0.997, tail) == pytest.approx(reached, rel=1e-6)
-    plane = np.exp(
-        mixture_spread(tail) * rng.standard_normal(1_000_000) - mixture_spread(tail) ** 2
-    )
-    size = plane * np.hypot(rng.standard_normal(1_000_000), rng.standard_normal(1_000_000))
-    radius = two_axis_radius(0.997, 1.0, 1.0, mixture_spread(tail))
-    assert np.mean(size > radius) == pytest.approx(0.003, abs=3e-4)
-
-
-def test_a_tail_beyond_all_mixtures_is_cut_and_finite() -> None:
-    assert math.isfinite(half_width("gaussian", 0.997, 50.0))
-
-
-def test_gaussian_rows_rule_and_sampling_agree() -> None:
-    found = combined([row("a", 3.0), row("b", 4.0)])
-    assert found.sigma_arcsec == pytest.approx(5.0)
-    assert found.rule_arcsec == pytest.approx(5.0 * one_axis_factor(0.997))
-    assert abs(found.sampled_arcsec - found.rule_arcsec) < 4.0 * found.sampled_se_arcsec
-    assert "agree" in found.explanation
-    assert found.dominant == "b"
-
-
-def test_means_add_with_their_signs() -> None:
-    rows = [row("a", 1.0, mean_arcsec=5.0), row("b", 1.0, mean_arcsec=-3.0)]
-    found = combined(rows)
-    assert found.mean_arcsec == pytest.approx(2.0)
-    assert found.rule_arcsec == pytest.approx(2.0 + math.sqrt(2.0) * one_axis_factor(0.997))
-    sides = stats.norm(2.0, math.sqrt(2.0))
-    assert sides.cdf(found.sampled_arcsec) - sides.cdf(-found.sampled_arcsec) == pytest.approx(
-        0.997, abs=5e-4
-    )
-    # A shifted error exceeds on one side only: fewer sigmas hold it, and the budget says so.
-    assert found.sampled_arcsec < found.rule_arcsec
-    assert "mean shifts" in found.explanation
-
-
-def test_rows_of_a_group_add_linearly_in_rule_and_samples() -> None:
-    alone = [row("a", 3.0), row("b", 4.0)]
-    together = [dataclasses.replace(entry, correlation_group="thermal") for entry in alone]
-    assert grouped_sigma(alone) == pytest.approx(5.0)
-    assert grouped_sigma([*together, row("c", 24.0)]) == pytest.approx(25.0)
-    found, apart = combined(together), combined(alone)
-    assert found.rule_arcsec == pytest.approx(7.0 * one_axis_factor(0.997))
-    assert abs(found.sampled_arcsec - found.rule_arcsec) < 4.0 * found.sampled_se_arcsec
-    # Negative control: the same rows without the group are far below.
-    assert found.sampled_arcsec - apart.sampled_arcsec > 20.0 * found.sampled_se_arcsec
-
-
-@pytest.mark.parametrize(
-    ("shape", "end"), [("uniform", math.sqrt(3.0)), ("arcsine", math.sqrt(2.0))]
-)
-def test_a_dominant_bounded_row_is_named_and_never_exceeded(shape: str, end: float) -> None:
-    found = combined([row("big", 10.0, distribution=shape), row("small", 0.1)])
-    assert found.sampled_arcsec == pytest.approx(10.0 * end, rel=0.02)
-    assert found.rule_arcsec > 1.5 * found.sampled_arcsec
-    assert (
-        "'big'" in found.explanation and shape in found.explanation and "above" in found.explanation
-    )
-
-
-def test_a_heavy_tail_puts_the_rule_below_the_samples_and_is_named() -> None:
-    found = combined(
-        [row("noise", 1.0, tail_997=3.9, interpretation="temporal"), row("other", 0.2)]
-    )
-    assert found.sampled_arcsec > found.rule_arcsec * 1.2
-    assert (
-        "below" in found.explanation
-        and "'noise'" in found.explanation
-        and "3.90 sigma" in found.explanation
-    )
-
-
-def test_rayleigh_row_against_its_own_quantile() -> None:
-    scale = 2.0
-    sd, mean = stats.rayleigh.std(scale=scale), stats.rayleigh.mean(scale=scale)
-    found = combined([row("tilt", sd, mean_arcsec=mean, distribution="rayleigh")])
-    assert found.sampled_arcsec == pytest.approx(stats.rayleigh.ppf(0.997, scale=scale), rel=0.02)
-
-
-def test_both_axes_together() -> None:
-    found = combined(both("a", 2.0), "cross-boresight")
-    assert found.factor == pytest.approx(3.409, abs=5e-4)
-    assert abs(found.sampled_arcsec - found.rule_arcsec) < 4.0 * found.sampled_se_arcsec
-    unequal = combined([row("a", 3.0), row("b", 1.0, "yaw")], "cross-boresight")
-    assert unequal.rule_arcsec == pytest.approx(two_axis_radius(0.997, 3.0, 1.0))
-    assert abs(unequal.sampled_arcsec - unequal.rule_arcsec) < 4.0 * unequal.sampled_se_arcsec
-    shifted = combined(
-        [row("a", 1.0, mean_arcsec=3.0), row("b", 1.0, "yaw", mean_arcsec=4.0)], "cross-boresight"
-    )
-    assert shifted.mean_arcsec == pytest.approx(5.0)
-    assert shifted.rule_arcsec >= shifted.sampled_arcsec
-
-
-def test_a_varying_sigma_is_shared_by_both_axes() -> None:
-    found = combined(both("noise", 1.0, tail_997=3.9), "cross-boresight")
-    exact = two_axis_radius(0.997, 1.0, 1.0, mixture_spread(3.9))
-    assert abs(found.sampled_arcsec - exact) < 4.0 * found.sampled_se_arcsec
-
-
-def test_interpretations_differ_by_what_counts_as_random() -> None:
-    rows = [row("calibration", 3.0), row("noise", 4.0, interpretation="temporal")]
-    factor = one_axis_factor(0.997)
-    mixed, ensemble, temporal = (
-        combined(rows, interpretation=kind) for kind in ("mixed", "ensemble", "temporal")
-    )
-    assert mixed.rule_arcsec == pytest.approx(5.0 * factor)
-    assert ensemble.sigma_arcsec == pytest.approx(3.0) and ensemble.worst_arcsec == pytest.approx(
-        4.0 * factor
-    )
-    assert temporal.sigma_arcsec == pytest.approx(4.0) and temporal.worst_arcsec == pytest.approx(
-        3.0 * factor
-    )
-    assert (
-        ensemble.rule_arcsec == pytest.approx(7.0 * factor) == pytest.approx(temporal.rule_arcsec)
-    )
-    bounded = [row("shift", 1.0, distribution="uniform"), rows[1]]
-    found = combined(bounded, interpretation="temporal")
-    assert found.worst_arcsec == pytest.approx(math.sqrt(3.0))
-    # A row that is random over both spreads in both.
-    both_kinds = combined([row("rest", 1.0, interpretation="mixed")], interpretation="ensemble")
-    assert both_kinds.rule_arcsec == pytest.approx(factor) and both_kinds.sigma_arcsec == 1.0
-    # Where nothing is random there is no factor.
-    assert math.isnan(combined(rows[:1], interpretation="temporal").factor)
 
 
 def of_one_sensor(
@@ -281,18 +91,6 @@ def of_one_sensor(
     grid = np.quantile(np.abs(sensors), confidence)
     side = math.copysign(1.0, mean) if mean else 1.0
     return float(at_worst), float(np.quantile(np.abs(side * grid + moments), confidence))
-
-
-def test_three_rows_that_are_random_over_both_do_not_add_linearly() -> None:
-    rows = [row(name, 6.6, interpretation="mixed") for name in ("catalogue", "pixels", "colour")]
-    found = combined(rows, confidence=0.9973, interpretation="temporal")
-    sampled, _ = of_one_sensor(rows, 0.9973, np.random.default_rng(1))
-    assert found.rule_arcsec == pytest.approx(34.3, abs=0.1) and found.worst_arcsec == 0.0
-    assert found.sampled_arcsec == pytest.approx(sampled, rel=0.02) == pytest.approx(34.2, rel=0.02)
-    asked = Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal")
-    assert Outcome(asked, found).verdict == "met"
-    # Control: the rule of before, n sigma of each added linearly, called 45 arcsec violated.
-    assert 3.0 * 6.6 * one_axis_factor(0.9973) == pytest.approx(59.4, abs=0.1)
 
 
 def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
@@ -340,7 +138,7 @@ def test_what_is_absorbed_in_part_leaves_a_limit_open() -> None:
     assert before.verdict == "violated"
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_temporal_totals_of_random_rows_against_monte_carlo(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kinds = [
@@ -409,9 +207,7 @@ OPTICS = (("A", 3.0, "opt"), ("B", 4.0, "opt"), ("C", 2.0, "-opt"))
 
 @pytest.mark.parametrize("axis", ["pitch", "cross-boresight"])
 def test_signs_count_in_a_group_that_is_at_its_worst(axis: str) -> None:
-    """A and B against C: one cause of 5 arcsec, and noise of 5; by lengths alone it was one of
-    9.
-    """
+    """A and B against C: one cause of 5 arcsec, and noise of 5."""
     axes = ["pitch"] if axis == "pitch" else ["pitch", "yaw"]
     rows = [
         row(name, sigma, one, correlation_group=group)
@@ -447,7 +243,7 @@ def test_signs_count_in_a_group_that_is_at_its_worst(axis: str) -> None:
     assert combined(plain, axis, interpretation="temporal").sampled_least_arcsec > limit
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_at_the_least_is_no_more_than_nested_draws_of_random_groups(seed: int) -> None:
     rng = np.random.default_rng([26, seed])
     rows, constant = [], []
@@ -501,35 +297,6 @@ def test_a_rule_above_what_is_sampled_violates_nothing() -> None:
         assert Outcome(asked, found).verdict == "violated"
 
 
-def test_least_and_worst_across_the_boresight_against_monte_carlo() -> None:
-    rng = np.random.default_rng(8)
-    rows = [
-        *both("ground", 3.0),
-        row("launch", 6.0),
-        row("launch", 1.0, "yaw"),
-        *both("noise", 2.0, interpretation="temporal"),
-    ]
-    found = combined(rows, "cross-boresight", 0.95, interpretation="temporal")
-    sensors = rng.standard_normal((400, 2)) * np.hypot(3.0, [6.0, 1.0])
-    quantiles = [
-        np.quantile(np.hypot(*(own[:, None] + 2.0 * rng.standard_normal((2, 4000)))), 0.95)
-        for own in sensors
-    ]
-    assert found.sampled_least_arcsec == pytest.approx(np.quantile(quantiles, 0.95), rel=0.12)
-    assert found.sampled_least_arcsec < found.sampled_arcsec
-
-
-def test_alignment_takes_away_and_brings_in() -> None:
-    rows = [
-        row("bias", 10.0, absorbed_by_alignment="yes"),
-        row("residual", 1.0, absorbed_by_alignment="caused by it"),
-        row("half", 2.0, absorbed_by_alignment="in part"),
-        row("noise", 2.0),
-    ]
-    assert combined(rows).sigma_arcsec == pytest.approx(math.sqrt(100.0 + 4.0 + 4.0))
-    assert combined(rows, scope="after alignment").sigma_arcsec == pytest.approx(3.0)
-
-
 def test_a_row_that_is_not_assessed_is_no_zero() -> None:
     missing = Contributor("pixel", "pixel spatial", "pitch")
     assert math.isnan(missing.sigma_arcsec) and not missing.assessed
@@ -548,33 +315,12 @@ def test_a_row_that_is_not_assessed_is_no_zero() -> None:
     assert not combined([row("noise", 1.0), gone]).at_least
 
 
-def test_zero_is_zero() -> None:
-    found = combined([row("none", 0.0)])
-    assert found.rule_arcsec == 0.0 and found.sampled_arcsec == 0.0
-
-
 def test_the_seed_decides() -> None:
     rows = [row("a", 1.0)]
     first, again, other = (
         draw(rows, 1000, seed).sums["before alignment", "ensemble"] for seed in (1, 1, 2)
     )
     assert np.array_equal(first, again) and not np.array_equal(first, other)
-
-
-@pytest.mark.parametrize(
-    ("confidence", "text"),
-    [
-        (0.997, "99.7"),
-        (0.95, "95"),
-        (math.erf(3.0 / math.sqrt(2.0)), "99.73"),
-        (0.9999999, "99.99999"),
-        (0.999999999999, "99.9999999999"),
-        (0.0001, "0.01"),
-        (1e-9, "0.0000001"),
-    ],
-)
-def test_a_confidence_keeps_its_nines(confidence: float, text: str) -> None:
-    assert confidence_text(confidence) == f"{text}\N{NO-BREAK SPACE}%"
 
 
 def test_a_quantile_beyond_the_samples_is_not_known() -> None:
@@ -632,16 +378,6 @@ def test_the_heaviest_tail_weighs_its_size() -> None:
     assert _heaviest([row("noise", 10.0, tail_997=GAUSSIAN_997)]) is None
 
 
-@pytest.mark.parametrize("confidence", [0.9999999, 1.0 - 1e-12])
-def test_quantiles_of_the_heaviest_tails_are_found(confidence: float) -> None:
-    assert one_axis_factor(confidence) == pytest.approx(
-        stats.norm.isf(0.5 * (1.0 - confidence)), rel=1e-12
-    )
-    spread = mixture_spread(50.0)
-    reach = half_width("gaussian", confidence, 50.0)
-    assert math.isfinite(reach) and two_axis_radius(confidence, 1.0, 1.0, spread) >= reach
-
-
 @pytest.mark.parametrize(
     ("axis", "words"), [("pitch", "a mean shifts"), ("cross-boresight", "adds the whole mean")]
 )
@@ -656,11 +392,7 @@ def test_no_reason_is_a_bare_share() -> None:
     cases = [
         ([row("noise", 1.0, tail_997=3.9)], 0.6, "more of its errors are small"),
         ([row("step", 1.0, distribution="uniform")], 0.6, "reaches further"),
-        (
-            [row("step", 0.2, distribution="uniform"), row("noise", 0.2)],
-            0.997,
-            "'step' cannot exceed a fixed size",
-        ),
+        ([row("step", 0.2, distribution="uniform"), row("noise", 0.2)], 0.997, "'step' cannot"),
         (
             [row("noise", 1.0), row("tiny", 0.001, distribution="uniform", mean_arcsec=0.5)],
             0.997,
@@ -724,10 +456,6 @@ def test_the_case_of_many_is_of_one_sided_errors_about_their_mean() -> None:
     assert 2.0 * one.mean() - one.ppf(0.05) < 0.9 * found.sampled_least_arcsec
 
 
-# --- correlated axes, and other frames
-# --------------------------------------------------------------------------------
-
-
 CORRELATION = np.array([[1.0, 0.3, -0.1], [0.3, 1.0, 0.8], [-0.1, 0.8, 1.0]])
 # The payload looks along the sensor's -X, turned by 20 degrees.
 TURN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -747,9 +475,7 @@ def correlated(sigmas: tuple[float, float, float]) -> list[Contributor]:
 
 @pytest.mark.parametrize("rotation", [None, TURN, PAYLOAD])
 @pytest.mark.parametrize("axis", ["pitch", "cross-boresight"])
-def test_totals_of_correlated_axes_in_any_frame_against_monte_carlo(
-    rotation: np.ndarray | None, axis: str
-) -> None:
+def test_totals_of_correlated_axes_in_any_frame_against_monte_carlo(rotation, axis):
     rng = np.random.default_rng(6)
     rows = [
         *correlated((4.0, 5.0, 3.0)),
@@ -829,9 +555,7 @@ def test_what_is_missing_on_an_axis_is_missing_wherever_it_is_seen() -> None:
 
 
 @pytest.mark.parametrize("coupled", [(0, 1), (1, 2), (0, 2), ()])
-def test_sampled_totals_do_not_follow_the_rounding_of_a_correlation(
-    coupled: tuple[int, ...],
-) -> None:
+def test_sampled_totals_do_not_follow_the_rounding_of_a_correlation(coupled):
     # Eigenvectors of a matrix with an axis of its own change their signs with the last digit.
     exact = np.eye(3)
     if coupled:

@@ -174,9 +174,7 @@ def test_file_states_the_conventions(tmp_path):
 
 
 def test_file_by_hand(tmp_path):
-    """Whole numbers for floats, a byte order mark and Windows line ends are all fine; defaults fill
-    in.
-    """
+    """Whole numbers for floats, a byte order mark and Windows line ends are all fine."""
     text = "[camera]\nwidth_px=10\nheight_px=8\npixel_um=5\nfocal_mm=50\nx0_px=4\ny0_px=3\n"
     path = tmp_path / "camera.toml"
     path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
@@ -186,58 +184,22 @@ def test_file_by_hand(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            file_text(focal_mm=None),
-            "section [camera]: key focal_mm is missing; add the focal length in millimetres",
-        ),
-        (
-            file_text(focal_mm=None, x0_px=None),
-            (
-                "key focal_mm is missing; add the focal length in millimetres, a number from 0.001 "
-                "to 10000000 (1 more bad"
-            ),
-        ),
+        (file_text(focal_mm=None), "section [camera]: key focal_mm is missing; add the focal"),
+        (file_text(focal_mm=None, x0_px=None), "key focal_mm is missing; add the focal length in"),
         (file_text(colour=1, focal_mm=None, x0_px=None), "(2 more bad keys)."),
         (file_text(focal_m=1), "key focal_m is unknown; did you mean focal_mm?"),
         (file_text(colour="red"), "key colour is unknown; remove it (known: width_px"),
-        (
-            file_text(k3=1e-20),
-            (
-                "key k3 is no coefficient of distortion 'brown' (it has k1, k2); remove it or set "
-                "distortion to 'brown3'."
-            ),
-        ),
-        (
-            file_text(distortion="none"),
-            "key k1 is no coefficient of distortion 'none' (it has none); remove it",
-        ),
-        (
-            file_text(width_px=10.5),
-            "key width_px is 10.5; write the width of the detector in pixels, a whole number",
-        ),
+        (file_text(k3=1e-20), "key k3 is no coefficient of distortion 'brown' (it has k1, k2);"),
+        (file_text(distortion="none"), "key k1 is no coefficient of distortion 'none'"),
+        (file_text(width_px=10.5), "key width_px is 10.5; write the width of the detector in"),
         (file_text(width_px=0), "key width_px is 0; write"),
-        (
-            file_text(focal_mm="long"),
-            "key focal_mm is 'long'; write the focal length in millimetres",
-        ),
+        (file_text(focal_mm="long"), "key focal_mm is 'long'; write the focal length in"),
         (file_text(pixel_um="true").replace("'true'", "true"), "key pixel_um is True; write"),
-        (
-            file_text(x0_px=math.inf),
-            "key x0_px is inf; write the principal point along x in pixels, a number from -1",
-        ),
+        (file_text(x0_px=math.inf), "key x0_px is inf; write the principal point along x in"),
         (file_text(k1=math.nan), "key k1 is nan; write the coefficient, a number from -1 to 1."),
-        (
-            file_text(distortion="unheard"),
-            "key distortion: distortion model 'unheard' is unknown: use one of none, k1",
-        ),
-        (
-            file_text(distortion=3),
-            "key distortion is 3; write the name of the distortion model, one of none",
-        ),
-        (
-            file_text().replace("[camera]\n", ""),
-            "section [camera] is missing; write [camera] above",
-        ),
+        (file_text(distortion="unheard"), "key distortion: distortion model 'unheard' is unknown:"),
+        (file_text(distortion=3), "key distortion is 3; write the name of the distortion model,"),
+        (file_text().replace("[camera]\n", ""), "section [camera] is missing; write [camera]"),
         ("camera = 3\n", "camera is no section; write [camera]"),
         ("units = 1\n" + file_text(), "units stands outside section [camera]"),
         ("[camera\n", "is not valid TOML"),
@@ -280,71 +242,8 @@ def test_save_asks_before_it_overwrites(tmp_path):
     assert Camera.load(path) == PAPER
 
 
-@pytest.mark.parametrize("distortion", ["brown", "brown3", "brown_tangential"])
-def test_opencv_round_trip(distortion):
-    camera = awkward(distortion)
-    matrix, dist = camera.to_opencv()
-    assert (matrix.shape, dist.shape) == ((3, 3), (5,))
-    back = Camera.from_opencv(matrix, dist, 640, 480, camera.pixel_um, name=camera.name)
-    assert back.distortion == distortion
-    np.testing.assert_allclose(back.theta, camera.theta, rtol=1e-14)
-
-
-@pytest.mark.parametrize("distortion", ["none", "k1"])
-def test_opencv_round_trip_into_a_named_model(distortion):
-    camera = awkward(distortion)
-    back = Camera.from_opencv(*camera.to_opencv(), 640, 480, camera.pixel_um, distortion=distortion)
-    np.testing.assert_allclose(back.theta, camera.theta, rtol=1e-14)
-
-
-def test_opencv_scales_by_powers_of_the_focal_length():
-    f = PAPER.focal_px
-    np.testing.assert_allclose(
-        PAPER.to_opencv()[1], [2e-10 * f**2, -3.5e-15 * f**4, 0, 0, 0], rtol=1e-15
-    )
-    camera = PAPER.replace(distortion="brown_tangential", coefficients=(0.0, 0.0, 1e-7, 2e-7))
-    np.testing.assert_allclose(camera.to_opencv()[1], [0, 0, 1e-7 * f, 2e-7 * f, 0], rtol=1e-15)
-    assert Camera.from_opencv(PAPER.to_opencv()[0], None, 1024, 1024, 12.0).coefficients == (
-        0.0,
-        0.0,
-    )
-    assert (
-        Camera.from_opencv(PAPER.to_opencv()[0], np.zeros((1, 14)), 1024, 1024, 12.0).distortion
-        == "brown"
-    )
-
-
 def matrix(fx=5000.0, fy=5000.0, skew=0.0):
     return np.array([[fx, skew, 500.0], [0.0, fy, 500.0], [0.0, 0.0, 1.0]])
-
-
-@pytest.mark.parametrize(
-    ("camera_matrix", "dist", "options", "message"),
-    [
-        (matrix(fy=5001.0), None, {"distortion": "k1"}, "square pixels; use 'k1\\+axes'"),
-        (matrix(skew=0.1), None, {"distortion": "brown"}, "skew.*use 'brown\\+axes'"),
-        (matrix().T, None, {}, "below its diagonal"),
-        (matrix(fx=-1.0, fy=-1.0), None, {}, "focal lengths are -1.0"),
-        (np.eye(2), None, {}, "3x3"),
-        (matrix(), [0, 0, 0, 0, 0, 1e-3, 0, 0], {}, "rational"),
-        (matrix(), [np.nan], {}, "finite"),
-        (matrix(), [0.1, 0, 1e-4, 0, 0.2], {}, "'brown_tangential' cannot hold k3"),
-        (matrix(), [0.1, 0.2], {"distortion": "k1"}, "'k1' cannot hold k2"),
-        (matrix(), [0.1], {"distortion": "inverse"}, "'inverse' cannot hold"),
-        (matrix(), [0.1], {"distortion": "unheard"}, "unknown"),
-    ],
-)
-def test_from_opencv_refuses_what_it_cannot_hold(camera_matrix, dist, options, message):
-    with pytest.raises(CameraError, match=message):
-        Camera.from_opencv(camera_matrix, dist, 1000, 1000, 10.0, **options)
-
-
-def test_two_focal_lengths_and_skew_of_opencv_are_axes_of_the_detector():
-    camera = Camera.from_opencv(matrix(fy=5001.0, skew=0.5), [0.1], 1000, 1000, 10.0)
-    assert camera.distortion == "brown+axes"
-    assert camera.focal_px == 5000.0
-    assert camera.axes == pytest.approx((2e-4, 1e-4), rel=1e-12)
-    np.testing.assert_allclose(camera.to_opencv()[0], matrix(fy=5001.0, skew=0.5), rtol=1e-15)
 
 
 def stated(**changes):
@@ -394,11 +293,6 @@ def test_no_other_model_makes_pixels_square():
     assert camera.data_sheet().coefficients == (0.0, 0.0, 0.1, 0.0)
     square = PAPER.replace(distortion="brown+axes")
     assert square.replace(distortion="brown") == PAPER
-
-
-def test_inverse_model_has_no_opencv_form():
-    with pytest.raises(CameraError, match="OpenCV"):
-        awkward("inverse").to_opencv()
 
 
 def test_html_escapes_the_name():

@@ -1,6 +1,4 @@
-"""Equidistant models against OpenCV's fisheye, against their formula beyond 90 degrees, and at the
-optical axis.
-"""
+"""Equidistant models against OpenCV's fisheye, against their formula beyond 90 degrees."""
 
 from __future__ import annotations
 

@@ -84,17 +84,13 @@ def null_pairs(n: int, seed: int = 0, size_b: float = 1.0) -> list[tuple[Any, An
 
 
 @lru_cache
-def null_comparisons(n: int = 400) -> tuple[CameraComparison, ...]:
+def null_comparisons(n: int = 200) -> tuple[CameraComparison, ...]:
     return tuple(compare(a, b, **SMALL) for a, b in null_pairs(n, size_b=1.7))
 
 
 @lru_cache
 def halves() -> CameraComparison:
     return compare_halves(observations(), nominal(camera()))
-
-
-# --- calibration of the tests
-# -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["p_map", "p_parameters", "p_worst"])
@@ -110,7 +106,7 @@ def test_leaving_one_covariance_out_is_found_out(name: str) -> None:
     """Negative control: the second camera taken for the truth."""
     certain = [
         compare(a, SimpleNamespace(**{**vars(b), "covariance": 1e-6 * COVARIANCE}), **SMALL)
-        for a, b in null_pairs(100, seed=1)
+        for a, b in null_pairs(60, seed=1)
     ]
     p = np.array([getattr(found, name) for found in certain])
     assert kstest(p, "uniform").pvalue < 1e-4
@@ -119,10 +115,10 @@ def test_leaving_one_covariance_out_is_found_out(name: str) -> None:
 
 def test_verdict_keeps_its_level() -> None:
     wrong = sum(found.verdict != "agree" for found in null_comparisons())
-    # 1 % of 400: more than 12 come up once in 2500 tries.
-    assert wrong <= 12
+    # 1 % of 200: more than 7 come up once in 1000 tries.
+    assert wrong <= 7
     loose = [dataclasses.replace(found, level=0.2) for found in null_comparisons()]
-    assert 0.08 < np.mean([found.verdict != "agree" for found in loose]) < 0.22
+    assert 0.06 < np.mean([found.verdict != "agree" for found in loose]) < 0.25
 
 
 def test_a_focal_length_that_changed_is_seen() -> None:
@@ -131,7 +127,7 @@ def test_a_focal_length_that_changed_is_seen() -> None:
     shift[2] = 3.0 * np.sqrt(2.0) * SD[2]
     found = [
         compare(a, SimpleNamespace(**{**vars(b), "theta": b.theta + shift}), **SMALL)
-        for a, b in null_pairs(60, seed=2)
+        for a, b in null_pairs(30, seed=2)
     ]
     assert np.mean([f.verdict == "maps differ" for f in found]) > 0.95
     # The same change along the weakest direction is what noise does all the time, and has less
@@ -139,7 +135,7 @@ def test_a_focal_length_that_changed_is_seen() -> None:
     weak = 3.0 * np.sqrt(2.0) * ROOT[:, 2]
     weak_found = [
         compare(a, SimpleNamespace(**{**vars(b), "theta": b.theta + weak}), **SMALL)
-        for a, b in null_pairs(60, seed=2)
+        for a, b in null_pairs(30, seed=2)
     ]
     assert np.mean([f.verdict != "agree" for f in weak_found]) < np.mean(
         [f.verdict != "agree" for f in found]
@@ -155,10 +151,6 @@ def test_an_estimated_noise_counts() -> None:
     assert few.p_map > 1.5 * known.p_map
     assert few.p_parameters > 1.5 * known.p_parameters
     assert few.rms_arcsec == known.rms_arcsec
-
-
-# --- the numbers
-# --------------------------------------------------------------------------------------------------
 
 
 def test_rotation_and_map_are_what_was_put_in() -> None:
@@ -203,14 +195,14 @@ def test_uncertainties_are_those_of_draws() -> None:
     """Joint sigma of map and rotation, against the scatter of compared draws."""
     many = null_comparisons()
     lengths = np.array([np.sum(f.difference_arcsec**2, axis=-1) for f in many])
-    np.testing.assert_allclose(np.sqrt(lengths.mean(axis=0)), many[0].sigma_arcsec, rtol=0.15)
+    np.testing.assert_allclose(np.sqrt(lengths.mean(axis=0)), many[0].sigma_arcsec, rtol=0.2)
     assert np.sqrt(lengths.mean(axis=0)).mean() == pytest.approx(
-        many[0].sigma_arcsec.mean(), rel=0.05
+        many[0].sigma_arcsec.mean(), rel=0.07
     )
     rotations = np.array([f.rotation_arcsec for f in many])
-    np.testing.assert_allclose(rotations.std(axis=0), many[0].rotation_sigma_arcsec, rtol=0.12)
+    np.testing.assert_allclose(rotations.std(axis=0), many[0].rotation_sigma_arcsec, rtol=0.17)
     assert np.sqrt(np.mean([f.rms_arcsec**2 for f in many])) == pytest.approx(
-        many[0].expected_rms_arcsec, rel=0.06
+        many[0].expected_rms_arcsec, rel=0.08
     )
 
 
@@ -228,10 +220,6 @@ def test_no_difference_at_all() -> None:
     found = compare(result(truth), result(truth, provenance=other()), **SMALL)
     assert found.p_map == found.p_parameters == found.p_worst == 1.0
     assert found.verdict == "agree"
-
-
-# --- which covariance
-# -------------------------------------------------------------------------------------------------
 
 
 @lru_cache
@@ -265,9 +253,7 @@ def calibrated(model: str = "brown", method: str = "efficient", part: str = "all
         (("brown", "three_stage", "all"), ("brown", "three_stage", "odd"), "B within A", None, "neither estimate"),
     ],
 )  # fmt: skip
-def test_rule_follows_from_what_the_data_share(
-    a: Any, b: Any, data: str, signs: Any, words: str
-) -> None:
+def test_rule_follows_from_what_the_data_share(a, b, data, signs, words):
     tables = {
         "all": observations(),
         "odd": split_frames(observations())[0],
@@ -344,10 +330,6 @@ def test_other_models_are_compared_by_their_directions() -> None:
     assert "p < 10⁻¹²" in apart.text
 
 
-# --- halves, files, words
-# ---------------------------------------------------------------------------------------------
-
-
 def test_splits_share_nothing_and_lose_nothing() -> None:
     obs = observations()
     for how in ("odd-even", "halves", "random"):
@@ -365,9 +347,7 @@ def test_splits_share_nothing_and_lose_nothing() -> None:
     # Frames are known by what they hold, not by their numbers.
     renumbered = dataclasses.replace(obs, frame=obs.frame + 1000)
     assert shared_frames(obs, renumbered) == 60
-    with pytest.raises(
-        ComparisonError, match="split 'thirds' is unknown: use one of odd-even, halves, random"
-    ):
+    with pytest.raises(ComparisonError, match="split 'thirds' is unknown: use one of odd-even,"):
         split_frames(obs, "thirds")
     with pytest.raises(ComparisonError, match="cannot be split in two"):
         split_frames(obs.select_frames(obs.frame_ids[:1]))
@@ -546,13 +526,9 @@ def test_tables_of_false_alarms_and_power(capsys: pytest.CaptureFixture[str]) ->
     assert rows[-1].endswith("| 1.00 | 1.00 | 1.00 |")
 
 
-# --- whole campaigns
-# --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_p_values_of_whole_campaigns_are_uniform() -> None:
-    """200 pairs of simulated and calibrated campaigns; and a richer model on the same data."""
+    """Sixty pairs of simulated and calibrated campaigns; and a richer model on the same data."""
     from starcal_uq.simulation.frames import simulate
     from starcal_uq.sky.catalogue import load_catalogue
 
@@ -562,9 +538,9 @@ def test_p_values_of_whole_campaigns_are_uniform() -> None:
         nominal(truth).replace(distortion="brown3", coefficients=(0.0, 0.0, 0.0)),
     )
     p = []
-    for seed in range(0, 400, 2):
+    for seed in range(0, 120, 2):
         first, second = (
-            simulate(stars, truth, n_frames=60, min_stars=8, sigma_px=0.05, seed=7000 + seed + i)
+            simulate(stars, truth, n_frames=25, min_stars=8, sigma_px=0.05, seed=7000 + seed + i)
             for i in range(2)
         )
         a, b, c = calibrate(first, start), calibrate(second, start), calibrate(first, richer)

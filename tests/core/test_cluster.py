@@ -1,6 +1,4 @@
-"""Work spread over processes: order, sums, and what happens when a scheduler or a worker is not
-there.
-"""
+"""Work spread over processes."""
 
 from __future__ import annotations
 

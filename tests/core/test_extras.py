@@ -78,9 +78,7 @@ NEEDS: dict[str, tuple[str, str, Callable[[Path], Any]]] = {
 
 
 @pytest.mark.parametrize("what", NEEDS)
-def test_a_missing_library_is_named_with_the_command_that_installs_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
+def test_a_missing_library_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch, what):
     library, extra, ask = NEEDS[what]
     hide(monkeypatch, library)
     words = f'{what} need {library}: run `pip install "starcal-uq[{extra}]"`'
@@ -103,9 +101,7 @@ def test_what_needs_no_extra_does_not_ask_for_it(monkeypatch: pytest.MonkeyPatch
         assert here.map(abs, [-1, 2]) == [1, 2]
 
 
-def test_a_command_ends_with_status_2(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_ends_with_status_2(tmp_path, monkeypatch, capsys):
     hide(monkeypatch, "astropy")
     (tmp_path / "night.fits").write_bytes(b"SIMPLE  ")
     arguments = [

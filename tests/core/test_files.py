@@ -62,9 +62,7 @@ def test_names_of_stars_come_back(tmp_path: Path, ending: str) -> None:
     assert ending != "csv" or (b",=" not in text and b",@" not in text and b",-1+1" not in text)
 
 
-def test_files_of_a_step_are_on_the_disk_before_they_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_of_a_step_are_on_the_disk_before_they_count(tmp_path, monkeypatch):
     done: list[str] = []
     flush, rename = os.fsync, os.replace
 

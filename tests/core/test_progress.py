@@ -34,9 +34,7 @@ def test_a_notebook_gets_one_output_that_is_replaced(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("terminal", "said"), [(True, "\rstep 1 of 900\rstep 900 of 900\n"), (False, "")]
 )
-def test_a_terminal_gets_one_line_and_a_file_nothing(
-    terminal: bool, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_terminal_gets_one_line_and_a_file_nothing(terminal, said, monkeypatch, capsys):
     monkeypatch.setattr(progress, "_shell", lambda: None)
     monkeypatch.setattr(progress, "_EVERY_S", 1e6)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)

@@ -1,6 +1,4 @@
-"""Results that are kept while a command is under way: every bit of them, found by what they depend
-on.
-"""
+"""Results that are kept while a command is under way."""
 
 from __future__ import annotations
 

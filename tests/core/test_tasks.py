@@ -1,6 +1,4 @@
-"""Tasks over processes: the same results for any number of them, Ctrl-C, and what cannot be sent to
-them.
-"""
+"""Tasks over processes: the same results for any number of them, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -50,9 +48,7 @@ def test_interrupt_keeps_what_is_done(workers: int) -> None:
 
 
 def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path: Path, root: Path) -> None:
-    """The processes import the script, which starts processes; without care both wait for each
-    other forever.
-    """
+    """The processes import the script, which starts processes."""
     script = tmp_path / "script.py"
     script.write_text(
         "from starcal_uq.core.tasks import run_tasks\n"

@@ -1,6 +1,4 @@
-"""Ctrl-C while sampling: one sentence, what was done is kept, and the run goes on to the same
-draws.
-"""
+"""Ctrl-C while sampling: one sentence, what was done is kept."""
 
 from __future__ import annotations
 

@@ -63,9 +63,7 @@ def dense(
     return x, a, covariance
 
 
-def test_sums_are_products_with_the_inverse_of_the_dense_covariance(
-    scene: tuple[sc.Observations, sc.Calibration],
-) -> None:
+def test_sums_are_products_with_the_inverse_of_the_dense_covariance(scene):
     obs, cal = scene
     x, a, covariance = dense(obs, cal, True)
     inverse = np.linalg.inv(covariance)
@@ -89,9 +87,7 @@ def test_sums_are_products_with_the_inverse_of_the_dense_covariance(
     assert np.abs((other - wanted) / unit).max() > 1e-3
 
 
-def test_the_exact_likelihood_is_that_of_the_dense_covariance(
-    scene: tuple[sc.Observations, sc.Calibration],
-) -> None:
+def test_the_exact_likelihood_is_that_of_the_dense_covariance(scene):
     obs, cal = scene
     x, a, covariance = dense(obs, cal, False)
     inverse = np.linalg.inv(covariance)

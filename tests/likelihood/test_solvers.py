@@ -1,6 +1,4 @@
-"""Solvers against NIST's Statistical Reference Datasets for nonlinear regression, and on the edges
-of their status.
-"""
+"""Solvers against NIST's Statistical Reference Datasets for nonlinear regression."""
 
 from __future__ import annotations
 

@@ -39,9 +39,7 @@ def vector(r: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["chain", "aligned", "mount"])
-def test_sums_are_those_of_one_dense_system(
-    scene: tuple[sc.Observations, sc.Calibration, RelativeAttitudes], kind: str
-) -> None:
+def test_sums_are_those_of_one_dense_system(scene, kind):
     obs, cal, known = scene
     x, a, r = pieces(obs, cal)
     unknown = np.zeros((0, 3))
@@ -107,9 +105,7 @@ def test_sums_are_those_of_one_dense_system(
     assert sums.cost > plain.cost * (1.0 + 1e-6)
 
 
-def test_the_compressed_likelihood_is_the_exact_one_within_three_sigma(
-    scene: tuple[sc.Observations, sc.Calibration, RelativeAttitudes],
-) -> None:
+def test_the_compressed_likelihood_is_the_exact_one_within_three_sigma(scene):
     obs, plain, known = scene
     cal = sc.calibrate(obs, plain.nominal, relative_attitudes=known)
     assert cal.ties is not None

@@ -1,6 +1,4 @@
-"""Matched stars out and in: FITS tables, astrometry.net's files, matches of tetra3 and tetra3rs;
-judged by astropy.
-"""
+"""Matched stars out and in: FITS tables, astrometry.net's files, matches of tetra3 and tetra3rs."""
 
 from __future__ import annotations
 
@@ -143,9 +141,7 @@ def test_a_stated_factor_goes_before_the_unit_of_the_file(tmp_path, obs):
 
 
 def test_a_fits_table_of_another_program_is_no_image(tmp_path, obs):
-    """By what the headers say: tables of any name, with long headers; images, plain or compressed
-    in a table.
-    """
+    """By what the headers say: tables of any name, with long headers."""
     table = Table(
         {name: values for name, values in obs.columns.items() if values.dtype.kind != "U"}
     )
@@ -170,9 +166,7 @@ def test_a_fits_table_of_another_program_is_no_image(tmp_path, obs):
 
 
 def test_corr_files_are_as_astrometry_net_writes_them(tmp_path, obs):
-    """By astropy's world coordinates with pixels counted from one: field and index differ where a
-    star was moved.
-    """
+    """By astropy's world coordinates with pixels counted from one."""
     moved = obs.x_px.copy()
     moved[[2, 14]] += 0.5
     Observations(**{**obs.columns, "x_px": moved}, meta=obs.meta).save(
@@ -287,9 +281,6 @@ def test_what_are_no_matches_is_refused_with_the_way_to_get_them(tmp_path, obs, 
 
 
 def test_matches_of_tetra3rs_come_in(tmp_path):
-    """Of its own centroids, of stars painted where they are known, which says from where it
-    counts.
-    """
     solver = pytest.importorskip("tetra3rs")
     y, x = np.mgrid[:200, :301]
     places = np.array([[40.3, 50.7], [200.0, 120.0], [260.5, 30.25], [100.1, 170.9]])

@@ -1,6 +1,4 @@
-"""Two exposures of one field are no repeated measurement, however poor the fit of the campaign that
-they are in.
-"""
+"""Two exposures of one field are no repeated measurement."""
 
 from __future__ import annotations
 
