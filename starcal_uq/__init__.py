@@ -40,7 +40,7 @@ register_commands(_commands)
 
 
 def _wording() -> Callable[[Finding], Any]:
-    from starcal_uq.presentation.sentences import wording
+    from starcal_uq.presentation.words.sentences import wording
 
     return wording
 

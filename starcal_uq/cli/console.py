@@ -75,21 +75,24 @@ def show_calibration(calibration: Calibration, truth: Camera | None = None) -> N
     from starcal_uq.presentation.words.effects import effects_table
     from starcal_uq.presentation.words.estimation import (
         calibration_table,
-        decided,
-        fitted_noise_text,
-        focal_length,
     )
-    from starcal_uq.presentation.words.inputs import PITCH_UNKNOWN
+    from starcal_uq.presentation.words.sentences import say as wording
+    from starcal_uq.presentation.words.sentences import told
 
     print_table(calibration_table(calibration, truth))
-    say(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
+    say(
+        f"Focal length {told('focal_length', calibration)}. Status: {calibration.status.name.lower()}."
+    )
     if calibration.camera.pixel_um is None:
-        say(PITCH_UNKNOWN)
+        say(wording("Part.pitch_unknown"))
     effects = None if calibration.effects is None else effects_table(calibration.effects)
     if effects is not None:
         print_table(effects)
-    for words in filter(None, (fitted_noise_text(calibration).strip(), *decided(calibration))):
-        say(words)
+    for words in (told("fitted_noise", calibration) + "\n" + told("decided", calibration)).split(
+        "\n"
+    ):
+        if words:
+            say(words)
 
 
 def show_posterior(posterior: Posterior) -> None:
@@ -202,12 +205,13 @@ def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera)
     """Say what follows for this camera when nothing is known of the observer's motion, and what was
     left out.
     """
-    from starcal_uq.presentation.sentences.observed import aberration_words
+    from starcal_uq.diagnostics.verdict.observed import aberration_size
+    from starcal_uq.presentation.words.sentences import say as wording
 
     if not obs.directions_declared:
         words = (
             "warning: Neither time nor observer velocity was declared: annual aberration "
-            f"{aberration_words(camera)}. "
+            f"{wording('Part.aberration', **aberration_size(camera))}. "
             "Declare --directions apparent, or --directions catalogue with a time_utc column."
         )
         tell(words)

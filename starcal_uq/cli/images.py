@@ -160,7 +160,6 @@ def inspect_command(
     """Look at the frames of a run: their stars identified, rejected, expected and missed, and what
     to do next.
     """
-    from starcal_uq.presentation.words.images import frame_text
 
     if out is not None:
         ensure_new(out, force)
@@ -168,7 +167,7 @@ def inspect_command(
     chosen = held.inspect(*(frames or ()), most=most, images=images)
     page = held.keep_frames(chosen, force=force) if out is None else sc.report(chosen, out)
     for frame in chosen if frames else ():
-        say(frame_text(frame))
+        say(frame.text)
     say(f"{chosen.text} Page: {page}")
     return Answer({"run": run, "page": page, "frames": chosen.to_dataframe(), "text": chosen.text})
 

@@ -275,25 +275,18 @@ def _show_plan(
     found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None
 ) -> list[str]:
     """Show the plan; the sentences beside its own text."""
-    from starcal_uq.presentation.words.planning import (
-        choice_table,
-        costs_sentence,
-        costs_table,
-        distortion_sentence,
-        need_sentence,
-        plan_table,
-        ties_sentence,
-    )
+    from starcal_uq.presentation.words.planning import choice_table, costs_table, plan_table
+    from starcal_uq.presentation.words.sentences import told
 
     print_table(plan_table(found))
     costs = found.effects
     if costs is not None:
         print_table(costs_table(costs))
     notes = [
-        "" if costs is None else costs_sentence(costs),
-        distortion_sentence(found),
-        ties_sentence(found),
-        *(need_sentence(found, need) for need in found.needs),
+        told("costs", costs),
+        told("open_distortion", found),
+        told("planned_ties", found),
+        *(told("need_by_part", need, spread=found.distortion) for need in found.needs),
     ]
     notes = [sentence for sentence in notes if sentence]
     words = [found.text, *notes]

@@ -12,7 +12,7 @@ from starcal_uq.core.types import AnyDict
 
 
 def _calibration(result: Any) -> AnyDict:
-    from starcal_uq.presentation.words.estimation import fallback_words, fitted_noise_text
+    from starcal_uq.presentation.words.sentences import told
 
     cal, truth = result if isinstance(result, tuple) else (result, None)
     table = cal.to_dataframe()
@@ -29,9 +29,7 @@ def _calibration(result: Any) -> AnyDict:
         "focal_mm": cal.camera.focal_mm,
         "focal_sigma_mm": None if pitch is None else cal.sigmas[2] * pitch * 1e-3,
         "parameters": table,
-        "notes": [
-            words for words in (fitted_noise_text(cal).strip(), fallback_words(cal)) if words
-        ],
+        "notes": [*filter(None, (told("fitted_noise", cal), told("fallback", cal)))],
         "effects": cal.effects,
         "ties": cal.ties,
     }

@@ -1,6 +1,6 @@
 """Findings: codes with values. The sentence of each is made where it is shown.
 
-A wing states facts. How a code is worded is known to `starcal_uq.presentation.sentences`, which
+A wing states facts. How a code is worded is known to `starcal_uq.presentation.words`, which
 stands above and registers itself here.
 """
 

@@ -88,7 +88,7 @@ def template_environment() -> Environment:
     """Jinja's environment for the templates of the package: everything is escaped but text, and a
     missing name is an error.
 
-    Templates know most functions of `starcal_uq.core.formatting`.
+    Templates know most functions of `starcal_uq.core.formatting`, and all sentences.
     """
     import jinja2
 
@@ -106,6 +106,9 @@ def template_environment() -> Environment:
         "wrapped": wrapped,
         "when": lambda utc: utc.replace("T", " ").replace("Z", " UTC"),
     }
+    from starcal_uq.presentation.words.sentences import say, told
+
+    environment.globals |= {"say": say, "told": told}
     names = ("count", "fixed", "join_words", "percent", "plural", "significant")
     environment.globals |= {name: getattr(formatting, name) for name in names}
     environment.globals["TextTable"] = TextTable

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from starcal_uq.attitude.profile import AttitudeProfile
@@ -83,12 +84,9 @@ from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.pages.budgeting import section_html
 from starcal_uq.presentation.pages.gallery import frames_html
 from starcal_uq.presentation.report.results import Results
-from starcal_uq.presentation.report.words import run_html, run_text
-from starcal_uq.presentation.sentences.budgeting import outcome_text
-from starcal_uq.presentation.sentences.estimate import models_sentence, star_sentence
+from starcal_uq.presentation.report.words import run_html
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import (
-    budgeting,
     comparison,
     diagnostics,
     effects,
@@ -100,6 +98,7 @@ from starcal_uq.presentation.words import (
     propagation,
     studies,
 )
+from starcal_uq.presentation.words.sentences import told
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError
 from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
@@ -112,19 +111,22 @@ from starcal_uq.studies.result import Study
 
 def _view(
     title: str,
-    text: Callable[[Any], str],
+    text: str | Callable[[Any], str],
     table: Callable[[Any], TextTable | Sequence[TextTable | None] | None],
     notes: Callable[[Any], Iterable[str]] = lambda result: (),
     **figures: Callable[..., Any],
 ) -> View:
-    """A result with its sentences, its table, what is worth noting, and its figures."""
+    """A result with its sentences (the name of a text, or what makes them), its table, what is worth
+    noting, and its figures.
+    """
+    said = partial(told, text) if isinstance(text, str) else text
 
     def html(result: Any) -> str:
         found = table(result)
         tables = filter(None, [found] if isinstance(found, TextTable | None) else found)
-        return card(title, text(result), *tables) + listed(notes(result))
+        return card(title, said(result), *tables) + listed(notes(result))
 
-    return View(text, html, figures)
+    return View(said, html, figures)
 
 
 def _rows(result: Any) -> TextTable:
@@ -141,24 +143,20 @@ def _messages(result: Any) -> Iterable[str]:
 
 
 VIEWS: Mapping[type, View] = {
-    Camera: _view("Camera", inputs.camera_text, inputs.camera_table),
-    AttitudeProfile: _view(
-        "Attitude profile", inputs.profile_text, lambda profile: None, _messages
-    ),
-    Observations: _view("Observations", inputs.observations_text, inputs.observations_table),
-    ExampleData: _view("Example data", inputs.example_text, lambda example: None),
-    StarCatalogue: _view("Star catalogue", inputs.catalogue_text, inputs.catalogue_table),
-    Centroids: _view("Centroids", images.centroids_text, images.centroids_table, _messages),
-    Identification: _view(
-        "Identification", images.identification_text, images.identification_table
-    ),
+    Camera: _view("Camera", "camera", inputs.camera_table),
+    AttitudeProfile: _view("Attitude profile", "profile", lambda profile: None, _messages),
+    Observations: _view("Observations", "observations", inputs.observations_table),
+    ExampleData: _view("Example data", "example", lambda example: None),
+    StarCatalogue: _view("Star catalogue", "catalogue", inputs.catalogue_table),
+    Centroids: _view("Centroids", "centroids", images.centroids_table, _messages),
+    Identification: _view("Identification", "identification", images.identification_table),
     ImageCalibration: View(images.image_calibration_text),
-    ImageRecord: View(images.image_record_text),
-    Frames: View(images.frames_text, frames_html),
-    InspectedFrame: View(images.frame_text),
+    ImageRecord: View(partial(told, "image_record")),
+    Frames: View(partial(told, "frames"), frames_html),
+    InspectedFrame: View(partial(told, "frame")),
     Calibration: _view(
         "Calibration",
-        estimation.calibration_text,
+        "calibration",
         estimation.calibration_tables,
         convergence=plot_convergence,
         effects=plot_effects,
@@ -166,45 +164,35 @@ VIEWS: Mapping[type, View] = {
     ),
     Effects: _view(
         "Effects beyond the camera",
-        effects.effects_text,
+        "effects",
         effects.effects_table,
         scales=plot_effect_scales,
     ),
     Screening: _view("Screening", estimation.screening_text, estimation.screening_table),
-    Consistency: _view(
-        "Consistency", estimation.consistency_text, estimation.consistency_table, _messages
-    ),
-    Priors: _view("Priors", inference.priors_text, _rows),
-    PriorPredictive: _view("Prior predictive check", inference.predictive_text, _rows),
-    PriorSensitivity: _view("Prior sensitivity", inference.sensitivity_text, _rows),
-    ShiftTest: _view("Shift", inference.shift_text, _rows),
+    Consistency: _view("Consistency", "consistency", estimation.consistency_table, _messages),
+    Priors: _view("Priors", "priors", _rows),
+    PriorPredictive: _view("Prior predictive check", "prior_predictive", _rows),
+    PriorSensitivity: _view("Prior sensitivity", "prior_sensitivity", _rows),
+    ShiftTest: _view("Shift", "shift", _rows),
     Posterior: _view(
         "Posterior",
-        inference.posterior_text,
+        "posterior",
         inference.posterior_table,
         lambda post: map(str, post.diagnostics.checks),
         corner=plot_corner,
         prior_posterior=plot_prior_posterior,
     ),
-    Misfit: _view(
-        "Misfit", diagnostics.misfit_text, diagnostics.misfit_table, p_values=plot_misfit
-    ),
-    Jackknife: _view(
-        "Jackknife", diagnostics.jackknife_text, diagnostics.jackknife_table, ratios=plot_jackknife
-    ),
-    StarTest: _view("Errors of the stars", star_sentence, diagnostics.star_table),
-    ModelComparison: _view(
-        "Models", models_sentence, diagnostics.models_table, models=plot_comparison
-    ),
+    Misfit: _view("Misfit", "misfit", diagnostics.misfit_table, p_values=plot_misfit),
+    Jackknife: _view("Jackknife", "jackknife", diagnostics.jackknife_table, ratios=plot_jackknife),
+    StarTest: _view("Errors of the stars", "stars", diagnostics.star_table),
+    ModelComparison: _view("Models", "models", diagnostics.models_table, models=plot_comparison),
     PredictiveCheck: _view(
-        "Posterior predictive check", diagnostics.predictive_text, diagnostics.predictive_table
+        "Posterior predictive check", "predictive", diagnostics.predictive_table
     ),
     Diagnosis: View(
-        diagnostics.diagnosis_text, diagnostics.diagnosis_html, {"diagnosis": plot_diagnosis}
+        partial(told, "diagnosis"), diagnostics.diagnosis_html, {"diagnosis": plot_diagnosis}
     ),
-    Verdict: _view(
-        "Verdict", diagnostics.verdict_text, lambda verdict: None, diagnostics.verdict_notes
-    ),
+    Verdict: _view("Verdict", "verdict", lambda verdict: None, diagnostics.verdict_notes),
     Validation: _view(
         "Validation",
         diagnostics.validation_text,
@@ -213,42 +201,42 @@ VIEWS: Mapping[type, View] = {
     ),
     CameraComparison: _view(
         "Comparison",
-        comparison.comparison_text,
+        "comparison",
         comparison.comparison_table,
         difference=plot_camera_comparison,
     ),
-    Need: View(planning.need_text),
+    Need: View(partial(told, "need")),
     Plan: _view(
         "Plan",
-        planning.plan_text,
+        "plan",
         planning.plan_table,
         forecast=plot_forecast,
         sweeps=plot_plan_sweeps,
     ),
     FrameChoice: _view(
         "Frames to take",
-        planning.choice_text,
+        "choice",
         lambda choice: TextTable.of(choice.worth()),
         choice=plot_frame_choice,
     ),
     ForecastCheck: _view(
         "Forecast against simulation", planning.check_text, _rows, check=plot_forecast_check
     ),
-    Outcome: View(outcome_text),
-    Budget: View(budgeting.headline, section_html, {"contributors": plot_budget}),
+    Outcome: View(partial(told, "outcome")),
+    Budget: View(partial(told, "budget"), section_html, {"contributors": plot_budget}),
     Agreement: _view(
         "Sampled over first order", propagation.agreement_text, propagation.agreement_table
     ),
     AttitudeError: _view(
         "Attitude error",
-        propagation.attitude_text,
+        "attitude",
         propagation.attitude_table,
         lambda error: [f"{error.n_draws} posterior draws through QUEST on {error.told_frames}."],
         contributors=plot_attitude,
     ),
     Coupling: _view(
         "Coupling",
-        propagation.coupling_text,
+        "coupling",
         propagation.coupling_table,
         correlation=plot_correlation,
         correlations=plot_correlations,
@@ -256,20 +244,20 @@ VIEWS: Mapping[type, View] = {
     ),
     FieldMap: _view(
         "Direction uncertainty over the detector",
-        propagation.field_text,
+        "field",
         propagation.field_table,
         maps=plot_field_map,
     ),
     DistortionCurve: _view(
         "Distortion",
-        propagation.distortion_text,
+        "distortion",
         lambda curve: None,
         _draws,
         curve=plot_distortion_curve,
     ),
     ErrorSpectrum: _view(
         "Error spectrum",
-        propagation.spectrum_text,
+        "spectrum",
         propagation.spectrum_table,
         _draws,
         spectrum=plot_spectrum,
@@ -277,11 +265,11 @@ VIEWS: Mapping[type, View] = {
     ),
     ThermalError: _view(
         "Attitude error over a temperature profile",
-        propagation.thermal_text,
+        "thermal",
         propagation.thermal_table,
         profile=plot_thermal,
     ),
-    Results: View(run_text, run_html),
+    Results: View(partial(told, "run"), run_html),
     Study: _view(
         "Study",
         studies.study_text,

@@ -25,7 +25,6 @@ from starcal_uq.budgeting.totals import (
     total,
     totals,
 )
-from starcal_uq.presentation.sentences.budgeting import outcome_text
 
 
 def row(name: str, sigma: float, axis: str = "pitch", **changes: object) -> Contributor:
@@ -108,7 +107,7 @@ def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
             Requirement("R", "pitch", limit, 0.9973, "before alignment", "temporal"), found
         )
         assert outcome.verdict == verdict and outcome.between == (verdict == "open")
-        assert f"is {verdict}" in outcome_text(outcome)
+        assert f"is {verdict}" in outcome.text
     # Open for another reason: half an arcsecond is left, and a row is missing.
     missing = dataclasses.replace(outcome, total=dataclasses.replace(found, not_assessed=("one",)))
     missing = dataclasses.replace(
@@ -120,7 +119,7 @@ def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
     )
     assert (
         "is open: at the least 34.3 and at most 59.4 arcsec against a limit of 45.0."
-        in outcome_text(open_one)
+        in open_one.text
     )
 
 

@@ -14,7 +14,7 @@ from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.verdict import estimate
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import symmetric_inverse
-from starcal_uq.presentation.words.estimation import fallback_words
+from starcal_uq.presentation.words.sentences import told
 from tests.helpers.outside import Campaign, campaign
 
 
@@ -44,11 +44,13 @@ def test_the_richest_model_that_the_data_determine_is_fitted_and_said(tmp_path):
     assert cal.status.ok and cal.camera.distortion == cal.nominal.distortion == "none"
     record = cal.provenance["fallback"]
     assert (record["model"], record["used"], record["status"]) == ("brown", "none", "SINGULAR")
-    assert fallback_words(cal) in cal.text and "k1 and k2 are zero" in fallback_words(cal)
+    assert told("fallback", cal) in cal.text and "k1 and k2 are zero" in told("fallback", cal)
     check = estimate.determined(cal)
     assert check.level is Level.WARN and "--model" not in check.remedy and check.remedies == PLAN
     cal.save(tmp_path / "calibration.json")
-    assert fallback_words(sc.Calibration.load(tmp_path / "calibration.json")) == fallback_words(cal)
+    assert told("fallback", sc.Calibration.load(tmp_path / "calibration.json")) == told(
+        "fallback", cal
+    )
 
 
 def test_asking_for_the_simpler_model_removes_no_condition():
@@ -75,7 +77,7 @@ def test_sigmas_are_those_without_the_coma_of_a_distortion_that_may_be_none():
     assert (
         check.level is Level.WARN
         and check.remedies == PLAN
-        and "without its coma" in fallback_words(cal)
+        and "without its coma" in told("fallback", cal)
     )
     assert np.array_equal(sc.calibrate(obs, camera, model="brown").theta, cal.theta)
     # Draws are as wide.

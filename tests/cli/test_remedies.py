@@ -527,7 +527,7 @@ def texts():
     """All texts of the package; those of the help stand in a table beside the modules."""
     for _, tree in trees():
         yield from sentences(tree)
-    for path in (PACKAGE / "cli").glob("*.toml"):
+    for path in (*(PACKAGE / "cli").glob("*.toml"), *(PACKAGE / "presentation").rglob("*.toml")):
         yield path.read_text(encoding="utf-8").replace("\\\n", "")
 
 

@@ -26,12 +26,11 @@ from starcal_uq.diagnostics.verdict import estimate
 from starcal_uq.diagnostics.verdict import limits as limiting
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.judge import judge
-from starcal_uq.diagnostics.verdict.observed import OUTLIER_P, PATTERN_P
+from starcal_uq.diagnostics.verdict.observed import OUTLIER_P, PATTERN_P, aberration_size
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.presentation.report.tables import mean_to_mcse
-from starcal_uq.presentation.sentences.observed import aberration_words
-from starcal_uq.presentation.words.diagnostics import sensitivity
+from starcal_uq.presentation.words.sentences import say, told
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.onboard import Extended
 from starcal_uq.propagation.onboard_error import OnboardError
@@ -575,7 +574,9 @@ def test_the_smallest_effect_that_few_data_show_is_said(run, found):
     few = dataclasses.replace(
         found.jackknife, effective_frames=found.jackknife.effective_frames / 20.0
     )
-    words, fewer = (sensitivity(d) for d in (found, dataclasses.replace(found, jackknife=few)))
+    words, fewer = (
+        told("sensitivity", d) for d in (found, dataclasses.replace(found, jackknife=few))
+    )
     assert (
         "120 frames" in words
         and "smooth pattern over radius" in words
@@ -588,7 +589,10 @@ def test_the_smallest_effect_that_few_data_show_is_said(run, found):
 def test_annual_aberration_is_that_of_the_field(run):
     """The sentence that named 10 degrees and 3.6 arcsec for every camera is the control."""
     narrow = run.truth.replace(focal_mm=5.0 * run.truth.focal_mm)
-    assert "5.0 arcsec" in aberration_words(run.truth) and "1.0 arcsec" in aberration_words(narrow)
+    said, of_narrow = (
+        say("Part.aberration", **aberration_size(camera)) for camera in (run.truth, narrow)
+    )
+    assert "5.0 arcsec" in said and "1.0 arcsec" in of_narrow
 
 
 def test_a_stated_noise_that_is_not_in_pixels_is_recognised():

@@ -33,8 +33,8 @@ from starcal_uq.planning.open_distortion import with_distortion
 from starcal_uq.planning.plan import plan
 from starcal_uq.planning.planned import Plan
 from starcal_uq.presentation.pages.planning import render_plan, write_plan
-from starcal_uq.presentation.words.planning import distortion_sentence
-from starcal_uq.presentation.words.planning import frames as frames_words
+from starcal_uq.presentation.words.numbers import frames as frames_words
+from starcal_uq.presentation.words.sentences import told
 from tests.helpers.outside import attitude_errors, campaign
 from tests.helpers.scenes import COEFFICIENTS, camera, observations
 
@@ -515,15 +515,15 @@ def test_a_sheet_without_distortion_leaves_a_range_and_known_distortion_none(mon
         assert known.frames_needed == pytest.approx(frames, rel=0.1) and known.frames_range is None
         assert "distortion" not in known.text
     assert f"{frames_words(int(least)).split()[0]} to {frames_words(int(most))}" in found.text
-    assert "principal point" in distortion_sentence(
-        found
-    ) and "2.1 % of barrel" in distortion_sentence(found)
+    assert "principal point" in told("open_distortion", found) and "2.1 % of barrel" in told(
+        "open_distortion", found
+    )
     table = found.to_dataframe()
     assert (table["radius_least_arcsec"] < table["radius_arcsec"]).all()
     assert (table["radius_arcsec"] < table["radius_most_arcsec"]).all()
     assert "distortion of −2.1 % to 2.1 %" in render_plan(found, {})
     rest = plan(sheet(), sky(5.0), scope="rest", distortion_percent=(-1.0, 0.5), **SMALL)
-    assert "hardly matters for the rest" in distortion_sentence(rest)
+    assert "hardly matters for the rest" in told("open_distortion", rest)
     assert plan(sheet(), sky(5.0), distortion_percent=(0.0, 0.0), **SMALL).distortion is None
 
 

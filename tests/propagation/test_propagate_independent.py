@@ -21,7 +21,7 @@ from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.records import to_plain
 from starcal_uq.observations.splits import frame_sample
 from starcal_uq.observations.table import Observations
-from starcal_uq.presentation.sentences.propagation import two_figures
+from starcal_uq.presentation.words.numbers import two_figures
 from starcal_uq.propagation import propagate as propagating
 from starcal_uq.propagation import sampled as through
 from starcal_uq.propagation.alignment import random_sky
@@ -406,10 +406,10 @@ def test_what_is_taken_where_nothing_is_said() -> None:
         True,
         True,
     ]
-    assert two_figures(2.0, 1.0) == "2.0 arcsec with the misfit found (1.0 if the model holds)"
-    assert two_figures(1.001, 1.0) == "1.0 arcsec"
+    assert two_figures((2.0, 1.0)) == "2.0 arcsec with the misfit found (1.0 if the model holds)"
+    assert two_figures((1.001, 1.0)) == "1.0 arcsec"
     assert (
-        two_figures(np.nan, 1.0)
+        two_figures((np.nan, 1.0))
         == "1.0 arcsec if the model holds (with the misfit found: not assessed)"
     )
 

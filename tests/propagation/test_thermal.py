@@ -13,7 +13,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import AttitudeProfileError, CalibrationError
 from starcal_uq.presentation.figures.propagation import plot_thermal
-from starcal_uq.presentation.words.propagation import thermal_table, thermal_text
+from starcal_uq.presentation.words.propagation import thermal_table
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.thermal import (
     TemperatureProfile,
@@ -128,8 +128,8 @@ def test_the_table_the_words_and_the_figure() -> None:
     assert len(table) == 4 * 40
     row = table[table["axis"] == "roll"].iloc[3]
     assert row["onboard_effects_arcsec"] == error.effects_arcsec[3, 2]
-    assert "alignment at −" in thermal_text(error)
-    assert "of the time are outside of the calibration's −22.0 to 5.0 °C" in thermal_text(error)
+    assert "alignment at −" in error.text
+    assert "of the time are outside of the calibration's −22.0 to 5.0 °C" in error.text
     assert thermal_table(error).rows[2][:2] == ("rest, rms over the profile", "model")
     assert len(plot_thermal(error).axes) == 2
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.budgeting.rows import confidence_text
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import count
 from starcal_uq.core.types import AnyDict, FloatArray, floats
@@ -19,7 +20,7 @@ from starcal_uq.presentation.figures.sweeps import (
     target_line,
     target_words,
 )
-from starcal_uq.presentation.words.planning import level, need_words
+from starcal_uq.presentation.words.numbers import need_words
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,7 +125,7 @@ def _radius_panel(ax: Axes, plan: Plan, n: FloatArray) -> None:
             _diamond(ax, needed, plan.target_arcsec, markersize=6, zorder=4)
         target_words(ax, plan.target_arcsec, words)
     _plain_ticks(ax)
-    title = f"Two-axis error at {level(plan.confidence)}, {_SCOPES[plan.scope]}"
+    title = f"Two-axis error at {confidence_text(plan.confidence)}, {_SCOPES[plan.scope]}"
     style.label(ax, title, "frames", "error across the boresight [arcsec]")
 
 
@@ -200,7 +201,7 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
         style.label(ax, "", _SWEEPS[name])
         if target is not None:
             target_line(ax, target)
-    at, scope = level(plan.confidence), _SCOPES[plan.scope]
+    at, scope = confidence_text(plan.confidence), _SCOPES[plan.scope]
     title, words = f"Frames for {plan.target_arcsec or 0:g} arcsec at {at}, {scope}", "frames"
     if not of_frames:
         after = count(int(plan.sweeps["n_frames"].iloc[0]))

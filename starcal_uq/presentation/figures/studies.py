@@ -27,7 +27,8 @@ from starcal_uq.presentation.figures.sweeps import (
     ticks,
     two_axes,
 )
-from starcal_uq.presentation.words.axes import axis_label, capital, value_words
+from starcal_uq.presentation.words.axes import axis_label, value_words
+from starcal_uq.presentation.words.numbers import capital
 from starcal_uq.presentation.words.studies import model_bias, simpler_models
 from starcal_uq.propagation.coupling import PART
 

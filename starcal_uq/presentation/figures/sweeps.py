@@ -10,7 +10,8 @@ import numpy as np
 from starcal_uq.core.formatting import count, fixed, significant
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, floats
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.words.axes import axis_label, capital, place, value_words
+from starcal_uq.presentation.words.axes import axis_label, place, value_words
+from starcal_uq.presentation.words.numbers import capital
 from starcal_uq.studies.findings import Sweep
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page, template_environment
-from starcal_uq.presentation.sentences.budgeting import NOT_RESOLVED, outcome_text
 from starcal_uq.presentation.tables import tex
-from starcal_uq.presentation.words.budgeting import headline, tables
+from starcal_uq.presentation.words.budgeting import NOT_RESOLVED, tables
+from starcal_uq.presentation.words.sentences import told
 from starcal_uq.propagation.attitude_error import NOT_ASSESSED
 
 if TYPE_CHECKING:
@@ -93,12 +93,12 @@ def write_xlsx(budget: Budget, path: PathLike) -> None:
     _sheet(book, "Totals", totals, [_AMBER if row.at_least else "" for row in budget.totals])
     if budget.outcomes:
         requirements = budget.requirements_dataframe()
-        requirements["in_words"] = [outcome_text(outcome) for outcome in budget.outcomes]
+        requirements["in_words"] = [told("outcome", outcome) for outcome in budget.outcomes]
         colours = {Level.FAIL: _RED, Level.WARN: _AMBER, Level.PASS: _GREEN}
         outcomes = [colours[outcome.level] for outcome in budget.outcomes]
         _sheet(book, "Requirements", requirements, outcomes)
     created = budget.provenance.created_utc
-    lines = [budget.title, created, headline(budget), *tables(budget)["explanations"]]
+    lines = [budget.title, created, told("budget", budget), *tables(budget)["explanations"]]
     notes = pd.DataFrame({"notes": [line for line in (*lines, *budget.notes) if line]})
     _sheet(book, "Notes", notes, [""] * len(notes))
     with atomic_path(path) as temporary:

@@ -17,7 +17,6 @@ from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.comparison import headline, rotation_words
 
 # Class and badge of the page.
 _VERDICTS = {
@@ -54,8 +53,6 @@ def render_comparison(comparison: CameraComparison, image: bytes) -> str:
         found=comparison,
         level=level,
         badge=badge,
-        headline=headline,
-        rotation_words=rotation_words,
         p_words=p_words,
         parameters=_parameter_table(comparison),
         sources=_source_table(comparison),

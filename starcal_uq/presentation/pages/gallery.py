@@ -29,7 +29,8 @@ from starcal_uq.pipeline.inspection import (
 )
 from starcal_uq.presentation.figures.scales import round_below
 from starcal_uq.presentation.html import page, template_environment
-from starcal_uq.presentation.words.images import frames_text, next_step, outcome_words
+from starcal_uq.presentation.words.images import next_step
+from starcal_uq.presentation.words.sentences import told
 from starcal_uq.sky.names import short_name
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def gallery(frames: Frames) -> str:
         "frames": frames,
         "shown": [_card(frame, frames) for frame in frames],
         "legend": _LEGEND,
-        "intro": frames_text(frames),
+        "intro": told("frames", frames),
         # How much residuals are enlarged: 1, 2 or 5 times a power of ten, for all frames alike.
         "factor": round_below(_ARROW * frames.camera.width_px / max(typical, 1e-6)),
         # Of a circle, px of the image.
@@ -159,7 +160,7 @@ def _card(frame: InspectedFrame, frames: Frames) -> AnyDict:
     kinds = {key: detections[detections["kind"] == kind] for key, kind, _ in _LEGEND[:3]}
     card: AnyDict = {
         "frame": frame,
-        "outcome": outcome_words(frame),
+        "outcome": told("outcome_of_frame", frame),
         "marks": {"e": stars, **kinds, "m": stars[stars["missed"]]},
         "named": kinds["i"].nsmallest(_NAMED, "mag"),
         "reasons": [(reason, n) for (_, reason), n in reasons.items()],

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from starcal_uq.budgeting.rows import confidence_text
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
 from starcal_uq.core.formatting import significant
@@ -29,6 +30,8 @@ from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import planning as words
+from starcal_uq.presentation.words.numbers import need_words, range_words, span
+from starcal_uq.presentation.words.sentences import SCOPE_NAMES, told
 
 PAGE = "plan.html"
 # Settings that the record has as they are.
@@ -98,12 +101,12 @@ def write_plan(
 def plan_record(plan: Plan) -> AnyDict:
     """The plan as plain values: settings, what is needed, and the forecast by number of frames."""
     return {
-        "verdict": words.plan_text(plan),
+        "verdict": plan.text,
         "camera": plan.camera.to_dict(),
         **{name: getattr(plan, name) for name in _RECORDED},
         "effects": None if plan.effects is None else _costs(plan.effects),
         "distortion": None if plan.distortion is None else _finite(to_plain(plan.distortion)),
-        "distortion_words": words.distortion_sentence(plan),
+        "distortion_words": told("open_distortion", plan),
         "needs": to_plain(plan.needs),
         # What a campaign does not determine is infinite.
         "forecast": _finite(plan.to_dataframe().to_dict("records")),
@@ -158,6 +161,9 @@ def render_plan(
         forecast=_forecast_table(plan),
         infinite=lambda values: not np.isfinite(values).all(),
         words=words,
+        level=confidence_text(plan.confidence),
+        scope=SCOPE_NAMES[plan.scope],
+        distortion_span="" if plan.distortion is None else span(plan.distortion),
         images=images,
     )
 
@@ -167,15 +173,15 @@ def _needs_table(plan: Plan) -> TextTable:
     spread = plan.distortion
     rows = tuple(
         (
-            words.SCOPE_NAMES[need.scope],
-            words.need_words(need, need.frames),
-            words.need_words(need, need.frames_surely),
-            *(() if spread is None else (words.range_words(*spread.frames_range(need.scope)),)),
+            SCOPE_NAMES[need.scope],
+            need_words(need, need.frames),
+            need_words(need, need.frames_surely),
+            *(() if spread is None else (range_words(spread.frames_range(need.scope)),)),
             significant(need.floor_arcsec, 3) if need.floor_arcsec > 0.0 else "0",
         )
         for need in plan.needs
     )
-    over = () if spread is None else (f"Distortion of {words.span(spread)}",)
+    over = () if spread is None else (f"Distortion of {span(spread)}",)
     heads = ("Part of the error", "On average", "In 95 % of campaigns", *over, "Floor [arcsec]")
     return TextTable(
         heads,

@@ -15,9 +15,7 @@ from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.presentation.html import page
 from starcal_uq.presentation.report import summary, tables, words
 from starcal_uq.presentation.report.results import Results
-from starcal_uq.presentation.sentences.estimate import models_sentence, star_sentence
 from starcal_uq.presentation.words import budgeting, diagnostics, effects, propagation
-from starcal_uq.presentation.words.inputs import detector_words
 
 
 def render(results: Results, figures: Mapping[str, bytes], gallery: str = "") -> str:
@@ -65,7 +63,7 @@ def context(results: Results) -> AnyDict:
 _KNOWN: AnyDict = {
     one.__name__.rpartition(".")[2]: one
     for one in (
-        *(Code, Level, Question, Remedy, worst, limits, p_words, models_sentence, star_sentence),
-        *(detector_words, diagnostics, effects, propagation, summary, tables, words),
+        *(Code, Level, Question, Remedy, worst, limits, p_words),
+        *(diagnostics, effects, propagation, summary, tables, words),
     )
 } | {"RUN": RUN, "MISFIT_P": MISFIT_P}

@@ -14,9 +14,8 @@ from starcal_uq.core.formatting import join_words, plural, significant
 from starcal_uq.core.status import Level, Note, Question, worst
 from starcal_uq.presentation.html import WIDTH, template_environment, wrapped
 from starcal_uq.presentation.report.tables import parameter_rows
-from starcal_uq.presentation.sentences.budgeting import axis_label, bound
-from starcal_uq.presentation.sentences.propagation import two_figures
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.numbers import axis_label, bound, two_figures
 from starcal_uq.propagation.attitude_error import (
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
@@ -68,8 +67,7 @@ def uses(results: Results) -> tuple[list[str], list[str]]:
     if error is not None:
         common, rest = (
             two_figures(
-                error.with_misfit_found_arcsec[row, 3],
-                error.if_model_holds_arcsec[row, 3],
+                (error.with_misfit_found_arcsec[row, 3], error.if_model_holds_arcsec[row, 3])
             )
             for row in (1, 2)
         )

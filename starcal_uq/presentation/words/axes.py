@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS
+from starcal_uq.camera.distortion import COEFFICIENTS
 from starcal_uq.core.formatting import count, fixed, join_words, pretty_unit
 from starcal_uq.core.types import AnyMapping
 from starcal_uq.studies.axes import AXES
@@ -47,11 +47,6 @@ def said(axis: str, value: Any) -> str:
     unit = _unit(axis)
     space = "" if unit in ("", "°") else " "
     return f"{axis_name(axis)} {value_words(value)}{space}{unit}"
-
-
-def capital(text: str) -> str:
-    """First letter of a sentence; the name of a parameter stays as it is written."""
-    return text if text.split(" ")[0].rstrip(":") in PARAMETERS else text[:1].upper() + text[1:]
 
 
 def place(values: AnyMapping) -> str:

@@ -5,6 +5,8 @@ differ.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
@@ -13,20 +15,15 @@ from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.findings import Finding
-from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
+from starcal_uq.core.formatting import decimals_for, fixed, significant
 from starcal_uq.core.types import AnyDict
-from starcal_uq.presentation.sentences.budgeting import (
-    NOT_RESOLVED,
-    axis_label,
-    bound,
-    outcome_text,
-    ranged,
-    without_numbers,
-)
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.numbers import axis_label, bound
+from starcal_uq.presentation.words.sentences import told
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 Row = AnyDict
+NOT_RESOLVED = "not resolved"
 # Above what rounding makes of 2.968.
 _GAUSSIAN_TAIL = 2.98
 _MIXED, *_OTHERS = ("mixed", "ensemble", "temporal")
@@ -49,44 +46,19 @@ def tables(budget: Budget) -> AnyDict:
         "totals": total_rows(budget),
         "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
         "requirements": [_requirement_row(outcome) for outcome in budget.outcomes],
-        "headline": headline(budget),
+        "headline": told("budget", budget),
         "not_drawn": len(budget.outcomes) - len(budget.comparable),
         "violated": bool(budget.violations),
         "open": bool(budget.not_assessed or budget.open_requirements),
         "explanations": explanations(budget),
         "notes": list(budget.notes),
-        "factors": factor_sentence(budget),
+        "factors": told(
+            "factor",
+            budget.confidence,
+            one_axis=one_axis_factor(budget.confidence),
+            two_axes=two_axis_radius(budget.confidence, 1.0, 1.0),
+        ),
     }
-
-
-def headline(budget: Budget) -> str:
-    """The budget in one or two sentences."""
-    parts = []
-    if budget.violations:
-        names = join_words([repr(outcome.requirement.name) for outcome in budget.violations])
-        verb = "requirement is" if len(budget.violations) == 1 else "requirements are"
-        parts.append(f"{len(budget.violations)} {verb} violated: {names}.")
-    opened = budget.open_requirements
-    unresolved = sum(outcome.unresolved for outcome in opened)
-    between = sum(outcome.between for outcome in opened)
-    for number, became in (
-        (sum(outcome.verdict == "met" for outcome in budget.outcomes), "met."),
-        (len(opened) - unresolved - between, "open: contributors are missing."),
-        (between, "open: only an upper bound exceeds the limit."),
-        (unresolved, "open: the samples do not resolve so high a confidence."),
-    ):
-        if number:
-            parts.append(f"{plural(number, 'requirement')} {became}")
-    if budget.not_assessed:
-        every = len(by_contributor(budget.rows))
-        parts.append(
-            f"{len(budget.not_assessed)} of {every} contributors are not assessed on one axis or "
-            "more, so the totals "
-            "read “at least”."
-        )
-    elif not budget.outcomes:
-        parts.append("Every contributor is assessed; no requirement was given.")
-    return " ".join(parts)
 
 
 def contributor_rows(budget: Budget) -> list[Row]:
@@ -250,7 +222,7 @@ def _requirement_row(outcome: Outcome) -> Row:
         "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),
         "verdict": outcome.verdict,
         "level": outcome.level.value,
-        "sentence": outcome_text(outcome),
+        "sentence": told("outcome", outcome),
     }
 
 
@@ -262,26 +234,43 @@ def explanations(budget: Budget) -> list[str]:
     found: dict[Any, tuple[list[str], list[Finding]]] = {}
     for entry in budget.totals:
         if entry.interpretation == _MIXED and entry.difference is not None:
-            where, alike = found.setdefault(without_numbers(entry.difference), ([], []))
+            where, alike = found.setdefault(_without_numbers(entry.difference), ([], []))
             where.append(f"{AXIS_LABELS[entry.axis]}, {entry.scope}")
             alike.append(entry.difference)
     every = len(SCOPES) * len(TOTAL_AXES)
     return [
-        f"{'All totals' if len(where) == every else '; '.join(where)}: {ranged(alike).sentence}"
+        f"{'All totals' if len(where) == every else '; '.join(where)}: {_ranged(alike).sentence}"
         for where, alike in found.values()
     ]
 
 
-def factor_sentence(budget: Budget) -> str:
-    """Which quantiles the rule took."""
-    level = budget.confidence
-    return (
-        f"At {confidence_text(level)} a Gaussian error stays within "
-        f"{fixed(one_axis_factor(level), 3)} sigma on one "
-        "axis, but the angle of two equal axes within "
-        f"{fixed(two_axis_radius(level, 1.0, 1.0), 3)} sigma per axis; "
-        "for unequal ones the factor refers to the root mean square of both."
-    )
+def _without_numbers(finding: Finding) -> tuple[Any, ...]:
+    """What findings have in common that differ in their numbers alone."""
+    return (finding.code, *(_without(value) for value in finding.values.values()))
+
+
+def _without(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_without(item) for item in value)
+    if isinstance(value, Finding):
+        return _without_numbers(value)
+    return value if isinstance(value, str) else None
+
+
+def _ranged(alike: Sequence[Finding]) -> Finding:
+    """Findings that differ in their numbers alone as one, with the ranges of these."""
+    first = alike[0]
+    columns = ([one.values[name] for one in alike] for name in first.values)
+    return replace(first, values=dict(zip(first.values, map(_range, columns), strict=True)))
+
+
+def _range(values: Sequence[Any]) -> Any:
+    first = values[0]
+    if isinstance(first, tuple):
+        return tuple(_range(items) for items in zip(*values, strict=True))
+    if isinstance(first, Finding):
+        return _ranged(values)
+    return first if isinstance(first, str) else (min(values), max(values))
 
 
 def contributors_table(budget: Budget) -> TextTable:

@@ -4,7 +4,6 @@ validation.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,9 +14,7 @@ from starcal_uq.core.formatting import (
     count,
     decimals_for,
     fixed,
-    join_words,
     p_value,
-    p_words,
     percent,
     plural,
     significant,
@@ -30,22 +27,17 @@ from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD
-from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES, Validation
-from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, MISFIT_P
+from starcal_uq.diagnostics.validation.result import Validation
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.judge import Verdict
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.presentation.tables import TextTable, with_units
+from starcal_uq.presentation.words.sentences import told
 
-NBSP = "\N{NO-BREAK SPACE}"
 # Errors this far from one posterior standard deviation are said to be too narrow or too wide; a
 # mean error this far from zero is said to be a bias.
 _SCALE_NOTED = 0.03
 _BIAS_NOTED = 0.1
-
-
-def verdict_text(verdict: Verdict) -> str:
-    """The outcome and the headline."""
-    return f"{verdict.level.value}. {verdict.headline}"
 
 
 def verdict_notes(verdict: Verdict) -> list[str]:
@@ -54,15 +46,6 @@ def verdict_notes(verdict: Verdict) -> list[str]:
     """
     here = f"{Path.cwd()}/"
     return [str(check).replace(here, "") for check in verdict.doubts]
-
-
-def misfit_text(found: Misfit) -> str:
-    """How many tests there are, and what they found."""
-    tests = f"{plural(len(found.tests), 'test')}, overall {p_words(found.p_value)}"
-    rejected = [test.name for test in found.found()]
-    return (
-        f"{tests}: {join_words(rejected)}." if rejected else f"{tests}: no unexplained structure."
-    )
 
 
 def misfit_table(found: Misfit, *, found_only: bool = False) -> TextTable:
@@ -94,16 +77,6 @@ def misfit_table(found: Misfit, *, found_only: bool = False) -> TextTable:
     )
     marks = tuple("warning" if test.p_holm < MISFIT_P else "" for test in found.tests)
     return TextTable(heads, rows, "Misfit", "llrrrrrl", marks)
-
-
-def jackknife_text(found: Jackknife) -> str:
-    """By how much frames scatter more than the formal errors say."""
-    low, high = found.ratio.min(), found.ratio.max()
-    frames = plural(found.n_frames, "frame")
-    return (
-        f"Sigmas from the scatter of {frames} are {fixed(low, 2)} to {fixed(high, 2)} times the "
-        "formal ones."
-    )
 
 
 def _sigmas(covariance: FloatArray, specs: Sequence[Parameter]) -> list[str]:
@@ -196,18 +169,6 @@ def models_table(found: ModelComparison, sigma_unit: str = "", fitted: str = "fi
     return TextTable(heads, tuple(rows), f"Distortion models{of}", "lrrrlrrr")
 
 
-def predictive_text(found: PredictiveCheck) -> str:
-    """How many statistics of the residuals lie outside what the posterior predicts."""
-    extreme = [s.name for s in found.statistics if s.extreme]
-    asked = (
-        f"{len(found.statistics)} statistics of the residuals against "
-        f"{plural(found.n_draws, 'draw')}"
-    )
-    if found.n_frames < found.of_frames:
-        asked += f" on {count(found.n_frames)} of {plural(found.of_frames, 'frame')}"
-    return f"{asked}: {'nothing extreme' if not extreme else 'extreme are ' + join_words(extreme)}."
-
-
 def predictive_table(found: PredictiveCheck) -> TextTable:
     """One row per statistic: the data, and the range of 95 % of the replicates."""
     rows = []
@@ -219,39 +180,6 @@ def predictive_table(found: PredictiveCheck) -> TextTable:
     return TextTable(
         ("Statistic", "Data", "Replicates (95 %)", "p"), tuple(rows), "Predictive checks"
     )
-
-
-def sensitivity(diagnosis: Diagnosis) -> str:
-    """The smallest effects that the checks find nine times in ten, with as many data as there
-    were.
-    """
-    found, frames = diagnosis.misfit, diagnosis.jackknife
-    smooth = [test for test in found.tests if test.against == "radius" and test.detectable_px > 0.0]
-    seen = []
-    if smooth:
-        test = smooth[-1]
-        seen.append(
-            f"a {test.name} of {significant(test.detectable_px)} px (rms per axis, beyond what "
-            "the fit absorbs)"
-        )
-    if frames is not None:
-        ratio = float(frames.detectable(JACKKNIFE_P / len(frames.ratio)).min())
-        seen.append(f"frames that make sigma {significant(ratio)} times as large as stated")
-    if not seen:
-        return ""
-    data = f"{plural(found.n_frames, 'frame')} and {plural(found.n_stars, 'star')}"
-    return (
-        f"What {data} let these checks see nine times in ten: {join_words(seen)}; less may be "
-        "there."
-    )
-
-
-def diagnosis_text(found: Diagnosis) -> str:
-    """Every part in its own words."""
-    parts = (found.misfit, found.jackknife, found.stars, found.comparison, found.predictive)
-    return "\n".join(
-        [*(part.text for part in parts if part is not None), sensitivity(found)]
-    ).strip()
 
 
 def diagnosis_html(found: Diagnosis) -> str:
@@ -276,134 +204,20 @@ def validation_table(found: Validation) -> TextTable:
 
 def validation_text(found: Validation) -> str:
     """One paragraph: is all well, on what evidence, what does not hold, and what else to know."""
-    rejected = [f for f in found.findings if f.rejected]
-    if rejected:
-        opening = "The uncertainties are not right"
-    elif found.n_replicates < ENOUGH_REPLICATES:
-        opening = (
-            f"Too few replicates to judge (give at least {ENOUGH_REPLICATES}); nothing objects "
-            "so far"
-        )
-    else:
-        opening = "The uncertainties are right as far as this validation can tell"
-    frames = found.provenance.settings.get("n_frames")
-    data = "" if frames is None else f" of {plural(int(frames), 'frame')}"
-    sentences = [
-        f"{opening}: over {plural(found.n_replicates, 'replicate')}{data}, {_evidence(found)}."
-    ]
-    if rejected:
-        sentences.append(_objections(found))
-    else:
-        first = found.findings[0]
-        sentences.append(
-            f"None of {len(found.findings)} tests objects at an overall level of 1{NBSP}% "
-            "(smallest p-value: "
-            f"{significant(first.p_value)}, {first.test} of {spoken(first.quantity)})."
-        )
-    return " ".join([*sentences, *_notes(found)])
-
-
-def spoken(quantity: str) -> str:
-    """A quantity's name within a sentence."""
-    return quantity.replace("_", " ")
-
-
-def _evidence(found: Validation) -> str:
-    coverage = found.coverage
-    low, high = int(np.argmin(coverage)), int(np.argmax(coverage))
-    half = 1.96 * np.sqrt(0.95 * 0.05 / found.n_replicates)
-    return (
-        f"95{NBSP}% intervals hold the truth in {percent(coverage[low], 3)} "
-        f"({spoken(found.quantities[low])}) to "
-        f"{percent(coverage[high], 3)} ({spoken(found.quantities[high])}) of the cases, where "
-        "chance alone moves each "
-        f"by ±{fixed(100.0 * half, 1)}{NBSP}%, and the squared errors of the camera parameters are "
-        f"{fixed(found.nees_ratio, 3)} times what the posterior covariance says, where chance "
-        "alone moves that by "
-        f"±{fixed(1.96 * found.nees_ratio_se, 3)}"
-    )
-
-
-def _objections(found: Validation) -> str:
-    """What the tests object to, and how the errors of these quantities compare with their
-    posteriors.
-    """
-    rejected = [f for f in found.findings if f.rejected]
-    parts = []
-    for test, words in (("ranks", "the ranks of {}"), ("coverage", "the coverage of {}")):
-        some = [f for f in rejected if f.test == test]
-        if some:
-            names = join_words(
-                [spoken(q) for q in found.quantities if any(f.quantity == q for f in some)]
-            )
-            parts.append(f"{words.format(names)} (p{NBSP}{_p(max(f.p_value for f in some))})")
-    if any(f.test == "NEES" for f in rejected):
-        parts.append(
-            f"the squared errors of the camera parameters (p{NBSP}{_p(found.nees_p_value)})"
-        )
-    wrong = {f.quantity for f in rejected}
-    return (
-        "What does not hold: "
-        f"{join_words(parts)}.{_how(found, [q for q in found.quantities if q in wrong])}"
-    )
-
-
-def _p(value: float) -> str:
-    return f"<{NBSP}0.0001" if value < 1e-4 else f"={NBSP}{significant(value)}"
-
-
-def _how(found: Validation, names: list[str]) -> str:
-    """Too narrow, too wide or off-centre, where the errors show it; the log likelihood has no
-    symmetric error.
-    """
-    sentences = []
-    # All of the camera parameters where they are rejected together.
-    names = [n for n in names if n != LOG_LIKELIHOOD] or list(
-        found.quantities[: found.n_parameters]
-    )
+    # Errors of camera parameters that are rejected together; the log likelihood has no symmetric
+    # error.
+    wrong = {f.quantity for f in found.findings if f.rejected} - {LOG_LIKELIHOOD}
+    names = [n for n in found.quantities if n in wrong] or found.quantities[: found.n_parameters]
     z = {name: found.z[:, found.quantities.index(name)] for name in names}
     spread = {name: float(np.std(values)) for name, values in z.items()}
-    for word, factors in (
-        ("narrow", {n: s for n, s in spread.items() if s > 1.0 + _SCALE_NOTED}),
-        ("wide", {n: 1.0 / s for n, s in spread.items() if s < 1.0 - _SCALE_NOTED}),
-    ):
-        if factors:
-            low, high = (fixed(v, 2) for v in (min(factors.values()), max(factors.values())))
-            by = f"a factor of {low}" if low == high else f"factors of {low} to {high}"
-            sentences.append(
-                f" Intervals are too {word} for {join_words([*map(spoken, factors)])}, by {by}."
-            )
-    for name, values in z.items():
-        mean = float(np.mean(values))
-        if abs(mean) > max(_BIAS_NOTED, 3.0 * spread[name] / np.sqrt(len(values))):
-            side = "high" if mean > 0 else "low"
-            sentences.append(
-                f" Estimates of {spoken(name)} are too {side} by {fixed(abs(mean), 2)} posterior "
-                "standard deviations."
-            )
-    return "".join(sentences)
-
-
-def _notes(found: Validation) -> list[str]:
-    notes = []
-    if found.failures:
-        reason, number = Counter(found.failures).most_common(1)[0]
-        total = found.n_replicates + len(found.failures)
-        notes.append(
-            f"{count(len(found.failures))} of {plural(total, 'replicate')} gave no result, "
-            f"{count(number)} of them "
-            f"because {reason}"
-        )
-    far = int(np.sum(np.abs(found.compression_error) > COMPRESSED_BOUND))
-    if far:
-        notes.append(
-            f"In {plural(far, 'replicate')} the compressed likelihood was more than "
-            f"{COMPRESSED_BOUND:g} nat from the "
-            "exact one at the truth; `sample` would have taken the exact one there."
-        )
-    if found.interrupted:
-        notes.append(
-            f"The run was interrupted after {count(found.n_replicates)} of "
-            f"{count(found.n_requested)}."
-        )
-    return notes
+    mean = {name: float(np.mean(values)) for name, values in z.items()}
+    root = np.sqrt(found.n_replicates)
+    return told(
+        "validation",
+        found,
+        chance_percent=196.0 * np.sqrt(0.95 * 0.05) / root,
+        narrow={n: s for n, s in spread.items() if s > 1.0 + _SCALE_NOTED},
+        wide={n: 1.0 / s for n, s in spread.items() if s < 1.0 - _SCALE_NOTED},
+        biased={n: m for n, m in mean.items() if abs(m) > max(_BIAS_NOTED, 3 * spread[n] / root)},
+        far=int(np.sum(np.abs(found.compression_error) > COMPRESSED_BOUND)),
+    )

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-from starcal_uq.core.formatting import decimals_for, fixed, join_words, significant
+from starcal_uq.core.formatting import decimals_for, fixed, significant
 from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
-from starcal_uq.presentation.sentences.observed import air_words
 from starcal_uq.presentation.tables import TextTable
 
 # What every effect is, in one sentence.
@@ -70,23 +69,3 @@ def _row(effect: FittedEffect) -> tuple[str, ...]:
         fixed(effect.gain_nat, 1),
         f"{effect.moved_name} by {significant(effect.moved_sigma)} sigma",
     )
-
-
-def effects_text(effects: Effects) -> str:
-    """Which effects the calibration holds, and which were not taken up, with their gains."""
-    # An earlier version did not keep what was asked for beside a selection.
-    asked = effects.names if not effects.selected else effects.asked
-    held = join_words([name for name in effects.names if name not in asked])
-    given = f"Effects that were asked for: {join_words(asked)}"
-    seen = "" if effects.air is None else f" {air_words(effects.air)}"
-    if not effects.selected:
-        return f"{given}; none were chosen by the data.{seen}"
-    least = f"an effect has to gain {fixed(effects.penalty_nat, 1)} nat"
-    gains = ", ".join(f"{name} {fixed(gain, 1)}" for name, gain in effects.refused)
-    first = (
-        f"Effects that the data ask for: {held}."
-        if held
-        else f"The data ask for no {'further ' if asked else ''}effect beyond the camera."
-    )
-    first = f"{given}. {first}{seen}" if asked else first + seen
-    return f"{first} Not taken up ({least}): {gains}." if gains else first

@@ -6,7 +6,7 @@ along every axis.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import compress
 from typing import TYPE_CHECKING, Any
 
@@ -16,17 +16,16 @@ from starcal_uq.camera.distortion import COEFFICIENTS, parameter_called
 from starcal_uq.core.formatting import (
     count,
     fixed,
-    join_words,
     percent,
-    plural,
     pretty_unit,
     significant,
 )
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.axes import axis_label, axis_name, place, value_words
+from starcal_uq.presentation.words.sentences import say
 from starcal_uq.propagation.coupling import COUPLED, PART
 from starcal_uq.studies.findings import Curve, Pair, place_of
 
@@ -48,20 +47,19 @@ def study_text(study: Study) -> str:
     """The strongest coupling, and what changes correlations."""
     sweep = study.sweep
     if not sweep.ok.any():
-        return "No cell of the study has numbers."
+        return say("Study.empty")
     pairs = sweep.coupled or sweep.pairs[:1]
     if not pairs:
-        return "No two parameters were estimated together: there is nothing to couple."
-    ends = sorted((float(pairs[0].strongest), float(pairs[0].weakest)))
+        return say("Study.uncoupled")
     axes = {cost.axis for pair in sweep.coupled for cost in pair.decoupling()}
-    changing = [axis_name(axis) for axis in sweep.axes if axis in axes]
-    changed = "Nothing that was varied changes them by much."
-    if changing:
-        changed = f"Correlations change with {join_words(changing)}."
-    return (
-        f"{len(sweep.coupled)} of {plural(len(sweep.pairs), 'pair')} of parameters are coupled "
-        f"(correlation {COUPLED:g} or more); the strongest is {dashed(pairs[0])}: "
-        f"{_span(ends, correlation_text)}. {changed}"
+    return say(
+        "Study.coupled",
+        n_coupled=len(sweep.coupled),
+        n_pairs=len(sweep.pairs),
+        limit=COUPLED,
+        strongest=dashed(pairs[0]),
+        span=_span([float(pairs[0].strongest), float(pairs[0].weakest)], correlation_text),
+        changing=[axis_name(axis) for axis in sweep.axes if axis in axes],
     )
 
 
@@ -73,13 +71,12 @@ def study_answer(study: Study) -> list[str]:
     inflation = study.data["variance_inflation"][sweep.ok] ** 0.5
     medians = inflation.median("cell").to_series().dropna()
     price = [f"{name} {significant(factor)}" for name, factor in medians.items()]
+    spans = {"rest": _span(sweep.frame_error), "common": _span(sweep.common_rotation)}
     return [
         study_text(study),
-        _weakest(study),
-        f"Coupling multiplies sigma (median over cells): {join_words(price)}.",
-        "Attitude errors of the calibration across the boresight, 1 sigma per axis: "
-        f"{_span(sweep.frame_error)} arcsec from frame to frame, {_span(sweep.common_rotation)} "
-        "arcsec common to all frames.",
+        say("Study.weakest", **_weakest(study)),
+        say("Study.price", price=price),
+        say("Study.attitude", **spans),
         *_targets(study),
         *_simpler(study),
         *_simulated(study),
@@ -92,20 +89,18 @@ def _span(values: Any, form: Callable[[float], str] = lambda value: significant(
     return low if low == high else f"{low} to {high}"
 
 
-def _weakest(study: Study) -> str:
+def _weakest(study: Study) -> AnyDict:
     """The parameters that most often make up the weakest direction, and its variance."""
     parts = np.abs(study.data["weak_direction"].values[study.ok]) >= PART
     kinds, n = np.unique(parts, axis=0, return_counts=True)
-    names = compress(study.parameter_names, kinds[np.argmax(n)])
-    variance = significant(np.median(study.data["weak_variance"].values[study.ok]))
-    return (
-        f"The weakest direction is one of {join_words(list(names))} in "
-        f"{percent(n.max() / len(parts))} of the cells, with {variance} times the variance of "
-        "uncoupled parameters (median)."
-    )
+    return {
+        "names": list(compress(study.parameter_names, kinds[np.argmax(n)])),
+        "share": n.max() / len(parts),
+        "variance": np.median(study.data["weak_variance"].values[study.ok]),
+    }
 
 
-def _targets(study: Study) -> list[str]:
+def _targets(study: Study) -> Iterator[str]:
     """Share of the places that meet each target, and the frames that it takes."""
     aims = []
     if (target := study.definition.target_arcsec) is not None:
@@ -116,15 +111,16 @@ def _targets(study: Study) -> list[str]:
         text = f"{significant(target / spec.scale)} {pretty_unit(spec.scaled_unit)} for {name}"
         sigma = study.values("sigma", parameter=name)
         aims.append((text, target, sigma, study.values("frames_needed_sigma", parameter=name)))
-    sentences = []
     for text, target, found, cells in aims:
-        met, needed = _share(study, found, target), study.sweep.over(cells).values
+        needed = study.sweep.over(cells).values
         finite = needed[np.isfinite(needed)]
-        frames = f"it takes {_span(finite, _frames)} frames" if len(finite) else "no number does it"
-        never = int(np.isinf(needed).sum())
-        floor = f"; errors of the stars prevent it in {count(never)}" if never else ""
-        sentences.append(f"The target of {text} is met in {met} places; {frames}{floor}.")
-    return sentences
+        yield say(
+            "Study.target",
+            target=text,
+            met=_share(study, found, target),
+            frames=_span(finite, _frames) if len(finite) else "",
+            never=int(np.isinf(needed).sum()),
+        )
 
 
 def _share(study: Study, found: FloatArray, limit: Any) -> str:
@@ -134,18 +130,14 @@ def _share(study: Study, found: FloatArray, limit: Any) -> str:
     return f"{count(int((numbers <= limits).sum()))} of {count(int(numbers.notnull().sum()))}"
 
 
-def _simpler(study: Study) -> list[str]:
+def _simpler(study: Study) -> Iterator[str]:
     """Share of the places where a simpler distortion model would do."""
-    sentences = []
     for model in simpler_models(study):
         bias = model_bias(study, model)
         if np.isfinite(bias).any():
             share = _share(study, bias, study.sweep.frame_error)
             left = _span(study.sweep.over(bias))
-            sentences.append(
-                f"The distortion model {model} would do in {share} places: it leaves {left} arcsec."
-            )
-    return sentences
+            yield say("Study.simpler", model=model, share=share, left=left)
 
 
 def simpler_models(study: Study) -> list[str]:
@@ -182,44 +174,27 @@ def _simulated(study: Study) -> list[str]:
                 wrong += [] if low <= 0.95 <= high else [words]
     if not rates:
         return []
-    verdict = "chance explains the differences from 95 %"
-    if wrong:
-        verdict = f"chance does not explain {join_words(wrong)}: do not use these intervals"
-    n_cells = count(int(sweep.ok.sum()))
-    held = f"95 % intervals hold the truth in {join_words(rates)} of {n_cells} simulated cells"
-    return [f"{held}; {verdict}.", *_posteriors(study)]
-
-
-def _posteriors(study: Study) -> list[str]:
-    if "posterior_sigma" not in study.data:
-        return []
-    ratio = (study.data["posterior_sigma"] / study.data["sigma"]).values[study.ok]
-    low, middle, high = (fixed(q, 2) for q in np.nanquantile(ratio, (0.05, 0.5, 0.95)))
-    return [f"Posterior sigma over forecast: median {middle}, 90 % between {low} and {high}."]
+    n_cells = int(sweep.ok.sum())
+    answer = [say("Study.covered", rates=rates, wrong=wrong, n_cells=n_cells)]
+    if "posterior_sigma" in study.data:
+        ratio = (study.data["posterior_sigma"] / study.data["sigma"]).values[study.ok]
+        low, middle, high = np.nanquantile(ratio, (0.05, 0.5, 0.95))
+        answer.append(say("Study.posteriors", low=low, middle=middle, high=high))
+    return answer
 
 
 def study_advice(study: Study) -> list[str]:
     """What a designer can do with the answer."""
     if not study.ok.any():
-        return ["Nothing can be advised: see why the cells failed."]
-    return [*_apart(study), *_cheapest(study)]
-
-
-def _apart(study: Study) -> list[str]:
-    """Where pairs are least coupled, if their sigmas are smaller there, and pairs that stay."""
+        return [say("Study.nothing_to_advise")]
     pairs: dict[str, list[str]] = {}
     for pair in study.sweep.coupled:
+        # Where the pair is least coupled, if its sigmas are smaller there.
         costs = [cost for cost in pair.decoupling() if _pays(study, pair, cost)]
         where = place({costs[0].axis: costs[0].values[costs[0].least]}) if costs else ""
         pairs.setdefault(where, []).append(dashed(pair))
-    return [
-        f"To tell {join_words(names)} apart, choose {where}."
-        if where
-        else f"No choice in this sweep tells {join_words(names)} apart and makes their sigmas "
-        "smaller: report their covariance, give one of each pair as a prior, or use a model with "
-        "fewer coefficients."
-        for where, names in pairs.items()
-    ]
+    apart = (say("Study.apart", where=where, names=names) for where, names in pairs.items())
+    return [*apart, *_cheapest(study)]
 
 
 def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
@@ -246,10 +221,10 @@ def _cheapest(study: Study) -> list[str]:
     worst = sweep.over(sweep.frame_error).max(given, skipna=False)
     kept = worst.where(worst <= target).dropna("frames", how="all")
     if not kept.size:
-        return [f"No place of this sweep keeps {target:g} arcsec: take more frames."]
+        return [say("Study.more_frames", target=target)]
     fewest = kept.isel(frames=[0])
     best = fewest.isel(fewest.argmin(list(fewest.dims)))
-    return [f"The fewest frames that keep {target:g} arcsec: {place(place_of(best))}."]
+    return [say("Study.fewest", target=target, where=place(place_of(best)))]
 
 
 def study_limits(study: Study) -> list[str]:
@@ -257,25 +232,13 @@ def study_limits(study: Study) -> list[str]:
     sweep = study.sweep
     parts = []
     if sweep.failures:
-        reasons = [f"{count(n)}: {reason.rstrip('.')}" for reason, n in sweep.failures[:3]]
-        failed = f"{count(int((~sweep.ok).sum()))} of {plural(len(sweep.ok), 'cell')}"
-        parts.append(f"{failed} have no numbers ({'; '.join(reasons)}).")
+        n, of = int((~sweep.ok).sum()), len(sweep.ok)
+        parts.append(say("Study.failed", n=n, of=of, failures=sweep.failures[:3]))
     if sweep.drawn:
-        drawn = join_words([axis_name(axis) for axis in sweep.drawn])
-        parts.append(f"Drawn from a Latin hypercube, and shown in parts of equal number: {drawn}.")
+        parts.append(say("Study.drawn", axes=[axis_name(axis) for axis in sweep.drawn]))
     elif len(study.definition.seeds) == 1:
-        parts.append("One seed: what another sky or other frames would change was not assessed.")
-    if study.definition.mode == "simulate":
-        parts.append(
-            "Simulated with the noise and the distortion model that the calibration assumes."
-        )
-    else:
-        parts.append(
-            "Fisher information assumes Gaussian noise, right identifications and a right "
-            "distortion model. Coverage, bias and convergence were not assessed; "
-            'mode = "simulate" does.'
-        )
-    return parts
+        parts.append(say("Study.one_seed"))
+    return [*parts, say(f"Study.{study.definition.mode}")]
 
 
 def study_notes(study: Study) -> list[str]:

@@ -1,0 +1,127 @@
+"""Numbers and names as sentences and tables write them, beside `core.formatting`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from starcal_uq.budgeting.file import SENSOR, Requirement
+from starcal_uq.budgeting.rows import AXIS_LABELS
+from starcal_uq.camera.distortion import PARAMETERS
+from starcal_uq.core.formatting import (
+    MINUS,
+    decimals_for,
+    fixed,
+    plural,
+    plus_minus,
+    significant,
+)
+from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
+
+if TYPE_CHECKING:
+    from starcal_uq.planning.open_distortion import DistortionRange
+    from starcal_uq.planning.planned import Need
+
+# A number, or the least and the most of several.
+Number: TypeAlias = float | tuple[float, float]
+
+
+def capital(text: str) -> str:
+    """First letter of a sentence; the name of a parameter stays as it is written."""
+    return text if text.split(" ")[0].rstrip(":") in PARAMETERS else text[:1].upper() + text[1:]
+
+
+def two_figures(pair: Sequence[float]) -> str:
+    """One error by its two names, arcsec, for a sentence; once, where both print alike."""
+    found, held = (significant(float(value)) for value in pair)
+    if np.isnan(pair[0]):
+        return f"{held} arcsec {IF_MODEL_HOLDS} ({WITH_MISFIT_FOUND}: {NOT_ASSESSED})"
+    more = f" {WITH_MISFIT_FOUND} ({held} {IF_MODEL_HOLDS})" if found != held else ""
+    return f"{found} arcsec{more}"
+
+
+def with_error(value: float, sigma: float) -> str:
+    """A number and its sigma, both with the decimals that sigma leaves."""
+    decimals = decimals_for(sigma)
+    return f"{fixed(value, decimals)} ± {fixed(sigma, decimals)}"
+
+
+def change(value: float, sigma: float) -> str:
+    """A difference with its sigma; what no one can tell from zero without digits that mean
+    nothing.
+    """
+    if not np.isfinite(sigma):
+        return significant(value) if abs(value) >= 1e-6 else "0"
+    return f"{fixed(value, 3)} ± 0.000" if sigma < 5e-4 else plus_minus(value, sigma)
+
+
+def numbers(values: Sequence[float]) -> str:
+    """Numbers of the axes, in their order."""
+    return ", ".join(significant(v) if np.isfinite(v) else "an unknown number of" for v in values)
+
+
+def digits(value: Number, n: int = 2, scale: float = 1.0) -> str:
+    """A number, or the range of several, with significant digits."""
+    ends = value if isinstance(value, tuple) else (value,)
+    return " to ".join(dict.fromkeys(significant(scale * end, n) for end in ends))
+
+
+def percents(value: Number, n: int = 2) -> str:
+    """A fraction, or the range of several, in per cent."""
+    return f"{digits(value, n, 100.0)}\N{NO-BREAK SPACE}%"
+
+
+def least(value: Any) -> Any:
+    """The least of a range, or a number itself."""
+    return value[0] if isinstance(value, tuple) else value
+
+
+def bound(value: float, at_least: bool, n: int = 3) -> str:
+    """A bound in arcsec, with "≥" while contributors are missing."""
+    if math.isnan(value):
+        return NOT_ASSESSED
+    return ("≥ " if at_least else "") + significant(value, n)
+
+
+def axis_label(asked: Requirement) -> str:
+    """Axis of a requirement, with the frame where it is not the sensor's."""
+    label = AXIS_LABELS[asked.axis]
+    return label if asked.frame == SENSOR else f"{label.split(' (')[0]} of {asked.frame}"
+
+
+def frames(number: int | None) -> str:
+    """A number of frames to three digits, rounded up; what cannot be reached is said."""
+    if number is None:
+        return "no number of frames"
+    step = 10 ** max(0, len(str(number)) - 3)
+    return plural(-(-number // step) * step, "frame")
+
+
+def need_words(need: Need, number: int | None) -> str:
+    """`frames` of a need, or why there is no number."""
+    if number is None and not need.floor_arcsec > 0.0:
+        return "more than ten million"
+    return frames(number)
+
+
+def range_words(ends: tuple[float, float]) -> str:
+    """A range of numbers of frames; infinite where none does."""
+    low, high = (frames(None if np.isinf(n) else int(n)) for n in ends)
+    return low if low == high else f"{low.removesuffix('s').removesuffix(' frame')} to {high}"
+
+
+def corner(percent: float) -> str:
+    """A displacement of the corner by the distortion."""
+    if percent == 0.0:
+        return "no distortion"
+    kind = "barrel" if percent < 0.0 else "pincushion"
+    return f"{significant(abs(percent))} % of {kind} distortion"
+
+
+def span(found: DistortionRange) -> str:
+    """The range of the displacement of the corner."""
+    low, high = (f"{significant(p)} %" for p in (found.percent[0], found.percent[-1]))
+    return f"{low} to {high}".replace("-", MINUS)

@@ -1,0 +1,149 @@
+"""All sentences: templates by the codes of findings and the names of results.
+
+The ``.toml`` files beside this module are the table. Jinja fills the templates with facts; white
+space is worth one blank, and a pilcrow ends a line. A code that is added needs a template there, and
+nothing else that knows words.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+from collections import Counter
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from starcal_uq.attitude.earth import DENSITY_SPREAD
+from starcal_uq.budgeting.rows import confidence_text
+from starcal_uq.calibration.fallback import fallback_facts
+from starcal_uq.core import formatting
+from starcal_uq.core.conflicts import words_of
+from starcal_uq.core.constants import AXES
+from starcal_uq.core.findings import Finding
+from starcal_uq.core.remedy import RUN, Remedy
+from starcal_uq.core.status import Check, Level
+from starcal_uq.core.times import TIMES_IN_NAMES
+from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES
+from starcal_uq.diagnostics.verdict.draws import propagation_difference
+from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, model_facts, star_facts
+from starcal_uq.estimation.merging import ALPHA
+from starcal_uq.estimation.undetermined import remedy_of, what_is_open
+from starcal_uq.inference.checks import COMPRESSED_BOUND
+from starcal_uq.planning.open_distortion import AFTER_FRAMES
+from starcal_uq.presentation.words import numbers
+from starcal_uq.propagation.onboard_error import with_cross
+
+# Radii that differ by less than this over the open distortion hardly matter.
+LITTLE = 1.2
+SCOPE_NAMES = {
+    "common": "common rotation",
+    "rest": "rest of the calibration",
+    "calibration": "calibration (common rotation and rest)",
+    "total": "calibration and centroid noise",
+}
+_NUMBERS = (
+    *("capital", "two_figures", "with_error", "change", "numbers", "digits", "percents", "least"),
+    *("bound", "axis_label", "frames", "need_words", "range_words", "corner", "span"),
+)
+_FORMATTING = (
+    *("count", "fixed", "join_words", "p_words", "percent", "plural", "plus_minus", "significant"),
+    "superscript",
+)
+
+
+class _Absent(jinja2.StrictUndefined):
+    """A fact that is not there: false in a condition, an error where it would be printed."""
+
+    def __bool__(self) -> bool:  # type: ignore[override]
+        return False
+
+
+@cache
+def templates() -> dict[str, str]:
+    """Templates by ``Table.NAME``; of a check, value, bound and sentence as three lines."""
+    found = {}
+    for path in files("starcal_uq.presentation.words").iterdir():
+        if path.name.endswith(".toml"):
+            for kind, entries in tomllib.loads(path.read_text("utf-8")).items():
+                for name, text in entries.items():
+                    parts = [text] if isinstance(text, str) else text.values()
+                    found[f"{kind}.{name}"] = "¶".join(parts)
+    return found
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.DictLoader(templates()), undefined=_Absent, extensions=["jinja2.ext.do"]
+    )
+    own: dict[str, Callable[..., Any]] = {
+        **{name: getattr(numbers, name) for name in _NUMBERS},
+        **{name: getattr(formatting, name) for name in _FORMATTING},
+        "all_finite": lambda values: bool(np.isfinite(values).all()),
+        "some_finite": lambda values: bool(np.isfinite(values).any()),
+        "brief": _brief,
+        "confidence_text": confidence_text,
+        "largest": lambda values: int(np.argmax(np.abs(values))),
+        "mean": np.mean,
+        "median": np.median,
+        "repr": repr,
+        "spoken": lambda name: name.replace("_", " "),
+        "typed": lambda options: shlex.join(words_of(options)),
+    }
+    environment.filters |= own
+    known: list[Any] = [Counter, fallback_facts, model_facts, propagation_difference, remedy_of]
+    known += [say, star_facts, what_is_open, with_cross]
+    environment.globals |= {one.__name__: one for one in known}
+    environment.globals |= {
+        "AFTER_FRAMES": AFTER_FRAMES,
+        "ALPHA": ALPHA,
+        "AXES": AXES,
+        "COMPRESSED_BOUND": COMPRESSED_BOUND,
+        "DENSITY_SPREAD": DENSITY_SPREAD,
+        "ENOUGH_REPLICATES": ENOUGH_REPLICATES,
+        "JACKKNIFE_P": JACKKNIFE_P,
+        "LITTLE": LITTLE,
+        "SCOPE_NAMES": SCOPE_NAMES,
+        "TIMES_IN_NAMES": TIMES_IN_NAMES,
+        "diagnose": Remedy("diagnose", (RUN,)),
+    }
+    return environment
+
+
+def say(name: str, /, **facts: Any) -> str:
+    """The text of a template, as ``Result.camera``, with these facts.
+
+    Raises
+    ------
+    LookupError
+        Where no template has this name.
+    """
+    lines = _environment().get_template(name).render(facts).split("¶")
+    tidy = (re.sub("[ \n]+", " ", line).strip(" ") for line in lines)
+    return "\n".join(filter(None, tidy))
+
+
+def told(name: str, it: object, /, **facts: Any) -> str:
+    """A text about a result, by its name in the table; empty where there is no result."""
+    return "" if it is None else say(f"Result.{name}", it=it, **facts)
+
+
+def _brief(finding: Finding) -> str:
+    """What is wrong by a note, in few words; empty where nothing is."""
+    name = f"Brief.{finding.code.name}"
+    return say(name, **finding.values) if name in templates() else ""
+
+
+def wording(finding: Finding) -> Any:
+    """The sentence of a finding; of a check value, bound and sentence."""
+    name = f"{type(finding.code).__name__}.{finding.code.name}"
+    if isinstance(finding, Check):
+        good = finding.level is Level.PASS
+        return tuple(say(name, good=good, **finding.values, **finding.bounds).split("\n", 2))
+    return say(name, **finding.values)
