@@ -375,15 +375,15 @@ WITHOUT_NAMESAKE = {
     "core": (
         "conflicts constants display documents errors facts findings remedy status times types"
     ),
-    "diagnostics": "explain jackknife misfit_test models noise_tests predictive residuals shape_sums",
+    "diagnostics": "explain misfit_test noise_tests residuals shape_sums",
     "estimation": (
-        "assemble consensus duplicates kept local_effects normals outliers "
+        "assemble duplicates kept local_effects normals "
         "partitioned_effects residual_map result scales settings stages undetermined "
         "weights"
     ),
     "identification": "brightness engine growth match nearby outcome pairs proposers pyramid result sheet",
     "images": "background detection extract fits fits_files image optics pixel_phase pixels psf raw",
-    "inference": "derived exact named power_scaling surrogate target",
+    "inference": "derived surrogate",
     "likelihood": (
         "arrays effect_likelihood effect_sums elimination fitted_effects "
         "frame_products ipopt loops/common loops/expansion loops/frames loops/unrolled "

@@ -1,6 +1,4 @@
-"""A model that the data do not determine: the richest that they do is fitted, what is asked for is
-refused.
-"""
+"""A model that the data do not determine."""
 
 from dataclasses import replace
 
@@ -97,9 +95,7 @@ def test_sigmas_are_those_without_the_coma_of_a_distortion_that_may_be_none():
 
 def test_what_is_asked_for_is_refused_with_the_model_that_converges():
     obs, camera = given(few_stars(OPEN))
-    with pytest.raises(
-        CalibrationError, match=r"do not determine .*'none' converges \(--model none, or"
-    ) as caught:
+    with pytest.raises(CalibrationError, match=r"do not determine .*'none' converges") as caught:
         sc.calibrate(obs, camera, model="brown")
     assert caught.value.status is Status.SINGULAR and caught.value.undetermined
     assert sc.calibrate(obs, camera, model="brown", throw=False).status is Status.SINGULAR
@@ -194,16 +190,16 @@ def narrow_fields(n: int) -> tuple[list[str], np.ndarray]:
 
 @pytest.mark.slow
 def test_noise_in_the_distortion_of_a_narrow_field_tells_no_principal_point(monkeypatch):
-    models, z = narrow_fields(40)
+    models, z = narrow_fields(16)
     assert np.sqrt(np.mean(z**2)) < 1.3
     # Believed, it does: many estimates come with sigmas that are too small.
     monkeypatch.setattr(
         "starcal_uq.estimation.undetermined._without_coma",
         lambda covariance, told, size, lens: np.ones(len(told)),
     )
-    models, z = narrow_fields(40)
+    models, z = narrow_fields(16)
     kept = np.array(models) == "brown"
-    assert kept.sum() > 10 and np.sqrt(np.mean(z[kept] ** 2)) > 1.4
+    assert kept.sum() > 5 and np.sqrt(np.mean(z[kept] ** 2)) > 1.4
 
 
 NOISY = (
@@ -213,7 +209,7 @@ NOISY = (
 )
 
 
-def noisy(model: str | None, n: int = 40) -> np.ndarray:
+def noisy(model: str | None, n: int = 16) -> np.ndarray:
     """Whether x0, y0, f, and k1, k2 where fitted, lie in their 95 % intervals: tables with 5 px of
     noise.
     """
@@ -231,7 +227,7 @@ def noisy(model: str | None, n: int = 40) -> np.ndarray:
 @pytest.mark.slow
 def test_intervals_of_noisy_stars_hold():
     taken = noisy(None)
-    # 600 intervals, of which five of a table go together.
-    assert 0.93 < np.mean(taken) < 0.99
+    # 240 intervals, of which five of a table go together.
+    assert 0.91 < np.mean(taken) < 0.999
     # Distortion that is left out moves f by several of its sigmas.
-    assert np.mean(noisy("none", 10)) < 0.85
+    assert np.mean(noisy("none", 6)) < 0.85

@@ -44,9 +44,7 @@ def test_floor_and_scale_are_found(floor_px: float, scale: float) -> None:
 
 
 def test_noise_below_the_floor_is_not_blown_up() -> None:
-    """Where stars state far too much, as of JPEG images, the noise is the scatter seen, and no
-    factor is left over.
-    """
+    """Where stars state far too much, as of JPEG images, the noise is the scatter seen."""
     settled = settle_noise(obs := measured(0.2, 0.05), sc.calibrate(obs, nominal(camera())))
     assert settled.sigma_px is not None
     assert np.median(settled.sigma_px) == pytest.approx(0.2, rel=0.05)
@@ -64,16 +62,16 @@ def _pulls(cal: sc.Calibration, obs: sc.Observations, chosen: np.ndarray) -> flo
 @pytest.mark.slow
 def test_errors_are_what_the_covariance_says_once_the_floor_is_known() -> None:
     truth, with_floor, without = camera().theta, [], []
-    for seed in range(200):
+    for seed in range(60):
         obs = measured(0.04, seed=seed, n_frames=30)
         plain = sc.calibrate(obs, nominal(camera()))
         settled = sc.calibrate(settle_noise(obs, plain), nominal(camera()))
         for cal, squares in ((settled, with_floor), (plain, without)):
             off = cal.theta - truth
             squares.append(off @ np.linalg.solve(cal.covariance, off) / len(off))
-    # A thousand squared errors: one sigma of their mean is 4.5 %. The control is the same stars
+    # 300 squared errors: one sigma of their mean is 8 %. The control is the same stars
     # without a floor.
-    assert np.mean(with_floor) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(with_floor) == pytest.approx(1.0, abs=0.25)
     assert np.mean(without) > 2.0
 
 

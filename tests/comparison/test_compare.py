@@ -514,6 +514,7 @@ def test_posteriors_are_compared_by_their_means() -> None:
     assert difference_rule(wide, a, ("A", "B"), None, None).signs is None
 
 
+@pytest.mark.slow
 def test_tables_of_false_alarms_and_power(capsys: pytest.CaptureFixture[str]) -> None:
     from verification.comparison_power import main
 

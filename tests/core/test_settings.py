@@ -175,6 +175,7 @@ def test_odd_numbers_in_a_study_are_refused_in_a_sentence_or_make_sense():
     assert len(refused) > 200 and len(taken) > 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, axis in AXES.items() if axis.kind != "name"])
 def test_cells_at_the_limits_of_an_axis_have_numbers_or_a_reason(name):
     """Warnings are errors here: nothing overflows on the way."""

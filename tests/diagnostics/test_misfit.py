@@ -1,6 +1,4 @@
-"""Tests for structure in the residuals: false alarms of refitted data sets, power, and tests that
-must go wrong.
-"""
+"""Tests for structure in the residuals."""
 
 from __future__ import annotations
 
@@ -19,14 +17,13 @@ from starcal_uq.diagnostics.shape_sums import ShapeSums
 from starcal_uq.diagnostics.verdict.estimate import misfit
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import View, shapes
-from starcal_uq.maths.intervals import holm
 from starcal_uq.observations.frames import StarFrames
 from tests.helpers.outside import campaign
-from tests.helpers.scenes import COEFFICIENTS, camera, nominal, observations, with_sigmas
+from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 from verification import regimes
 from verification.misfit_power import SCENARIOS, main, power
 
-N_NULL = 100
+N_NULL = 60
 
 
 def refit(obs, model="brown"):
@@ -79,6 +76,7 @@ def test_sums_are_products_of_columns_without_attitudes(stated):
     assert np.allclose(sums.raw, np.sum(many**2, axis=(1, 2)))
 
 
+@pytest.mark.slow
 def test_false_alarms_are_nominal_after_refitting():
     names, p, overall = null()
     assert len(names) == 19
@@ -97,9 +95,7 @@ def test_false_alarms_are_nominal_after_refitting():
 
 
 def test_control_shapes_that_the_fit_absorbed_are_not_nominal():
-    """Without the projection the same statistic is far from uniform: the fit has taken up most of
-    these shapes.
-    """
+    """Without the projection the same statistic is far from uniform."""
     obs = observations(n_frames=25)
     cal = sc.calibrate(obs, sc.paper.paper_start())
     family = next(
@@ -144,9 +140,7 @@ def test_no_structure_in_data_of_the_model():
     ("model", "term", "value"), [("brown3", "k3", 1.0), ("brown_tangential", "p2", -0.06)]
 )
 def test_score_tests_estimate_the_term_that_is_missing(model, term, value):
-    """The amplitude is that of the richer model: the same as fitting it, and right within its
-    error.
-    """
+    """The amplitude is that of the richer model."""
     names = list(camera(model).parameter_names[3:])
     base = camera("brown")
     order = 7 if term == "k3" else 2
@@ -176,9 +170,7 @@ def test_score_tests_estimate_the_term_that_is_missing(model, term, value):
 
 
 def test_a_pattern_of_the_detectable_size_is_found_nine_times_in_ten():
-    """Sums of squares of noise and a pattern of the announced size, drawn without the package; the
-    control is half.
-    """
+    """Sums of squares of noise and a pattern of the announced size, drawn without the package."""
     found = refit(observations(n_frames=30))
     test, rng = named(found, "decentring"), np.random.default_rng(8)
     limit = stats.f.isf(ALPHA / len(found.tests), test.dof, test.dof_residual)
@@ -210,9 +202,7 @@ def _angles(r):
 
 
 def test_what_the_data_hardly_tell_apart_is_said_to_be_so():
-    """On one patch of sky, aberration is nearly a focal length; errors of stars make its test
-    reject.
-    """
+    """On one patch of sky, aberration is nearly a focal length."""
     c = campaign(np.random.default_rng(1), n_frames=60, patch_stars=40, star_sigma_px=0.03)
     obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
     cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
@@ -272,7 +262,7 @@ def test_stated_noise_whitens_the_tests():
     assert test.amplitudes[0].value == pytest.approx(0.2, abs=5 * test.amplitudes[0].sigma + 0.01)
 
 
-@pytest.mark.parametrize("model", sorted(COEFFICIENTS))
+@pytest.mark.parametrize("model", ["none", "brown3", "brown_tangential", "inverse"])
 def test_every_model_is_tested_for_the_terms_it_lacks(model):
     found = refit(observations(model, n_frames=30), model)
     text = " ".join(test.name for test in found.tests)
@@ -301,12 +291,6 @@ def test_parts_of_the_table_give_the_same_sums(monkeypatch):
     assert len(StarFrames.from_observations(obs).parts(100)) > 5
     for a, b in zip(whole.tests, parts.tests, strict=True):
         assert a.p_value == pytest.approx(b.p_value, rel=1e-6), a.name
-
-
-def test_holm_is_that_of_the_textbook():
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([0.9, 0.8]) == pytest.approx([1.0, 1.0])
-    assert holm([]).size == 0
 
 
 def test_result_survives_json_and_shows_itself():
@@ -352,7 +336,7 @@ def test_regimes_are_written_between_their_markers(monkeypatch, tmp_path, capsys
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_power_at_a_thousand_frames(scenario):
     """What is flagged, and what cannot be: as the table of the documentation says."""
-    found = power(scenario, 8, 1000, seed=900)
+    found = power(scenario, 4, 1000, seed=900)
     if not scenario.test:
         assert found.specific < 0.14 and found.overall <= 0.25
         assert found.error < 2.0

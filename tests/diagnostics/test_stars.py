@@ -1,6 +1,4 @@
-"""Errors that stars bring along, held against a star sensor of a second make; the control has
-none.
-"""
+"""Errors that stars bring along, held against a star sensor of a second make."""
 
 from __future__ import annotations
 
@@ -95,9 +93,7 @@ def test_without_recurring_stars_the_test_says_so():
 
 @pytest.mark.slow
 def test_false_alarms_and_power_are_as_stated():
-    """On one geometry, refitted linearly: 400 draws of noise, with and without errors of the
-    stars.
-    """
+    """On one geometry, refitted linearly."""
     _, obs, cal = patch(7, 0.0)
     rng = np.random.default_rng(7)
     likelihood = MarginalLikelihood(obs, "brown")

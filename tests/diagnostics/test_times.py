@@ -1,6 +1,4 @@
-"""A wrong time is named by what it does to the directions; good tables, however hard, are not
-blamed.
-"""
+"""A wrong time is named by what it does to the directions."""
 
 from __future__ import annotations
 
@@ -176,7 +174,7 @@ def field(seed, *, twice, dated=True, **options):
 STARING = {"pointings": 1, "drift_px": 3.3}
 
 
-@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("dated", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_f_of_one_field_rests_on_aberration(dated):
     _, obs, cal = field(8, twice=False, dated=dated, **STARING)
     found = unseen_aberration(obs, cal)
@@ -250,7 +248,7 @@ def test_control_a_right_time_is_not_blamed(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", HARD)
 def test_control_no_good_table_is_blamed(kind):
-    for seed in range(10, 18):
+    for seed in range(10, 14):
         rng = np.random.default_rng(seed)
         field, noise, n = (
             rng.choice([5.0, 12.0, 25.0]),

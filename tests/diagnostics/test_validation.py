@@ -1,6 +1,4 @@
-"""Validation finds right uncertainties right and wrong ones wrong, the same for any number of
-workers.
-"""
+"""Validation finds right uncertainties right and wrong ones wrong."""
 
 from __future__ import annotations
 
@@ -25,12 +23,8 @@ from starcal_uq.core.errors import (
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD, Replication, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
-from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.maths.ranks import (
     counts_below,
-    evaluation_points,
-    uniformity_band,
-    uniformity_p_value,
 )
 from starcal_uq.presentation.figures.diagnostics import plot_validation
 from starcal_uq.presentation.figures.style import png_bytes
@@ -108,65 +102,8 @@ def good(stars, remembered):
         return validate_study(study(), stars, 100, workers=0, settings={"n_frames": 12})
 
 
-# --- ranks ---
-
-
-def test_band_and_p_value_say_the_same_and_are_exact():
-    """Of 400 uniform samples, 5 % leave the 95 % band, which are those with p < 0.05."""
-    rng = np.random.default_rng(1)
-    n, n_values = 50, 64
-    _, lower, upper = uniformity_band(n, n_values)
-    outside, below = 0, 0
-    p_values = []
-    for _ in range(400):
-        ranks = rng.integers(0, n_values, n)
-        curve = counts_below(ranks, n_values) / n
-        left = bool(np.any((curve < lower) | (curve > upper)))
-        p_values.append(uniformity_p_value(ranks, n_values))
-        outside += left
-        below += p_values[-1] < 0.05
-        assert left == (p_values[-1] < 0.05)
-    assert below == outside
-    # Counts are discrete, so that the band holds at least 95 %; four standard errors of the
-    # simulation.
-    assert 0.015 < outside / 400 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 400)
-    assert np.mean(p_values) == pytest.approx(0.5, abs=0.06)
-
-
-@pytest.mark.parametrize("n_values", [1280, 320, 1000, 7])
-def test_points_divide_the_ranks(n_values):
-    k = evaluation_points(n_values)
-    assert n_values % k == 0
-    assert 1 < k <= 128
-    assert counts_below(np.arange(n_values), n_values).tolist() == [
-        i * n_values // k for i in range(1, k)
-    ]
-
-
-@pytest.mark.parametrize(
-    "transform",
-    [lambda u: 0.5 + 0.8 * (u - 0.5), lambda u: u**1.2, lambda u: np.where(u < 0.5, u**1.5, u)],
-)
-def test_ranks_that_are_not_uniform_are_found(transform):
-    u = (np.arange(1000) + 0.5) / 1000
-    assert uniformity_p_value((u * 1280).astype(int), 1280) > 0.99
-    assert uniformity_p_value((transform(u) * 1280).astype(int), 1280) < 1e-3
-
-
-def test_binomial_interval():
-    # Clopper & Pearson's own example: 3 of 10 at 95 %.
-    assert binomial_interval(3, 10) == pytest.approx((0.0667, 0.6525), abs=1e-4)
-    assert binomial_interval(0, 10)[0] == 0.0
-    assert binomial_interval(6, 6)[1] == 1.0
-
-
-# --- one replicate ---
-
-
 def test_draws_are_those_that_users_get(stars):
-    """A replicate's moments agree with those of `sample` on its data, within what the number of
-    draws leaves open.
-    """
+    """A replicate's moments agree with those of `sample` on its data."""
     settings = study(n_frames=40, n_steps=200)
     outcome = run_replicate(settings, stars, 3)
     noise = np.random.SeedSequence(settings.seed, spawn_key=(3,)).spawn(3)[1]
@@ -210,11 +147,7 @@ def test_attitude_errors_are_what_quest_finds(stars):
     np.testing.assert_allclose(linear[2], found[2], atol=0.01)
 
 
-# --- verdicts ---
-
-
 def test_right_uncertainties_pass(good):
-    """A hundred replicates; the bounds are those that chance leaves with that many."""
     assert good.quantities == QUANTITIES
     assert good.n_replicates == 100
     assert good.failures == ()
@@ -227,8 +160,9 @@ def test_right_uncertainties_pass(good):
     assert "are right as far as" in good.text
 
 
-@pytest.mark.parametrize("model", ["none", "brown_tangential"])
-def test_other_models_pass_with_truths_from_the_prior(stars, model):
+@pytest.mark.slow
+def test_another_model_passes_with_truths_from_the_prior(stars):
+    model = "brown_tangential"
     truth = camera(model)
     # A tenth of the default: decentring of several px makes another minimum, in which a calibration
     # can end.
@@ -265,6 +199,7 @@ def test_pairs_taken_as_independent_are_found(stars, same_data):
     assert "too narrow" in found.text
 
 
+@pytest.mark.slow
 def test_pairs_with_their_curvature_put_right_pass(stars):
     found = validate_study(study(likelihood="pairs", n_frames=20), stars, 25, workers=0)
     assert not any(f.rejected for f in found.findings), found.text
@@ -272,17 +207,11 @@ def test_pairs_with_their_curvature_put_right_pass(stars):
 
 
 def test_noise_understated_by_a_fifth_is_found(stars, same_data):
-    """A tenth takes a thousand replicates to be sure of; the slow tests have them."""
     found = validate_study(study(assumed_sigma_px=0.04), stars, 40, workers=0)
     assert "sigma" not in found.quantities
     assert not found.ok
     assert found.nees_p_value < 1e-3
     assert "too narrow" in found.text
-
-
-def test_the_right_noise_given_passes(stars, same_data):
-    found = validate_study(study(assumed_sigma_px=0.05), stars, 40, workers=0)
-    assert not any(f.rejected for f in found.findings), found.text
 
 
 def test_few_replicates_are_no_verdict(stars, same_data):
@@ -308,10 +237,7 @@ def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
         raise sc.errors.CalibrationError("the stars do not suffice: add some.")
 
     monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail)
-    with pytest.raises(
-        sc.errors.CalibrationError,
-        match="no replicate gave a result; the commonest reason: the stars do not",
-    ):
+    with pytest.raises(sc.errors.CalibrationError, match="no replicate gave a result; the"):
         validate_study(study(), stars, 3, workers=0)
 
 
@@ -328,9 +254,6 @@ def test_some_failures_leave_the_other_replicates(stars, monkeypatch):
     found = validate_study(study(), stars, 4, workers=0)
     assert found.replicate.tolist() == [0, 2, 3]
     assert found.failures == ("the stars do not suffice: add some.",)
-
-
-# --- workers, interrupts ---
 
 
 def _same(a, b):
@@ -358,10 +281,10 @@ def test_workers_do_not_change_a_bit_and_progress_is_told(stars):
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
     # A longer run begins with the shorter one.
     np.testing.assert_array_equal(
-        validate_study(settings, stars, 4, workers=0).ranks, alone.ranks[:4]
+        validate_study(settings, stars, 2, workers=0).ranks, alone.ranks[:2]
     )
     assert not np.array_equal(
-        validate_study(study(seed=12), stars, 4, workers=0).ranks, alone.ranks[:4]
+        validate_study(study(seed=12), stars, 2, workers=0).ranks, alone.ranks[:2]
     )
 
 
@@ -417,9 +340,6 @@ def test_interrupt_before_the_first_result_is_an_interrupt(stars, monkeypatch):
 def test_a_local_function_cannot_go_to_workers(stars):
     with pytest.raises(SamplingError, match="top level, or use workers=0"):
         validate_study(study(likelihood=lambda obs, cal: cal.compressed), stars, 20, workers=2)
-
-
-# --- surface ---
 
 
 def test_validate_from_the_camera_alone():
@@ -510,9 +430,7 @@ def test_figure_shows_curves_bands_and_coverage(good):
 
 
 def test_log_likelihood_is_one_of_the_quantities(good):
-    """The joint log likelihood lies half a chi-square of p + 1 below its maximum, at the truth as
-    at draws.
-    """
+    """The joint log likelihood lies half a chi-square of p + 1 below its maximum."""
     at = QUANTITIES.index(LOG_LIKELIHOOD)
     assert good.units[at] == "nat"
     assert good.sd[:, at].mean() == pytest.approx(np.sqrt(6 / 2), rel=0.05)

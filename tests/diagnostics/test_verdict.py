@@ -1,6 +1,4 @@
-"""Every check of the verdict, turned to its other outcome; the test for patterns against its
-nominal false alarms.
-"""
+"""Every check of the verdict, turned to its other outcome."""
 
 from __future__ import annotations
 
@@ -192,9 +190,7 @@ def with_draws(post, change):
 
 
 def test_derived_quantities_have_diagnostics_of_their_own(run):
-    """The rotation that the first ensemble implies is another one, although no diagnostic of a
-    parameter says so.
-    """
+    """The rotation that the first ensemble implies is another one."""
     quarter = len(run.post.draws) // run.post.n_ensembles
 
     def shift(draws):
@@ -450,6 +446,7 @@ def test_a_pattern_in_the_residuals_is_found_and_sized(run):
     assert "moves directions over the field by" in check.sentence
 
 
+@pytest.mark.slow
 def test_wrong_stars_of_a_robust_estimate_are_no_pattern(run):
     rng = np.random.default_rng(2)
     wrong = rng.random(run.obs.n_stars) < 0.05
@@ -482,9 +479,7 @@ def test_wrong_stars_of_a_robust_estimate_are_no_pattern(run):
 
 
 def test_the_pattern_test_raises_no_more_false_alarms_than_it_says(run):
-    """Residuals that are noise alone, 400 times: the share of p below 5 % is 5 % within its own
-    error.
-    """
+    """Residuals that are noise alone, 400 times."""
     rng = np.random.default_rng(5)
     scale = residual_scale(run.cal, run.obs)[:, None]
     p = [
@@ -554,9 +549,7 @@ def test_propagation_that_departs_from_first_order_warns(run):
 
 
 def test_false_alarms_add_up_to_less_than_five_and_one_per_cent():
-    """By design, whatever the data are; the levels of before (5 % for structure alone) are the
-    control.
-    """
+    """By design, whatever the data are."""
     warns = [estimate.MISFIT_P, estimate.JACKKNIFE_P, estimate.STAR_P, PATTERN_P, OUTLIER_P]
     fails = [
         estimate.MISFIT_FAIL_P,

@@ -65,6 +65,7 @@ def test_an_effect_that_cannot_be_is_refused(effects: str, match: str) -> None:
         sc.calibrate(table(c), sheet(c), effects=effects)
 
 
+@pytest.mark.slow
 def test_draws_hold_the_scales_and_agree_with_the_exact_likelihood() -> None:
     rng = np.random.default_rng(5)
     c = campaign(rng, n_frames=5, stars_per_frame=30, displaced=breathing(rng, 5, 0.3))
@@ -92,7 +93,7 @@ def test_a_calibration_with_effects_survives_its_file(tmp_path) -> None:
 @pytest.mark.slow
 def test_intervals_cover_with_the_effects_selected() -> None:
     z, chosen = [], []
-    for seed in range(100):
+    for seed in range(40):
         rng = np.random.default_rng(1000 + seed)
         shifts = together(bump(0.2), breathing(rng, 30, 0.2))
         c = campaign(rng, n_frames=30, displaced=shifts)
@@ -101,22 +102,24 @@ def test_intervals_cover_with_the_effects_selected() -> None:
         z.append((cal.theta - nearest_camera(c.theta, bump(0.2))) / cal.sigmas)
     covered = np.mean(np.abs(z) < 1.96, axis=0)
     print("covered", covered, "rms", np.sqrt(np.mean(np.square(z), axis=0)))
-    assert np.mean(chosen) > 0.97
-    assert np.all((covered > 0.88) & (covered <= 1.0))
-    assert 0.92 < covered.mean() < 0.98
+    assert np.mean(chosen) > 0.94
+    # 200 intervals, few of them independent.
+    assert np.all(covered > 0.84)
+    assert 0.89 < covered.mean() < 0.99
 
 
 @pytest.mark.slow
 def test_selection_takes_up_nothing_on_clean_data() -> None:
     taken = 0
-    for seed in range(300):
+    for seed in range(120):
         c = campaign(np.random.default_rng(seed), n_frames=12)
         taken += bool(sc.calibrate(table(c), sheet(c), effects="auto").effects.names)
-    print("taken up", taken, "of 300")
-    # 1 % on average: more than 9 of 300 has a probability of 4e-4.
-    assert taken <= 9
+    print("taken up", taken, "of 120")
+    # 1 % on average: more than 5 of 120 has a probability of 2e-3.
+    assert taken <= 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weighing", ["tails", "noise"])
 def test_weights_follow_what_effects_leave(weighing: str) -> None:
     """Tails and a noise model of the camera alone would hold the field's displacement as well."""

@@ -1,6 +1,4 @@
-"""Calibration: every solver on every scene, statuses, results that save themselves, and the paper's
-numbers.
-"""
+"""Calibration: every solver on every scene, statuses, results that save themselves."""
 
 from __future__ import annotations
 
@@ -18,17 +16,20 @@ from tests.helpers.scenes import USUAL, camera, nominal, observations, with_sigm
 
 
 @pytest.mark.parametrize("model", (*USUAL, "thin_prism+axes", "fisheye"))
-@pytest.mark.parametrize("solver", ["lm", "minpack", "ipopt"])
-def test_every_solver_on_every_model(model, solver):
+def test_solvers_agree_on_every_model(model):
     truth, obs = camera(model), observations(model, max_mag=6.5)
-    cal = sc.calibrate(obs, nominal(truth), solver=solver)
-    reference = sc.calibrate(obs, nominal(truth))
+    cal = sc.calibrate(obs, nominal(truth))
     assert cal.status is Status.CONVERGED
     z = (cal.theta - truth.theta) / cal.sigmas
     assert np.max(np.abs(z)) < 4.0
-    assert np.max(np.abs(cal.pair_theta - reference.pair_theta) / cal.sigmas) < 1e-4
-    assert np.max(np.abs(cal.theta - reference.theta) / cal.sigmas) < 1e-5
     assert cal.sigma == pytest.approx(0.05, rel=0.1)
+    for solver in (
+        ("minpack", "ipopt") if model in ("brown", "inverse", "fisheye") else ("minpack",)
+    ):
+        other = sc.calibrate(obs, nominal(truth), solver=solver)
+        assert other.status is Status.CONVERGED
+        assert np.max(np.abs(other.pair_theta - cal.pair_theta) / cal.sigmas) < 1e-4
+        assert np.max(np.abs(other.theta - cal.theta) / cal.sigmas) < 1e-5
 
 
 def test_three_stages_as_the_paper_describes_them():
@@ -57,9 +58,6 @@ def test_three_stages_as_the_paper_describes_them():
 
 
 def test_distortion_ignored_moves_the_focal_length_below_the_truth():
-    """Eq. 14 read as ideal to distorted reproduces the paper's stage 1 (70.2122 mm in its
-    Table 2).
-    """
     obs = observations(n_frames=300)
     cal = sc.calibrate(obs, sc.paper.paper_start())
     focal_mm = cal.stages[0].theta[2] * 0.012
@@ -82,25 +80,24 @@ def test_residuals_and_attitudes_are_those_of_the_estimate():
     assert np.allclose(cal.correlation.diagonal(), 1.0)
 
 
+@pytest.mark.slow
 def test_stated_noise_is_used():
-    """Stars with large stated noise must count less: the estimate is better than without the
-    column.
-    """
+    """Stars with large stated noise must count less."""
     clean = observations(n_frames=60, sigma_px=0.0)
     errors, claimed, unweighted = [], [], []
-    for seed in range(40):
+    for seed in range(25):
         obs = with_sigmas(clean, seed)
         cal = sc.calibrate(obs, sc.paper.paper_start())
         errors.append(cal.theta - camera().theta)
         claimed.append(cal.sigmas)
-        # These hardly change from seed to seed: ten give their mean.
-        if seed < 10:
+        # These hardly change from seed to seed: five give their mean.
+        if seed < 5:
             unweighted.append(
                 sc.calibrate(dataclasses.replace(obs, sigma_px=None), sc.paper.paper_start()).sigmas
             )
     assert (np.mean(claimed, axis=0) < 0.65 * np.mean(unweighted, axis=0)).all()
     ratio = np.std(errors, axis=0) / np.mean(claimed, axis=0)
-    bound = 4.0 / np.sqrt(2 * 40)
+    bound = 4.0 / np.sqrt(2 * 25)
     assert np.allclose(ratio, 1.0, atol=bound)
     # Control: the unweighted sigmas would not pass for the spread of the weighted estimates.
     assert not np.allclose(np.std(errors, axis=0) / np.mean(unweighted, axis=0), 1.0, atol=0.1)
@@ -124,11 +121,9 @@ def test_repeats_bit_for_bit():
     assert np.array_equal(a.covariance, b.covariance)
 
 
-@pytest.mark.parametrize("k1", [-2e-7, -8e-8, 8e-8, 2e-7])
+@pytest.mark.parametrize("k1", [-2e-7, 2e-7])
 def test_distortion_of_tens_of_pixels(k1):
-    """The fit without distortion then lands hundreds of pixels off the axis; the result must not
-    stay there.
-    """
+    """The fit without distortion then lands hundreds of pixels off the axis."""
     truth = camera("brown").replace(coefficients=(k1, 0.0))
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     obs = sc.simulate(stars, truth, n_frames=60, min_stars=8, sigma_px=0.05, seed=3)
@@ -191,13 +186,13 @@ def test_ipopt_keeps_the_principal_point_on_the_detector():
 
 
 @pytest.mark.slow
-def test_a_thousand_random_starts_reach_one_optimum():
+def test_random_starts_reach_one_optimum():
     """Principal point anywhere within 15 % of the width of the centre, focal length within 10 %."""
     obs = observations(n_frames=25)
     reference = sc.calibrate(obs, sc.paper.paper_start())
     rng = np.random.default_rng(8)
     failures, worst = 0, 0.0
-    for _ in range(1000):
+    for _ in range(150):
         x, y = 511.5 + rng.uniform(-0.15, 0.15, 2) * 1024
         start = sc.paper.paper_start().replace(
             x0_px=x, y0_px=y, focal_mm=sc.paper.paper_camera().focal_mm * rng.uniform(0.9, 1.1)
@@ -211,11 +206,11 @@ def test_a_thousand_random_starts_reach_one_optimum():
     assert failures == 0
 
 
-def _replicates(seeds, sigma_claimed=1.0):
+def _replicates(seeds):
     stars, truth = sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera()
     errors, sigmas, pair_errors, pair_sigmas = [], [], [], []
     for seed in seeds:
-        obs = sc.simulate(stars, truth, n_frames=1000, min_stars=10, sigma_px=0.05, seed=seed)
+        obs = sc.simulate(stars, truth, n_frames=200, min_stars=10, sigma_px=0.05, seed=seed)
         cal = sc.calibrate(obs, sc.paper.paper_start())
         errors.append(cal.theta - truth.theta)
         sigmas.append(cal.sigmas)
@@ -226,12 +221,7 @@ def _replicates(seeds, sigma_claimed=1.0):
 
 @pytest.mark.slow
 def test_the_spread_over_seeds_is_the_sigma_that_is_reported():
-    """Paper's set-up: variance ratios 0.8-1.2 and coverage 91-98 %, against sigma and Cramer-Rao
-    bound.
-
-    400 seeds rather than 200: with 200 a right 95 % interval leaves 98 % once in ninety times for
-    each parameter.
-    """
+    """Paper's set-up: variance ratios 0.8-1.2 and coverage 91-98 %."""
     errors, sigmas, pair_errors, pair_sigmas = _replicates(range(400))
     for e, s in ((errors, sigmas), (pair_errors, pair_sigmas)):
         ratio = np.mean(e**2, axis=0) / np.mean(s**2, axis=0)
@@ -246,8 +236,9 @@ def test_the_spread_over_seeds_is_the_sigma_that_is_reported():
     naive = sigmas / 2.5
     assert (np.mean(np.abs(errors / naive) < 1.96, axis=0) < 0.91).all()
     # Cramer-Rao bound of the true noise, by an independent path: the information at the truth
-    # scaled to 0.05 px.
-    assert np.allclose(np.mean(sigmas, axis=0), [0.14, 0.14, 0.026, 0.36e-10, 0.068e-15], rtol=0.06)
+    # scaled to 0.05 px; a fifth of the paper's 1000 frames.
+    bound = np.sqrt(5.0) * np.array([0.14, 0.14, 0.026, 0.36e-10, 0.068e-15])
+    assert np.allclose(np.mean(sigmas, axis=0), bound, rtol=0.06)
 
 
 def test_intervals_without_sampling_are_students_and_stand_in_the_table():

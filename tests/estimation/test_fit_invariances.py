@@ -1,6 +1,4 @@
-"""What must not change an estimate, or changes it in a known way: axes of sky and detector, orders,
-names, units.
-"""
+"""What must not change an estimate, or changes it in a known way."""
 
 from functools import cache
 

@@ -1,6 +1,4 @@
-"""From narrow to wide fields, from 64 to 20,000 px: a right answer with an honest sigma, or what is
-left open.
-"""
+"""From narrow to wide fields, from 64 to 20,000 px."""
 
 import numpy as np
 import pytest
@@ -159,9 +157,7 @@ def test_every_way_to_an_estimate_has_an_honest_sigma(way, name):
 )
 def test_a_filter_that_went_astray_is_sent_to_what_it_has(method, name, status):
     c = observed(name, 1)
-    with pytest.raises(
-        CalibrationError, match="use method='efficient', which weighs all frames together"
-    ) as caught:
+    with pytest.raises(CalibrationError, match="use method='efficient', which weighs") as caught:
         sc.calibrate(sc.Observations(**c.columns), sheet(c, name), method=method)
     assert caught.value.status is status
 
@@ -282,24 +278,9 @@ def in_a_corner(rng):
 
 
 LEFT_OPEN = {
-    "one radius": (
-        on_a_ring,
-        {},
-        "brown",
-        "do not tell k1 and k2 apart: stars at more radii are needed",
-    ),
-    "one radius, without noise": (
-        on_a_ring,
-        {"sigma_px": 1e-7},
-        "brown",
-        "stars at more radii are needed",
-    ),
-    "the middle of the field": (
-        in_the_middle,
-        {},
-        "k1",
-        "k1.* are needed, or a distortion model with fewer",
-    ),
+    "one radius": (on_a_ring, {}, "brown", "do not tell k1 and k2 apart: stars at more radii are"),
+    "one radius, without noise": (on_a_ring, {"sigma_px": 1e-07}, "brown", "stars at more radii"),
+    "the middle of the field": (in_the_middle, {}, "k1", "k1.* are needed, or a distortion model"),
     "a field of half a degree, 64 px": (
         lambda rng: rng.uniform(-28.0, 28.0, (2, 10)),
         {"n_frames": 20, "size_px": 64, "field_deg": 0.5, "corner_px": (0.0, 0.0)},

@@ -1,6 +1,4 @@
-"""Merged runs are what a calibration on all stars gives, and runs of different cameras are told
-apart.
-"""
+"""Merged runs are what a calibration on all stars gives."""
 
 from __future__ import annotations
 
@@ -21,10 +19,9 @@ from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.estimation.merging import Consistency, consistency_of, merge, welch_james
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.sample import sample
-from starcal_uq.likelihood.compressed import Optimum, moved, optimum, scaled, total
+from starcal_uq.likelihood.compressed import Optimum, moved, optimum, total
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.table import Observations, load_observations
-from starcal_uq.propagation.coupling import coupling
 from starcal_uq.runs.merge import join_observations, merge_runs
 from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
@@ -74,25 +71,6 @@ def write(folder: Path, obs: Observations, cal: Calibration) -> Path:
     cal.nominal.save(folder / "camera.toml")
     cal.save(folder / "calibration.json")
     return folder
-
-
-@pytest.mark.parametrize("model", ["none", "brown", "brown_tangential", "inverse"])
-def test_moving_the_point_of_expansion_changes_no_value(model: str) -> None:
-    cal = calibrate(scenes.observations(model, n_frames=20), scenes.nominal(scenes.camera(model)))
-    rng = np.random.default_rng(1)
-    p = len(cal.theta)
-    matrix = cal.compressed.whitening @ (np.eye(p) + 0.3 * rng.standard_normal((p, p)))
-    whitening = (
-        np.linalg.cholesky(matrix @ matrix.T / np.outer(cal.sigmas, cal.sigmas))
-        * cal.sigmas[:, None]
-    )
-    there = moved(cal.compressed, cal.theta + 2.0 * cal.sigmas * rng.standard_normal(p), whitening)
-    theta = points(cal)
-    before, after = (c.log_likelihood(theta, cal.sigma) for c in (cal.compressed, there))
-    assert np.max(np.abs(before - after)) < 1e-6
-    # The control: without the slope of the log determinant, the values are not the same.
-    wrong = dataclasses.replace(there, log_determinant_slope=np.zeros(p))
-    assert np.max(np.abs(before - wrong.log_likelihood(theta, cal.sigma))) > 1e-4
 
 
 def test_optimum_of_a_compressed_likelihood_is_the_calibration() -> None:
@@ -185,28 +163,6 @@ def test_own_noise_is_that_of_stars_which_state_it() -> None:
     assert np.array_equal(merged.theta, merge(runs, obs).theta)
     # One noise for all is the worse estimate when they differ by a factor of four.
     assert np.all(merged.sigmas < common.sigmas)
-
-
-def test_scaling_the_noise_leaves_the_likelihood_up_to_the_data_s_volume() -> None:
-    cal = calibrated(1)
-    theta = points(cal)
-    a = scaled(cal.compressed, 0.05).log_likelihood(theta, 1.3)
-    b = cal.compressed.log_likelihood(theta, 0.065)
-    assert np.ptp(a - b) < 1e-6
-
-
-def test_merged_calibration_can_be_sampled_and_analysed(tmp_path: Path) -> None:
-    merged = merge([calibrated(1), calibrated(2)])
-    merged.save(tmp_path / "calibration.json")
-    loaded = Calibration.load(tmp_path / "calibration.json")
-    post = sample(None, loaded, seed=1)
-    assert post.diagnostics.rhat.max() < 1.02
-    assert np.all(np.abs(post.mean - merged.theta) < 0.15 * merged.sigmas)
-    assert np.allclose(post.sd[:5], merged.sigmas, rtol=0.1)
-    assert coupling(post).correlation.shape == (5, 5)
-    record = consistency_of(loaded)
-    assert record is not None
-    assert to_plain(record) == to_plain(consistency_of(merged))
 
 
 def test_run_folders_are_merged_with_their_observations(tmp_path: Path) -> None:
@@ -344,10 +300,6 @@ def test_total_of_one_part_is_the_part() -> None:
     assert np.allclose(value, cal.compressed.log_likelihood(theta, 0.05), rtol=0.0, atol=1e-6)
 
 
-# --- runs of unequal noise
-# --------------------------------------------------------------------------------------------
-
-
 def old_p_value(runs: list[Optimum]) -> float:
     """The control: the F test of the version before, which has one noise for all runs."""
     p = len(runs[0].theta)
@@ -360,9 +312,7 @@ def old_p_value(runs: list[Optimum]) -> float:
 @pytest.mark.parametrize(
     ("noise", "dof"), [((1.0, 1.0), (200, 30)), ((1.0, 5.0), (200, 30)), ((1.0, 2.0), (10, 40))]
 )
-def test_agreement_is_tested_at_any_ratio_of_noises(
-    noise: tuple[float, float], dof: tuple[int, int]
-) -> None:
+def test_agreement_is_tested_at_any_ratio_of_noises(noise, dof):
     rng = np.random.default_rng(7)
     sigma, nu, p = np.array(noise), np.array(dof, dtype=float), 5
     root = (
@@ -392,11 +342,9 @@ def test_agreement_is_tested_at_any_ratio_of_noises(
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1.0, 5.0])
 def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
-    """100 pairs of runs from outside, the smaller with more noise: uniform p, and errors of the
-    stated size.
-    """
+    """50 pairs of runs from outside, the smaller with more noise."""
     new, old, squares = [], [], []
-    for seed in range(100):
+    for seed in range(50):
         runs, truth = [], np.zeros(5)
         for part, (frames, sigma) in enumerate(((10, 0.05), (4, 0.05 * ratio))):
             c = campaign(
@@ -420,8 +368,8 @@ def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
         f"{np.mean(squares):.3f}"
     )
     assert kstest(new, "uniform").pvalue > 0.01
-    # Five degrees of freedom each: the mean of 100 has a standard error of 0.063.
-    assert abs(np.mean(squares) - 1.0) < 0.2
+    # Five degrees of freedom each: the mean of 50 has a standard error of 0.09.
+    assert abs(np.mean(squares) - 1.0) < 0.27
     assert (kstest(old, "uniform").pvalue < 1e-3) == (ratio > 1.0)
 
 

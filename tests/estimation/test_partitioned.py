@@ -1,6 +1,4 @@
-"""Calibration of partitioned observations: that of one table, whatever the partitions and
-processes.
-"""
+"""Calibration of partitioned observations."""
 
 from __future__ import annotations
 
@@ -66,9 +64,7 @@ def assert_equal(
 
 
 @pytest.fixture(scope="module")
-def small(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[sc.Observations, sc.Camera, PartitionedObservations]:
+def small(tmp_path_factory):
     # One clean campaign in about a hundred takes up an effect by chance; that of seed 5 does.
     obs, camera = sensor(90, seed=6)
     return (
@@ -105,6 +101,7 @@ def test_partitions_give_the_calibration_of_the_table(small, tmp_path: Path) -> 
         np.testing.assert_allclose(getattr(frames, name), getattr(of_one, name), rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_frames_that_disagree_are_found_in_files_that_the_sample_leaves_out(tmp_path: Path) -> None:
     obs, camera = sensor(100)
     parts = divided(obs, tmp_path / "frames", list(range(0, 101, 5)))
@@ -174,9 +171,7 @@ def test_folders_that_share_a_file_are_not_merged(small, tmp_path: Path) -> None
         frames = sc.observations.open_partitions(tmp_path / f"frames-{name}")
         sc.Run(tmp_path / name).calibrate(frames, camera)
         sc.Run(tmp_path / name).sample(seed=1, n_steps=20)
-    with pytest.raises(
-        CalibrationError, match="b: holds the same observations as a, which would count twice"
-    ):
+    with pytest.raises(CalibrationError, match="b: holds the same observations as a, which would"):
         sc.runs.merge_runs([tmp_path / "a", tmp_path / "b"])
     assert sc.runs.compare_runs(tmp_path / "a", tmp_path / "b").data == "overlapping"
 
@@ -259,9 +254,7 @@ def test_frames_are_counted_once(small, tmp_path: Path, monkeypatch: pytest.Monk
     }
     columns["frame"][len(table) :] = 60
     doubled = divided(sc.Observations(**columns, meta=obs.meta), tmp_path / "twice", [0, 30, 61])
-    with pytest.raises(
-        RepeatedFramesError, match="frame 60 holds the same measurement as frame 7:"
-    ):
+    with pytest.raises(RepeatedFramesError, match="frame 60 holds the same measurement as frame"):
         sc.calibrate(doubled, camera)
     # Of a larger table the sample may not hold both.
     monkeypatch.setattr("starcal_uq.calibration.calibrate.repeating_frames", lambda *_: np.empty(0))
@@ -299,9 +292,7 @@ def test_bad_row_names_its_file(small, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_killed(
-    tmp_path: Path,
-) -> None:
+def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_killed(tmp_path):
     from distributed import Client, LocalCluster
 
     obs, camera = sensor(1200)
@@ -330,9 +321,7 @@ def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_kill
 
 @pytest.mark.slow
 def test_memory_and_time_grow_with_the_partition_and_the_stars(tmp_path: Path) -> None:
-    """One process whose address space may grow by 300 MB over what its imports take, ten times the
-    frames each time.
-    """
+    """One process whose address space may grow by 300 MB over what its imports take."""
     code = (
         "import resource, sys, time\n"
         "import numpy as np\n"
@@ -382,9 +371,7 @@ def test_memory_and_time_grow_with_the_partition_and_the_stars(tmp_path: Path) -
 
 
 @pytest.fixture(scope="module")
-def moved(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[sc.Observations, sc.Camera, PartitionedObservations]:
+def moved(tmp_path_factory):
     """A campaign of three nights whose field is bent, whose frames breathe and warm up."""
     rng, n = np.random.default_rng(3), 90
     warm = rng.uniform(-10.0, 20.0, n)
@@ -406,9 +393,7 @@ def moved(
         ("temperature,time,epoch,magnitude,phase,frame", 1e-3),
     ],
 )
-def test_effects_of_partitions_are_those_of_the_table(
-    moved, effects: str, bound: float, tmp_path: Path
-) -> None:
+def test_effects_of_partitions_are_those_of_the_table(moved, effects, bound, tmp_path):
     obs, camera, parts = moved
     one = sc.calibrate(obs, camera, effects=effects)
     many = sc.calibrate(parts, camera, effects=effects)

@@ -59,7 +59,7 @@ def test_what_no_effect_moves_is_refused() -> None:
 @pytest.mark.slow
 def test_predictions_cover() -> None:
     z = []
-    for seed in range(150):
+    for seed in range(60):
         c, obs, focal_px = warmed(seed, slope_px=0.2, n_frames=20)
         cal = sc.calibrate(obs, sheet(c), effects="temperature")
         z.append(
@@ -71,13 +71,14 @@ def test_predictions_cover() -> None:
         )
     covered = np.mean(np.abs(z) < 1.96, axis=0)
     print("covered", covered)
-    assert np.all((covered > 0.89) & (covered < 0.99))
+    assert np.all(covered > 0.86)
+    assert np.sqrt(np.mean(np.square(z))) > 0.75
 
 
 @pytest.mark.slow
 def test_a_night_that_was_left_out_is_covered() -> None:
     nights, per_night, z, narrow = 8, 6, [], []
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng([seed, 9])
         offsets = 0.4 * rng.standard_normal(nights)
         night = np.repeat(np.arange(nights), per_night)
@@ -95,6 +96,6 @@ def test_a_night_that_was_left_out_is_covered() -> None:
         narrow.append(off / np.hypot(cal.sigmas[2], alone.sigmas[2]))
     covered = float(np.mean(np.abs(z) < 1.96))
     print("covered", covered, "without the spread of nights", np.mean(np.abs(narrow) < 1.96))
-    assert 0.87 < covered <= 1.0
+    assert 0.84 < covered <= 1.0
     # Control: the camera of the nights that were seen does not cover another one.
     assert np.mean(np.abs(narrow) < 1.96) < 0.8

@@ -43,8 +43,8 @@ def test_subset_keeps_whole_frames() -> None:
     )
 
 
-@pytest.mark.parametrize("model", ["brown", "none", "brown_tangential", "inverse"])
-def test_robust_estimate_of_every_model(model: str) -> None:
+@pytest.mark.parametrize("model", ["brown", "inverse"])
+def test_robust_estimates(model: str) -> None:
     clean = observations(model, n_frames=40)
     obs, _ = spoil(clean, 0.05)
     truth = camera(model)

@@ -142,7 +142,7 @@ def test_a_frame_that_the_table_does_not_hold_is_refused() -> None:
 @pytest.mark.parametrize(("arcsec", "first"), [(1.0, 1000), (10.0, 2000)])
 def test_intervals_of_a_chain_cover(arcsec: float, first: int) -> None:
     z, chi2 = [], []
-    for seed in range(100):
+    for seed in range(40):
         c, columns = observed(first + seed, arcsec)
         cal = sc.calibrate(table(c), sheet(c), relative_attitudes=known_of(columns))
         assert cal.ties is not None
@@ -150,10 +150,10 @@ def test_intervals_of_a_chain_cover(arcsec: float, first: int) -> None:
         chi2.append(cal.ties.chi2 / cal.ties.dof)
     covered = np.mean(np.abs(z) < 1.96, axis=0)
     print("covered", covered, "rms", np.sqrt(np.mean(np.square(z), axis=0)), np.mean(chi2))
-    # 200 intervals of x0 and y0: 0.95 with a standard deviation of 0.015; the others go together.
-    assert 0.91 <= covered[:2].mean() <= 0.99
-    assert 0.89 <= covered[2:].mean() <= 1.0
-    assert np.mean(chi2) == pytest.approx(1.0, abs=0.06)
+    # 80 intervals of x0 and y0: 0.95 with a standard deviation of 0.024; the others go together.
+    assert 0.88 <= covered[:2].mean() <= 0.99
+    assert 0.85 <= covered[2:].mean() <= 1.0
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.slow
@@ -172,10 +172,10 @@ def test_intervals_of_a_chain_with_errors_five_times_the_stated_do_not_cover() -
 @pytest.mark.slow
 def test_intervals_on_a_fixed_mount_cover() -> None:
     z = []
-    for seed in range(40):
+    for seed in range(20):
         c, obs = on_a_mount(500 + seed)
         cal = sc.calibrate(obs, sheet(c), mount="fixed", mount_sigma_arcsec=1.0)
         z.append((cal.theta - c.theta) / cal.sigmas)
     covered = np.mean(np.abs(z) < 1.96, axis=0)
     print("covered", covered, "rms", np.sqrt(np.mean(np.square(z), axis=0)))
-    assert 0.91 <= covered.mean() <= 0.99
+    assert covered.mean() > 0.88 and np.sqrt(np.mean(np.square(z))) > 0.75

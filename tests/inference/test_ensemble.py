@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 from starcal_uq.inference import arviz as arviz_compat
 from starcal_uq.inference.checks import chain_order, step_order
@@ -21,13 +22,14 @@ def _variance_z(moves: list[tuple[Any, float]] | None) -> float:
     target.
     """
     seeds = np.random.SeedSequence(11).spawn(4)
-    settings = EnsembleSettings(40, 300, 50, "mixture")
+    settings = EnsembleSettings(40, 150, 50, "mixture")
     chains = run_ensembles(lambda u: -0.5 * np.sum(u * u, axis=1), 5, seeds, settings, moves=moves)
     squares = chain_order(chains.u) ** 2
     z = [(squares[..., i].mean() - 1.0) / arviz_compat.mcse_mean(squares[..., i]) for i in range(5)]
     return float(np.max(np.abs(z)))
 
 
+@pytest.mark.slow
 def test_variance_is_right_and_the_test_can_tell() -> None:
     import emcee
 

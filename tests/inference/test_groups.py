@@ -1,6 +1,4 @@
-"""ArviZ's groups against integration over the attitude, a second exposure, and the product's own
-comparison.
-"""
+"""ArviZ's groups against integration over the attitude, a second exposure."""
 
 from __future__ import annotations
 
@@ -62,9 +60,7 @@ def directions(obs: sc.Observations) -> np.ndarray:
     return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
 
 
-def test_groups_have_names_units_and_the_same_draws(
-    data: Any, post: Posterior, obs: sc.Observations
-) -> None:
+def test_groups_have_names_units_and_the_same_draws(data, post, obs):
     for group in ("posterior", "sample_stats", *GROUPS):
         dataset = data[group]
         assert all(dataset[name].attrs["units"] for name in dataset.data_vars), group
@@ -111,9 +107,7 @@ def test_the_same_seed_gives_the_same_images(post: Posterior, obs: sc.Observatio
 
 
 @pytest.mark.parametrize("frame", [0, 77])
-def test_log_likelihood_is_the_integral_over_the_attitude(
-    frame: int, data: Any, post: Posterior, night: outside.Campaign, obs: sc.Observations
-) -> None:
+def test_log_likelihood_is_the_integral_over_the_attitude(frame, data, post, night, obs):
     draw = data["posterior"].isel(chain=1, draw=7)
     theta = np.array([float(draw[p.name]) * p.scale for p in post.parameters[:-1]])
     sigma = float(draw["sigma"])
@@ -145,13 +139,7 @@ def test_log_likelihood_is_the_integral_over_the_attitude(
     assert found == pytest.approx(expected, abs=1e-3)
 
 
-def test_drawn_images_are_those_of_a_second_exposure(
-    data: Any,
-    post: Posterior,
-    night: outside.Campaign,
-    obs: sc.Observations,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_drawn_images_are_those_of_a_second_exposure(data, post, night, obs, monkeypatch):
     rng = np.random.default_rng(8)
     b = np.einsum("nij,nj->ni", np.repeat(night.attitudes, 5, axis=0), directions(obs))
     again = project(night.theta, b) + SIGMA * rng.standard_normal((len(b), 2))
@@ -189,6 +177,7 @@ def test_residuals_of_data_and_drawn_images_are_alike(data: Any) -> None:
     assert spread.mean() == pytest.approx(SIGMA * np.sqrt(0.7), rel=0.05)
 
 
+@pytest.mark.slow
 def test_loo_is_the_comparison_of_the_product() -> None:
     import arviz as az
 
@@ -228,9 +217,7 @@ def test_frames_of_a_student_likelihood_add_up() -> None:
     assert likelihood.by_frame(*at).sum() == pytest.approx(likelihood.log_likelihood(*at), abs=1e-5)
 
 
-def test_student_draws_have_tails_and_stated_noise_its_density(
-    post: Posterior, obs: sc.Observations
-) -> None:
+def test_student_draws_have_tails_and_stated_noise_its_density(post, obs):
     settings = {"settings": {**post.provenance["settings"], "dof": 3.0}}
     heavy = replace(
         post,

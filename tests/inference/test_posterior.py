@@ -39,9 +39,7 @@ def given() -> Posterior:
 
 
 @pytest.mark.parametrize("which", ["post", "given"])
-def test_file_round_trip_is_lossless(
-    which: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_file_round_trip_is_lossless(which, tmp_path, request):
     original = request.getfixturevalue(which)
     path = tmp_path / "posterior.nc"
     original.save(path)
@@ -77,9 +75,7 @@ def test_other_tools_can_read_the_file(post: Posterior, tmp_path: Path) -> None:
 
 
 def test_every_place_of_the_draws_states_its_unit(post: Posterior, tmp_path: Path) -> None:
-    """The same draws stand plain at the top of the file and in the data frame, and scaled in
-    ArviZ's group.
-    """
+    """The same draws stand plain at the top of the file and in the data frame."""
     import xarray as xr
 
     post.save(tmp_path / "posterior.nc")

@@ -1,6 +1,4 @@
-"""A posterior as the next prior: two runs in a row give what both give at once, and a moved camera
-is noticed.
-"""
+"""A posterior as the next prior."""
 
 from __future__ import annotations
 
@@ -77,7 +75,7 @@ def test_gaussian_priors_survive_files(tmp_path: Path) -> None:
     assert isinstance(again, GaussianPriors)
     assert again.to_dict() == priors.to_dict()
     assert "from ground" in priors.to_dataframe()["statement"].iloc[0]
-    post = sample(None, calibrated(2), priors, seed=1)
+    post = sample(None, calibrated(2), priors, seed=1, n_steps=20)
     post.save(tmp_path / "posterior.nc")
     assert Posterior.load(tmp_path / "posterior.nc").priors.to_dict() == priors.to_dict()
 
@@ -97,6 +95,7 @@ def test_improper_priors_are_refused(change: dict[str, object], match: str) -> N
         gaussian(**change)
 
 
+@pytest.mark.slow
 def test_two_runs_in_a_row_are_both_at_once() -> None:
     second = calibrated(2)
     chained = sample(None, second, prior_from(ground(), noise="posterior"), seed=2)
@@ -196,7 +195,7 @@ def test_the_same_data_do_not_count_twice(tmp_path: Path) -> None:
     with pytest.raises(PriorError, match="count twice"):
         load_priors(path, NOMINAL, data_sha256=[calibrated(1).provenance["data_sha256"]])
     # The history is kept over two links of a chain.
-    second = sample(None, calibrated(2), prior_from(ground()), seed=2)
+    second = sample(None, calibrated(2), prior_from(ground()), seed=2, n_steps=20)
     third = prior_from(second)
     for cal in (calibrated(1), calibrated(2)):
         with pytest.raises(PriorError, match="count twice"):
@@ -236,7 +235,7 @@ def test_shift_test_sees_what_moved() -> None:
 def test_shift_test_refuses_what_is_not_independent() -> None:
     with pytest.raises(PriorError, match="same observations"):
         shift_test(calibrated(1), calibrated(1))
-    chained = sample(None, calibrated(2), prior_from(ground()), seed=2)
+    chained = sample(None, calibrated(2), prior_from(ground()), seed=2, n_steps=20)
     with pytest.raises(PriorError, match="test its calibration"):
         shift_test(calibrated(3), chained)
     with pytest.raises(PriorError, match="do not compare"):

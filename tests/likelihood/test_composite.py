@@ -387,6 +387,7 @@ def test_godambe_is_the_covariance_of_the_pair_estimate() -> None:
     assert np.all(np.diag(sampled) > 5.0 * np.diag(np.mean(naive, axis=0)))
 
 
+@pytest.mark.slow
 def test_ignoring_attitudes_spoils_sigma() -> None:
     """A likelihood that counts 2 m numbers a frame."""
     stars, truth = load_catalogue(max_mag=6.0, epoch=2026.9), camera()
