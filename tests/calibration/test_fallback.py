@@ -190,16 +190,16 @@ def narrow_fields(n: int) -> tuple[list[str], np.ndarray]:
 
 @pytest.mark.slow
 def test_noise_in_the_distortion_of_a_narrow_field_tells_no_principal_point(monkeypatch):
-    models, z = narrow_fields(16)
+    models, z = narrow_fields(40)
     assert np.sqrt(np.mean(z**2)) < 1.3
     # Believed, it does: many estimates come with sigmas that are too small.
     monkeypatch.setattr(
         "starcal_uq.estimation.undetermined._without_coma",
         lambda covariance, told, size, lens: np.ones(len(told)),
     )
-    models, z = narrow_fields(16)
+    models, z = narrow_fields(40)
     kept = np.array(models) == "brown"
-    assert kept.sum() > 5 and np.sqrt(np.mean(z[kept] ** 2)) > 1.4
+    assert kept.sum() > 10 and np.sqrt(np.mean(z[kept] ** 2)) > 1.4
 
 
 NOISY = (
@@ -230,4 +230,4 @@ def test_intervals_of_noisy_stars_hold():
     # 240 intervals, of which five of a table go together.
     assert 0.91 < np.mean(taken) < 0.999
     # Distortion that is left out moves f by several of its sigmas.
-    assert np.mean(noisy("none", 6)) < 0.85
+    assert np.mean(noisy("none", 10)) < 0.85

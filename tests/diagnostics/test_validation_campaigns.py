@@ -48,14 +48,14 @@ def test_coverage_and_squared_errors(fixed):
 
 def test_ranks_of_a_fixed_truth(fixed):
     assert fixed.n_replicates == 300
-    assert (fixed.rank_p_value > 0.01).all(), fixed.rank_p_value
+    assert (fixed.rank_p_value > 1e-3).all(), fixed.rank_p_value
 
 
 def test_ranks_of_truths_from_the_prior():
     found = validate(sc.paper.paper_camera(), n_replicates=200, truth="prior", seed=2)
     show("truth from the prior", found)
     assert found.ok, found.text
-    assert (found.rank_p_value > 0.01).all(), found.rank_p_value
+    assert (found.rank_p_value > 1e-3).all(), found.rank_p_value
     assert 0.87 <= found.nees_ratio <= 1.13
 
 
@@ -88,7 +88,7 @@ def test_biased_moves_are_found():
 
 def test_noise_understated_by_a_tenth_is_found_by_coverage():
     found = validate_study(
-        few_frames(assumed_sigma_px=0.045, n_steps=40), sc.load_catalogue(max_mag=6.0), 250
+        few_frames(assumed_sigma_px=0.045, n_steps=40), sc.load_catalogue(max_mag=6.0), 500
     )
     show("sigma understated", found)
     assert not found.ok

@@ -225,11 +225,12 @@ def test_the_spread_over_seeds_is_the_sigma_that_is_reported():
     errors, sigmas, pair_errors, pair_sigmas = _replicates(range(400))
     for e, s in ((errors, sigmas), (pair_errors, pair_sigmas)):
         ratio = np.mean(e**2, axis=0) / np.mean(s**2, axis=0)
-        assert (ratio > 0.8).all(), ratio
-        assert (ratio < 1.2).all(), ratio
+        # One standard error of a ratio is 0.07.
+        assert (ratio > 0.76).all(), ratio
+        assert (ratio < 1.24).all(), ratio
         coverage = np.mean(np.abs(e / s) < 1.96, axis=0)
         assert (coverage >= 0.91).all(), coverage
-        assert (coverage <= 0.98).all(), coverage
+        assert (coverage <= 0.985).all(), coverage
         # Bias is within what the replicates can show.
         assert (np.abs(np.mean(e / s, axis=0)) < 4 / np.sqrt(len(e))).all()
     # Negative control: sigmas understated to the size that naive pairs claim do not pass.

@@ -164,7 +164,7 @@ def test_misfit_tests_keep_their_size_with_fitted_axes():
 @pytest.mark.parametrize("covariance", [SMEARED, TURNED])
 def test_intervals_with_fitted_axes_hold(covariance):
     inside, wrong = [], []
-    for seed in range(30):
+    for seed in range(60):
         c = observed(covariance, seed)
         obs, camera = given(c)
         cal = sc.calibrate(obs, camera, effects="noise")
@@ -173,5 +173,5 @@ def test_intervals_with_fitted_axes_hold(covariance):
         # The control: intervals as narrow for the estimate that weighs both axes alike.
         error = np.abs(sc.calibrate(obs, camera).theta - c.theta)
         wrong.append(error < 0.5 * (high - low))
-    assert 0.9 < np.mean(inside) < 0.99
+    assert 0.92 < np.mean(inside) < 0.98
     assert np.mean(wrong) < 0.9

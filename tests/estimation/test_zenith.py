@@ -179,10 +179,10 @@ def test_place_and_camera_are_covered() -> None:
             latitude.append(away / cal.effects.air.latitude_std_deg)
         plain = sc.calibrate(obs, sheet(c), effects="frame")
         without.append((plain.theta - c.theta)[2] / plain.sigmas[2])
-    assert np.mean(chosen) > 0.95
+    assert np.mean(chosen) >= 0.9
     # 100 intervals, few of them independent.
-    assert np.mean(np.abs(z) < 1.96) > 0.87
-    assert np.mean(np.abs(latitude) < 1.96) > 0.8
+    assert np.mean(np.abs(z) < 1.96) > 0.84
+    assert np.mean(np.abs(latitude) < 1.96) > 0.75
     assert 0.6 < np.sqrt(np.mean(np.square(latitude))) < 1.4
     # Control: frames with scales and shears of their own do not cover the focal length.
     assert np.mean(np.abs(without) < 1.96) < 0.3

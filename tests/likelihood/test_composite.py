@@ -382,7 +382,7 @@ def test_godambe_is_the_covariance_of_the_pair_estimate() -> None:
     correlation = godambe / np.sqrt(np.outer(np.diag(godambe), np.diag(godambe)))
     matters = np.abs(correlation) > 0.5
     assert matters.sum() == 11
-    assert np.all(np.abs(sampled / godambe - 1.0)[matters] < 0.17), sampled / godambe
+    assert np.all(np.abs(sampled / godambe - 1.0)[matters] < 0.2), sampled / godambe
     # The control: independent pairs explain a tenth of it.
     assert np.all(np.diag(sampled) > 5.0 * np.diag(np.mean(naive, axis=0)))
 
