@@ -175,7 +175,7 @@ _XY, _POLAR = ("x", "y"), ("radial", "tangential")
 
 
 def residual_profiles(cal: Calibration, obs: Observations) -> tuple[Profile1D, ...]:
-    """Residuals against azimuth, pixel phase in x and y, order of frames, magnitude and
+    """Residuals against radius, azimuth, pixel phase in x and y, order of frames, magnitude and
     temperature, in bins.
 
     The phase is that of the predicted position, from -0.5 to 0.5 px around the centre of a pixel.
@@ -192,6 +192,7 @@ def residual_profiles(cal: Calibration, obs: Observations) -> tuple[Profile1D, .
     phase = predicted - np.round(predicted)
     order = np.searchsorted(obs.frame_ids, obs.frame).astype(np.float64)
     wanted: list[tuple[str, str, tuple[str, str], FloatArray | None, FloatArray]] = [
+        ("Radius", "distance from principal point [px]", _POLAR, np.hypot(*offset), polar),
         (
             "Azimuth",
             "azimuth in the field [°]",

@@ -15,7 +15,6 @@ from starcal_uq.core.formatting import (
     fixed,
     join_words,
     percent,
-    plural,
     plus_minus,
     pretty_unit,
     significant,
@@ -29,6 +28,7 @@ from starcal_uq.paper.judgement import Judged, Outcome, Trial, trial
 from starcal_uq.paper.published import LEAST_SQUARES, PAPER_METHODS, PROPOSED, SAMAAN, printed
 from starcal_uq.paper.readings import AS_PRINTED
 from starcal_uq.paper.statistics import ENOUGH_REPLICATES
+from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
@@ -291,38 +291,24 @@ def errors(found: Reproduction) -> TextTable:
 
 def replicates_text(found: Replicates) -> str:
     """Who is honest, who is biased, and who claims too little or too much."""
-    frames = found.provenance.settings.get("n_frames")
-    data = "" if frames is None else f" of {plural(int(frames), 'frame')}"
-    text = f"Over {plural(found.n_replicates, 'replicate')}{data}: "
-    if found.n_replicates < ENOUGH_REPLICATES:
-        text += f"too few to judge (give at least {ENOUGH_REPLICATES})."
-    else:
+    named: dict[str, set[str]] = {}
+    if found.n_replicates >= ENOUGH_REPLICATES:
         table = found.table()
         little = table["claimed_over_spread"] < 1.0
-        groups = {
+        wrong = {
             "biased": table["biased"],
             "claiming too little": table["claim_wrong"] & little,
             "claiming too much": table["claim_wrong"] & ~little,
         }
-        named = {what: list(dict.fromkeys(table["method"][rows])) for what, rows in groups.items()}
-        guilty = {label for labels in named.values() for label in labels}
-        named = {"honest": [label for label in found.labels if label not in guilty], **named}
-        text += (
-            "; ".join(f"{what}: {join_words(labels)}" for what, labels in named.items() if labels)
-            + "."
-        )
-    failed = [
-        f"{label} in {count(found.n_failed(label))}"
-        for label in found.labels
-        if found.n_failed(label)
-    ]
-    text += f" No result from {join_words(failed)}." if failed else ""
-    if found.interrupted:
-        text += (
-            f" The run was interrupted after {count(found.n_replicates)} of "
-            f"{count(found.n_requested)}."
-        )
-    return text
+        named = {what: set(table["method"][rows]) for what, rows in wrong.items()}
+        named = {"honest": set(found.labels).difference(*named.values()), **named}
+    template = template_environment().get_template("replicates.txt.j2")
+    return template.render(
+        found=found,
+        frames=found.provenance.settings.get("n_frames"),
+        enough=ENOUGH_REPLICATES,
+        groups={what: [one for one in found.labels if one in some] for what, some in named.items()},
+    ).strip()
 
 
 def replicates(found: Replicates) -> TextTable:

@@ -117,17 +117,19 @@ def plot_residual_profiles(cal: Calibration, obs: Observations) -> Figure:
     """Mean residuals against azimuth, pixel phase, magnitude, time or order of frames, and
     temperature.
     """
-    profiles = residual_profiles(cal, obs)
+    # The radius stands beside the map of the residuals.
+    profiles = residual_profiles(cal, obs)[1:]
     columns = 3
     rows = -(-len(profiles) // columns)
     figure = style.new_figure(11.0, 2.75 * rows)
     grid = style.panels(figure, rows, columns, (0.92, 0.14, 0.5, 0.34), (0.92, 0.76))
     for place, profile in enumerate(profiles):
-        _plot_profile(figure.add_subplot(grid[place]), profile)
+        plot_profile(profile, figure.add_subplot(grid[place]))
     return figure
 
 
-def _plot_profile(ax: Axes, profile: Profile1D) -> None:
+def plot_profile(profile: Profile1D, ax: Axes) -> Axes:
+    """Means of both components with their standard errors."""
     style.dress(ax, grid=True)
     shift = 0.006 * np.ptp(profile.centres)
     looks = ((style.BLUE, "o", -shift), (style.ORANGE, "s", shift))
@@ -140,6 +142,7 @@ def _plot_profile(ax: Axes, profile: Profile1D) -> None:
         )
     style.about_zero(ax)
     style.label(ax, profile.title, profile.label, "mean residual [px]")
+    return ax
 
 
 _BAND = 0.95

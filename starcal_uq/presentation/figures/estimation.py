@@ -10,8 +10,9 @@ from starcal_uq.camera.distortion import parameters as camera_parameters
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import pretty_unit, significant
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
+from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_profiles
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.diagnostics import plot_profile
 from starcal_uq.presentation.figures.scales import symbol
 
 if TYPE_CHECKING:
@@ -203,30 +204,7 @@ def plot_residual_radius(cal: Calibration, obs: Observations, ax: Axes | None = 
     """Radial and tangential residual against the distance from the principal point, with one
     standard error.
     """
-    ax = style.panel(ax, 4.4, 3.8, grid=True)
-    offset = np.stack([obs.x_px - cal.camera.x0_px, obs.y_px - cal.camera.y0_px], axis=1)
-    radius = np.hypot(*offset.T)
-    unit = offset / np.maximum(radius, 1e-9)[:, None]
-    residuals = np.asarray(cal.residuals_px)
-    parts = (
-        np.sum(residuals * unit, axis=1),
-        unit[:, 0] * residuals[:, 1] - unit[:, 1] * residuals[:, 0],
-    )
-    n_bins = int(np.clip(obs.n_stars // 60, 4, 14))
-    # Bins of equal number, so that all error bars mean the same.
-    edges = np.quantile(radius, np.linspace(0.0, 1.0, n_bins + 1))
-    index = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, n_bins - 1)
-    counts = np.maximum(np.bincount(index, minlength=n_bins), 1)
-    centre = np.bincount(index, radius, n_bins) / counts
-    spread = np.sqrt(np.bincount(index, residual_scale(cal, obs) ** 2, n_bins)) / counts
-    looks = ((style.BLUE, "o", "radial", -1), (style.ORANGE, "s", "tangential", 1))
-    for part, (colour, marker, name, side) in zip(parts, looks, strict=True):
-        mean = np.bincount(index, part, n_bins) / counts
-        at = centre + side * 0.004 * radius.max()
-        ax.errorbar(at, mean, spread, color=colour, marker=marker, label=name, **style.BARS)
-    style.about_zero(ax)
-    style.label(ax, "Against radius", "distance from principal point [px]", "mean residual [px]")
-    return ax
+    return plot_profile(residual_profiles(cal, obs)[0], style.panel(ax, 4.4, 3.8))
 
 
 def plot_residual_histogram(cal: Calibration, obs: Observations, ax: Axes | None = None) -> Axes:

@@ -16,74 +16,7 @@ from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import Progress
-
-# File of the run that a part needs, heading, sentence, and cells.
-_PARTS = (
-    ("observations", "What it rests on", "", ["run.observations"]),
-    ("images", "The images", "Frames that tell most.", ["run.shown_frames"]),
-    (
-        "calibration",
-        "The estimate",
-        "Every stage on its way to the optimum, and what the model leaves of each star.",
-        [
-            "run.calibration",
-            "run.calibration.plot.convergence()",
-            "run.calibration.plot.residuals(run.observations)",
-        ],
-    ),
-    (
-        "effects",
-        "Effects beyond the camera",
-        "Estimated beside the camera; every interval contains them.",
-        ["run.calibration.effects", "run.calibration.plot.effects(run.observations)"],
-    ),
-    (
-        "posterior",
-        "What is known of the parameters",
-        "Where prior and posterior are alike, the data have said nothing.",
-        ["run.posterior", "run.posterior.plot.corner()", "run.posterior.plot.prior_posterior()"],
-    ),
-    (
-        "calibration",
-        "Which parameters lean on each other",
-        "An error of one is made good by those that it is coupled to.",
-        ["run.coupling", "run.coupling.plot.correlation();"],
-    ),
-    (
-        "attitude",
-        "What it does to attitude",
-        "The common rotation is one constant, which an alignment calibration with the same "
-        "parameters absorbs; the "
-        "rest changes from frame to frame.",
-        ["run.attitude", "run.attitude.plot.contributors();"],
-    ),
-    ("field_map", "Where on the detector", "", ["run.field_map.plot.maps()"]),
-    ("diagnosis", "Does the model hold?", "", ["run.diagnosis", "run.diagnosis.plot.diagnosis()"]),
-    (
-        "budget",
-        "The error budget",
-        "",
-        ["run.error_budget", "run.error_budget.plot.contributors()"],
-    ),
-    (
-        "calibration",
-        "May it be used?",
-        "Every check, with its bound; the remedy of each stands in `run.verdict.checks`.",
-        [
-            "import pandas as pd\n\n"
-            'pd.DataFrame(run.verdict.to_dict()["checks"])[["level", "name", "value", '
-            '"bound"]].set_index("name")'
-        ],
-    ),
-    (
-        "posterior",
-        "Go on",
-        "`run.posterior.to_dataframe()` has the draws, `run.arviz()` all groups of ArviZ, "
-        "`run.calibration.camera` and "
-        "`sc.export(run, ...)` the camera for other programs.",
-        ["run.posterior.summary()"],
-    ),
-)
+from starcal_uq.presentation.html import template_environment
 
 
 def write_cells(name: str, parts: Collection[str], folder: str) -> Iterator[tuple[str, str]]:
@@ -93,19 +26,15 @@ def write_cells(name: str, parts: Collection[str], folder: str) -> Iterator[tupl
     `parts` are names of the files that the run holds, such as ``posterior``, and ``effects`` where
     its calibration holds some.
     """
-    written = Remedy("report", (RUN,), {"notebook": True})
-    yield (
-        "markdown",
-        f"# Calibration `{name}`\n\nWritten by `{written.command}`. The folder "
-        "below is all that it "
-        "depends on: name another run there, and run all cells.",
-    )
-    yield "parameters", f"folder = {folder!r}"
-    yield "code", "import starcal_uq as sc\n\nrun = sc.Run(folder)\nrun"
-    for needs, heading, sentence, cells in _PARTS:
-        if needs in parts:
-            yield "markdown", f"## {heading}\n\n{sentence}".strip()
-            yield from (("code", cell) for cell in cells)
+    written = Remedy("report", (RUN,), {"notebook": True}).command
+    template = template_environment().get_template("notebook.txt.j2")
+    text = template.render(name=name, parts=parts, folder=repr(folder), written=written)
+    for number, cell in enumerate(text.split("```")):
+        if number % 2:
+            kind, _, source = cell.partition("\n")
+            yield "parameters" if kind == "parameters" else "code", source.strip()
+        elif cell.strip():
+            yield "markdown", cell.strip()
 
 
 def executed(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from starcal_uq.budgeting.result import by_contributor
 from starcal_uq.budgeting.rows import AXIS_LABELS, confidence_text
 from starcal_uq.core.constants import CROSS_BORESIGHT
-from starcal_uq.core.formatting import join_words, plural, significant
+from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Level, Note, Question, worst
 from starcal_uq.presentation.html import WIDTH, template_environment, wrapped
 from starcal_uq.presentation.report.tables import parameter_rows
@@ -42,58 +42,20 @@ _PARTS_SAID = (
 
 def uses(results: Results) -> tuple[list[str], list[str]]:
     """What of the run can be used, and what cannot or only with care; sentences."""
-    verdict, error, budget = results.verdict, results.attitude, results.budget
-    usable, unusable = [], []
-    violated, doubts = (join_words(verdict.summary.values[one]) for one in ("violated", "doubts"))
-    failed = verdict.summary.code is Note.NOT_USABLE
-    if violated:
-        unusable.append(f"The sensor with this budget: {violated} is violated.")
-    if failed:
-        unusable.append(f"Parameters, intervals and attitude error: {doubts} failed.")
-        if worst(verdict.of(Question.CONVERGED)) is Level.FAIL:
-            usable.append("What tells the cause: residuals and checks.")
-        else:
-            usable.append(
-                f"The errors {IF_MODEL_HOLDS}, as the least that they are; residuals and checks, "
-                "as clues."
-            )
-    elif doubts:
-        usable.append(
-            "The parameters, their intervals and the attitude error, if you accept the "
-            f"warnings: {doubts}."
+    curve = results.distortion_curve
+    text = (
+        template_environment()
+        .get_template("uses.txt.j2")
+        .render(
+            {
+                one.__name__: one
+                for one in (Level, Note, Question, by_contributor, worst, two_figures)
+            },
+            results=results,
+            unseen=curve is not None and curve.star_radius_px < _SEEN * curve.radius_px[-1],
         )
-    else:
-        usable.append("The parameters, their σ and intervals: every check passed.")
-    if error is not None:
-        common, rest = (
-            two_figures(
-                (error.with_misfit_found_arcsec[row, 3], error.if_model_holds_arcsec[row, 3])
-            )
-            for row in (1, 2)
-        )
-        if not failed:
-            usable.append(
-                f"Attitudes {AFTER}: the calibration adds {rest} per axis across the boresight."
-            )
-        unusable.append(
-            f"Attitudes before alignment calibration: all are off by one common rotation, {common}."
-        )
-    elif results.posterior is None:
-        unusable.append("Attitude errors and couplings with priors: the posterior was not sampled.")
-    if (
-        curve := results.distortion_curve
-    ) is not None and curve.star_radius_px < _SEEN * curve.radius_px[-1]:
-        unusable.append(
-            f"Directions farther than {curve.star_radius_px:.0f} px from the principal point: no "
-            "star was there."
-        )
-    if budget is not None and budget.not_assessed:
-        every = len(by_contributor(budget.rows))
-        unusable.append(
-            f"The budget as a total: {len(budget.not_assessed)} of "
-            f"{plural(every, 'contributor')} are {NOT_ASSESSED}, "
-            "so it is a lower bound."
-        )
+    )
+    usable, unusable = (part.strip().splitlines() for part in text.partition("\n---")[::2])
     return usable, unusable
 
 
