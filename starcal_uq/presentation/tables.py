@@ -8,6 +8,7 @@ terminal.
 from __future__ import annotations
 
 import html
+import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from starcal_uq.camera.distortion import Parameter
+
+
+_LOOKS = {"r": 'class="n" style="text-align:right"', "l": 'style="text-align:left"'}
 
 
 @dataclass(frozen=True)
@@ -91,34 +95,26 @@ class TextTable:
         """A ``<table>`` of a class; everything is escaped, but the first column is left to
         `name`.
         """
-        classes = [
-            'class="n"' if side == "r" else 'class="unit"' if head.lower() == "unit" else ""
+        looks = [
+            'class="unit" style="text-align:left"' if head.lower() == "unit" else _LOOKS[side]
             for head, side in zip(self.heads, self.align, strict=True)
-        ]
-        styles = [
-            'style="text-align:right"' if side == "r" else 'style="text-align:left"'
-            for side in self.align
         ]
 
         def line(tag: str, cells: Sequence[str], mark: str = "") -> str:
-            shown = [
-                name(cells[0]) if tag == "td" else html.escape(cells[0]),
-                *map(html.escape, cells[1:]),
-            ]
             parts = (
-                f"<{tag} {' '.join(filter(None, (k, s)))}>{cell}</{tag}>"
-                for cell, k, s in zip(shown, classes, styles, strict=True)
+                f"<{tag} {look}>{cell}</{tag}>" for cell, look in zip(cells, looks, strict=True)
             )
             return f"<tr{f' class={mark!r}' if mark else ''}>{''.join(parts)}</tr>"
 
         title = self.title if caption is None else caption
         above = f"<caption>{html.escape(title)}</caption>" if title else ""
         opening = f'<table class="{kind}">' if kind else "<table>"
-        marks = self.marks or ("",) * len(self.rows)
-        body = "".join(line("td", row, mark) for row, mark in zip(self.rows, marks, strict=True))
-        return (
-            f"{opening}{above}<thead>{line('th', self.heads)}</thead><tbody>{body}</tbody></table>"
+        head = line("th", [html.escape(head) for head in self.heads])
+        body = "".join(
+            line("td", [name(first), *map(html.escape, cells)], mark)
+            for (first, *cells), mark in itertools.zip_longest(self.rows, self.marks, fillvalue="")
         )
+        return f"{opening}{above}<thead>{head}</thead><tbody>{body}</tbody></table>"
 
     def markdown(self) -> str:
         """A table of Markdown with pipes, aligned as the columns are."""

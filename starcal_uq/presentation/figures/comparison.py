@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     from starcal_uq.comparison.result import CameraComparison
@@ -41,42 +38,19 @@ def plot_camera_comparison(comparison: CameraComparison) -> Figure:
     both = np.stack([length, comparison.sigma_arcsec]) if comparison.tested else length
     # Lengths vanish at points; what is a small share of the largest has one colour.
     foot = _FOOT * float(both.max())
-    levels, norm = round_levels(np.maximum(both, foot))
+    of = np.maximum(both, foot)
     a, b = comparison.labels
-    image = _filled(panels[0], comparison, length, levels, norm, f"{b} minus {a}")
+    shown = [(length, f"{b} minus {a}")]
+    if comparison.tested:
+        shown.append((comparison.sigma_arcsec, "Expected from both uncertainties (1 sigma)"))
+    unit = "difference of directions [arcsec]"
+    for ax, (values, title) in zip(panels, shown, strict=True):
+        style.filled(ax, comparison.x_px, comparison.y_px, values, title, unit, of)
     if comparison.tested:
         _multiples(panels[0], comparison)
-        _filled(
-            panels[1],
-            comparison,
-            comparison.sigma_arcsec,
-            levels,
-            norm,
-            "Expected from both uncertainties (1 sigma)",
-        )
     if length.max() > 0.0:
         _arrows(panels[0], comparison)
-    bar = figure.colorbar(image, ax=list(panels), fraction=0.046, pad=0.02)
-    style.dress_bar(bar, "difference of directions [arcsec]")
-    ticks_at_levels(bar, levels)
     return figure
-
-
-def _filled(
-    ax: Axes,
-    comparison: CameraComparison,
-    values: FloatArray,
-    levels: FloatArray,
-    norm: Normalize | None,
-    title: str,
-) -> Any:
-    style.dress(ax)
-    x, y = comparison.x_px, comparison.y_px
-    image = ax.contourf(
-        x, y, np.maximum(values, levels[0]), levels=levels, norm=norm, cmap="cividis"
-    )
-    style.detector(ax, x, y, title)
-    return image
 
 
 def _multiples(ax: Axes, comparison: CameraComparison) -> None:

@@ -40,7 +40,8 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
         side = 1.4 + 0.62 * len(names)
         ax = style.new_axes(side + 0.8, side)
     image = _extended(ax, coupling) if extended else heat_map(ax, coupling.correlation, names)
-    style.label(ax, "With the boresight" if extended else "Camera parameters", pad=24)
+    title = "With the constant attitude error they cause" if extended else "Camera parameters"
+    style.label(ax, title, pad=24)
     style.colour_bar(ax, image, "correlation")
     return ax
 
@@ -49,12 +50,8 @@ def plot_correlations(coupling: Coupling) -> Figure:
     """Both matrices side by side: the camera parameters alone, and with the boresight."""
     p, q = len(coupling.parameter_names), len(coupling.extended_names)
     figure = style.new_figure(11.0, 5.2)
-    left, right = figure.subplots(1, 2, width_ratios=(p, q))
-    heat_map(left, coupling.correlation, coupling.parameter_names)
-    image = _extended(right, coupling)
-    style.label(left, "Camera parameters", pad=24)
-    style.label(right, "With the constant attitude error they cause", pad=24)
-    style.colour_bar(right, image, "correlation")
+    for extended, ax in enumerate(figure.subplots(1, 2, width_ratios=(p, q))):
+        plot_correlation(coupling, ax, extended=bool(extended))
     return figure
 
 

@@ -18,7 +18,7 @@ from starcal_uq.estimation.effect_curves import (
     found_zeniths,
 )
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.scales import round_levels, symbol, ticks_at_levels
+from starcal_uq.presentation.figures.scales import symbol
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -154,14 +154,11 @@ def _map(cal: Calibration, name: str, ax: Axes) -> None:
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
     shift, covariance = cal.displacement(pixels.reshape(-1, 2), (name,))
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2)).reshape(_GRID, _GRID)
-    levels, norm = round_levels(np.maximum(sigma, 1e-2 * sigma.max()))
-    drawn = np.clip(sigma, levels[0], levels[-1])
-    image = ax.contourf(x, y, drawn, levels=levels, norm=norm, cmap="cividis")
-    style.detector(ax, x, y, _TITLES[name])
+    of = np.maximum(sigma, 1e-2 * sigma.max())
+    style.filled(ax, x, y, sigma, _TITLES[name], "1 σ of the shift [px]", of)
     step = (_GRID - 1) // (_ARROWS - 1)
     some = slice(step // 2, None, step)
     style.arrows(ax, x[some], y[some], shift.reshape(_GRID, _GRID, 2)[some, some], " px")
-    ticks_at_levels(style.colour_bar(ax, image, "1 σ of the shift [px]"), levels)
 
 
 def _curve(curve: EffectCurve, ax: Axes) -> None:

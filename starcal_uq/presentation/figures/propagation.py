@@ -11,7 +11,7 @@ from starcal_uq.core.formatting import percent, significant
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.estimation import plot_residual_map
-from starcal_uq.presentation.figures.scales import round_below, round_levels, ticks_at_levels
+from starcal_uq.presentation.figures.scales import round_below
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
@@ -134,18 +134,14 @@ def _panel(
     title: str,
     scale: str = "1 sigma per axis [arcsec]",
 ) -> None:
-    style.dress(ax)
     x, y = field.x_px, field.y_px
-    levels, norm = round_levels(values)
-    image = ax.contourf(x, y, values, levels=levels, norm=norm, cmap="cividis")
+    _, levels = style.filled(ax, x, y, values, title, scale)
     ax.contour(x, y, values, levels=levels[1:-1], colors="white", linewidths=0.5)
     # A sample is enough to show where stars were, and evenly spaced rows are a sample.
     some = slice(None, None, max(1, len(field.star_x_px) // _STARS_SHOWN))
     ax.scatter(
         field.star_x_px[some], field.star_y_px[some], s=2.0, color="white", alpha=0.45, linewidths=0
     )
-    style.detector(ax, x, y, title)
-    ticks_at_levels(style.colour_bar(ax, image, scale), levels)
     if covariance is not None:
         _ellipses(ax, x, y, covariance)
 

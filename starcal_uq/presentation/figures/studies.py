@@ -16,9 +16,9 @@ from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.coupling import correlation_text, heat_map
 from starcal_uq.presentation.figures.scales import symbol
 from starcal_uq.presentation.figures.sweeps import (
-    faceted,
     held_title,
     plain,
+    plot_swept,
     short,
     small_multiples,
     some,
@@ -130,10 +130,11 @@ def plot_study_correlation(
         if "posterior_correlation" in study.data and second not in AXES:
             r = study.values("posterior_correlation", parameter=first, parameter_2=second)
             posterior[title] = np.abs(r)
-    data = faceted(sweep, panels, along, by, at, posterior)
-    figure, axes = small_multiples(data, along, by, log=False, sharey=True, dashed="posterior")
+    look: AnyDict = {"log": False, "sharey": True, "dashed": "posterior"}
+    figure, axes = plot_swept(sweep, panels, along, by, at, posterior, **look)
     style.label(axes[0], y="size of the correlation")
-    _correlation_axis(axes[0], float(np.nanmax(data.to_array())))
+    drawn = [*panels.values(), *posterior.values()]
+    _correlation_axis(axes[0], max(float(np.nanmax(r[sweep.ok])) for r in drawn))
     return figure
 
 
@@ -304,8 +305,7 @@ def plot_weakest(
         share = study.values("weak_direction", parameter=name) ** 2
         if np.nanmax(share) >= PART**2:
             panels[f"Share of {symbol(name)} [%]"] = 100.0 * share
-    data = faceted(study.sweep, panels, along, by, at)
-    figure, axes = small_multiples(data, along, by, log=False)
+    figure, axes = plot_swept(study.sweep, panels, along, by, at, log=False)
     for ax in axes[1:]:
         ax.set_ylim(0.0, 105.0)
     axes[0].set_ylim(0.0)
@@ -382,8 +382,7 @@ def plot_needed(
     panels = {"Error that differs from frame to frame [arcsec]": study.sweep.frame_error}
     if target is not None:
         panels[f"Frames for {target:g} arcsec"] = study.frames_for(target)
-    data = faceted(study.sweep, panels, along, by, at)
-    figure, (ax, *_) = small_multiples(data, along, by, wide=2.0)
+    figure, (ax, *_) = plot_swept(study.sweep, panels, along, by, at, wide=2.0)
     if target is not None:
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, target / 1.5), max(high, target * 1.5))
@@ -421,9 +420,8 @@ def plot_inflation(
         numbers, text = numbers_of(study, "sigma", name)
         panels[capital(text)] = numbers
         known[capital(text)], _ = numbers_of(study, "sigma_conditional", name)
-    data = faceted(study.sweep, panels, along, by, at, known)
     dashed = "all others known"
-    return small_multiples(data, along, by, dashed=dashed)[0]
+    return plot_swept(study.sweep, panels, along, by, at, known, dashed=dashed)[0]
 
 
 def plot_simpler(
@@ -463,8 +461,8 @@ def plot_simpler(
         raise ValueError("no simpler distortion model was tried in this study.")
     along, by = two_axes(study.sweep, along, by)
     known = dict.fromkeys(panels, study.sweep.frame_error)
-    data = faceted(study.sweep, panels, along, by, at, known)
-    return small_multiples(data, along, by, sharey=True, dashed="error of the calibration")[0]
+    look: AnyDict = {"sharey": True, "dashed": "error of the calibration"}
+    return plot_swept(study.sweep, panels, along, by, at, known, **look)[0]
 
 
 def plot_coverage(study: Study, *, along: str | None = None) -> Figure:

@@ -17,7 +17,7 @@ import numpy as np
 
 from starcal_uq.core.formatting import MINUS, significant, superscript
 from starcal_uq.core.types import AnyDict
-from starcal_uq.presentation.figures.scales import round_below
+from starcal_uq.presentation.figures.scales import round_below, round_levels, ticks_at_levels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -226,6 +226,23 @@ def detector(ax: Axes, x: Any, y: Any, title: str) -> None:
     ax.set_ylim(y[-1], y[0])
     ax.set_aspect("equal")
     label(ax, title, "x [px]", "y [px]")
+
+
+def filled(
+    ax: Axes, x: Any, y: Any, values: Any, title: str, unit: str | None, of: Any = None
+) -> tuple[Any, Any]:
+    """Filled levels of values (ny, nx) over the detector, with a colour bar in a unit, if any.
+
+    Levels are round and those of `of`, the values themselves by default. Returned are image and
+    levels.
+    """
+    levels, norm = round_levels(values if of is None else of)
+    drawn = np.clip(values, levels[0], levels[-1])
+    image = dress(ax).contourf(x, y, drawn, levels=levels, norm=norm, cmap="cividis")
+    detector(ax, x, y, title)
+    if unit is not None:
+        ticks_at_levels(colour_bar(ax, image, unit), levels)
+    return image, levels
 
 
 def arrows(ax: Axes, x: Any, y: Any, shifts: Any, unit: str) -> None:

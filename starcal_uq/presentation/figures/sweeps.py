@@ -91,31 +91,30 @@ def ticks(axis: Any, values: Sequence[Any], places: FloatArray) -> None:
         axis.set_tick_params(rotation=28)
 
 
-def faceted(
+def plot_swept(
     sweep: Sweep,
     panels: Mapping[str, FloatArray],
     along: str,
     by: str | None,
     at: AnyMapping | None,
-    dashed: Mapping[str, FloatArray] | None = None,
-) -> xr.Dataset:
-    """What `small_multiples` draws of numbers (C,), by the titles of their panels: a sweep's lines,
-    and `dashed` beside them.
+    beside: Mapping[str, FloatArray] | None = None,
+    **look: Any,
+) -> tuple[Figure, list[Axes]]:
+    """`small_multiples` of numbers (C,), by the titles of their panels: a sweep's lines, and dashed
+    those of `beside`.
     """
     import pandas as pd
     import xarray as xr
 
     titles = pd.Index(panels, name="panel")
     found = xr.concat([sweep.lines(panels[t], along, by, at) for t in titles], titles)
-    if dashed:
-        beside = xr.concat(
-            [sweep.lines(dashed[t], along, by, at)["median"] for t in titles], titles
-        )
-        found["dashed"] = beside
+    if beside:
+        lines = [sweep.lines(beside[t], along, by, at)["median"] for t in titles]
+        found["dashed"] = xr.concat(lines, titles)
     # Values at which no cell has numbers are left out.
     for axis in filter(None, (along, by)):
         found = found.dropna(axis, how="all")
-    return found
+    return small_multiples(found, along, by, **look)
 
 
 def small_multiples(
