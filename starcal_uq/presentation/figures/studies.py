@@ -93,10 +93,7 @@ def numbers_of(
 def plot_study_correlation(
     study: Study,
     pairs: Sequence[tuple[str, str]] | None = None,
-    *,
-    along: str | None = None,
-    by: str | None = None,
-    at: AnyMapping | None = None,
+    **where: Any,
 ) -> Figure:
     """Size of the correlation of pairs against a swept axis, a line for every value of a second
     one.
@@ -111,13 +108,11 @@ def plot_study_correlation(
     pairs : sequence of (str, str), optional
         Names of parameters, or of a parameter and pitch, yaw or roll of the common rotation; those
         that are coupled most by default.
-    along, by : str, optional
-        Axes; the first two that were swept by default.
-    at : dict, optional
-        Values at which other axes are held, their middle ones by default.
+    **where
+        ``along`` and ``by``, names of axes, the first two that were swept by default; and ``at``, values
+        at which other axes are held, their middle ones by default.
     """
     sweep = study.sweep
-    along, by = two_axes(sweep, along, by)
     if pairs is None:
         # The pairs that are coupled in most of the sweep, or the strongest.
         main = sorted(sweep.coupled or sweep.pairs[:_MOST_PANELS], key=lambda pair: -pair.mean_size)
@@ -131,7 +126,7 @@ def plot_study_correlation(
             r = study.values("posterior_correlation", parameter=first, parameter_2=second)
             posterior[title] = np.abs(r)
     look: AnyDict = {"log": False, "sharey": True, "dashed": "posterior"}
-    figure, axes = plot_swept(sweep, panels, along, by, at, posterior, **look)
+    figure, axes = plot_swept(sweep, panels, posterior, **where, **look)
     style.label(axes[0], y="size of the correlation")
     drawn = [*panels.values(), *posterior.values()]
     _correlation_axis(axes[0], max(float(np.nanmax(r[sweep.ok])) for r in drawn))
@@ -278,10 +273,7 @@ def plot_study_maps(study: Study, x: str | None = None, y: str | None = None) ->
 
 def plot_weakest(
     study: Study,
-    *,
-    along: str | None = None,
-    by: str | None = None,
-    at: AnyMapping | None = None,
+    **where: Any,
 ) -> Figure:
     """What the weakest direction is made of along an axis, and its variance, a line for every value
     of a second one.
@@ -294,18 +286,16 @@ def plot_weakest(
     ----------
     study : Study
         Result of `starcal_uq.study`.
-    along, by : str, optional
-        Axes; the first two that were swept by default.
-    at : dict, optional
-        Values at which other axes are held, their middle ones by default.
+    **where
+        ``along`` and ``by``, names of axes, the first two that were swept by default; and ``at``, values
+        at which other axes are held, their middle ones by default.
     """
-    along, by = two_axes(study.sweep, along, by)
     panels = {"Variance along it / of uncoupled ones": study.values("weak_variance")}
     for name in study.parameter_names:
         share = study.values("weak_direction", parameter=name) ** 2
         if np.nanmax(share) >= PART**2:
             panels[f"Share of {symbol(name)} [%]"] = 100.0 * share
-    figure, axes = plot_swept(study.sweep, panels, along, by, at, log=False)
+    figure, axes = plot_swept(study.sweep, panels, **where, log=False)
     for ax in axes[1:]:
         ax.set_ylim(0.0, 105.0)
     axes[0].set_ylim(0.0)
@@ -358,10 +348,8 @@ def plot_matrices(
 def plot_needed(
     study: Study,
     *,
-    along: str | None = None,
-    by: str | None = None,
     target_arcsec: float | None = None,
-    at: AnyMapping | None = None,
+    **where: Any,
 ) -> Figure:
     """Frame-dependent attitude error along an axis with its target, and the frames that the target
     takes.
@@ -370,19 +358,17 @@ def plot_needed(
     ----------
     study : Study
         Result of `starcal_uq.study`.
-    along, by : str, optional
-        Axes; the first two that were swept by default.
     target_arcsec : float, optional
         1 sigma per axis across the boresight; the study's own by default.
-    at : dict, optional
-        Values at which other axes are held, their middle ones by default.
+    **where
+        ``along`` and ``by``, names of axes, the first two that were swept by default; and ``at``, values
+        at which other axes are held, their middle ones by default.
     """
-    along, by = two_axes(study.sweep, along, by)
     target = study.definition.target_arcsec if target_arcsec is None else target_arcsec
     panels = {"Error that differs from frame to frame [arcsec]": study.sweep.frame_error}
     if target is not None:
         panels[f"Frames for {target:g} arcsec"] = study.frames_for(target)
-    figure, (ax, *_) = plot_swept(study.sweep, panels, along, by, at, wide=2.0)
+    figure, (ax, *_) = plot_swept(study.sweep, panels, **where, wide=2.0)
     if target is not None:
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, target / 1.5), max(high, target * 1.5))
@@ -395,10 +381,7 @@ def plot_needed(
 
 def plot_inflation(
     study: Study,
-    *,
-    along: str | None = None,
-    by: str | None = None,
-    at: AnyMapping | None = None,
+    **where: Any,
 ) -> Figure:
     """Sigma of every parameter along an axis, with all others unknown and, dashed, with all others
     known.
@@ -409,27 +392,22 @@ def plot_inflation(
     ----------
     study : Study
         Result of `starcal_uq.study`.
-    along, by : str, optional
-        Axes; the first two that were swept by default.
-    at : dict, optional
-        Values at which other axes are held, their middle ones by default.
+    **where
+        ``along`` and ``by``, names of axes, the first two that were swept by default; and ``at``, values
+        at which other axes are held, their middle ones by default.
     """
-    along, by = two_axes(study.sweep, along, by)
     panels, known = {}, {}
     for name in study.parameter_names:
         numbers, text = numbers_of(study, "sigma", name)
         panels[capital(text)] = numbers
         known[capital(text)], _ = numbers_of(study, "sigma_conditional", name)
     dashed = "all others known"
-    return plot_swept(study.sweep, panels, along, by, at, known, dashed=dashed)[0]
+    return plot_swept(study.sweep, panels, known, **where, dashed=dashed)[0]
 
 
 def plot_simpler(
     study: Study,
-    *,
-    along: str | None = None,
-    by: str | None = None,
-    at: AnyMapping | None = None,
+    **where: Any,
 ) -> Figure:
     """Attitude error that a simpler distortion model would leave, beside the error of the
     calibration itself.
@@ -440,10 +418,9 @@ def plot_simpler(
     ----------
     study : Study
         Result of `starcal_uq.study`.
-    along, by : str, optional
-        Axes; the first two that were swept by default.
-    at : dict, optional
-        Values at which other axes are held, their middle ones by default.
+    **where
+        ``along`` and ``by``, names of axes, the first two that were swept by default; and ``at``, values
+        at which other axes are held, their middle ones by default.
 
     Raises
     ------
@@ -459,10 +436,9 @@ def plot_simpler(
     }
     if not panels:
         raise ValueError("no simpler distortion model was tried in this study.")
-    along, by = two_axes(study.sweep, along, by)
     known = dict.fromkeys(panels, study.sweep.frame_error)
     look: AnyDict = {"sharey": True, "dashed": "error of the calibration"}
-    return plot_swept(study.sweep, panels, along, by, at, known, **look)[0]
+    return plot_swept(study.sweep, panels, known, **where, **look)[0]
 
 
 def plot_coverage(study: Study, *, along: str | None = None) -> Figure:

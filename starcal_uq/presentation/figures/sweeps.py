@@ -94,18 +94,20 @@ def ticks(axis: Any, values: Sequence[Any], places: FloatArray) -> None:
 def plot_swept(
     sweep: Sweep,
     panels: Mapping[str, FloatArray],
-    along: str,
-    by: str | None,
-    at: AnyMapping | None,
     beside: Mapping[str, FloatArray] | None = None,
+    *,
+    along: str | None = None,
+    by: str | None = None,
+    at: AnyMapping | None = None,
     **look: Any,
 ) -> tuple[Figure, list[Axes]]:
-    """`small_multiples` of numbers (C,), by the titles of their panels: a sweep's lines, and dashed
-    those of `beside`.
+    """`small_multiples` of numbers (C,), by the titles of their panels: a sweep's lines along one
+    axis, by a second one, with others held at values, and dashed those of `beside`.
     """
     import pandas as pd
     import xarray as xr
 
+    along, by = two_axes(sweep, along, by)
     titles = pd.Index(panels, name="panel")
     found = xr.concat([sweep.lines(panels[t], along, by, at) for t in titles], titles)
     if beside:
