@@ -22,7 +22,7 @@ from starcal_uq.paper.show.field import CAMERA_NAMES
 from starcal_uq.paper.show.tables import METHOD_NAMES, NAMES
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import symbol
-from starcal_uq.presentation.words.axes import value_words
+from starcal_uq.presentation.figures.sweeps import ticks
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -223,9 +223,8 @@ def plot_printed_numbers(found: Reproduction) -> Figure:
     ax.plot(nearest, place, "o", label="closest of all readings", **open_)
     ax.plot(main, place, "o", color=style.BLUE, markersize=5.0, label="as printed (main reading)")
     reach = 1.6 * max(10.0, float(np.abs(main).max()))
-    ax.set_xscale("symlog", linthresh=_LINEAR_Z, linscale=1.3)
-    ax.set_xlim(-reach, reach)
-    signed_ticks(ax, reach, (-_LINEAR_Z, 0.0, _LINEAR_Z))
+    inner = (-_LINEAR_Z, 0.0, _LINEAR_Z)
+    style.signed_log(ax.xaxis, _LINEAR_Z, reach, inner, most=6, linscale=1.3)
     ax.set_yticks(place, [_axis_name(one) for one in judged])
     ax.tick_params(axis="y", length=0.0)
     ax.set_ylim(-0.7, len(judged) - 0.3)
@@ -254,6 +253,7 @@ _PARTS = {
     "rest": (style.ORANGE, "rest"),
     "noise": (style.SKY, "noise"),
 }
+_DASH: AnyDict = {"linestyle": "", "marker": "_", "markersize": 9.0, "markeredgewidth": 2.4}
 # Cameras of one tolerance stand side by side, so that their bars can be told apart.
 _SPREAD = 1.035
 
@@ -299,18 +299,24 @@ def plot_errors(found: FieldExperiment) -> Figure:
     figure = style.new_figure(10.4, 4.6)
     panels = figure.subplots(1, 3, sharey=True)
     cameras = [name for name in _COLOURS if name in set(parts["camera"])]
+    place = np.arange(len(cameras))
     for ax, axis in zip(panels, AXES, strict=True):
         style.dress(ax, grid=True)
-        for place, camera in enumerate(cameras):
-            row = parts[(parts["camera"] == camera) & (parts["axis"] == axis)].iloc[0]
-            _camera_column(ax, place, row)
+        rows = parts[parts["axis"] == axis].set_index("camera").loc[cameras]
+        for part, x, colour, marker in (
+            ("rms", -0.17, style.INK, "s"),
+            ("aligned", 0.03, style.BLUE, "o"),
+        ):
+            value, low, high = (rows[f"{part}{end}"].to_numpy() for end in ("", "_low", "_high"))
+            ends = np.maximum([value - low, high - value], 0.0)
+            look: AnyDict = {"fmt": marker, "markersize": 5.5, "elinewidth": 1.2}
+            ax.errorbar(place + x, value, ends, color=colour, **look)
+        for part, (colour, _) in _PARTS.items():
+            ax.plot(place + 0.22, rows[part].abs(), color=colour, **_DASH)
+        for at, camera in enumerate(cameras):
             if camera in FIELD_METHODS:
-                _mark(
-                    ax,
-                    place - 0.36,
-                    printed_field(camera, f"{axis}_arcsec").value,
-                    style.VERMILLION,
-                )
+                value = printed_field(camera, f"{axis}_arcsec").value
+                _mark(ax, at - 0.36, value, style.VERMILLION)
         ax.set_yscale("log")
         ax.set_ylim(0.03, 9000.0)
         ax.set_xlim(-0.6, len(cameras) - 0.4)
@@ -326,42 +332,9 @@ def plot_errors(found: FieldExperiment) -> Figure:
         style.key("against the true attitude", style.INK, marker="s", **plain),
         style.key("after alignment", style.BLUE, marker="o", **plain),
     ]
-    bar: AnyDict = {"linestyle": "", "marker": "_", "markersize": 9.0, "markeredgewidth": 2.4}
-    keys += [style.key(words, colour, **bar) for colour, words in _PARTS.values()]
+    keys += [style.key(words, colour, **_DASH) for colour, words in _PARTS.values()]
     style.legend_above(figure, keys, columnspacing=1.3, handletextpad=0.5)
     return figure
-
-
-def _camera_column(ax: Axes, place: int, row: pd.Series) -> None:
-    """One camera in one panel."""
-    for part, x, colour, marker in (
-        ("rms", -0.17, style.INK, "s"),
-        ("aligned", 0.03, style.BLUE, "o"),
-    ):
-        value = float(row[part])
-        error = [
-            [max(value - float(row[f"{part}_low"]), 0.0)],
-            [max(float(row[f"{part}_high"]) - value, 0.0)],
-        ]
-        ax.errorbar(
-            place + x,
-            value,
-            error,
-            color=colour,
-            marker=marker,
-            markersize=5.5,
-            linestyle="",
-            elinewidth=1.2,
-        )
-    for part, (colour, _) in _PARTS.items():
-        ax.plot(
-            place + 0.22,
-            abs(float(row[part])),
-            marker="_",
-            markersize=9.0,
-            markeredgewidth=2.4,
-            color=colour,
-        )
 
 
 # Errors up to this many bounds are drawn to scale, larger ones on a logarithmic axis.
@@ -438,15 +411,7 @@ def _signed_axis(ax: Axes, reach: float) -> None:
         ax.set_xlim(-_LINEAR, _LINEAR)
         plain_ticks(ax, (-3.0, 0.0, 3.0))
     else:
-        ax.set_xscale("symlog", linthresh=_LINEAR, linscale=1.2)
-        ax.set_xlim(-1.5 * reach, 1.5 * reach)
-        signed_ticks(ax, 1.5 * reach, (0.0,))
-
-
-def signed_ticks(ax: Axes, reach: float, inner: Sequence[float]) -> None:
-    """Powers of ten up to the reach on both sides of some inner ticks."""
-    powers = 10.0 ** np.arange(1, np.floor(np.log10(reach)) + 1)
-    plain_ticks(ax, [*(-powers[::-1]), *inner, *powers])
+        style.signed_log(ax.xaxis, _LINEAR, 1.5 * reach, linscale=1.2)
 
 
 def plain_ticks(ax: Axes, ticks: Sequence[float] | FloatArray) -> None:
@@ -585,8 +550,7 @@ def _scale(ax: Axes, at: FloatArray) -> None:
         ax.set_xlim(-0.1 * float(positive[0]), 1.4 * float(positive[-1]))
     else:
         ax.set_xscale("log")
-    shown = values[:: -(-len(values) // 5)]
-    ax.set_xticks(shown, [value_words(value) for value in shown])
+    ticks(ax.xaxis, values.tolist(), values, 5)
     ax.set_xticks([], minor=True)
 
 

@@ -59,7 +59,8 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
         lower.axhspan(-1.0, 1.0, color=style.GREEN, alpha=0.2, linewidth=0)
         lower.axhline(0.0, color=style.VERMILLION, **_REFERENCE)
         lower.plot(iteration, error, color=style.BLUE, **_PATH)
-        _error_axis(lower, float(np.abs(error).max()))
+        decades = max(1.0, np.ceil(np.log10(max(np.abs(error).max(), 2.0))))
+        style.signed_log(lower.yaxis, 1.0, 10.0 ** (decades + 0.15), linscale=0.6)
         style.label(lower, x="iteration")
     what = "truth" if known else "final estimate"
     style.label(axes[0, 0], y="value")
@@ -99,17 +100,6 @@ def _mark_stages(ax: Axes, starts: list[int], total: int) -> None:
             place = {"xycoords": ax.get_xaxis_transform(), "ha": "center"}
             style.note(ax, str(i + 1), at, color=style.GREY, **place)
     ax.set_xlim(-0.5, total - 0.5)
-
-
-def _error_axis(ax: Axes, largest: float) -> None:
-    from matplotlib.ticker import FixedLocator
-
-    decades = max(1, int(np.ceil(np.log10(max(largest, 2.0)))))
-    style.log_scale(ax.yaxis, 1.0, linscale=0.6)
-    ax.set_ylim(-(10.0 ** (decades + 0.15)), 10.0 ** (decades + 0.15))
-    step = 1 if decades <= 2 else -(-decades // 2)
-    powers = 10.0 ** np.arange(decades, 0, -step)
-    ax.yaxis.set_major_locator(FixedLocator([*-powers, 0.0, *powers[::-1]]))
 
 
 # chi-square with 2 degrees of freedom at 99 %: a mean vector beyond it is drawn as significant.

@@ -165,26 +165,25 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
     """
     if plan.sweeps is None:
         raise ValueError("this plan was made without sweeps: call plan with sweeps=True.")
-    import pandas as pd
-
     of_frames, found = plan.frames_needed is not None, plan.distortion
     column = "frames_needed" if of_frames else "radius_arcsec"
     here = {"magnitude limit": plan.max_mag, "noise": plan.sigma_px, "part of the detector": 1.0}
-    rows = plan.sweeps[["sweep", "value", column]]
+    shown = {
+        name: rows[["value", column]].to_numpy().T for name, rows in plan.sweeps.groupby("sweep")
+    }
     if found is not None:
         drawn = found.radius_after_arcsec
         if of_frames:
             drawn = found.frames[:, found.scopes.index(plan.scope)]
-        changed = {"sweep": "distortion", "value": found.percent, column: drawn}
-        rows = pd.concat([rows, pd.DataFrame(changed)])
+        shown["distortion"] = np.stack([found.percent, drawn])
         here["distortion"] = found.percent[np.argmin(np.abs(found.percent - found.own_percent))]
-    swept = [name for name in _SWEEPS if name in set(rows["sweep"])]
+    swept = [name for name in _SWEEPS if name in shown]
     figure = style.new_figure(2.0 + 3.0 * len(swept), 3.6)
     panels = figure.subplots(1, len(swept), sharey=True, squeeze=False)[0]
     target = None if of_frames else plan.target_arcsec
     for ax, name in zip(panels, swept, strict=True):
         style.dress(ax, grid=True)
-        x, y = rows.loc[rows["sweep"] == name, ["value", column]].to_numpy(np.float64).T
+        x, y = shown[name]
         ax.set_yscale("log")
         if name == "noise":
             ax.set_xscale("log")

@@ -159,6 +159,20 @@ def log_scale(axis: Axis, linear: float | None = None, **options: Any) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: power_text(value)))
 
 
+def signed_log(
+    axis: Axis, linear: float, reach: float, inner: Any = (0.0,), most: int = 2, **options: Any
+) -> None:
+    """An axis from -`reach` to `reach`, linear within `linear`, with ticks at `most` powers of ten
+    on either side of `inner` ones.
+    """
+    ax = axis.axes
+    log_scale(axis, linear, **options)
+    powers = 10.0 ** np.arange(1, np.floor(np.log10(reach)) + 1)
+    powers = powers[:: -max(1, -(-len(powers) // most))]
+    axis.set_ticks([*-powers, *inner, *powers])
+    (ax.set_xlim if axis is ax.xaxis else ax.set_ylim)(-reach, reach)
+
+
 def power_text(value: float) -> str:
     """A power of ten as a tick label, without the mathematical typesetting that takes as long as a
     panel.

@@ -80,11 +80,11 @@ def _scale(ax: Axes, values: Sequence[Any]) -> FloatArray:
     return places
 
 
-def ticks(axis: Any, values: Sequence[Any], places: FloatArray) -> None:
+def ticks(axis: Any, values: Sequence[Any], places: FloatArray, most: int = 8) -> None:
     """Ticks at the swept values, every second or third where they are many; long names stand
     aslant.
     """
-    shown = some(len(values), 8)
+    shown = some(len(values), most)
     words = [value_words(values[i]) for i in shown]
     axis.set_ticks(places[shown], words)
     if axis.axis_name == "x" and not numeric(values) and max(map(len, words)) * len(words) > 26:
