@@ -8,7 +8,6 @@ terminal.
 from __future__ import annotations
 
 import html
-import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -111,8 +110,8 @@ class TextTable:
         opening = f'<table class="{kind}">' if kind else "<table>"
         head = line("th", [html.escape(head) for head in self.heads])
         body = "".join(
-            line("td", [name(first), *map(html.escape, cells)], mark)
-            for (first, *cells), mark in itertools.zip_longest(self.rows, self.marks, fillvalue="")
+            line("td", [name(row[0]), *map(html.escape, row[1:])], mark)
+            for row, mark in zip(self.rows, self.marks or [""] * len(self.rows), strict=True)
         )
         return f"{opening}{above}<thead>{head}</thead><tbody>{body}</tbody></table>"
 
