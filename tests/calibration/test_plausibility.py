@@ -153,7 +153,7 @@ def refuse(slip, field):
     assert "max_iterations" not in str(caught.value)
 
 
-@pytest.mark.parametrize("slip", ["hours", "x", "frames"])
+@pytest.mark.parametrize("slip", ["hours", "x"])
 def test_the_error_of_a_calibration_names_the_slip(slip):
     refuse(slip, 8.0)
 

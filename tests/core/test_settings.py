@@ -153,6 +153,7 @@ def study_files():
         yield "n", odd, file(sweep={"latin": {"n": odd, "sigma_px": {"start": 0.1, "stop": 0.2}}})
 
 
+@pytest.mark.slow
 def test_odd_numbers_in_a_study_are_refused_in_a_sentence_or_make_sense():
     """Every key and axis that is declared."""
     refused, taken = set(), []

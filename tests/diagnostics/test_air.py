@@ -149,7 +149,7 @@ def outside(seed, *, air=None, effects="none", meta=None, **options):
     )
 
 
-@pytest.mark.parametrize("effects", ["none", "star"])
+@pytest.mark.parametrize("effects", ["none", pytest.param("star", marks=pytest.mark.slow)])
 def test_errors_of_stars_are_not_refraction(effects):
     for seed in range(2):
         _, obs, cal = outside(seed, effects=effects, **PATCH)
@@ -210,7 +210,11 @@ LOOKALIKES = {
 }
 
 
-@pytest.mark.parametrize("where", [{}, {"pointings": 1, "drift_px": 3.3}], ids=str)
+@pytest.mark.parametrize(
+    "where",
+    [{}, pytest.param({"pointings": 1, "drift_px": 3.3}, marks=pytest.mark.slow)],
+    ids=str,
+)
 @pytest.mark.parametrize("name", LOOKALIKES)
 def test_without_times_what_is_not_refraction_is_not_named(name, where):
     _, obs, cal = outside(3, **LOOKALIKES[name], **where)

@@ -390,7 +390,7 @@ def moved(tmp_path_factory):
     [
         ("auto", 1e-7),
         ("field", 1e-7),
-        ("temperature,time,epoch,magnitude,phase,frame", 1e-3),
+        pytest.param("temperature,time,epoch,magnitude,phase,frame", 1e-3, marks=pytest.mark.slow),
     ],
 )
 def test_effects_of_partitions_are_those_of_the_table(moved, effects, bound, tmp_path):

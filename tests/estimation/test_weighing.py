@@ -138,7 +138,7 @@ def selected(made, seed, effects="auto"):
         (clean, ()),
         (uneven_gaussian, ("noise",)),
         (heavy, ("tails",)),
-        (uneven_and_wrong, ("noise", "tails")),
+        pytest.param(uneven_and_wrong, ("noise", "tails"), marks=pytest.mark.slow),
     ],
 )
 def test_auto_takes_up_noise_and_tails_where_the_data_ask_for_them(made, chosen):

@@ -33,7 +33,6 @@ def test_default_priors_expect_the_paper_s_camera() -> None:
     ("change", "quantity"),
     [
         ({"focal_fraction": 1e-3, "distortion_corner_px": 0.5}, "scale_percent"),
-        ({"focal_px": 7000.0, "focal_fraction": 0.01}, "scale_percent"),
         (
             {
                 "sigma_median": 1e-4,

@@ -442,7 +442,7 @@ def test_a_wrong_compressed_likelihood_is_replaced(few_frames, replaced):
 
 
 @pytest.mark.usefixtures("few_importance_draws", "no_polynomial")
-@pytest.mark.parametrize("stop", [20, 70])
+@pytest.mark.parametrize("stop", [pytest.param(20, marks=pytest.mark.slow), 70])
 def test_a_replaced_likelihood_is_resumed(few_frames, replaced, tmp_path, stop):
     obs, cal = few_frames
     wrong = spoilt(cal)

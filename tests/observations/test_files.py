@@ -555,6 +555,7 @@ def test_save_needs_a_known_ending(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_large_table_is_read_quickly(tmp_path):
     """15,000 rows, the paper's experiment."""
     obs = Observations(*(getattr(random_table(1000, 15), name) for name in HEADER))
