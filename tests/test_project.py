@@ -385,8 +385,8 @@ WITHOUT_NAMESAKE = {
     "images": "background detection extract fits fits_files image optics pixel_phase pixels psf raw",
     "inference": "derived surrogate",
     "likelihood": (
-        "arrays effect_likelihood effect_sums elimination fitted_effects "
-        "frame_products ipopt loops/common loops/expansion loops/frames loops/unrolled "
+        "arrays effect_likelihood effect_sums elimination expansion fitted_effects "
+        "frame_products ipopt loops/common loops/frames loops/unrolled "
         "noise_model paths shapes star_errors zenith"
     ),
     "maths": "circular linear",

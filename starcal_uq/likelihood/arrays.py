@@ -8,6 +8,8 @@ beyond that.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,17 +18,18 @@ from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import (
     backward_kernel,
     backward_root,
-    bent_index,
     forward_kernel,
     forward_root,
     unproject_theta,
 )
 from starcal_uq.core.types import FloatArray
+from starcal_uq.likelihood.elimination import products_by_frame
+from starcal_uq.likelihood.expansion import GramRows, expand, frame_rows
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
 
 # Stars whose arrays stay in the second-level cache, and are enough to hide the interpreter.
-BLOCK_STARS, PAIR_STARS, _EXPANSION_STARS = 3072, 4096, 2048
+BLOCK_STARS, PAIR_STARS, _EXPANSION_STARS = 3072, 4096, 3072
 # Enough for the turn of all frames together.
 _FEW_STARS = 128
 
@@ -160,98 +163,20 @@ def blocks(
         yield Block(slice(first, last), part, columns, turn, buffers)
 
 
-class _Expansion:
-    """The residuals of frames expanded around one point, block by block.
+@dataclass
+class _Block:
+    """Stars of some frames, for `starcal_uq.likelihood.expansion`."""
 
-    Second derivatives Q over (theta, phi) are contracted with the directions (L z, phi(z)), in
-    which the attitudes phi(z) = K z follow the parameters; most entries of Q that belong to theta
-    alone vanish and are not formed.
-    """
+    whitening: list[float]
+    of_frames: dict[int, FloatArray]  # Rows (n,) that stars of a frame share, or (2, n)
+    own: dict[int, FloatArray]  # Rows (2, n), two numbers each
 
-    def __init__(self, model_name: str, theta: FloatArray, whitening: FloatArray) -> None:
-        self.model_name, self.theta, self.whitening = model_name, theta, whitening
-        p = self.p = len(theta)
-        self.q = (p + 1) * (p + 2) // 2
-        self._kernel = forward_kernel(model_name, "bent")
-        rows, columns = bent_index(model_name)
-        own, mixed, turned = columns < p, (rows < p) & (columns >= p), rows >= p
-        self._own, self._mixed = np.flatnonzero(own), np.flatnonzero(mixed)
-        self._turned = {
-            (int(rows[n]) - p, int(columns[n]) - p): int(n) for n in np.flatnonzero(turned)
-        }
-        i, j = np.triu_indices(p)
-        # A diagonal entry of z z^T stands once in the expansion, halved; the others stand for both
-        # orders.
-        self._halved = np.where(i == j, 0.5, 1.0)
-        r, c = rows[own], columns[own]
-        both = whitening[r][:, i] * whitening[c][:, j] + np.where(r == c, 0.0, 1.0)[:, None] * (
-            whitening[c][:, i] * whitening[r][:, j]
-        )
-        self._to_square = (both * self._halved).T
-        # From the entries (theta_t, phi_c) to (z_a, phi_c), rows a, c.
-        self._to_mixed = np.zeros((p, 3, len(self._mixed)))
-        for n, entry in enumerate(self._mixed):
-            self._to_mixed[:, columns[entry] - p, n] = whitening[rows[entry]]
+    def numbers(self, n: int) -> list[float]:
+        return self.whitening
 
-    def block(
-        self,
-        part: StarFrames,
-        rotations: FloatArray,
-        moved: tuple[FloatArray, FloatArray, FloatArray],
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Columns (q, 2, n) of frames that fit into the cache, those of the attitudes (3, 2, n), and
-        the slope of the log determinant.
-
-        Columns are derivatives of the residuals along the attitudes' first-order path: value and
-        first derivatives are free of what attitudes can reproduce, second derivatives are not.
-        """
-        p, n = self.p, part.n_stars
-        xy, h, a = np.empty((2, n)), np.empty((p, 2, n)), np.empty((3, 2, n))
-        bent = np.empty((self._kernel.shapes[3][0], 2, n))
-        b, (shift, response, inverse) = part.rotated(rotations), moved
-        outputs = (xy, h.reshape(-1, n), a.reshape(-1, n), bent.reshape(-1, n))
-        self._kernel.into((self.theta, b, forward_root(self.model_name, self.theta, b)), outputs)
-        e = part.pixel - xy
-        for array in (e, h, a, bent):
-            part.whiten(array)
-        d = (self.whitening.T @ h.reshape(p, -1)).reshape(p, 2, n)
-        path = part.spread(np.einsum("ipk,pa->iak", response, self.whitening))
-        columns = np.empty((self.q, 2, n))
-        columns[0] = e - np.sum(part.spread(shift)[:, None] * a, axis=0)
-        first, second = columns[1 : p + 1], columns[p + 1 :]
-        np.copyto(first, d)
-        for c in range(3):
-            first += path[c][:, None] * a[c]
-        np.negative(first, out=first)
-        bend = self._curves(bent, path, second)
-        pseudo = np.einsum("ijn,jxn->ixn", part.spread(inverse), a)
-        return columns, a, 2.0 * (bend.reshape(p, -1) @ pseudo.ravel())
-
-    def _curves(self, bent: FloatArray, path: FloatArray, second: FloatArray) -> FloatArray:
-        """Second derivatives along z into `second`; the derivatives (p, 3, 2, n) of the attitude
-        columns come back.
-        """
-        p, n = self.p, bent.shape[2]
-        flat = bent.reshape(len(bent), -1)
-        bend = (self._to_mixed.reshape(3 * p, -1) @ flat[self._mixed]).reshape(p, 3, 2, n)
-        turned = np.zeros((p, 3, 2, n))
-        for (c, d), entry in self._turned.items():
-            turned[:, c] += path[d][:, None] * bent[entry]
-            if c != d:
-                turned[:, d] += path[c][:, None] * bent[entry]
-        half = bend + 0.5 * turned
-        np.matmul(self._to_square, flat[self._own], out=second.reshape(len(second), -1))
-        start = 0
-        for i in range(p):
-            rows = second[start : start + p - i]
-            for c in range(3):
-                rows[0] += half[i, c] * path[c, i]
-                rows[1:] += half[i, c] * path[c, i + 1 :, None]
-                rows[1:] += half[i + 1 :, c] * path[c, i]
-            start += p - i
-        np.negative(second, out=second)
-        bend += turned
-        return bend
+    @contextmanager
+    def each(self) -> Iterator[tuple[dict[int, FloatArray], dict[int, FloatArray]]]:
+        yield self.of_frames, self.own
 
 
 def gram(
@@ -266,18 +191,35 @@ def gram(
     """As `starcal_uq.likelihood.paths.Sums.gram`; `look` is shown which frames are in a block, and
     the columns (q, 2, n) of its stars.
     """
-    expansion, p = _Expansion(model_name, theta, whitening), len(theta)
-    total, slope = np.zeros((expansion.q, expansion.q)), np.zeros(p)
+    p, at, kernel = (
+        len(theta),
+        GramRows.of(model_name, len(theta)),
+        forward_kernel(model_name, "bent"),
+    )
+    q = (p + 1) * (p + 2) // 2
+    total, slope, by_frame = np.zeros((q, q)), np.zeros(p), frame_rows(whitening, moved)
     for first, last in frames.parts(_EXPANSION_STARS):
         part = frames.part(first, last)
-        own = (moved[0][..., first:last], moved[1][..., first:last], moved[2][..., first:last])
-        columns, attitude, log_slope = expansion.block(part, rotations[first:last], own)
-        flat, second = columns.reshape(len(columns), -1), columns[p + 1 :]
+        b, n = part.rotated(rotations[first:last]), part.n_stars
+        rows = np.empty((at.slope // 2, 2, n))
+        outputs = rows[:1], rows[1 : p + 1], rows[p + 1 : p + 4], rows[p + 4 :]
+        root = forward_root(model_name, theta, b)
+        kernel.into((theta, b, root), [output.reshape(-1, n) for output in outputs])
+        np.subtract(part.pixel, rows[0], out=rows[0])
+        part.whiten(rows)
+        shared = dict(enumerate(part.spread(by_frame[:, first:last])))
+        block = _Block(
+            whitening.ravel().tolist(), shared, {2 * k: row for k, row in enumerate(rows)}
+        )
+        expand(block, model_name, p)
+        columns = np.stack([block.own[at.columns + 2 * k] for k in range(q)])
+        flat, second = columns.reshape(q, -1), columns[p + 1 :]
         total += flat @ flat.T
-        slopes = np.stack([part.sum(np.sum(column * second, axis=1)) for column in attitude])
-        solved = np.einsum("ijk,jqk->iqk", own[2], slopes)
-        total[p + 1 :, p + 1 :] -= np.tensordot(slopes, solved, axes=([0, 2], [0, 2]))
-        slope += log_slope
+        slopes = products_by_frame(part, outputs[2], second)
+        total[p + 1 :, p + 1 :] -= np.einsum(
+            "kiq,ijk,kjr->qr", slopes, moved[2][..., first:last], slopes, optimize=True
+        )
+        slope += [np.sum(block.own[at.slope + 2 * z]) for z in range(p)]
         if look is not None:
             look(slice(first, last), columns)
     return total, slope

@@ -25,7 +25,7 @@ from starcal_uq.likelihood.effects import Effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.frame_products import FrameProducts
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
-from starcal_uq.likelihood.shapes import View, Waves
+from starcal_uq.likelihood.shapes import View
 from starcal_uq.likelihood.star_errors import StarModel
 from starcal_uq.likelihood.terms import Eliminated, TermSums, add_by_group
 from starcal_uq.observations.frames import StarFrames
@@ -113,55 +113,22 @@ class Columns:
         )
 
     def products(self, added: FloatArray) -> Products:
-        """Products with added columns (q, 2, n) and among themselves, attitudes projected out.
-
-        They are taken of waves along x and y and of the other columns, of which those of the run are
-        made, but for rotations.
-        """
-        frames, view = self.frames, self.view
-        shapes = [effect.columns.columns for effect in self.of_run]
-        smooth = next((shape for shape in shapes if isinstance(shape, Waves)), None)
-        waves, held = np.zeros((0, frames.n_stars)), self.star[:0]
-        if smooth is not None:
-            waves = smooth.along(view) * (1.0 if frames.weight is None else frames.weight)
-            # A wave of second order is what a shift of the camera leaves of a turn, many times.
-            held = self.attitudes.removed_from(_whitened(frames, view.parameter_columns))
-        plain = [_whitened(frames, shape(view)) for shape in shapes if shape is not smooth]
-        others = np.concatenate([held, *plain, self.frame, added])
-        w, place = 2 * len(waves), 2 * len(waves) + len(held)
-        size, made = w + len(others), []
-        for shape, effect in zip(shapes, self.of_run, strict=True):
-            own = np.eye(len(effect.prior), size, place)
-            if shape is smooth:
-                mixed = np.eye(2) if frames.whitening is None else frames.whitening.T
-                own[:, :w] = np.kron(np.eye(len(waves)), mixed)
-                own[:, w:] = 0.0
-                own[:, w : w + len(held)] = smooth.beside[:, : len(held)]
-            else:
-                place += len(own)
-            made.append(own)
-        factors = np.concatenate([*made, np.eye(size - place, size, place)])
+        """Products with added columns (q, 2, n) and among themselves, attitudes projected out."""
+        others = np.concatenate([self.raw, self.frame, added])
         local = np.concatenate([self.attitudes.columns, self.frame])
-        axes = [products_by_frame(frames, local[:, x : x + 1], waves[:, None]) for x in (0, 1)]
-        along = np.stack(axes, axis=3).reshape(frames.n_frames, len(local), w)
-        by_frame = np.concatenate([along, products_by_frame(frames, local, others)], axis=2)
+        by_frame = products_by_frame(self.frames, local, others)
         root = np.linalg.cholesky(np.moveaxis(self.attitudes.inverse, 2, 0))
-        turned = (np.swapaxes(root, 1, 2) @ by_frame[:, :3]).reshape(3 * frames.n_frames, size)
-        flat = others.reshape(len(others), 2 * frames.n_stars)
-        across = np.stack([waves @ others[:, x].T for x in (0, 1)], axis=1).reshape(w, len(others))
-        gram = np.block([[np.kron(waves @ waves.T, np.eye(2)), across], [across.T, flat @ flat.T]])
-        gram, frame = gram - turned.T @ turned, by_frame[:, 3:] @ factors.T
-        gram = factors @ gram @ factors.T
-        end = len(factors) - len(added)
-        m = end - len(self.frame)
-        of_stars = np.zeros((0, len(factors)))
+        turned = (np.swapaxes(root, 1, 2) @ by_frame[:, :3]).reshape(-1, len(others))
+        flat, frame = others.reshape(len(others), -1), by_frame[:, 3:]
+        gram = flat @ flat.T - turned.T @ turned
+        m, end, star = len(self.raw), len(others) - len(added), np.zeros((0, len(others)))
         if self.n_stars:
             left = self.attitudes.removed_from(added)
-            of_stars = self.cross(np.concatenate([self.run, self.frame, left])).star
+            star = self.cross(np.concatenate([self.run, self.frame, left])).star
         return Products(
             gram[end:, end:],
-            Cross(gram[:m, end:], frame[:, :, end:], of_stars[:, end:]),
-            Cross(gram[:m, :m], frame[:, :, :end], of_stars[:, :end]),
+            Cross(gram[:m, end:], frame[:, :, end:], star[:, end:]),
+            Cross(gram[:m, :m], frame[:, :, :end], star[:, :end]),
             None,
         )
 

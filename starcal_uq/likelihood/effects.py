@@ -26,7 +26,6 @@ from starcal_uq.likelihood.shapes import (
     Extent,
     Shape,
     View,
-    Waves,
     axes_shape,
     frame_shapes,
     magnitude_shape,
@@ -144,11 +143,7 @@ def run_shifts(
     for part, state, rows in likelihood.pieces(theta, None, _STARS_AT_ONCE):
         view = View.of(part, state, theta, rows)
         for effect, coefficients in effects:
-            columns = effect.columns.columns
-            if isinstance(columns, Waves):
-                shift = columns.shift(view, coefficients)
-            else:
-                shift = np.tensordot(coefficients, columns(view), 1)
+            shift = np.tensordot(coefficients, effect.columns.columns(view), 1)
             if effect.known:
                 part.frames.whiten(shift)
                 shift = part.frames.in_pixels(part.project_out(state, shift[None])[0])
@@ -206,18 +201,14 @@ def field_effect(camera: Camera) -> Effect:
     half = np.array([camera.width_px, camera.height_px]) / 2.0
     i, j = np.array([(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i)]).T
 
-    def waves(xy: FloatArray) -> FloatArray:
+    def raw(xy: FloatArray) -> FloatArray:
         from numpy.polynomial.legendre import legvander
 
         x, y = ((xy + 0.5) / half[:, None]) - 1.0
-        along, across = legvander(x, _ORDER).T, legvander(y, _ORDER).T
-        return np.concatenate([one * across[: _ORDER + 1 - k] for k, one in enumerate(along)])
+        waves = legvander(x, _ORDER).T[i] * legvander(y, _ORDER).T[j]
+        return np.einsum("tn,xy->txyn", waves, np.eye(2)).reshape(-1, *xy.shape)
 
-    def raw(xy: FloatArray) -> FloatArray:
-        found = np.kron(waves(xy), np.eye(2)).reshape(-1, *xy.T.shape)
-        return np.asarray(found.swapaxes(1, 2), dtype=np.float64)
-
-    return _smooth("field", camera, raw, i + j, waves)
+    return _smooth("field", camera, raw, i + j)
 
 
 @lru_cache(maxsize=8)
@@ -240,10 +231,9 @@ def _smooth(
     camera: Camera,
     raw: Callable[[FloatArray], FloatArray],
     order: IntArray,
-    waves: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Effect:
     """Columns (c, 2, n) at pixels (2, n), less what the camera and a rotation do; smaller the
-    higher the orders (t,) of their terms are. They may be `waves` (c / 2, n) along each axis.
+    higher the orders (t,) of their terms are.
     """
     unit, taken = _of_camera(camera, raw)
     removed = -taken.T / unit
@@ -253,8 +243,7 @@ def _smooth(
     def columns(view: View) -> FloatArray:
         return raw(view.predicted) + np.tensordot(removed, view.held, 1)
 
-    made = columns if waves is None else Waves(waves, removed)
-    shape = Shape(f"smooth {name} shift", name, len(prior), made)
+    shape = Shape(f"smooth {name} shift", name, len(prior), columns)
     return Effect(name, "run", shape, prior)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
@@ -15,10 +16,8 @@ from starcal_uq.likelihood.solvers import Constraints, Evaluate, Normal, Solutio
 class _Cache:
     """The model at the last point, shared by value, gradient and Hessian callbacks."""
 
-    def __init__(
-        self, evaluate: Evaluate, origin: FloatArray, scale: FloatArray, unit: float
-    ) -> None:
-        self.evaluate, self.origin, self.scale, self.unit = evaluate, origin, scale, unit
+    def __init__(self, evaluate: Evaluate, origin: FloatArray, scale: FloatArray) -> None:
+        self.evaluate, self.origin, self.scale = evaluate, origin, scale
         self.point: FloatArray | None = None
         self.normal: Normal | None = None
         self.count = 0
@@ -31,109 +30,47 @@ class _Cache:
         return self.normal
 
 
-class _Objective(ca.Callback):
-    """Half the scaled cost."""
+class _Callback(ca.Callback):
+    """A function of NumPy as one of CasADi, by the sparsities of its inputs and of its output.
 
-    def __init__(self, cache: _Cache, p: int) -> None:
+    `gradient` is that of a scalar.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        inputs: Sequence[Any],
+        output: Any,
+        gradient: _Callback | None = None,
+        names: Sequence[str] = (),
+    ) -> None:
         ca.Callback.__init__(self)
-        self.model, self.p = cache, p
-        self.gradient = _Gradient(cache, p)
-        self.construct("objective", {})
-
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.p, 1)
-
-    def eval(self, arg: Any) -> list[Any]:
-        cost = self.model.at(arg[0]).cost
-        return [0.5 * cost / self.model.unit if np.isfinite(cost) else np.nan]
-
-    def has_jacobian(self) -> bool:
-        return True
-
-    def get_jacobian(self, name: str, inames: Any, onames: Any, opts: Any) -> Any:
-        z, f = ca.MX.sym("z", self.p), ca.MX.sym("f", 1)
-        return ca.Function(name, [z, f], [self.gradient(z).T], inames, onames)
-
-
-class _Gradient(ca.Callback):
-    """Gradient of half the scaled cost."""
-
-    def __init__(self, cache: _Cache, p: int) -> None:
-        ca.Callback.__init__(self)
-        self.model, self.p = cache, p
-        self.construct("gradient", {})
-
-    def get_sparsity_in(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.p, 1)
-
-    def get_sparsity_out(self, i: int) -> Any:
-        return ca.Sparsity.dense(self.p, 1)
-
-    def eval(self, arg: Any) -> list[Any]:
-        return [self.model.at(arg[0]).gradient * self.model.scale / self.model.unit]
-
-
-class _Hessian(ca.Callback):
-    """Gauss-Newton Hessian of the Lagrangian (the constraints' curvature is left out)."""
-
-    def __init__(self, cache: _Cache, p: int, n_constraints: int) -> None:
-        ca.Callback.__init__(self)
-        self.model, self.p, self.n_constraints = cache, p, n_constraints
-        self.construct("hessian", {})
+        self.function, self.inputs, self.output = function, inputs, output
+        self.gradient, self.names = gradient, names
+        self.construct("callback", {})
 
     def get_n_in(self) -> int:
-        return 4
-
-    def get_sparsity_in(self, i: int) -> Any:
-        # Order of IPOPT's Hessian: x, parameters, multiplier of the objective, multipliers of the
-        # constraints.
-        return [
-            ca.Sparsity.dense(self.p, 1),
-            ca.Sparsity(0, 0),
-            ca.Sparsity.dense(1, 1),
-            ca.Sparsity.dense(self.n_constraints, 1),
-        ][i]
-
-    def get_sparsity_out(self, i: int) -> Any:
-        return ca.Sparsity.upper(self.p)
-
-    def eval(self, arg: Any) -> list[Any]:
-        matrix = (
-            self.model.at(arg[0]).matrix
-            * np.outer(self.model.scale, self.model.scale)
-            / self.model.unit
-        )
-        return [ca.triu(ca.DM(float(arg[2]) * matrix))]
-
-
-class _Recorder(ca.Callback):
-    """Keeps IPOPT's iterates."""
-
-    def __init__(self, p: int, n_constraints: int) -> None:
-        ca.Callback.__init__(self)
-        self.p, self.n_constraints = p, n_constraints
-        self.points: list[FloatArray] = []
-        self.construct("recorder", {})
-
-    def get_n_in(self) -> int:
-        return int(ca.nlpsol_n_out())
+        return len(self.inputs)
 
     def get_name_in(self, i: int) -> str:
-        return str(ca.nlpsol_out(i))
+        return self.names[i] if self.names else f"i{i}"
 
     def get_sparsity_in(self, i: int) -> Any:
-        size = {
-            "f": 1,
-            "x": self.p,
-            "lam_x": self.p,
-            "g": self.n_constraints,
-            "lam_g": self.n_constraints,
-        }
-        return ca.Sparsity.dense(size.get(str(ca.nlpsol_out(i)), 0), 1)
+        return self.inputs[i]
+
+    def get_sparsity_out(self, i: int) -> Any:
+        return self.output
 
     def eval(self, arg: Any) -> list[Any]:
-        self.points.append(np.array(arg[0], dtype=np.float64).ravel())
-        return [0]
+        return [self.function(*arg)]
+
+    def has_jacobian(self) -> bool:
+        return self.gradient is not None
+
+    def get_jacobian(self, name: str, inames: Any, onames: Any, opts: Any) -> Any:
+        assert self.gradient is not None
+        z, f = ca.MX.sym("z", self.inputs[0]), ca.MX.sym("f", 1)
+        return ca.Function(name, [z, f], [self.gradient(z).T], inames, onames)
 
 
 def ipopt(
@@ -164,15 +101,37 @@ def _solve(
     # One unit of a scaled variable raises the cost by about its own size.
     unit = max(normal.cost, np.finfo(float).tiny)
     scale = np.sqrt(unit / np.diag(normal.matrix))
-    cache = _Cache(evaluate, start, scale, unit)
-    objective = _Objective(cache, p)
+    cache, dense = _Cache(evaluate, start, scale), ca.Sparsity.dense
+
+    def value(z: Any) -> float:
+        cost = cache.at(z).cost
+        return 0.5 * cost / unit if np.isfinite(cost) else np.nan
+
+    def curvature(z: Any, _: Any, factor: Any, *others: Any) -> Any:
+        """Gauss-Newton Hessian of the Lagrangian; the constraints' curvature is left out."""
+        return ca.triu(ca.DM(float(factor) * (cache.at(z).matrix * np.outer(scale, scale) / unit)))
+
+    gradient = _Callback(lambda z: cache.at(z).gradient * scale / unit, [dense(p)], dense(p))
+    objective = _Callback(value, [dense(p)], dense(1), gradient)
     z = ca.MX.sym("z", p)
     theta = start + scale * z
     symbol = ca.SX.sym("t", p)
     positive = ca.SX.zeros(0, 1) if constraints.positive is None else constraints.positive(symbol)
     n_constraints = int(positive.numel())
     g = ca.Function("g", [symbol], [positive])(theta)
-    recorder, hessian = _Recorder(p, n_constraints), _Hessian(cache, p, n_constraints)
+    # Order of IPOPT's Hessian: x, parameters, multiplier of the objective, multipliers of the
+    # constraints.
+    shapes = [dense(p), ca.Sparsity(0, 0), dense(1), dense(n_constraints)]
+    hessian = _Callback(curvature, shapes, ca.Sparsity.upper(p))
+    points: list[FloatArray] = []
+    names = [str(ca.nlpsol_out(i)) for i in range(ca.nlpsol_n_out())]
+    sizes = {"f": 1, "x": p, "lam_x": p, "g": n_constraints, "lam_g": n_constraints}
+
+    def record(*arg: Any) -> int:
+        points.append(np.array(arg[names.index("x")], dtype=np.float64).ravel())
+        return 0
+
+    recorder = _Callback(record, [dense(sizes.get(n, 0)) for n in names], dense(1), None, names)
     solver = ca.nlpsol(
         "solver",
         "ipopt",
@@ -214,6 +173,6 @@ def _solve(
             final.cost, 1e-300
         )
         status = Status.CONVERGED if gain < 1e-10 else Status.STALLED
-    trajectory = np.array([start + scale * point for point in recorder.points] or [start])
+    trajectory = np.array([start + scale * point for point in points] or [start])
     costs = np.array([evaluate(point).cost for point in trajectory])
     return Solution(theta_final, final, trajectory, costs, status, cache.count)

@@ -82,31 +82,6 @@ class View:
 
 
 @dataclass(frozen=True)
-class Waves:
-    """Columns (2 w, 2, n) of w functions along each axis, with what parameters of the camera and
-    rotations do beside them.
-    """
-
-    functions: Callable[[FloatArray], FloatArray]  # (w, n) at pixels (2, n)
-    beside: FloatArray  # (2 w, p + 3): coefficients of the parameters and of a rotation
-
-    def along(self, view: View) -> FloatArray:
-        """The functions (w, n) at the stars."""
-        return self.functions(view.predicted)
-
-    def shift(self, view: View, coefficients: FloatArray) -> FloatArray:
-        """The shift (2, n) by coefficients (2 w,)."""
-        shift = np.tensordot(coefficients @ self.beside, view.held, 1)
-        return np.asarray(shift + coefficients.reshape(-1, 2).T @ self.along(view))
-
-    def __call__(self, view: View) -> FloatArray:
-        waves = self.along(view)
-        found = np.tensordot(self.beside, view.held, 1)
-        found.reshape(len(waves), 2, 2, -1)[:, (0, 1), (0, 1)] += waves[:, None]
-        return np.asarray(found)
-
-
-@dataclass(frozen=True)
 class Shape:
     """A family of shapes that one test looks for."""
 

@@ -21,7 +21,7 @@ from starcal_uq.camera.projection import (
     newton_kernel,
 )
 from starcal_uq.core.types import FloatArray
-from starcal_uq.likelihood.loops.expansion import expand, follow
+from starcal_uq.likelihood.expansion import expand, follow
 from starcal_uq.likelihood.loops.unrolled import STAR_FUNCTION, STRIDE, Code, Stars, call
 from starcal_uq.observations.frames import StarFrames
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.arrays import common_turn
+from starcal_uq.likelihood.expansion import GramRows, frame_rows
 from starcal_uq.likelihood.loops.common import (
     CHUNK,
     VERSION,
@@ -23,7 +24,6 @@ from starcal_uq.likelihood.loops.common import (
     symmetric,
     weighted,
 )
-from starcal_uq.likelihood.loops.expansion import GramRows
 from starcal_uq.likelihood.loops.unrolled import STRIDE, block_products, call, data, row
 from starcal_uq.observations.frames import StarFrames
 
@@ -184,8 +184,6 @@ def gram(
     q, at = (p + 1) * (p + 2) // 2, GramRows.of(model_name, p)
     # Groups of three fill up the last one.
     total, acc, slope = np.zeros((q + 2, q + 2)), np.zeros((3, q + 4 - p)), np.zeros(p)
-    path = np.einsum("ipk,pa->iak", moved[1], whitening).reshape(3 * p, -1)
-    inverse = moved[2][np.triu_indices(3)]
     _eliminated(
         VERSION,
         (
@@ -195,7 +193,7 @@ def gram(
         ),
         (given(theta), given(whitening.ravel())),
         weighted(frames, rotations),
-        given(np.concatenate([path, moved[0], inverse])),
+        given(frame_rows(whitening, moved)),
         (_GRAM_CHUNK, at.attitude, at.columns, q, p + 1, 2 * p, at.slope),
         (rows(WORK), rows(at.common), rows(at.own)),
         (total, acc, np.empty(6), slope),

@@ -14,8 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import reduce
-from operator import add
 from typing import Any
 
 from llvmlite import ir
@@ -25,6 +23,7 @@ from numba.core import typing as _typing
 from numba.extending import intrinsic
 
 from starcal_uq.camera.kernels import Kernel
+from starcal_uq.likelihood.expansion import added
 
 # Their functions carry no types.
 cgutils: Any = _cgutils
@@ -313,8 +312,3 @@ def turned_rows(more: bool) -> Any:
         return types.void(rows, matrix, begin, end, into), codegen
 
     return turned
-
-
-def added(terms: Sequence[Number]) -> Any:
-    """The sum of some numbers; 0.0 of none."""
-    return reduce(add, terms) if terms else 0.0

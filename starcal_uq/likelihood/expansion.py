@@ -1,12 +1,43 @@
-"""Columns of the compressed likelihood along one axis, written out for a model."""
+"""Columns of the compressed likelihood, written out for a model.
+
+The formula is one for both paths: its numbers are arrays of stars, with both axes at once, or the
+`starcal_uq.likelihood.loops.unrolled.Number` of one axis that is being compiled.
+
+Second derivatives Q over (theta, phi) are contracted with the directions (L z, phi(z)), in which the
+attitudes phi(z) = K z follow the parameters; most entries of Q that belong to theta alone vanish and
+are not formed. Columns are derivatives of the residuals along the attitudes' first-order path: value
+and first derivatives are free of what attitudes can reproduce, second derivatives are not.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from typing import Any, Protocol
+
+import numpy as np
 
 from starcal_uq.camera.projection import bent_index
-from starcal_uq.likelihood.loops.unrolled import Number, Stars, added
+from starcal_uq.core.types import FloatArray
+
+
+class Stars(Protocol):
+    """Numbers that all stars share, and rows of two buffers at each star."""
+
+    def numbers(self, n: int) -> list[Any]:
+        """The first numbers."""
+
+    def each(self) -> AbstractContextManager[tuple[Any, Any]]:
+        """The rows of both buffers, ``rows[n]``, at each star or at all of them."""
+
+
+def added(terms: Sequence[Any]) -> Any:
+    """The sum of some numbers; 0.0 of none."""
+    return reduce(add, terms) if terms else 0.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +80,16 @@ class GramRows:
         )
 
 
+def frame_rows(
+    whitening: FloatArray, moved: tuple[FloatArray, FloatArray, FloatArray]
+) -> FloatArray:
+    """Rows of the first buffer that stars of a frame share, (3 p + 9, K), from shift, response and
+    inverse of the frames.
+    """
+    path = np.einsum("ipk,pa->iak", moved[1], whitening)
+    return np.concatenate([path.reshape(-1, path.shape[2]), moved[0], moved[2][np.triu_indices(3)]])
+
+
 def packed(i: int, j: int) -> int:
     """Place of an entry of a symmetric matrix among its six unique ones."""
     return 3 * min(i, j) - min(i, j) * (min(i, j) + 1) // 2 + max(i, j)
@@ -58,7 +99,8 @@ Entries = list[tuple[int, int, int]]
 
 
 def expand(stars: Stars, model: str, p: int) -> None:
-    """Columns as `compressed._Expansion` forms them.
+    """Columns from e, H, A and second derivatives: along the parameters, and the slope of the log
+    determinant.
 
     The numbers are the whitening l, lower triangular. A loop holds no more values than there are
     registers for.
@@ -96,7 +138,7 @@ def follow(stars: Stars, model: str, p: int) -> None:
             own[2 + 2 * t] = own[2 + 2 * t] - turned
 
 
-def _turn(stars: Stars, at: GramRows, whitening: list[Number], z: int, entries: Entries) -> None:
+def _turn(stars: Stars, at: GramRows, whitening: list[Any], z: int, entries: Entries) -> None:
     """The derivatives of A along z, and half of what the path itself bends; the slope."""
     p = math.isqrt(len(whitening))
     with stars.each() as (common, own):
@@ -121,13 +163,13 @@ def _turn(stars: Stars, at: GramRows, whitening: list[Number], z: int, entries: 
 
 
 def _curve(
-    stars: Stars, at: GramRows, whitening: list[Number], z: int, column: int, entries: Entries
+    stars: Stars, at: GramRows, whitening: list[Any], z: int, column: int, entries: Entries
 ) -> None:
     """Second derivatives along z and each of the parameters from z on."""
     p = math.isqrt(len(whitening))
     # A diagonal entry of z z^T stands once in the expansion, halved; the others stand for both
     # orders.
-    weights: dict[tuple[int, int], Number] = {}
+    weights: dict[tuple[int, int], Any] = {}
     for y in range(z, p):
         for n, t, d in entries:
             orders = [(i, j) for i, j in {(t, d), (d, t)} if z <= i and y <= j]
