@@ -35,6 +35,8 @@ _LEAST_FRAMES, _LEAST_STARS, _FRAMES, _DRAWS, _STEPS = 4, 4, 300, 4000, 6
 # Groups that are looked for together; each may fall into more.
 _MOST_AT_ONCE = 4
 _WORDS = 12
+# Of the sample of frames, and of the draws that a split is held against.
+_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -111,28 +113,27 @@ def frame_ranges(frames: IntArray) -> str:
     )
 
 
-def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFocals:
+def frame_focals(obs: Observations, camera: Camera) -> FrameFocals:
     """Estimate the focal length of every frame by itself, and look for groups among them.
 
     `camera`: principal point and distortion, and the focal length to start from.
-    `seed`: seed of the draws that the split is held against.
     """
-    numbers, frames = frames_with_focals(obs, seed)
+    numbers, frames = frames_with_focals(obs)
     plane = get_model(camera.distortion).plane
-    return focals_of(numbers, ideal_frames(camera, frames), camera.focal_px, plane, seed=seed)
+    return focals_of(numbers, ideal_frames(camera, frames), camera.focal_px, plane)
 
 
-def frames_with_focals(obs: Observations, seed: int = 0) -> tuple[IntArray, StarFrames]:
+def frames_with_focals(obs: Observations) -> tuple[IntArray, StarFrames]:
     """Numbers (K,) and stars of the frames that have enough of them; of many frames, a sample."""
     enough = np.flatnonzero(obs.stars_per_frame >= _LEAST_STARS)
     chosen = np.zeros(obs.n_frames, dtype=bool)
-    chosen[enough[one_of_each(len(enough), _FRAMES, seed)]] = True
+    chosen[enough[one_of_each(len(enough), _FRAMES, _SEED)]] = True
     frames = StarFrames.from_observations(obs)
     return obs.frame_ids[chosen], frames.select(np.repeat(chosen, frames.sizes))
 
 
 def focals_of(
-    numbers: IntArray, ideal: StarFrames, start_px: float, plane: Plane = PINHOLE, *, seed: int = 0
+    numbers: IntArray, ideal: StarFrames, start_px: float, plane: Plane = PINHOLE
 ) -> FrameFocals:
     """The same of frames with these numbers (K,) by their ideal points, from a focal length in
     px.
@@ -157,15 +158,15 @@ def focals_of(
         log_scale -= np.clip(step, -0.2, 0.2)
     left = ideal.sum(np.sum(state.e**2, axis=0))
     sigma = np.sqrt(left / np.maximum(2 * ideal.sizes - 4, 1) / curvature)
-    group, p_value = _grouped(-log_scale, sigma, seed)
+    group, p_value = _grouped(-log_scale, sigma)
     focal = start_px * np.exp(-log_scale)
     return FrameFocals(numbers, focal, sigma * focal, group, p_value)
 
 
-def _grouped(value: FloatArray, sigma: FloatArray, seed: int) -> tuple[IntArray, float]:
+def _grouped(value: FloatArray, sigma: FloatArray) -> tuple[IntArray, float]:
     """Groups of values (K,), numbered upwards, and the probability of the first split."""
     group = np.zeros(len(value), dtype=np.int64)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     order = np.argsort(value)
     first, todo, done = 1.0, [order], 0
     while todo:

@@ -5,12 +5,13 @@ by partitions.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.likelihood.sums import sum_of, together
 
 # Residuals beyond it are counted: noise alone gives 7 of a million.
 OUTLIER_SIGMA = 4.5
@@ -62,16 +63,8 @@ class ResidualMap:
             stated2=np.bincount(index, stated_px**2, nx * ny).astype(np.float64),
         )
 
-    @classmethod
-    def joined(cls, parts: Sequence[ResidualMap]) -> ResidualMap:
-        """That of all stars of several with the same cells."""
-        return cls(
-            shape=parts[0].shape,
-            cell_px=parts[0].cell_px,
-            counts=np.sum([part.counts for part in parts], axis=0),
-            sums=np.sum([part.sums for part in parts], axis=0),
-            stated2=np.sum([part.stated2 for part in parts], axis=0),
-        )
+    def __add__(self, other: ResidualMap) -> ResidualMap:
+        return together(self, other, "shape", "cell_px")
 
 
 @dataclass(frozen=True)
@@ -111,14 +104,7 @@ class FrameScatter:
     middle: FloatArray
 
     def __add__(self, other: FrameScatter) -> FrameScatter:
-        return replace(
-            self,
-            **{
-                field.name: getattr(self, field.name) + getattr(other, field.name)
-                for field in fields(self)
-                if field.name not in ("theta", "scale")
-            },
-        )
+        return together(self, other, "theta", "scale")
 
     @property
     def formal(self) -> FloatArray:
@@ -179,7 +165,7 @@ class PartitionSums:
             n_stars=np.concatenate([part.n_stars for part in parts]),
             n_frames=np.concatenate([part.n_frames for part in parts]),
             chi2=np.concatenate([part.chi2 for part in parts]),
-            residuals=ResidualMap.joined([part.residuals for part in parts]),
+            residuals=sum_of([part.residuals for part in parts]),
             stated2=sum(part.stated2 for part in parts),
             n_beyond=sum(part.n_beyond for part in parts),
             largest=worst.largest,

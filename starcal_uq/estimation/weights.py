@@ -29,10 +29,9 @@ def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observa
     left_out = np.isin(obs.frame, result.provenance.dropped_frames)
     if left_out.any():
         obs = obs.select(~left_out)
-    if "tail_weights" not in result.provenance:
-        return by_noise_model(obs, result)
     obs = by_noise_model(obs, result)
-    if len(getattr(result, "residuals_px", ())) != len(obs):
+    known = len(getattr(result, "residuals_px", ())) == len(obs)
+    if "tail_weights" not in result.provenance or not known:
         # Of a mission's stars no tails are known.
         return obs
     from starcal_uq.estimation.robust import by_weights, tail_weights

@@ -29,47 +29,9 @@ from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
 
 # Stars whose arrays stay in the second-level cache, and are enough to hide the interpreter.
-BLOCK_STARS, PAIR_STARS, _EXPANSION_STARS = 3072, 4096, 3072
+BLOCK_STARS, PAIR_STARS, _EXPANSION_STARS = 3072, 4096, 6144
 # Enough for the turn of all frames together.
 _FEW_STARS = 128
-
-
-class Buffers:
-    """Arrays of one block, used again for the next one."""
-
-    def __init__(self, p: int, n: int) -> None:
-        self._columns = np.empty((4 + p) * 2 * n)
-        self._products = np.empty(3 * (3 + p) * n)
-        self._one, self._two = np.empty((4 + p) * n), np.empty((4 + p) * n)
-        self.p = p
-
-    def columns(self, n: int) -> FloatArray:
-        """A, e and H: (3 + 1 + p, 2, n)."""
-        return self._columns[: (4 + self.p) * 2 * n].reshape(4 + self.p, 2, n)
-
-    def products(self, columns: FloatArray) -> FloatArray:
-        """Products of the three rows of A with themselves and the ones that follow, over both axes:
-        (.., n).
-        """
-        rows, _, n = columns.shape
-        out = self._products[: 3 * (rows - 1) * n].reshape(3 * (rows - 1), n)
-        first = 0
-        for i in range(3):
-            count = rows - i
-            one, two = (buffer[: count * n].reshape(count, n) for buffer in (self._one, self._two))
-            np.multiply(columns[i:, 0], columns[i, 0], out=one)
-            np.multiply(columns[i:, 1], columns[i, 1], out=two)
-            np.add(one, two, out=out[first : first + count])
-            first += count
-        return out
-
-
-def unpacked(sums: FloatArray, rows: int) -> tuple[FloatArray, FloatArray]:
-    """From the sums of `Buffers.products`: packed A^T A (6, K), and A^T [e, H] (3, p + 1, K)."""
-    starts = (0, rows, 2 * rows - 1)
-    packed = np.concatenate([sums[first : first + 3 - i] for i, first in enumerate(starts)])
-    rest = np.stack([sums[first + 3 - i : first + rows - i] for i, first in enumerate(starts)])
-    return packed, rest
 
 
 def _common_turn(columns: FloatArray) -> FloatArray:
@@ -105,9 +67,13 @@ def normals(
     gram, turn = np.zeros((p + 1, p + 1)), np.zeros((3, p))
     packed, mixed = np.empty((6, k)), np.empty((3, p + 1, k))
     for block in blocks(frames, model_name, theta, rotations, residuals):
-        flat, turn = block.columns.reshape(p + 4, -1), block.turn
-        gram += flat[3:] @ flat[3:].T
-        packed[:, block.place], mixed[:, :, block.place] = unpacked(block.products(), p + 4)
+        columns, turn = block.columns, block.turn
+        flat = columns[3:].reshape(p + 1, -1)
+        gram += flat @ flat.T
+        # The three columns of A with themselves and the ones that follow.
+        rows = [block.part.sum(np.einsum("cxn,xn->cn", columns[i:], columns[i])) for i in range(3)]
+        packed[:, block.place] = np.concatenate([row[: 3 - i] for i, row in enumerate(rows)])
+        mixed[:, :, block.place] = [row[3 - i :] for i, row in enumerate(rows)]
     inverse, determinant = inverse_symmetric(packed)
     solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
     gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
@@ -123,11 +89,6 @@ class Block(NamedTuple):
     part: StarFrames
     columns: FloatArray
     turn: FloatArray
-    buffers: Buffers
-
-    def products(self) -> FloatArray:
-        """Sums over the stars of each frame of `Buffers.products`."""
-        return self.part.sum(self.buffers.products(self.columns))
 
 
 def blocks(
@@ -141,14 +102,11 @@ def blocks(
     p, starts = len(theta), frames.starts
     pieces = frames.parts(BLOCK_STARS)
     largest = max((int(starts[last] - starts[first]) for first, last in pieces), default=0)
-    buffers, kernel, turn = (
-        Buffers(p, largest),
-        forward_kernel(model_name, "first"),
-        np.zeros((3, p)),
-    )
+    buffer, kernel = np.empty((4 + p) * 2 * largest), forward_kernel(model_name, "first")
+    turn = np.zeros((3, p))
     for first, last in pieces:
         part = frames.part(first, last)
-        columns = buffers.columns(part.n_stars)
+        columns = buffer[: (4 + p) * 2 * part.n_stars].reshape(4 + p, 2, part.n_stars)
         b = part.rotated(rotations[first:last])
         flat = columns.reshape(2 * (p + 4), -1)
         kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
@@ -160,7 +118,7 @@ def blocks(
             turn = _common_turn(columns)
         flat = columns.reshape(p + 4, -1)
         flat[4:] -= turn.T @ flat[:3]
-        yield Block(slice(first, last), part, columns, turn, buffers)
+        yield Block(slice(first, last), part, columns, turn)
 
 
 @dataclass

@@ -29,6 +29,7 @@ import numpy as np
 from starcal_uq.camera.projection import backward_root, backward_second_kernel, second_index
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray
+from starcal_uq.likelihood.compressed import squares_by
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.likelihood.solvers import Normal, is_singular
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse, unit_inverse
@@ -90,10 +91,7 @@ class PairLikelihood:
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray | float) -> FloatArray:
         """Log likelihood (n,) at theta (n, p) and sigma (n,), from the Gram matrix."""
-        z = self.whiten(theta)
-        rows, columns = np.triu_indices(z.shape[1])
-        m = np.concatenate([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns]], axis=1)
-        return self._value(np.sum((m @ self.gram) * m, axis=1), sigma)
+        return self._value(squares_by(self.gram, self.whiten(theta)), sigma)
 
     def exact_log_likelihood(self, theta: FloatArray, sigma: FloatArray | float) -> FloatArray:
         """The same (n,) from all stars, point by point."""
@@ -104,18 +102,13 @@ class PairLikelihood:
 
     def _value(self, cost: FloatArray, sigma: FloatArray | float) -> FloatArray:
         sigma = np.asarray(sigma, dtype=np.float64)
-        value: FloatArray
         if not self.adjusted:
             ratio = self.tau / (self.pair_noise * sigma)
-            value = np.asarray(
-                -0.5 * cost * ratio**2 - self.n_pairs * np.log(sigma), dtype=np.float64
-            )
-            return value
+            return np.asarray(-0.5 * cost * ratio**2 - self.n_pairs * np.log(sigma))
         excess = cost - self.gram[0, 0]
         if self.variability == "expected":
             excess = excess * (self.sigma / sigma) ** 2
-        value = -0.5 * excess - 0.5 * self.chi2 / sigma**2 - self.dof * np.log(sigma)
-        return value
+        return np.asarray(-0.5 * excess - 0.5 * self.chi2 / sigma**2 - self.dof * np.log(sigma))
 
 
 def pair_likelihood(

@@ -23,7 +23,7 @@ from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.likelihood import arrays
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood, Profile
 from starcal_uq.likelihood.paths import sums_for
-from starcal_uq.likelihood.sums import Attitudes, NormalSums, settled_sums
+from starcal_uq.likelihood.sums import Attitudes, NormalSums, settled_sums, together
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 
@@ -73,10 +73,7 @@ class CompressedLikelihood:
 
     def sum_of_squares(self, z: FloatArray) -> FloatArray:
         """Sum of squared residuals (n,) at whitened parameters z (n, p)."""
-        rows, columns = _pairs(z.shape[1])
-        m = np.concatenate([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns]], axis=1)
-        s: FloatArray = np.sum((m @ self.gram) * m, axis=1)
-        return s
+        return squares_by(self.gram, z)
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray | float) -> FloatArray:
         """Log likelihood at many points.
@@ -103,6 +100,13 @@ class CompressedLikelihood:
         return value
 
 
+def squares_by(gram: FloatArray, z: FloatArray) -> FloatArray:
+    """Sums of squares ``m(z)^T G m(z)`` (n,) by a Gram matrix (q, q) at z (n, p)."""
+    rows, columns = _pairs(z.shape[1])
+    m = np.concatenate([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns]], axis=1)
+    return np.asarray(np.sum((m @ gram) * m, axis=1))
+
+
 @dataclass(frozen=True)
 class GramSums:
     """What a part of the frames adds to a compressed likelihood around a given point; they add
@@ -117,13 +121,7 @@ class GramSums:
     n_frames: int
 
     def __add__(self, other: GramSums) -> GramSums:
-        return GramSums(
-            self.gram + other.gram,
-            self.log_determinant + other.log_determinant,
-            self.log_determinant_slope + other.log_determinant_slope,
-            self.n_stars + other.n_stars,
-            self.n_frames + other.n_frames,
-        )
+        return together(self, other)
 
     def likelihood(self, theta_hat: FloatArray, whitening: FloatArray) -> CompressedLikelihood:
         """The compressed likelihood of all that was summed around theta_hat (p,) with the whitening

@@ -118,8 +118,9 @@ class Columns:
         local = np.concatenate([self.attitudes.columns, self.frame])
         by_frame = products_by_frame(self.frames, local, others)
         root = np.linalg.cholesky(np.moveaxis(self.attitudes.inverse, 2, 0))
-        turned = (np.swapaxes(root, 1, 2) @ by_frame[:, :3]).reshape(-1, len(others))
-        flat, frame = others.reshape(len(others), -1), by_frame[:, 3:]
+        turned = np.swapaxes(root, 1, 2) @ by_frame[:, :3]
+        turned = turned.reshape(3 * self.frames.n_frames, len(others))
+        flat, frame = others.reshape(len(others), 2 * self.frames.n_stars), by_frame[:, 3:]
         gram = flat @ flat.T - turned.T @ turned
         m, end, star = len(self.raw), len(others) - len(added), np.zeros((0, len(others)))
         if self.n_stars:

@@ -25,6 +25,8 @@ _ROUNDING = 1e-10
 # A step this small against the parameters is none, whatever the cost does: data without noise end
 # here.
 _NEGLIGIBLE = 1e-10
+# A trust region this small against the scaled parameters ends the search.
+_LEAST_BOUND = 1e-13
 _EPS, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 
 
@@ -106,14 +108,12 @@ def levenberg_marquardt(
     *,
     max_iterations: int = 200,
     tolerance: float = 1e-15,
-    step_tolerance: float = 1e-13,
     last: Last = "seen",
 ) -> Solution:
     """Minimise a sum of squares from its normal equations.
 
     `max_iterations`: most accepted and refused steps.
     `tolerance`: converged when the predicted relative reduction of the cost is below this.
-    `step_tolerance`: converged when the trust region is this small against the scaled parameters.
     `last`: what becomes of a full step that promises no more than `tolerance`: it is taken and the
     model evaluated
         there, taken without that, or left to what follows.
@@ -178,7 +178,7 @@ def levenberg_marquardt(
             scale = np.maximum(scale, _lengths(normal.matrix))
         if predicted <= tolerance and ratio > 1e-4:
             return finish(Status.CONVERGED)
-        if bound <= step_tolerance * float(np.linalg.norm(scale * theta)):
+        if bound <= _LEAST_BOUND * float(np.linalg.norm(scale * theta)):
             settled = predicted <= 1e-8 or _newton_length(normal, scale) <= _NEGLIGIBLE * float(
                 np.linalg.norm(scale * theta)
             )

@@ -27,7 +27,7 @@ one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import reduce
 from operator import add
 from typing import TypeVar
@@ -45,6 +45,13 @@ ATTITUDE_STEPS = 12
 ATTITUDE_TOLERANCE_RAD = 1e-9
 
 
+def together(one: T, other: T, *same: str) -> T:
+    """Fields of two records added up, but for those that are the `same` in both."""
+    names = [each.name for each in fields(one) if each.name not in same]  # type: ignore[arg-type]
+    added = {name: getattr(one, name) + getattr(other, name) for name in names}
+    return replace(one, **added)  # type: ignore[type-var]
+
+
 @dataclass(frozen=True)
 class NormalSums:
     """Normal equations of some frames; they add up."""
@@ -59,15 +66,7 @@ class NormalSums:
     n_frames: int
 
     def __add__(self, other: NormalSums) -> NormalSums:
-        return NormalSums(
-            self.cost + other.cost,
-            self.gradient + other.gradient,
-            self.matrix + other.matrix,
-            self.log_determinant + other.log_determinant,
-            max(self.turn, other.turn),
-            self.n_stars + other.n_stars,
-            self.n_frames + other.n_frames,
-        )
+        return replace(together(self, other, "turn"), turn=max(self.turn, other.turn))
 
     @property
     def normal(self) -> Normal:

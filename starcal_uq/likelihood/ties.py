@@ -126,7 +126,7 @@ class Ties:
         """The linear system around attitudes (K, 3, 3); `inverse` (3, 3, K) is that of ``A^T A`` in
         units of the noise `sigma`.
         """
-        from scipy.sparse import csr_array
+        from scipy.sparse import bsr_array
 
         measured, of_b = quaternion_to_rotation(self.known.quaternions), rotations[self.second]
         t, k = len(self.second), len(rotations)
@@ -146,14 +146,9 @@ class Ties:
             if self.known.alignment_arcsec > 0.0:
                 common = (np.eye(3) - turn).reshape(-1, 3)
                 precision = (sigma * ARCSEC / self.known.alignment_arcsec) ** 2
-        column = [3 * place[:, None, None] + np.arange(3) for place in places]
-        row = np.arange(3 * t).reshape(t, 3, 1)
-        entries = [
-            (own.ravel(), np.broadcast_to(row, own.shape).ravel(), np.repeat(at, 3, axis=1).ravel())
-            for own, at in zip(blocks, column, strict=True)
-        ]
-        values, rows, columns = (np.concatenate(part) for part in zip(*entries, strict=True))
-        jacobian = csr_array((values, (rows, columns)), shape=(3 * t, 3 * k))
+        own, place = np.stack(blocks, axis=1).reshape(-1, 3, 3), np.stack(places, axis=1).ravel()
+        ends = len(blocks) * np.arange(t + 1)
+        jacobian = bsr_array((own, place, ends), shape=(3 * t, 3 * k)).tocsr()
         response = block_diagonal(np.ascontiguousarray(np.moveaxis(inverse, 2, 0))) @ jacobian.T
         error = (self.known.sigma_arcsec / ARCSEC / sigma) ** 2
         omega = jacobian @ response + block_diagonal(error[:, :, None] * np.eye(3))

@@ -180,15 +180,11 @@ def fill_directions(
         while starts[f + 1] <= s0 + j:
             f += 1
         end = min(starts[f + 1] - s0, m)
-        k = 9 * f
-        a00, a01, a02 = rotations[k], rotations[k + 1], rotations[k + 2]
-        a10, a11, a12 = rotations[k + 3], rotations[k + 4], rotations[k + 5]
-        a20, a21, a22 = rotations[k + 6], rotations[k + 7], rotations[k + 8]
-        for i in range(j, end):
-            x, y, z = r0[s0 + i], r1[s0 + i], r2[s0 + i]
-            work[i] = a00 * x + a01 * y + a02 * z
-            work[STRIDE + i] = a10 * x + a11 * y + a12 * z
-            work[2 * STRIDE + i] = a20 * x + a21 * y + a22 * z
+        for q in range(3):
+            k, to = 9 * f + 3 * q, q * STRIDE
+            a, b, c = rotations[k], rotations[k + 1], rotations[k + 2]
+            for i in range(j, end):
+                work[to + i] = a * r0[s0 + i] + b * r1[s0 + i] + c * r2[s0 + i]
         j = end
     if root != 0:
         for i in range(m):

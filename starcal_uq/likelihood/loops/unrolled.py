@@ -36,77 +36,48 @@ STRIDE = 136
 class Number:
     """A double of the function that is being compiled."""
 
+    __add__: Any
+    __sub__: Any
+    __mul__: Any
+
     def __init__(self, code: Code, value: Any) -> None:
         self.code, self.value = code, value
 
-    def _with(self, operation: str, other: Number | float, swapped: bool = False) -> Number:
+    def __neg__(self) -> Number:
+        return self.code.number(-0.0) - self
+
+    def __abs__(self) -> Number:
+        return self.code.call(math.fabs, self)
+
+    def __pow__(self, other: Number | float) -> Number:
+        return self.code.call(math.pow, self, other)
+
+
+def _operator(operation: str, swapped: bool = False) -> Any:
+    """A method that writes one instruction."""
+
+    def method(self: Number, other: Number | float) -> Number:
         a, b = self.value, self.code.number(other).value
         write = getattr(self.code.builder, operation)
         return Number(self.code, write(*((b, a) if swapped else (a, b))))
 
-    def _of(self, function: Any, *others: Number | float) -> Number:
-        return self.code.call(function, self, *others)
+    return method
 
-    def __add__(self, other: Number | float) -> Number:
-        return self._with("fadd", other)
 
-    def __radd__(self, other: float) -> Number:
-        return self._with("fadd", other, swapped=True)
+def _function(function: Any) -> Any:
+    """A method that writes the call of a function of Python's `math`."""
+    return lambda self, *others: self.code.call(function, self, *others)
 
-    def __sub__(self, other: Number | float) -> Number:
-        return self._with("fsub", other)
 
-    def __rsub__(self, other: float) -> Number:
-        return self._with("fsub", other, swapped=True)
-
-    def __mul__(self, other: Number | float) -> Number:
-        return self._with("fmul", other)
-
-    def __rmul__(self, other: float) -> Number:
-        return self._with("fmul", other, swapped=True)
-
-    def __truediv__(self, other: Number | float) -> Number:
-        return self._with("fdiv", other)
-
-    def __rtruediv__(self, other: float) -> Number:
-        return self._with("fdiv", other, swapped=True)
-
-    def __neg__(self) -> Number:
-        return -0.0 - self
-
-    def __abs__(self) -> Number:
-        return self._of(math.fabs)
-
-    def __pow__(self, other: Number | float) -> Number:
-        return self._of(math.pow, other)
-
-    # NumPy's functions call these methods of what is no array.
-    def sqrt(self) -> Number:
-        return self._of(math.sqrt)
-
-    def sin(self) -> Number:
-        return self._of(math.sin)
-
-    def cos(self) -> Number:
-        return self._of(math.cos)
-
-    def tan(self) -> Number:
-        return self._of(math.tan)
-
-    def arctan(self) -> Number:
-        return self._of(math.atan)
-
-    def exp(self) -> Number:
-        return self._of(math.exp)
-
-    def log(self) -> Number:
-        return self._of(math.log)
-
-    def arctan2(self, other: Number) -> Number:
-        return self._of(math.atan2, other)
-
-    def hypot(self, other: Number) -> Number:
-        return self._of(math.hypot, other)
+# NumPy's functions call methods of their names of what is no array.
+for _name in ("add", "sub", "mul", "truediv"):
+    _instruction = f"f{_name.removeprefix('true')}"
+    setattr(Number, f"__{_name}__", _operator(_instruction))
+    setattr(Number, f"__r{_name}__", _operator(_instruction, swapped=True))
+for _name in ("sqrt", "sin", "cos", "tan", "exp", "log", "hypot"):
+    setattr(Number, _name, _function(getattr(math, _name)))
+for _name in ("atan", "atan2"):
+    setattr(Number, _name.replace("a", "arc", 1), _function(getattr(math, _name)))
 
 
 class Code:
