@@ -206,7 +206,7 @@ def field_effect(camera: Camera) -> Effect:
 
         x, y = ((xy + 0.5) / half[:, None]) - 1.0
         waves = legvander(x, _ORDER).T[i] * legvander(y, _ORDER).T[j]
-        return np.einsum("tn,xy->txyn", waves, np.eye(2)).reshape(-1, *xy.shape)
+        return np.asarray(np.einsum("tn,xy->txyn", waves, np.eye(2)).reshape(-1, *xy.shape))
 
     return _smooth("field", camera, raw, i + j)
 

@@ -44,7 +44,8 @@ class Number:
         self.code, self.value = code, value
 
     def __neg__(self) -> Number:
-        return self.code.number(-0.0) - self
+        minus_zero = self.code.number(-0.0).value
+        return Number(self.code, self.code.builder.fsub(minus_zero, self.value))
 
     def __abs__(self) -> Number:
         return self.code.call(math.fabs, self)
