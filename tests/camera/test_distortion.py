@@ -76,7 +76,7 @@ def test_a_fold_is_where_a_dense_scan_has_it(model):
     )
     rays = np.array([np.cos(angle), np.sin(angle)])
     points = (rays[:, :, None] * radius).reshape(2, -1)
-    for _ in range(20):
+    for _ in range(30):
         sizes = [
             10.0 ** rng.uniform(-2.0, 0.3) / reach ** (c.order - 1)
             for c in get_model(model).coefficients
@@ -97,7 +97,7 @@ def test_a_fold_is_where_a_dense_scan_has_it(model):
                 projection.before_fold(model, theta, where[some] * rays[:, some]) == clear
             ).all()
         folds += int(np.isfinite(first).any())
-    assert 1 < folds < 20
+    assert 1 <= folds < 30
 
 
 def test_where_a_bound_excludes_folds_there_are_none() -> None:
