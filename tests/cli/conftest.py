@@ -56,8 +56,9 @@ def painting_cli(one_process, monkeypatch, capsys, tmp_path):
 
 
 @pytest.fixture
-def cli(unpainted, painting_cli):
-    """The same, without painting the figures."""
+def cli(unpainted, painting_cli, monkeypatch):
+    """The same, without the figures and with few samples for half-widths."""
+    monkeypatch.setattr("starcal_uq.propagation.propagate._SAMPLES", 4000)
     return painting_cli
 
 

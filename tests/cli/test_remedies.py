@@ -627,8 +627,8 @@ def test_an_error_of_wrong_stars_ends_with_the_command_that_was_given(small, cli
     dataclasses.replace(small.obs, dec_deg=small.obs.dec_deg + 0.8 * wrong).save(
         tmp_path / "wrong ones.csv"
     )
-    call = ("run", "wrong ones.csv", small.folder / "CAMERA.toml", "-o", "new")
+    call = ("calibrate", "wrong ones.csv", small.folder / "CAMERA.toml", "-o", "new")
     status, _, err = cli(*call)
     command = re.search(r"`starcal-uq (.*)`", err.splitlines()[-1])[1]
     assert status == 2 and shlex.split(command) == [*map(str, call), "--screen"]
-    assert cli(*shlex.split(command), "--draws", 50, "--steps", 20)[0] in (0, 1)
+    assert cli(*shlex.split(command))[0] in (0, 1)

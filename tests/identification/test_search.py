@@ -478,9 +478,7 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(proposers, "entry_points", EntryPoints([offered]).select)
 
 
-@pytest.mark.parametrize(
-    ("fov_deg", "focal", "shift_px"), [(12.0, 1.02, 10.0), (20.0, 0.97, -20.0)]
-)
+@pytest.mark.parametrize(("fov_deg", "focal", "shift_px"), [(20.0, 0.97, -20.0)])
 def test_engines_agree(
     stars: Any,
     folder: Path,

@@ -47,7 +47,7 @@ ROOT = Path(__file__).parents[2]
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-@pytest.fixture(scope="module", params=["brown", "none", "brown_tangential"])
+@pytest.fixture(scope="module", params=["none", "brown_tangential"])
 def run(request):
     """A run per distortion model; the noise of the one without coefficients is given and not
     sampled.

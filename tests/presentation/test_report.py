@@ -183,7 +183,7 @@ def test_summary_fits_80_columns_and_its_commands_can_be_put_together(full):
     assert len(verdict_lines(results.verdict)) <= 2
 
 
-def test_without_a_browser_a_pdf_takes_one_sentence(run, monkeypatch, tmp_path):
+def test_without_a_browser_a_pdf_takes_one_sentence(run, unpainted, monkeypatch, tmp_path):
     made = sc.report(run.path)
     monkeypatch.setattr(printing, "browsers", lambda: iter(()))
     monkeypatch.setitem(sys.modules, "weasyprint", None)
