@@ -111,7 +111,6 @@ TABLES = (
     "field_map.npz",
 )
 LONG = {
-    "run": (f"run obs.parquet camera.toml {TINY} --draws 50 -o out", TABLES),
     "run from images": (
         f"run img camera.toml {TINY} --draws 50 --directions apparent --max-mag 6 -o out",
         (*TABLES, "identification.csv", "images.json"),
@@ -119,10 +118,6 @@ LONG = {
     "sample": ("sample out --walkers 32 --steps 1000", ()),
     "calibrate": ("calibrate parts camera.toml --workers 0 -o out", ()),
     "filter": ("filter obs.parquet camera.toml -o out", ("history.csv",)),
-    "reproduce": (
-        "reproduce --replicates 8 --frames 20 --no-study --workers 1 -o out",
-        ("rows.csv", "replicates.csv"),
-    ),
     "validate": (
         "validate camera.toml --replicates 20 --frames 8 --workers 1 -o out",
         ("validation.csv",),
@@ -232,7 +227,7 @@ def test_a_command_that_is_stopped_goes_on_to_the_same_result(
     assert {path.name for path in (folder / "out").iterdir()} == {
         path.name for path in (whole / "out").iterdir()
     }
-    if command in ("validate", "reproduce"):
+    if command == "validate":
         return
     found, wanted = sc.Run(folder / "out"), sc.Run(whole / "out")
     assert found.calibration.theta.tobytes() == wanted.calibration.theta.tobytes()

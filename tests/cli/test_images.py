@@ -321,7 +321,7 @@ def test_stars_beside_a_neighbour_are_left_out():
 def test_rendered_frames_through_the_whole_chain(tmp_path):
     truth = sc.paper.paper_camera()
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    sc.simulation.render_frames(stars, truth, tmp_path, n_frames=150, seed=11)
+    sc.simulation.render_frames(stars, truth, tmp_path, n_frames=60, seed=11)
     table = sc.images.extract_centroids(tmp_path)
     found = identify_and_calibrate(
         table,
@@ -330,9 +330,10 @@ def test_rendered_frames_through_the_whole_chain(tmp_path):
         prepare=lambda obs: without_disturbed(obs, stars, truth),
     )
     cal = found.calibration
-    assert found.identification.n_identified == 150
+    assert found.identification.n_identified == 60
     assert np.all(np.abs((cal.theta - truth.theta) / cal.sigmas) < 4.0)
-    assert cal.sigma == pytest.approx(1.0, abs=0.03)
+    # Three standard errors of the scale of some 1,500 stars.
+    assert cal.sigma == pytest.approx(1.0, abs=0.055)
     # The control: stars where they were eleven years before are not what the camera saw.
     old = sc.load_catalogue(max_mag=6.0, epoch=2016.0)
     control = identify_and_calibrate(
@@ -341,6 +342,7 @@ def test_rendered_frames_through_the_whole_chain(tmp_path):
     assert control.calibration.sigma > 1.3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("centroids_once")
 @pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
 def test_real_frames_from_images_to_the_report(cli, tmp_path):

@@ -88,7 +88,7 @@ OF_THE_DATA = {
     "--scheduler",
 }
 # Whole runs of the slow test.
-ROWS = 8
+ROWS = 4
 COMBINATIONS = [(name, value) for name, values in VALUES.items() for value in values]
 
 
@@ -203,10 +203,10 @@ def test_some_pairs_of_options_work_or_are_refused_in_words(asked):
     rng = np.random.default_rng(1)
     begun = [
         asked(rng.choice(KINDS), pairs[place])
-        for place in rng.choice(len(pairs), 120, replace=False)
+        for place in rng.choice(len(pairs), 40, replace=False)
     ]
     # Neither is everything refused, nor nothing.
-    assert 20 < np.sum(begun) < 100
+    assert 5 < np.sum(begun) < 35
     # Controls: these are known.
     assert asked("plain.csv", [("--effects", "tails"), ("--model", "k1")])
     assert asked("plain.csv", [("--effects", "tails,noise"), ("--likelihood", "student_t")])
@@ -233,13 +233,12 @@ def test_some_pairs_of_options_work_or_are_refused_in_words(asked):
 
 
 @pytest.mark.slow
-def test_every_pair_and_many_triples_of_options_work_or_are_refused_in_words(asked):
+def test_many_pairs_and_triples_of_options_work_or_are_refused_in_words(asked):
     rng = np.random.default_rng(2)
-    for names in itertools.combinations(VALUES, 2):
-        asked(rng.choice(KINDS), [(name, rng.choice(VALUES[name])) for name in names])
-    triples = list(itertools.combinations(VALUES, 3))
-    for place in rng.choice(len(triples), 300, replace=False):
-        asked(rng.choice(KINDS), [(name, rng.choice(VALUES[name])) for name in triples[place]])
+    for size, tried in ((2, 300), (3, 100)):
+        several = list(itertools.combinations(VALUES, size))
+        for place in rng.choice(len(several), tried, replace=False):
+            asked(rng.choice(KINDS), [(name, rng.choice(VALUES[name])) for name in several[place]])
 
 
 def test_a_fault_of_the_program_has_a_status_of_its_own(tables, cli, monkeypatch):
@@ -269,7 +268,7 @@ def test_runs_with_many_options_together_end_well_too(asked, cli, unreported):
                 row = more
         together |= set(itertools.combinations(sorted(row, key=COMBINATIONS.index), 2))
         rows.append((kind, row))
-    assert len(together) > 300
+    assert len(together) > 150
     ended, errors = [], []
     for kind, row in rows:
         words = command(kind, row)

@@ -83,6 +83,7 @@ def test_every_effect_has_a_meaning_in_words() -> None:
     assert set(MEANINGS) == set(get_args(EffectName))
 
 
+@pytest.mark.slow
 def test_the_remedy_that_a_misfit_prints_first_leads_to_a_usable_answer(cli, tmp_path) -> None:
     rng = np.random.default_rng(3)
     c = campaign(rng, n_frames=30, displaced=breathing(rng, 30, 0.5))

@@ -35,8 +35,10 @@ def one_by_one(obs):
 
 
 @pytest.mark.parametrize("model", USUAL)
-@pytest.mark.parametrize("stated", [False, True])
-@pytest.mark.parametrize(("method", "options"), BASELINES)
+@pytest.mark.parametrize(
+    ("method", "options", "stated"),
+    [(*one, stated) for one, stated in zip(BASELINES, [True, False, False, True], strict=True)],
+)
 def test_every_method_on_every_model(model, stated, method, options):
     truth, obs = camera(model), observations(model, max_mag=6.5)
     obs = with_sigmas(obs) if stated else obs
@@ -124,9 +126,9 @@ def test_samaan_decouples_what_griffith_with_all_parameters_couples():
 
 
 @pytest.mark.parametrize(
-    ("method", "options"), [("samaan", None), ("griffith", None), ("griffith", ALL)]
+    ("method", "options", "stated"),
+    [("samaan", None, True), ("griffith", None, False), ("griffith", ALL, True)],
 )
-@pytest.mark.parametrize("stated", [False, True])
 def test_a_stream_gives_what_the_table_gives(method, options, stated):
     obs = observations(n_frames=200)
     obs = with_sigmas(obs) if stated else obs
@@ -187,7 +189,7 @@ def test_a_stream_calibration_saves_itself(tmp_path):
         again.plot.residuals(observations())
 
 
-@pytest.mark.parametrize(("method", "options"), BASELINES)
+@pytest.mark.parametrize(("method", "options"), BASELINES[:2])
 def test_what_follows_a_calibration_follows_these(method, options):
     obs = observations(n_frames=100)
     cal = run(obs, sc.paper.paper_start(), method, options)
@@ -307,8 +309,9 @@ def variance_ratio(errors, sigmas):
     return np.mean(errors**2, axis=0) / np.mean(sigmas**2, axis=0)
 
 
-# 300 replicates: a right variance ratio strays by 0.08 (one sigma), a right coverage by 1.3 %.
-N_REPLICATES = 300
+# 100 replicates: a right variance ratio strays by 0.14, a right coverage by 2.2 %;
+# bounds are four times that.
+N_REPLICATES = 100
 
 
 @pytest.mark.slow
@@ -321,12 +324,11 @@ def test_the_filter_is_right_where_its_model_is(method):
     found, sigmas, claimed = replicates(truth, nominal(truth), method, None, N_REPLICATES)
     errors = found - truth.theta
     for widths in (sigmas, claimed):
-        assert np.all(np.abs(variance_ratio(errors, widths) - 1.0) < 0.3), variance_ratio(
+        assert np.all(np.abs(variance_ratio(errors, widths) - 1.0) < 0.55), variance_ratio(
             errors, widths
         )
         coverage = np.mean(np.abs(errors / widths) < 1.96, axis=0)
-        assert (coverage > 0.91).all(), coverage
-        assert (coverage < 0.985).all(), coverage
+        assert (coverage > 0.85).all(), coverage
     assert (np.abs(np.mean(errors / sigmas, axis=0)) < 4.0 / np.sqrt(N_REPLICATES)).all()
 
 
@@ -339,7 +341,7 @@ def test_pairs_taken_as_independent_claim_too_little():
     options = RecursionOptions(pair_covariance="diagonal")
     found, sigmas, claimed = replicates(truth, nominal(truth), "griffith", options, N_REPLICATES)
     errors = found - truth.theta
-    assert np.all(np.abs(variance_ratio(errors, sigmas) - 1.0) < 0.3), variance_ratio(
+    assert np.all(np.abs(variance_ratio(errors, sigmas) - 1.0) < 0.55), variance_ratio(
         errors, sigmas
     )
     assert (variance_ratio(errors, claimed) > 5.0).all()
@@ -354,10 +356,9 @@ def test_sigmas_are_the_spread_although_distortion_is_ignored(method):
     )
     errors = found - np.mean(found, axis=0)
     ratio = variance_ratio(errors, sigmas)
-    assert np.all(np.abs(ratio - 1.0) < 0.35), ratio
+    assert np.all(np.abs(ratio - 1.0) < 0.55), ratio
     coverage = np.mean(np.abs(errors / sigmas) < 1.96, axis=0)
-    assert (coverage > 0.91).all(), coverage
-    assert (coverage < 0.985).all(), coverage
+    assert (coverage > 0.85).all(), coverage
     if method != "least_squares":
         # Control: the filter, which takes its model for granted, claims about half.
         assert (variance_ratio(errors[:, :3], claimed[:, :3]) > 2.0).all()

@@ -154,7 +154,7 @@ def test_chosen_frames_beat_random_ones_in_simulated_campaigns():
     """
     found = choose_frames(camera(), sky(), n_frames=30, candidates=3000, seed=1)
     errors = {"chosen": [], "random": []}
-    for seed in range(150):
+    for seed in range(75):
         for name, options in (("chosen", {"attitudes": found.rotations}), ("random", {})):
             obs = sc.simulate(
                 sky(), camera(), n_frames=30, min_stars=10, seed=1000 + seed, **options
@@ -162,6 +162,6 @@ def test_chosen_frames_beat_random_ones_in_simulated_campaigns():
             errors[name].append(sc.calibrate(obs, camera()).theta[:2] - camera().theta[:2])
     rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in errors.items()}
     stated = found.factor("x0_px")[0]
-    # 300 numbers each know an rms to 4 %, a ratio to 6 %.
-    assert rms["random"] / rms["chosen"] == pytest.approx(stated, rel=0.18)
+    # 150 numbers each know an rms to 6 %, a ratio to 8 %.
+    assert rms["random"] / rms["chosen"] == pytest.approx(stated, rel=0.25)
     assert rms["random"] / rms["chosen"] > 1.3

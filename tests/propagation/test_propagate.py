@@ -536,8 +536,8 @@ def test_plots_itself() -> None:
 
 @pytest.mark.slow
 def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
-    """A thousand frames: one campaign from pixels to its posterior, six thousand others that it
-    must foretell.
+    """A thousand frames: one campaign from pixels to its posterior, 2,500 others that it must
+    foretell.
 
     Attitudes are those of every third frame: they are more than `propagate` takes through QUEST,
     and what they leave open is nothing beside what the number of campaigns does.
@@ -575,19 +575,21 @@ def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
         p95_arcsec=found.p95_arcsec[rows],
     )
     errors = (found, propagate(narrow, seen), propagate(quiet, seen), confused)
-    flown = fly(clean, errors, n=6000, every=3)
-    assert failures(flown[0], errors[0]) == set()
+    flown = fly(clean, errors, n=2500, every=3)
+    # A spread of 2,500 campaigns is known to 1.4 %.
+    slack = 0.05
+    assert failures(flown[0], errors[0], slack) == set()
     # Controls: a posterior 10 % too narrow, noise 10 % too small, and the two parts of the
     # calibration confused.
-    assert failures(flown[1], errors[1]) == {"common", "rest"}
-    assert failures(flown[2], errors[2]) == {"nea"}
-    assert failures(flown[3], errors[3]) == {"common", "rest"}
+    assert failures(flown[1], errors[1], slack) == {"common", "rest"}
+    assert failures(flown[2], errors[2], slack) == {"nea"}
+    assert failures(flown[3], errors[3], slack) == {"common", "rest"}
 
     # Noise and calibration are uncorrelated even on the calibration's own frames, so that squares
     # add up.
-    assert np.abs(flown[0].correlation).max() < 0.01
+    assert np.abs(flown[0].correlation).max() < 0.016
     parts = np.sqrt(sum(values**2 for values in flown[0].rms.values()))
-    np.testing.assert_allclose(flown[0].together, parts, rtol=0.005)
+    np.testing.assert_allclose(flown[0].together, parts, rtol=0.008)
     np.testing.assert_allclose(flown[0].interaction, found.interaction_arcsec, rtol=0.2)
 
     # The set-up of Ye & Yang (2017): noise, a constant ten times as large, and next to nothing that
@@ -600,7 +602,7 @@ def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
 
 @pytest.mark.slow
 def test_errors_of_simulated_campaigns_are_as_predicted() -> None:
-    """Two hundred campaigns on one set of frames: attitudes at the estimate against the true
+    """A hundred campaigns on one set of frames: attitudes at the estimate against the true
     ones.
     """
     from scipy import stats
@@ -610,7 +612,7 @@ def test_errors_of_simulated_campaigns_are_as_predicted() -> None:
     r, starts = clean.directions_icrs, clean.frame_starts
     true = quest(unproject_theta("brown", truth.theta, clean.xy), r, starts).quaternions
     rng = np.random.default_rng(6)
-    n = 200
+    n = 100
     common, rest = np.empty((n, 3)), np.empty((n, clean.n_frames, 3))
     for i in range(n):
         noise = 0.05 * rng.standard_normal((2, clean.n_stars))

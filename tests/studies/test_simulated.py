@@ -71,7 +71,7 @@ def test_what_a_method_does_not_estimate_has_no_numbers() -> None:
 
 @pytest.mark.slow
 def test_intervals_cover_and_sigmas_are_the_scatter_and_naive_pairs_are_found_out() -> None:
-    n = 150
+    n = 80
     made = definition(
         sweep={"likelihood": ("marginal", "pairs_naive")},
         observation={"frames": 50, "min_stars": 10},
@@ -86,14 +86,14 @@ def test_intervals_cover_and_sigmas_are_the_scatter_and_naive_pairs_are_found_ou
     )
     covered = good["covered_95"].mean("cell").values
     assert np.all((covered >= low) & (covered <= high)), covered
-    # The controls: naive pairs, and sigmas that are too small by a third.
+    # The controls: naive pairs, and sigmas that are too small by half.
     assert np.all(naive["covered_95"].mean("cell").values < low - 0.2)
-    small = (np.abs(good["z"].values) < 1.96 * 0.67).mean(axis=0)
+    small = (np.abs(good["z"].values) < 1.96 * 0.5).mean(axis=0)
     assert np.all(small < low)
     scatter = (good["estimate"] - good["truth"]).std("cell", ddof=1)
-    # One standard error of a scatter is 1 / sqrt(2 n), 6 %.
-    np.testing.assert_allclose(good["sigma_predicted"].mean("cell") / scatter, 1.0, atol=0.2)
-    np.testing.assert_allclose(good["sigma"].mean("cell") / scatter, 1.0, atol=0.2)
+    # One standard error of a scatter is 1 / sqrt(2 n), 8 %.
+    np.testing.assert_allclose(good["sigma_predicted"].mean("cell") / scatter, 1.0, atol=0.26)
+    np.testing.assert_allclose(good["sigma"].mean("cell") / scatter, 1.0, atol=0.26)
     # Information from other frames of the same sky.
     fisher = sc.study(
         definition(
@@ -150,7 +150,7 @@ def test_dasks_workers_compute_the_same_cells(tmp_path: Path) -> None:
 
     made = definition(
         mode="fisher",
-        sweep={"fov_deg": tuple(np.linspace(8.0, 16.0, 150).tolist()), "frames": (50, 200)},
+        sweep={"fov_deg": tuple(np.linspace(8.0, 16.0, 30).tolist()), "frames": (50, 200)},
         observation={"min_stars": 5},
     )
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as processes:
