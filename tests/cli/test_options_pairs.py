@@ -15,7 +15,6 @@ import starcal_uq as sc
 from starcal_uq.cli import run as cli_run
 from starcal_uq.cli.app import FAULT
 from starcal_uq.cli.commands import app
-from starcal_uq.presentation.report import drawing
 from tests.helpers.ground_scenes import SITE
 from tests.helpers.outside import campaign
 from tests.helpers.ties import gyro, write_columns
@@ -123,14 +122,6 @@ def tables(tmp_path):
     (tmp_path / "orbit.csv").write_text("time_s,temperature_c\n0,5\n60,25\n", encoding="utf-8")
     write_columns(tmp_path / "gyro.csv", gyro(np.random.default_rng(6), c, 5.0))
     return tmp_path
-
-
-@pytest.fixture
-def unreported(monkeypatch):
-    """Runs whose reports have no figures, which take most of the time and no option."""
-    monkeypatch.setattr(
-        drawing, "draw_figures", lambda _results, names, _progress: dict.fromkeys(names, b"<svg/>")
-    )
 
 
 def command(kind, given):
@@ -252,7 +243,7 @@ def test_a_fault_of_the_program_has_a_status_of_its_own(tables, cli, monkeypatch
 
 
 @pytest.mark.slow
-def test_runs_with_many_options_together_end_well_too(asked, cli, unreported):
+def test_runs_with_many_options_together_end_well_too(asked, cli):
     """Rows of as many options as can be given together, in random order: hundreds of pairs in a few
     runs.
     """
