@@ -54,44 +54,6 @@ def combined(
     return total(rows, draw(rows, 200_000, 3), axis=axis, confidence=confidence, **options)  # type: ignore[arg-type]
 
 
-def of_one_sensor(
-    rows: list[Contributor], confidence: float, rng: np.random.Generator
-) -> tuple[float, float]:
-    """NumPy alone, on one axis: quantiles over moments for the worst sensor, and for one in 1 / (1
-    - P).
-    """
-    shapes = {
-        "gaussian": lambda n: rng.standard_normal(n),
-        "uniform": lambda n: rng.uniform(-math.sqrt(3.0), math.sqrt(3.0), n),
-        "arcsine": lambda n: math.sqrt(2.0) * np.sin(rng.uniform(0.0, 2.0 * math.pi, n)),
-        "constant": lambda n: np.zeros(n),
-    }
-    ends = {
-        "gaussian": stats.norm.ppf(0.5 + 0.5 * confidence),
-        "uniform": math.sqrt(3.0),
-        "arcsine": math.sqrt(2.0),
-    }
-    constants = [entry for entry in rows if entry.interpretation == "ensemble"]
-    mean = sum(entry.mean_arcsec for entry in rows)
-    moments = np.zeros(400_000)
-    for entry in rows:
-        if entry.interpretation != "ensemble":
-            moments += entry.sigma_arcsec * shapes[entry.distribution](len(moments))
-    worst = sum(ends.get(entry.distribution, 0.0) * entry.sigma_arcsec for entry in constants)
-    at_worst = max(
-        np.quantile(np.abs(mean + side * worst + moments), confidence) for side in (1, -1)
-    )
-    sensors = mean + sum(
-        (entry.sigma_arcsec * shapes[entry.distribution](20_000) for entry in constants),
-        start=np.zeros(20_000),
-    )
-    # The quantile over moments grows with the size of the sensor's constant: its own quantile over
-    # sensors follows.
-    grid = np.quantile(np.abs(sensors), confidence)
-    side = math.copysign(1.0, mean) if mean else 1.0
-    return float(at_worst), float(np.quantile(np.abs(side * grid + moments), confidence))
-
-
 def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
     rows = [row(name, 6.6) for name in ("ground", "launch", "lens")]
     found = combined(rows, confidence=0.9973, interpretation="temporal")
@@ -135,47 +97,6 @@ def test_what_is_absorbed_in_part_leaves_a_limit_open() -> None:
     # Control: before alignment it is there in full.
     before = Outcome(Requirement("R", "pitch", 10.0, 0.997, "before alignment"), combined(rows))
     assert before.verdict == "violated"
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_temporal_totals_of_random_rows_against_monte_carlo(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    kinds = [
-        ("ensemble", "gaussian"),
-        ("ensemble", "uniform"),
-        ("mixed", "uniform"),
-        ("mixed", "gaussian"),
-    ]
-    kinds += [("temporal", "gaussian"), ("temporal", "arcsine"), ("ensemble", "constant")]
-    chosen = [kinds[i] for i in rng.permutation(len(kinds))[: rng.integers(3, 6)]] + [
-        ("temporal", "gaussian")
-    ]
-    rows = [
-        row(
-            str(number),
-            0.0 if shape == "constant" else rng.uniform(1.0, 8.0),
-            interpretation=kind,
-            distribution=shape,
-            mean_arcsec=rng.uniform(-5.0, 5.0) if shape == "constant" else 0.0,
-        )
-        for number, (kind, shape) in enumerate(chosen)
-    ]
-    found = combined(rows, interpretation="temporal", confidence=0.95)
-    worst, least = of_one_sensor(rows, 0.95, rng)
-    assert found.sampled_arcsec == pytest.approx(worst, rel=0.01)
-    assert found.sampled_least_arcsec == pytest.approx(min(least, worst), rel=0.02)
-    assert (
-        found.sampled_least_arcsec <= found.sampled_arcsec
-        and found.rule_least_arcsec <= found.rule_arcsec
-    )
-    # Control: the rule of before, which added what is random over both linearly.
-    mixed = [entry.sigma_arcsec for entry in rows if entry.interpretation == "mixed"]
-    if mixed:
-        random = math.hypot(
-            *(entry.sigma_arcsec for entry in rows if entry.interpretation == "temporal")
-        )
-        old = found.rule_arcsec + one_axis_factor(0.95) * (sum(mixed) + random - found.sigma_arcsec)
-        assert old > worst * 1.05
 
 
 def nested(
