@@ -112,13 +112,16 @@ def identify_command(
         obs, found, images = observations_from_centroids(
             table,
             nominal,
-            max_mag=max_mag,
+            place=tuple(place.options().values()),
             epoch=epoch,
-            identification={**vars(identification), "progress": progress},
-            known=known,
+            search={
+                **vars(identification),
+                "max_mag": max_mag,
+                "calibration": known,
+                "progress": progress,
+            },
             lenient=True,
             tell=tell,
-            **place.options(),
         )
     if obs is not None:
         _say_disturbed(obs)

@@ -37,7 +37,7 @@ from starcal_uq.cli.settings import (
     typed_words,
 )
 from starcal_uq.cli.steps import load_table, sample_run
-from starcal_uq.core.conflicts import conflict
+from starcal_uq.core.conflicts import conflict, parsed
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.store import finished
@@ -221,26 +221,16 @@ def _calibrate(
         show_screening(run.screening)
 
 
-# Options that hold for the images of another camera as well, and whether a value follows.
-_OF_ANY_CAMERA = {
-    "--time": 1,
-    "--epoch": 1,
-    "--site": 1,
-    "--directions": 1,
-    "--max-mag": 1,
-    "--in-space": 0,
-}
+# Options that hold for the images of another camera as well.
+_OF_ANY_CAMERA = ("--time", "--epoch", "--site", "--directions", "--max-mag", "--in-space")
 
 
 def _tell_other_cameras(run: Run) -> None:
     """Images of other cameras, and the command that calibrates each of these."""
-    frames, words = run.frames, typed_words(sys.argv[1:])
+    frames, (_, options) = run.frames, parsed(typed_words(sys.argv[1:]))
     kept: list[str] = []
-    for place, word in enumerate(words):
-        if word.partition("=")[0] in _OF_ANY_CAMERA:
-            kept += words[
-                place : place + 1 + _OF_ANY_CAMERA[word.partition("=")[0]] * ("=" not in word)
-            ]
+    for name in filter(options.__contains__, _OF_ANY_CAMERA):
+        kept += [name, *(value for value in options[name] if value is not None)]
     for place, other in enumerate(frames.record.others, 2):
         paths = [str(frames.paths[frame]) for frame in other.frames if frame in frames.paths]
         command = shlex.join(["starcal-uq", "run", *paths, *kept, "-o", f"{run.path}-{place}"])

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from starcal_uq.runs.run import Run
 
 
+# Settings of an estimation that change the nominal camera.
+_OF_CAMERA = ("start", "pixel_um")
+
+
 @dataclass(frozen=True)
 class EstimationSettings:
     """How a camera is estimated."""
@@ -36,7 +40,7 @@ class EstimationSettings:
     model: settings.ModelName | None = None
     method: settings.Method = "efficient"
     solver: settings.Solver = "lm"
-    screen: bool = False
+    screening: bool = False
     effects: str | None = None
     relative_attitudes: Path | None = None
     relative_alignment_arcsec: float | None = None
@@ -61,9 +65,7 @@ class EstimationSettings:
                 "--relative-alignment-arcsec needs --relative-attitudes: give both, or leave it "
                 "out."
             )
-        own = vars(self) | {"screening": self.screen}
-        for name in ("screen", "start", "pixel_um"):
-            del own[name]
+        own = {name: value for name, value in vars(self).items() if name not in _OF_CAMERA}
         own |= {name: None for name in ("effects", "mount") if own[name] == "none"}
         # No workers (0) are a choice, and no absence of one.
         return {
@@ -138,9 +140,9 @@ class SamplingSettings:
     seed: int = 0
     sigma: float | None = None
     priors: Path | None = None
-    ensembles: int = 4
-    walkers: int = 64
-    steps: int = 200
+    n_ensembles: int = 4
+    n_walkers: int = 64
+    n_steps: int = 200
     likelihood: settings.LikelihoodName | None = None
     evaluation: settings.Evaluation = "auto"
     moves: settings.Moves = "mixture"
@@ -151,19 +153,13 @@ class SamplingSettings:
         from starcal_uq.runs.priors import read_priors
 
         options: AnyDict = {
-            "seed": self.seed,
+            **vars(self),
             "sigma": "sampled" if self.sigma is None else self.sigma,
-            "n_ensembles": self.ensembles,
-            "n_walkers": self.walkers,
-            "n_steps": self.steps,
-            "likelihood": self.likelihood,
-            "evaluation": self.evaluation,
-            "moves": self.moves,
             "dof": parse_dof(self.dof),
         }
-        return (
-            options if self.priors is None else options | {"priors": read_priors(run, self.priors)}
-        )
+        if self.priors is not None:
+            options["priors"] = read_priors(run, self.priors)
+        return options
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,8 @@ from starcal_uq.sky.site import check_sky
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.core.types import FloatArray, Progress, StrArray
-    from starcal_uq.estimation.result import Calibration
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
-    from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
     from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.sky.site import Site
@@ -201,12 +199,9 @@ def observations_from_images(
     obs, identification, found = observations_from_centroids(
         asked,
         camera,
-        max_mag=max_mag,
+        place=(directions, site, in_space),
         epoch=epoch,
-        directions=directions,
-        site=site,
-        in_space=in_space,
-        identification={"engine": engine, "focal_tolerance": focal_tolerance},
+        search={"max_mag": max_mag, "engine": engine, "focal_tolerance": focal_tolerance},
         model=model,
         tell=tell,
         seen=noted,
@@ -220,13 +215,9 @@ def observations_from_centroids(
     centroids: Centroids,
     camera: Camera | None,
     *,
-    max_mag: float | None = None,
+    place: tuple[str | None, Site | None, bool] = (None, None, False),
     epoch: float | None = None,
-    directions: str | None = None,
-    site: Site | None = None,
-    in_space: bool = False,
-    identification: AnyDict | None = None,
-    known: Calibration | Posterior | None = None,
+    search: AnyDict | None = None,
     model: str | None = None,
     lenient: bool = False,
     tell: Callable[[str], None] | None = None,
@@ -234,7 +225,8 @@ def observations_from_centroids(
 ) -> tuple[Observations | None, Identification, ImageCalibration | None]:
     """What `observations_from_images` does with the centroids of its images.
 
-    With what is `known` of this camera the stars are identified once. If `lenient`, stars that do
+    `place` is directions, site and whether in space; `search` has the options of
+    `identify_to_depth`. With a calibration among them the stars are identified once. If `lenient`, stars that do
     not determine the camera are taken as they were identified first, and none is no error. The last
     identification is returned; the observations are None where no star was identified, the
     calibration where they were identified once.
@@ -245,6 +237,7 @@ def observations_from_centroids(
     from starcal_uq.sky.catalogue import load_catalogue
     from starcal_uq.sky.neighbours import without_disturbed
 
+    directions, site, in_space = place
     check_sky(directions, site, in_space)
     stated = None
     if site is not None:
@@ -252,24 +245,21 @@ def observations_from_centroids(
     elif directions in (None, "catalogue") and not in_space:
         stated = stated_site(centroids)
     year = epoch_of(centroids) if epoch is None else epoch
-    options = dict(identification or {})
-    progress = options.pop("progress", None)
-    stars, first = identify_to_depth(
-        centroids, camera, year, max_mag, calibration=known, progress=progress, **options
-    )
+    options: AnyDict = {"max_mag": None, "calibration": None} | (search or {})
+    max_mag: float | None = options["max_mag"]
+    known = options["calibration"]
+    stars, first = identify_to_depth(centroids, camera, year, **options)
     if known is None:
 
-        def search(table: Centroids) -> Identification:
+        def alone(table: Centroids) -> Identification:
             return identify_to_depth(
                 table, None, year, max_mag, engine=options.get("engine", "pyramid")
             )[1]
 
-        kept = of_one_camera(centroids, first, camera, options.get("focal_tolerance", 0.03), search)
+        kept = of_one_camera(centroids, first, camera, options.get("focal_tolerance", 0.03), alone)
         if kept is not centroids:
             centroids = kept
-            stars, first = identify_to_depth(
-                centroids, camera, year, max_mag, progress=progress, **options
-            )
+            stars, first = identify_to_depth(centroids, camera, year, **options)
     if seen is not None:
         seen(centroids, first)
     if tell is not None and max_mag is None:
