@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, fields, is_dataclass
+from dataclasses import astuple, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
@@ -380,19 +380,11 @@ def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]
     """
     from starcal_uq.core.manifest import identity
 
-    plain: AnyDict = {}
+    given: AnyDict = {}
     for key, value in settings.items():
-        given = (
-            asdict(value) if is_dataclass(value) and not isinstance(value, type) else {key: value}
-        )
-        plain |= {
-            key: str(content) if isinstance(content, Path) else content
-            for key, content in given.items()
-        }
-        files = {
-            **files,
-            **{name: content for name, content in given.items() if isinstance(content, Path)},
-        }
+        given |= vars(value) if is_dataclass(value) else {key: value}
+    paths = {key: value for key, value in given.items() if isinstance(value, Path)}
+    plain, files = given | {key: str(path) for key, path in paths.items()}, {**files, **paths}
     aligned = Path(str(plain.get("alignment")))
     files = {**files, "alignment": aligned} if aligned.is_file() else files
     return {"command": name, "settings": plain, "inputs": identity(files)}
