@@ -175,17 +175,17 @@ def _stated(table: Observations, factor: float) -> FloatArray:
 
 def _check_disjoint(columns: AnyDict, tables: Sequence[Observations], names: Sequence[str]) -> None:
     """The same centroid of the same star, to the last bit, is the same measurement."""
+    import pandas as pd
+
+    measured = ["x_px", "y_px", "ra_deg", "dec_deg"]
+    rows = pd.DataFrame({name: columns[name] for name in measured})
     owner = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
-    rows = np.column_stack([columns[name] for name in ("x_px", "y_px", "ra_deg", "dec_deg")])
-    _, group = np.unique(rows, axis=0, return_inverse=True)
-    group = group.reshape(-1)
-    order = np.lexsort((owner, group))
-    group, owner = group[order], owner[order]
-    twice = np.flatnonzero((np.diff(group) == 0) & (np.diff(owner) != 0))
-    if len(twice):
-        first, second = owner[twice[0] : twice[0] + 2]
+    owners = rows.assign(owner=owner).drop_duplicates().groupby(measured)["owner"].agg(list)
+    several = owners[owners.map(len) > 1]
+    if len(several):
+        first, second, *_ = several.iloc[0]
         raise CalibrationError(
-            f"{names[second]}: {len(twice)} of its stars are measurements that another run "
+            f"{names[second]}: {len(several)} of its stars are measurements that another run "
             f"holds too (first {names[first]}), which would count twice: leave one of the runs "
             "out, or calibrate them apart."
         )
