@@ -15,16 +15,15 @@ def schema_command(
     """The JSON Schema of what a command prints with `--json`."""
     from starcal_uq.cli.schemas import SCHEMAS, json_schema
 
-    chosen = SCHEMAS if name is None else {name: SCHEMAS[name]}
-    rows = [(each, version, part.text) for each, (version, part) in chosen.items()]
-    if name is None:
-        cells = tuple((each, str(version), text) for each, version, text in rows)
+    rows = [
+        {"name": each, "version": version, "text": part.text}
+        for each, (version, part) in SCHEMAS.items()
+        if name in (None, each)
+    ]
+    schema = None if name is None else json_schema(name)
+    if schema is None:
+        cells = tuple(tuple(map(str, row.values())) for row in rows)
         print_table(TextTable(("schema", "version", "what it holds"), cells, align="lrl"))
     else:
-        say(json.dumps(json_schema(name), indent=1))
-    return Answer(
-        {
-            "schemas": [dict(zip(("name", "version", "text"), row, strict=True)) for row in rows],
-            "json_schema": None if name is None else json_schema(name),
-        }
-    )
+        say(json.dumps(schema, indent=1))
+    return Answer({"schemas": rows, "json_schema": schema})

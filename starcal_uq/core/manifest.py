@@ -342,26 +342,10 @@ def _locked(folder: Path) -> Iterator[None]:
     if _writing.get(place) == thread:
         yield
         return
-    handle = _lock(folder)
-    _writing[place] = thread
-    try:
-        yield
-    finally:
-        del _writing[place]
-        if handle is not None:
-            os.close(handle)
-
-
-def _lock(folder: Path) -> int | None:
-    """Lock a folder as long as the handle is open and the process lives; None where there are no
-    locks.
-    """
-    try:
-        import fcntl
-    except ImportError:
-        return None
     handle = None
     try:
+        import fcntl
+
         handle = os.open(folder, os.O_RDONLY)
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (BlockingIOError, FileNotFoundError):
@@ -370,7 +354,13 @@ def _lock(folder: Path) -> int | None:
         raise RunFolderError(
             f"{folder}: another process is writing there; wait for it, or end it."
         ) from None
-    except OSError:
-        # A file system without locks; or whoever writes there says what is wrong.
+    except (ImportError, OSError):
+        # There are no locks; or whoever writes there says what is wrong.
         pass
-    return handle
+    _writing[place] = thread
+    try:
+        yield
+    finally:
+        del _writing[place]
+        if handle is not None:
+            os.close(handle)
