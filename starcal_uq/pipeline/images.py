@@ -226,10 +226,10 @@ def observations_from_centroids(
     """What `observations_from_images` does with the centroids of its images.
 
     `place` is directions, site and whether in space; `search` has the options of
-    `identify_to_depth`. With a calibration among them the stars are identified once. If `lenient`, stars that do
-    not determine the camera are taken as they were identified first, and none is no error. The last
-    identification is returned; the observations are None where no star was identified, the
-    calibration where they were identified once.
+    `identify_to_depth`. With a calibration among them the stars are identified once. If `lenient`,
+    stars that do not determine the camera are taken as they were identified first, and none is no
+    error. The last identification is returned; the observations are None where no star was
+    identified, the calibration where they were identified once.
     """
     from starcal_uq.pipeline.cameras import of_one_camera
     from starcal_uq.pipeline.depth import depth_text, identify_to_depth
@@ -245,10 +245,12 @@ def observations_from_centroids(
     elif directions in (None, "catalogue") and not in_space:
         stated = stated_site(centroids)
     year = epoch_of(centroids) if epoch is None else epoch
-    options: AnyDict = {"max_mag": None, "calibration": None} | (search or {})
-    max_mag: float | None = options["max_mag"]
-    known = options["calibration"]
-    stars, first = identify_to_depth(centroids, camera, year, **options)
+    options = dict(search or {})
+    max_mag, known = options.pop("max_mag", None), options.pop("calibration", None)
+    progress = options.pop("progress", None)
+    stars, first = identify_to_depth(
+        centroids, camera, year, max_mag, calibration=known, progress=progress, **options
+    )
     if known is None:
 
         def alone(table: Centroids) -> Identification:
@@ -259,7 +261,9 @@ def observations_from_centroids(
         kept = of_one_camera(centroids, first, camera, options.get("focal_tolerance", 0.03), alone)
         if kept is not centroids:
             centroids = kept
-            stars, first = identify_to_depth(centroids, camera, year, **options)
+            stars, first = identify_to_depth(
+                centroids, camera, year, max_mag, progress=progress, **options
+            )
     if seen is not None:
         seen(centroids, first)
     if tell is not None and max_mag is None:
