@@ -127,7 +127,7 @@ def test_workers_that_die_again_are_said_in_one_sentence() -> None:
     distributed = pytest.importorskip("distributed")
     with (
         distributed.LocalCluster(
-            n_workers=1,
+            n_workers=2,
             threads_per_worker=1,
             dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
