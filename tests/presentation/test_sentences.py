@@ -5,17 +5,21 @@ one.
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from starcal_uq.budgeting.totals import Difference
 from starcal_uq.core import status
 from starcal_uq.diagnostics.verdict.limits import Limit
 from starcal_uq.diagnostics.verdict.remedies import Refusal
-from starcal_uq.presentation.words.sentences import templates
+from starcal_uq.inference.power_scaling import CONFLICT, WEAK
+from starcal_uq.presentation.words.sentences import templates, told
 
 PACKAGE = Path(status.__file__).parents[1]
 # Wings that show findings, or stand above those that do.
@@ -109,3 +113,22 @@ def test_advice_is_an_order_and_values_are_put_in() -> None:
             assert said[0].isupper() and said.endswith("."), said
     missing = status.Order(status.Advice.STATE_WHAT_IS_MISSING, {"missing": ("a", "b")})
     assert missing.sentence == "State in the budget file what is missing: a and b."
+
+
+def test_lists_within_a_sentence_name_what_they_are_about() -> None:
+    error = SimpleNamespace(
+        alignment="frames", alignment_arcsec=np.ones(3), stays=np.array([True, False, True])
+    )
+    assert "the rest in pitch and roll is a bias that stays" in told("alignment", error)
+    error.stays[:] = False
+    assert "stays" not in told("alignment", error)
+    priors = SimpleNamespace(ok=False, names=("x0", "y0", "f"), diagnosis=(WEAK, CONFLICT, WEAK))
+    said = f"The priors matter: {CONFLICT} for y0; {WEAK} for x0, f."
+    assert told("prior_sensitivity", priors) == said
+
+
+def test_no_list_asks_for_its_own_loop_before_it_runs() -> None:
+    """Jinja knows `loop` within a loop, and not in the condition that chooses its items."""
+    asking = re.compile(r"{%[^%]*\bfor\b[^%]* if [^%]*\bloop\b")
+    assert [name for name, text in templates().items() if asking.search(text)] == []
+    assert asking.search("{% for a in b if c[loop.index0] %}")

@@ -35,6 +35,7 @@ from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, model_facts, st
 from starcal_uq.estimation.merging import ALPHA
 from starcal_uq.estimation.undetermined import remedy_of, what_is_open
 from starcal_uq.inference.checks import COMPRESSED_BOUND
+from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.planning.open_distortion import AFTER_FRAMES
 from starcal_uq.presentation.words import numbers
 from starcal_uq.propagation.onboard_error import with_cross
@@ -105,6 +106,7 @@ def _environment() -> jinja2.Environment:
         "ALPHA": ALPHA,
         "AXES": AXES,
         "COMPRESSED_BOUND": COMPRESSED_BOUND,
+        "CONFLICTS": (CONFLICT, WEAK),
         "DENSITY_SPREAD": DENSITY_SPREAD,
         "ENOUGH_REPLICATES": ENOUGH_REPLICATES,
         "JACKKNIFE_P": JACKKNIFE_P,
