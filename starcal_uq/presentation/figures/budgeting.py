@@ -14,7 +14,7 @@ from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.figures import style
-from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, WITH_MISFIT_FOUND
+from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,14 +72,13 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
     for place, name in enumerate(names):
         row = by_name[name][0]
         value = reaches[name]
-        if not _present(budget, name, axis):
-            _write(ax, left, place, "–", style.GREY)
-            continue
-        if value is None or value == 0.0:
-            missing = value is None
-            text = "not assessed" if missing else "does not apply" if not row.applies else "0"
-            colour = style.VERMILLION if missing else style.GREY
-            _write(ax, left, place, text, colour, italic=missing)
+        if not value or not _present(budget, name, axis):
+            text = "0" if row.applies else "does not apply"
+            if not _present(budget, name, axis):
+                text = "–"
+            elif value is None:
+                text = NOT_ASSESSED
+            _write(ax, left, place, text)
             continue
         hatch = "///" if row.absorbed_by_alignment == "yes" else ""
         source = next((r.source for r in by_name[name] if r.assessed), "file")
@@ -89,7 +88,7 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
     for offset, entry in enumerate(sums):
         at = len(names) + 0.7 + offset
         if not entry.rule_arcsec > 0.0:
-            _write(ax, left, at, "not assessed", style.VERMILLION, italic=True)
+            _write(ax, left, at, NOT_ASSESSED)
             continue
         ax.plot(entry.rule_arcsec, at, "o", color=style.INK, markersize=7)
         ax.plot(
@@ -139,9 +138,11 @@ def _reach(rows: list[Contributor], axis: str, confidence: float) -> float | Non
 
 
 def _write(
-    ax: Axes, x: float, y: float, text: str, colour: str, *, italic: bool = False, shift: int = 4
+    ax: Axes, x: float, y: float, text: str, colour: str = style.GREY, shift: int = 4
 ) -> None:
-    slant = "italic" if italic else "normal"
+    slant = "normal"
+    if text == NOT_ASSESSED:
+        colour, slant = style.VERMILLION, "italic"
     # The limits of the axis leave room for it.
     look = {"va": "center", "color": colour, "style": slant, "in_layout": False}
     style.note(ax, text, (x, y), (shift, 0), **look)

@@ -87,11 +87,10 @@ def plot_effect_scales(effects: Effects, ax: Axes | None = None) -> Axes:
     """Scale of every effect with its 95 % interval, and the shift that it explains."""
     ax = style.panel(ax, 4.6, 1.3 + 0.35 * len(effects.fitted))
     place = np.arange(len(effects.fitted))
-    known = np.array([e.low_px == e.high_px for e in effects.fitted])
     scale, low, high, size = np.array(
         [(e.scale_px, e.low_px, e.high_px, e.size_px) for e in effects.fitted]
     ).T
-    told = ~known
+    told = low < high
     bars = np.stack([scale - low, high - scale])[:, told]
     look: AnyDict = style.BARS | {
         "marker": "o",
@@ -102,8 +101,7 @@ def plot_effect_scales(effects: Effects, ax: Axes | None = None) -> Axes:
     hollow: AnyDict = {"markersize": 6.0, "markerfacecolor": "none", "linestyle": "none"}
     ax.plot(size, place, marker="D", color=style.VERMILLION, label="shift rms", **hollow)
     style.log_scale(ax.xaxis)
-    reach = np.concatenate([low[told], high[told], size])
-    reach = np.log10(np.maximum(reach, _LEAST_PX))
+    reach = np.log10(np.maximum([*low[told], *high[told], *size], _LEAST_PX))
     ax.set_xlim(10.0 ** np.floor(reach.min()), 10.0 ** np.ceil(reach.max()))
     ax.set_yticks(place, [effect.name for effect in effects.fitted])
     ax.set_ylim(len(place) - 0.4, -1.2)

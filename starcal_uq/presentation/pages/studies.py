@@ -13,16 +13,6 @@ import numpy as np
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.types import PathLike
-from starcal_uq.presentation.figures.studies import (
-    plot_coverage,
-    plot_inflation,
-    plot_matrices,
-    plot_needed,
-    plot_simpler,
-    plot_study_correlation,
-    plot_study_maps,
-    plot_weakest,
-)
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
@@ -53,22 +43,15 @@ def study_figures(study: Study) -> dict[str, bytes]:
     sweep = study.sweep
     if not sweep.axes or not sweep.ok.any():
         return {}
-    drawn = {"correlation": plot_study_correlation(study)} if sweep.pairs else {}
-    if len(sweep.axes) > 1:
-        drawn["maps"] = plot_study_maps(study)
-    drawn |= {
-        "matrices": plot_matrices(study),
-        "weakest": plot_weakest(study),
-        "inflation": plot_inflation(study),
-        "needed": plot_needed(study),
+    simpler = study.data.get("model_bias_arcsec", 0.0)
+    wanted = {
+        "correlation": bool(sweep.pairs),
+        "maps": len(sweep.axes) > 1,
+        **dict.fromkeys(("matrices", "weakest", "inflation", "needed"), True),
+        "simpler": bool(np.any(np.nan_to_num(simpler) > 0.0)),
+        "coverage": "covered_95" in study.data,
     }
-    if "simpler" in study.data.dims and np.any(
-        np.nan_to_num(study.data["model_bias_arcsec"].values) > 0.0
-    ):
-        drawn["simpler"] = plot_simpler(study)
-    if "covered_95" in study.data:
-        drawn["coverage"] = plot_coverage(study)
-    return {name: svg_bytes(figure) for name, figure in drawn.items()}
+    return {name: svg_bytes(getattr(study.plot, name)()) for name, one in wanted.items() if one}
 
 
 def render_study(study: Study, images: Mapping[str, bytes]) -> str:

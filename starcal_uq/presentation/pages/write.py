@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,14 @@ from starcal_uq.presentation.pages.gallery import write_frames
 from starcal_uq.presentation.pages.planning import write_plan
 from starcal_uq.presentation.pages.studies import write_study
 from starcal_uq.studies.result import Study
+
+_WRITERS: dict[type, Callable[..., Path]] = {
+    Plan: write_plan,
+    CameraComparison: write_comparison,
+    Budget: write_budget,
+    Study: write_study,
+    Frames: write_frames,
+}
 
 
 def write_page(
@@ -48,16 +57,9 @@ def write_page(
     RunFolderError
         If it cannot be written.
     """
-    if isinstance(what, Plan):
-        return write_plan(what, to, **options)
-    if isinstance(what, CameraComparison):
-        return write_comparison(what, to, **options)
-    if isinstance(what, Budget):
-        return write_budget(what, to, **options)
-    if isinstance(what, Study):
-        return write_study(what, to, **options)
-    if isinstance(what, Frames):
-        return write_frames(what, to, **options)
+    for kind, write in _WRITERS.items():
+        if isinstance(what, kind):
+            return write(what, to, **options)
     raise TypeError(
         f"there is no page for a {type(what).__name__}: give a Plan, a CameraComparison, a "
         "Budget, a Study or Frames."
