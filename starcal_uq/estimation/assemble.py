@@ -27,7 +27,7 @@ from starcal_uq.estimation.undetermined import (
 )
 from starcal_uq.likelihood.compressed import compress, settled, unit_covariance
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
-from starcal_uq.likelihood.solvers import is_singular
+from starcal_uq.likelihood.solvers import is_singular, reason_of
 from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
 
 if TYPE_CHECKING:
@@ -41,8 +41,6 @@ IMPLAUSIBLE_NOISE = 0.01
 _NEARLY_RAD = 1e-4
 # Noise that is assumed where there is no estimate to take it from.
 _USUAL_NOISE_PX = 0.1
-# Fewer stars than this that are seen twice do not tell their errors from noise.
-_FEWEST_STARS = 5
 
 
 class PairEstimate(NamedTuple):
@@ -75,14 +73,7 @@ def assemble(
         raise failed(likelihood, nominal.theta, nominal, status)
     normal = likelihood.sums(theta, tolerance=TURN_RAD)[0].normal
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
-        reason = (
-            status
-            if not status.ok
-            else Status.SINGULAR
-            if np.isfinite(normal.cost)
-            else Status.NOT_FINITE
-        )
-        raise failed(likelihood, theta, nominal, reason)
+        raise failed(likelihood, theta, nominal, reason_of(status, normal.cost))
     dof = likelihood.dof - p
     sigma = float(np.sqrt(normal.cost / dof))
     status = check_camera(nominal.with_theta(theta), status)

@@ -25,7 +25,6 @@ from starcal_uq.camera.distortion import get_model, like, model_names, simpler_m
 from starcal_uq.core.cluster import Cluster
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, IntArray, Progress
 from starcal_uq.estimation.assemble import check_noise
 from starcal_uq.estimation.duplicates import repeated
@@ -44,7 +43,7 @@ from starcal_uq.estimation.stages import Stage
 from starcal_uq.likelihood import paths
 from starcal_uq.likelihood.compressed import GramSums, gram_sums, optimum, settled
 from starcal_uq.likelihood.marginal import MarginalLikelihood
-from starcal_uq.likelihood.solvers import Normal, is_singular, levenberg_marquardt
+from starcal_uq.likelihood.solvers import Normal, is_singular, levenberg_marquardt, reason_of
 from starcal_uq.likelihood.sums import NormalSums, frame_sums, sum_of
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.checks import row_hashes
@@ -281,13 +280,7 @@ def calibrate_partitions(
     )
     theta, normal, status = found.theta, found.normal, found.status
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
-        reason = (
-            status
-            if not status.ok
-            else Status.SINGULAR
-            if np.isfinite(normal.cost)
-            else Status.NOT_FINITE
-        )
+        reason = reason_of(status, normal.cost)
         raise CalibrationError(
             f"the calibration failed ({reason.name})", reason, reason=reason.remedy
         )

@@ -458,40 +458,19 @@ class Calibration(Shown, Traced):
         """
         import pandas as pd
 
-        rows = [
+        low, high = np.vstack([self.interval(), self.sigma_interval()]).T
+        unit = "px" if self.sigma_name == "sigma" else "1"
+        return pd.DataFrame(
             {
-                "parameter": p.name,
-                "start": start,
-                "estimate": value,
-                "sigma": sigma,
+                "parameter": [*self.parameter_names, self.sigma_name],
+                "start": np.append(self.nominal.theta, np.nan),
+                "estimate": np.append(self.theta, self.sigma),
+                "sigma": np.append(self.sigmas, self.sigma_std),
                 "low": low,
                 "high": high,
-            }
-            | {"unit": p.unit}
-            for p, start, value, sigma, (low, high) in zip(
-                *(
-                    parameters(self.camera.distortion),
-                    self.nominal.theta,
-                    self.theta,
-                    self.sigmas,
-                    self.interval(),
-                ),
-                strict=True,
-            )
-        ]
-        unit = "px" if self.sigma_name == "sigma" else "1"
-        rows.append(
-            {
-                "parameter": self.sigma_name,
-                "start": np.nan,
-                "estimate": self.sigma,
-                "sigma": self.sigma_std,
-                "low": float(self.sigma_interval()[0]),
-                "high": float(self.sigma_interval()[1]),
-                "unit": unit,
+                "unit": [*(p.unit for p in parameters(self.camera.distortion)), unit],
             }
         )
-        return pd.DataFrame(rows)
 
     def __repr__(self) -> str:
         values = ", ".join(

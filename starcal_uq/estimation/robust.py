@@ -102,15 +102,15 @@ def usable_stars(frames: StarFrames, model_name: str, theta: FloatArray) -> Bool
     to speak of.
     """
     scores = star_scores(frames, model_name, theta)
-    return _in_threes(frames, scores <= _DISTRUST * np.median(scores))
+    return in_threes(frames, scores <= _DISTRUST * np.median(scores))
 
 
 def subset(frames: StarFrames, kept: BoolArray) -> StarFrames:
     """Some of the stars, without frames that keep fewer than three."""
-    return frames.select(kept & _in_threes(frames, kept))
+    return frames.select(kept & in_threes(frames, kept))
 
 
-def _in_threes(frames: StarFrames, kept: BoolArray) -> BoolArray:
+def in_threes(frames: StarFrames, kept: BoolArray) -> BoolArray:
     """Stars (N,), kept or not, of frames that keep three or more."""
     return np.asarray(frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0)
 
@@ -146,7 +146,7 @@ def robust_start(
         if not (status := stages[-1].status).ok:
             outcome = f"the calibration did not end well ({status.name})"
             raise CalibrationError(outcome, status, reason=status.remedy)
-    weight = np.where(trusted | ~_in_threes(frames, trusted), 1.0, _NEGLIGIBLE_WEIGHT)
+    weight = np.where(trusted | ~in_threes(frames, trusted), 1.0, _NEGLIGIBLE_WEIGHT)
     if frames.weight is not None:
         weight = weight * frames.weight**2
     b = unproject_theta(model_name, at, frames.pixel.T)
@@ -366,7 +366,7 @@ def compress_reweighted(fit: RobustFit) -> CompressedLikelihood:
     """
     frames, theta = fit.likelihood.frames, fit.stage.theta
     kept = fit.state.weight > _NEGLIGIBLE_WEIGHT
-    remaining = kept & _in_threes(frames, kept)
+    remaining = kept & in_threes(frames, kept)
     stated = np.ones(frames.n_stars) if frames.weight is None else frames.weight
     weight = (stated * np.sqrt(fit.state.weight))[remaining]
     rotations = fit.state.rotations[frames.sum(remaining.astype(np.float64)) > 0.0]

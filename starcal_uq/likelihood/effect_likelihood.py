@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.likelihood.effect_sums import Columns, Cross, EffectSums, expected, pull_of
+from starcal_uq.likelihood.effect_sums import Columns, Cross, EffectSums, by_run, expected, pull_of
 from starcal_uq.likelihood.effects import Effect
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.observations.frames import StarFrames
@@ -41,7 +41,7 @@ class EffectLikelihood(MarginalLikelihood):
         super().__init__(frames, model_name)
         state, _ = self.profile(theta, rotations)
         self.effects = tuple(effect for effect in effects if effect.name in ratio)
-        run = [effect for effect in self.effects if effect.grouping == "run"]
+        run = [effect for effect in self.effects if effect.of_run]
         self.mean, self.pull = expected(run, ratio) if given is None else given, pull_of(run)
         if self.mean.any() or given is not None:
             seen = Columns.of(self.effects, self, state, theta, slice(None))
@@ -51,7 +51,7 @@ class EffectLikelihood(MarginalLikelihood):
             state, _ = self.profile(theta, state.rotations)
         self.use_rotations(state.rotations)
         # What frames share may be known: products of its columns are not needed then.
-        free = [e for e in self.effects if given is None or e.grouping != "run"]
+        free = [e for e in self.effects if given is None or not e.of_run]
         sums = EffectSums(free, theta, sigma)
         nothing = np.zeros((0, 2, frames.n_stars))
         self.columns = sums.add(self, state, nothing, slice(None))
@@ -110,21 +110,9 @@ class EffectLikelihood(MarginalLikelihood):
 
     def of_effect(self, name: str, found: Cross) -> Cross:
         """The coefficients of one effect, those of the others zero."""
-        run, frame = (
-            np.concatenate(
-                [
-                    np.zeros(0),
-                    *(
-                        np.full(len(e.prior), float(e.name == name))
-                        for e in self.effects
-                        if e.grouping == grouping
-                    ),
-                ]
-            )
-            for grouping in ("run", "frame")
-        )
-        star = float(name == "star")
-        return Cross(found.run * run[:, None], found.frame * frame[:, None], found.star * star)
+        run = by_run([np.full(len(e.prior), e.name == name) for e in self.effects if e.of_run])
+        frame, star = float(name == "frame"), float(name == "star")
+        return Cross(found.run * run[:, None], found.frame * frame, found.star * star)
 
     def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
         rest, found = self.conditioned(state, columns)

@@ -56,7 +56,7 @@ class Columns:
     ) -> Columns:
         """The columns at these rows of the table, run, frame and star by themselves."""
         view = View.of(part, state, theta, rows)
-        of_run = tuple(effect for effect in effects if effect.grouping == "run")
+        of_run = tuple(effect for effect in effects if effect.of_run)
         of_frames = (e.columns.columns(view) for e in effects if e.grouping == "frame")
         frame = _whitened(part.frames, *of_frames)
         star, groups, n_stars = frame[:0], np.zeros(part.frames.n_stars, dtype=np.int64), 0
@@ -97,8 +97,7 @@ class Columns:
         """One where turns by a column of the run (m,) are the camera's, else zero: air bends light
         and does not turn the camera.
         """
-        own = [np.full(len(effect.prior), 1.0 - effect.known) for effect in self.of_run]
-        return np.concatenate([np.zeros(0), *own])
+        return by_run([np.full(len(effect.prior), 1.0 - effect.known) for effect in self.of_run])
 
     def cross(self, x: FloatArray) -> Cross:
         """Products with columns x (q, 2, n) whose attitudes are projected out."""
@@ -251,12 +250,12 @@ class EffectSums:
         """Variances of the coefficients of one grouping in units of sigma squared; `ratio` holds
         that of the scale of every effect, none for those that are not there.
         """
-        own = [ratio.get(e.name, 0.0) * e.prior**2 for e in self.effects if e.grouping == grouping]
-        return np.concatenate([np.zeros(0), *own])
+        own = [e for e in self.effects if e.grouping == grouping]
+        return by_run([ratio.get(e.name, 0.0) * e.prior**2 for e in own])
 
     def solved(self, ratio: Mapping[str, float]) -> Solved:
         """Eliminate all coefficients, whose scales have these squares in units of sigma squared."""
-        local = [effect.name for effect in self.effects if effect.grouping != "run"]
+        local = [effect.name for effect in self.effects if not effect.of_run]
         key = tuple(ratio.get(name, -1.0) for name in local)
         if key not in self._local:
             # The one before is wanted again where another scale is tried beside it.
@@ -271,13 +270,13 @@ class EffectSums:
     @property
     def places(self) -> dict[str, slice]:
         """Places of the coefficients of effects of the run."""
-        sizes = {e.name: len(e.prior) for e in self.effects if e.grouping == "run"}
+        sizes = {e.name: len(e.prior) for e in self.effects if e.of_run}
         ends = np.cumsum([0, *sizes.values()]).tolist()
         return {n: slice(*at) for n, *at in zip(sizes, ends[:-1], ends[1:], strict=True)}
 
     def mean(self, ratio: Mapping[str, float]) -> FloatArray:
         """Expected coefficients (m,) of the run, zero of effects that are not there."""
-        return expected([e for e in self.effects if e.grouping == "run"], ratio)
+        return expected([e for e in self.effects if e.of_run], ratio)
 
     def coefficients(self, ratio: Mapping[str, float]) -> FloatArray:
         """Best coefficients (m, q) of the run for the added columns."""
@@ -447,14 +446,19 @@ class Solved:
 
 def expected(effects: Sequence[Effect], present: Mapping[str, Any]) -> FloatArray:
     """Expected coefficients (m,) of effects, zero of those that are not present."""
-    own = [
-        effect.mean if effect.mean is not None and effect.name in present else 0.0 * effect.prior
-        for effect in effects
-    ]
-    return np.concatenate([np.zeros(0), *own])
+    own = (effect.mean if effect.name in present else None for effect in effects)
+    return by_run([_or_zero(one, effect) for one, effect in zip(own, effects, strict=True)])
 
 
 def pull_of(effects: Sequence[Effect]) -> FloatArray:
     """Slopes (m,) of the log prior of the coefficients of effects beyond its Gaussian."""
-    own = [0.0 * effect.prior if effect.pull is None else effect.pull for effect in effects]
-    return np.concatenate([np.zeros(0), *own])
+    return by_run([_or_zero(effect.pull, effect) for effect in effects])
+
+
+def _or_zero(values: FloatArray | None, effect: Effect) -> FloatArray:
+    return 0.0 * effect.prior if values is None else values
+
+
+def by_run(parts: Sequence[FloatArray]) -> FloatArray:
+    """Values (m,) of all coefficients from those of each effect; none of no effect."""
+    return np.concatenate([np.zeros(0), *parts])

@@ -68,6 +68,11 @@ class Effect:
     pull: FloatArray | None = None
 
     @property
+    def of_run(self) -> bool:
+        """Whether its coefficients belong to the run."""
+        return self.grouping == "run"
+
+    @property
     def known(self) -> bool:
         """Whether its prior is known, so that its scale is one and nothing to estimate."""
         return self.mean is not None

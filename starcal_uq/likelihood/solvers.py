@@ -209,6 +209,13 @@ def is_singular(matrix: FloatArray) -> bool:
     return bool(values[0] < 1e-12 * values[-1])
 
 
+def reason_of(status: Status, cost: float) -> Status:
+    """Why there is no estimate where a solver ended with this status and a model of this cost."""
+    if not status.ok:
+        return status
+    return Status.SINGULAR if np.isfinite(cost) else Status.NOT_FINITE
+
+
 def minpack(
     residuals: Residuals, evaluate: Evaluate, start: FloatArray, *, max_iterations: int = 200
 ) -> Solution:

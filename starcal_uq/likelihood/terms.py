@@ -25,6 +25,8 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 
+# Coefficients of a star.
+_SIZE = 2
 # A variance, in units of the noise, that is none.
 _NO_RATIO = 1e-10
 # Rows of a dense matrix, 400 MB; a larger one must have few entries, as frames all over the sky
@@ -61,8 +63,8 @@ class TermSums:
     """Sums over all images from which products with the covariance of a term follow."""
 
     def __init__(self, term: Term) -> None:
-        self.term, self.n_groups, self.size = term, term.n_groups, 2
-        self.own = np.zeros((self.n_groups, self.size, self.size))
+        self.term, self.n_groups = term, term.n_groups
+        self.own = np.zeros((self.n_groups, _SIZE, _SIZE))
         self._cross: FloatArray | None = None
         self._blocks: list[tuple[FloatArray, IntArray, IntArray]] = []
         self._frames = 0
@@ -70,7 +72,7 @@ class TermSums:
     @property
     def cross(self) -> FloatArray:
         """``Z^T (I-P) X`` (G c, q) of the columns that were added."""
-        rows = self.n_groups * self.size
+        rows = self.n_groups * _SIZE
         return np.zeros((rows, 0)) if self._cross is None else self._cross.reshape(rows, -1)
 
     def add(
@@ -88,7 +90,7 @@ class TermSums:
         """
         groups, z = self.term.groups[rows], self.term.columns(part, state, rows)
         if self._cross is None:
-            self._cross = np.zeros((self.n_groups, self.size, len(projected)))
+            self._cross = np.zeros((self.n_groups, _SIZE, len(projected)))
         add_by_group(self.own, np.einsum("ixn,jxn->ijn", z, z), groups)
         add_by_group(self._cross, np.einsum("ixn,qxn->iqn", z, projected), groups)
         # P in the coordinates of the groups is the square of this.
@@ -115,9 +117,9 @@ class TermSums:
         block, groups, frames = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
         block = columns(block, frames)
         width = block.shape[2]
-        rows = self.size * groups[:, None, None] + np.arange(self.size)[:, None]
+        rows = _SIZE * groups[:, None, None] + np.arange(_SIZE)[:, None]
         place = np.broadcast_arrays(rows, width * frames[:, None, None] + np.arange(width))
-        shape = (self.n_groups * self.size, width * self._frames)
+        shape = (self.n_groups * _SIZE, width * self._frames)
         return csr_array((block.ravel(), tuple(index.ravel() for index in place)), shape=shape)
 
     @cached_property
@@ -190,7 +192,7 @@ class Eliminated:
         if self._by_group:
             left = sums.matrix_without(b) + diags_array(precision)
         else:
-            own = sums.own + precision.reshape(-1, sums.size, 1) * np.eye(sums.size)
+            own = sums.own + precision.reshape(-1, _SIZE, 1) * np.eye(_SIZE)
             self._inverse: FloatArray = np.asarray(np.linalg.inv(own), dtype=np.float64)
             log_own = float(np.sum(np.log(np.linalg.det(own))))
             left = eye_array(b.shape[1]) - b.T @ self._own_solve(b)
@@ -212,6 +214,6 @@ class Eliminated:
     def variances(self) -> FloatArray:
         """Variances (G c,) of the coefficients in units of sigma^2, attitudes known."""
         sums = self._sums
-        precision = (1.0 / self.ratio).reshape(-1, sums.size, 1) * np.eye(sums.size)
+        precision = (1.0 / self.ratio).reshape(-1, _SIZE, 1) * np.eye(_SIZE)
         inverse = np.linalg.inv(sums.own + precision)
         return np.asarray(np.diagonal(inverse, axis1=1, axis2=2)).ravel()

@@ -144,14 +144,10 @@ def screen(
     check_duplicates(duplicates)
     options["duplicates"] = "keep"
     names = effect_names(options.get("effects"))
+    settings: AnyDict = {"significance": significance, "control": control}
+    settings |= {"max_rounds": max_rounds, "throw": throw}
     if "noise" in names:
-        settings = {
-            "significance": significance,
-            "control": control,
-            "max_rounds": max_rounds,
-            "throw": throw,
-        }
-        settings["duplicates"] = duplicates
+        settings |= {"duplicates": duplicates}
         return _with_noise_model(obs.unweighted, camera, settings, options, names)
     frames = StarFrames.from_observations(obs)
     rates = _rates(frames, significance, control, max_rounds)
@@ -211,14 +207,8 @@ def screen(
         calibration = calibrate(kept, camera, **last)
     repeating = repeating_frames(calibration, duplicates)
     if len(repeating):
-        again = {
-            "significance": significance,
-            "control": control,
-            "max_rounds": max_rounds,
-            "throw": throw,
-            **options,
-        }
-        return screen(obs.select_frames(np.setdiff1d(obs.frame_ids, repeating)), camera, **again)
+        rest = obs.select_frames(np.setdiff1d(obs.frame_ids, repeating))
+        return screen(rest, camera, **settings, **options)
     residuals = star_residuals(frames, calibration.camera.distortion, calibration.theta, use)
     table = rejected_table(obs, residuals, rates.star, rates.frame, rates.shrinkage)
     add_dropped_frames(
