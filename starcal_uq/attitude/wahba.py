@@ -24,9 +24,11 @@ NumPy is several times faster on them than on arrays of 3-vectors and 3x3 matric
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Literal
+from functools import cached_property, reduce
+from itertools import chain, combinations
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -42,6 +44,10 @@ DEGENERATE = 1e-12
 _NEWTON_STEPS = 60
 # Frames whose temporaries stay in the processor's cache.
 _PROFILES = 4096
+# Entries of 3x3 matrices, by rows.
+_Matrix: TypeAlias = list[list[FloatArray]]
+# Each axis with the two others.
+_AXES = (0, 1, 2), (1, 0, 2), (2, 0, 1)
 
 
 class DegenerateFrameError(StarcalError):
@@ -157,7 +163,7 @@ def quest(
     shape = (n_draws, n_frames)
     quaternions = np.empty((4, *shape))
     lambda_max, loss, gap = np.empty((3, *shape))
-    covariances = np.empty((6, *shape)) if covariance else None
+    covariances = np.empty((*shape, 3, 3)) if covariance else None
     chi2 = None if sigma_rad is None else np.empty(shape)
 
     for rows, frames, draws in _blocks(starts, n_draws):
@@ -170,7 +176,7 @@ def quest(
         q, lam, gap[part] = _solve(_profile(b3, r3, w_rows, local, total))
         quaternions[:, draws, frames], lambda_max[part], loss[part] = q, lam, 1.0 - lam
         if covariances is not None:
-            covariances[:, draws, frames] = _inverse(_information(b3, w_rows, local))
+            covariances[part] = np.moveaxis(_covariance(b3, w_rows, local), (0, 1), (2, 3))
         if chi2 is not None:
             chi2[part] = _squared_residuals(b3, r3, w_rows, local, counts, q)
             loss[part] = 0.5 * chi2[part] / total
@@ -182,7 +188,7 @@ def quest(
         quaternions[:, ~ok] = np.nan
         for array in (covariances, chi2):
             if array is not None:
-                array[..., ~ok] = np.nan
+                array[~ok] = np.nan
     first = slice(None) if b.ndim == 3 else 0
     return QuestResult(
         quaternions=np.ascontiguousarray(np.moveaxis(quaternions, 0, -1))[first],
@@ -191,7 +197,7 @@ def quest(
         observability=gap[first],
         ok=ok[first],
         dof=2 * np.diff(starts) - 3,
-        covariance=None if covariances is None else _full(covariances)[first],
+        covariance=None if covariances is None else covariances[first],
         taste=None if chi2 is None else chi2[first],
     )
 
@@ -263,8 +269,7 @@ def _blocks(starts: IntArray, n_draws: int) -> list[tuple[slice, slice, slice]]:
 def _components(vectors: FloatArray) -> FloatArray:
     """Components first, (3, d, n)."""
     c = np.ascontiguousarray(np.moveaxis(vectors, -1, 0))
-    norm2 = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
-    if np.any(np.abs(norm2 - 1.0) > 1e-6):
+    if np.any(np.abs(_dot(c, c) - 1.0) > 1e-6):
         raise ValueError("QUEST needs unit vectors: normalise b and r first.")
     return c
 
@@ -275,7 +280,7 @@ def _profile(
     w: FloatArray | None,
     local: IntArray,
     total: FloatArray | IntArray,
-) -> list[list[FloatArray]]:
+) -> _Matrix:
     """Attitude profile matrix B_ij = sum w b_i r_j / sum w, each entry (d, k)."""
     weighted = r if w is None else r * w
     scale = 1.0 / total
@@ -285,30 +290,42 @@ def _profile(
     ]
 
 
-def _solve(B: list[list[FloatArray]]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _solve(B: _Matrix) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Quaternions (4, d, k), largest eigenvalue (d, k) and observability (d, k)."""
-    (bxx, bxy, bxz), (byx, byy, byz), (bzx, bzy, bzz) = B
-    cofactors = (
-        byy * bzz - byz * bzy, byz * bzx - byx * bzz, byx * bzy - byy * bzx,
-        bxz * bzy - bxy * bzz, bxx * bzz - bxz * bzx, bxy * bzx - bxx * bzy,
-        bxy * byz - bxz * byy, bxz * byx - bxx * byz, bxx * byy - bxy * byx,
-    )  # fmt: skip
-    norm2 = _sum_of_squares((bxx, bxy, bxz, byx, byy, byz, bzx, bzy, bzz))
-    adjoint2 = _sum_of_squares(cofactors)
-    det = bxx * cofactors[0] + bxy * cofactors[1] + bxz * cofactors[2]
-    lam = _largest_root(norm2, adjoint2, det)
-    q = _adjugate_quaternion(B, lam)
-    q, curvature = _polish(q, B)
+    cofactors = _cofactors(B)
+    norm2, adjoint2 = (_sum_of_squares(chain(*rows)) for rows in (B, cofactors))
+    lam = _largest_root(norm2, adjoint2, _dot(B[0], cofactors[0]))
+    q, curvature = _polish(_adjugate_quaternion(B, lam), B)
     # |adj B| is about the second singular value of B: it sees coinciding stars, at which the
     # quaternion is arbitrary and the curvature found at it may look sound.
     return q, lam, np.minimum(curvature, np.sqrt(adjoint2 / np.where(norm2 > 0.0, norm2, 1.0)))
 
 
-def _sum_of_squares(parts: tuple[FloatArray, ...]) -> FloatArray:
-    total = parts[0] * parts[0]
-    for part in parts[1:]:
-        total += part * part
-    return total
+def _cofactors(m: _Matrix) -> _Matrix:
+    """Cofactors of 3x3 matrices, which need no signs in cyclic order."""
+    cycle = (1, 2, 0)
+    return [
+        [m[i][k] * m[cycle[i]][cycle[k]] - m[i][cycle[k]] * m[cycle[i]][k] for k in cycle]
+        for i in cycle
+    ]
+
+
+def _symmetric(m: _Matrix, scale: float = 1.0) -> _Matrix:
+    """Scaled sums of matrices and their transposes."""
+    return [[scale * (m[i][j] + m[j][i]) for j in range(3)] for i in range(3)]
+
+
+def _axial(m: _Matrix) -> list[FloatArray]:
+    """Axial vectors of the antisymmetric parts."""
+    return [m[k][j] - m[j][k] for j, k in ((1, 2), (2, 0), (0, 1))]
+
+
+def _dot(a: Sequence[FloatArray], b: Sequence[FloatArray]) -> FloatArray:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _sum_of_squares(parts: Iterable[FloatArray]) -> FloatArray:
+    return reduce(np.add, (part * part for part in parts))
 
 
 def _largest_root(norm2: FloatArray, adjoint2: FloatArray, det: FloatArray) -> FloatArray:
@@ -330,55 +347,50 @@ def _largest_root(norm2: FloatArray, adjoint2: FloatArray, det: FloatArray) -> F
     return lam
 
 
-def _adjugate_quaternion(B: list[list[FloatArray]], lam: FloatArray) -> FloatArray:
+def _adjugate_quaternion(B: _Matrix, lam: FloatArray) -> FloatArray:
     """Largest row of adj(K - lambda I), normalised: (4, d, k)."""
-    (bxx, bxy, bxz), (byx, byy, byz), (bzx, bzy, bzz) = B
-    a00, a11 = bxx - byy - bzz - lam, byy - bxx - bzz - lam
-    a22, a33 = bzz - bxx - byy - lam, bxx + byy + bzz - lam
-    a01, a02, a12 = bxy + byx, bxz + bzx, byz + bzy
-    a03, a13, a23 = bzy - byz, bxz - bzx, byx - bxy
+    axial = _axial(B)
+    a = [[*row, turn] for row, turn in zip(_symmetric(B), axial, strict=True)]
+    for i, j, k in _AXES:
+        a[i][i] = B[i][i] - B[j][j] - B[k][k] - lam
+    a.append([*axial, B[0][0] + B[1][1] + B[2][2] - lam])
     # 2x2 minors of the upper and of the lower two rows.
-    s0, s1, s2 = a00 * a11 - a01 * a01, a00 * a12 - a01 * a02, a00 * a13 - a01 * a03
-    s3, s4, s5 = a01 * a12 - a11 * a02, a01 * a13 - a11 * a03, a02 * a13 - a12 * a03
-    c5, c4, c3 = a22 * a33 - a23 * a23, a12 * a33 - a13 * a23, a12 * a23 - a13 * a22
-    c2, c1 = a02 * a33 - a03 * a23, a02 * a23 - a03 * a22
-    d00, d11 = a11 * c5 - a12 * c4 + a13 * c3, a00 * c5 - a02 * c2 + a03 * c1
-    d22, d33 = a03 * s4 - a13 * s2 + a33 * s0, a02 * s3 - a12 * s1 + a22 * s0
-    d01, d02 = a02 * c4 - a01 * c5 - a03 * c3, a13 * s5 - a23 * s4 + a33 * s3
-    d03, d12 = a22 * s4 - a12 * s5 - a23 * s3, a23 * s2 - a03 * s5 - a33 * s1
-    d13, d23 = a02 * s5 - a22 * s2 + a23 * s1, a12 * s2 - a02 * s4 - a23 * s0
+    upper, lower = (
+        {(i, j): p[i] * q[j] - p[j] * q[i] for i, j in combinations(range(4), 2)}
+        for p, q in (a[:2], a[2:])
+    )
+
+    def cofactor(i: int, j: int) -> FloatArray:
+        other, minors = a[i ^ 1], lower if i < 2 else upper
+        x, y, z = (column for column in range(4) if column != j)
+        value = other[x] * minors[y, z] - other[y] * minors[x, z] + other[z] * minors[x, y]
+        return -value if (i + j) % 2 else value
+
+    d = {(i, j): cofactor(i, j) for i in range(4) for j in range(i + 1)}
     # All diagonal entries are <= 0 (three negative factors): the largest in magnitude is the
     # smallest.
-    xy, zw = d00 < d11, d22 < d33
-    first = np.minimum(d00, d11) < np.minimum(d22, d33)
-    rows = ((d00, d01, d02, d03), (d01, d11, d12, d13), (d02, d12, d22, d23), (d03, d13, d23, d33))
+    first = np.minimum(d[0, 0], d[1, 1]) < np.minimum(d[2, 2], d[3, 3])
+    halves = [(k, d[k, k] < d[k + 1, k + 1]) for k in (0, 2)]
     q = np.empty((4, *lam.shape))
     for i in range(4):
-        q[i] = np.where(
-            first, np.where(xy, rows[0][i], rows[1][i]), np.where(zw, rows[2][i], rows[3][i])
-        )
+        pair = [
+            np.where(is_first, d[max(i, k), min(i, k)], d[max(i, k + 1), min(i, k + 1)])
+            for k, is_first in halves
+        ]
+        q[i] = np.where(first, *pair)
     return _normalise(q)
 
 
 def _normalise(q: FloatArray) -> FloatArray:
-    norm = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    norm = np.sqrt(_sum_of_squares(q))
     q /= np.where(norm > 0.0, norm, 1.0)
     return q
 
 
-def _matrix(q: FloatArray) -> list[list[FloatArray]]:
+def _matrix(q: FloatArray) -> _Matrix:
     x, y, z, w = q
-    xx, yy, zz, xy, xz, yz, xw, yw, zw = (
-        x * x,
-        y * y,
-        z * z,
-        x * y,
-        x * z,
-        y * z,
-        x * w,
-        y * w,
-        z * w,
-    )
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    xw, yw, zw = w * q[:3]
     return [
         [1.0 - 2.0 * (yy + zz), 2.0 * (xy - zw), 2.0 * (xz + yw)],
         [2.0 * (xy + zw), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - xw)],
@@ -386,33 +398,22 @@ def _matrix(q: FloatArray) -> list[list[FloatArray]]:
     ]
 
 
-def _polish(q: FloatArray, B: list[list[FloatArray]]) -> tuple[FloatArray, FloatArray]:
+def _polish(q: FloatArray, B: _Matrix) -> tuple[FloatArray, FloatArray]:
     """One Newton step of Wahba's loss on the left rotation vector, and the least curvature of the
     loss.
 
     With M = B R^T the gradient is minus the axial vector of M, and the Hessian tr(M) I - (M +
     M^T)/2 has the eigenvalues s_i + s_j (sums of two signed singular values of B).
     """
-    R = _matrix(q)
-    M = [
-        [B[i][0] * R[j][0] + B[i][1] * R[j][1] + B[i][2] * R[j][2] for j in range(3)]
-        for i in range(3)
-    ]
-    gx, gy, gz = M[2][1] - M[1][2], M[0][2] - M[2][0], M[1][0] - M[0][1]
-    hxx, hyy, hzz = M[1][1] + M[2][2], M[0][0] + M[2][2], M[0][0] + M[1][1]
-    hxy, hxz, hyz = (
-        -0.5 * (M[0][1] + M[1][0]),
-        -0.5 * (M[0][2] + M[2][0]),
-        -0.5 * (M[1][2] + M[2][1]),
-    )
-    ixx, iyy, izz = hyy * hzz - hyz * hyz, hxx * hzz - hxz * hxz, hxx * hyy - hxy * hxy
-    ixy, ixz, iyz = hxz * hyz - hxy * hzz, hxy * hyz - hxz * hyy, hxy * hxz - hxx * hyz
-    det = hxx * ixx + hxy * ixy + hxz * ixz
+    M = [[_dot(row, turned) for turned in _matrix(q)] for row in B]
+    gradient, h = _axial(M), _symmetric(M, -0.5)
+    for i, j, k in _AXES:
+        h[i][i] = M[j][j] + M[k][k]
+    inverse = _cofactors(h)
+    det = _dot(h[0], inverse[0])
     sound = det > 0.0
     half = 0.5 / np.where(sound, det, np.inf)
-    px = half * (ixx * gx + ixy * gy + ixz * gz)
-    py = half * (ixy * gx + iyy * gy + iyz * gz)
-    pz = half * (ixz * gx + iyz * gy + izz * gz)
+    px, py, pz = (half * _dot(row, gradient) for row in inverse)
     x, y, z, w = q
     better = np.empty_like(q)
     better[0] = x + px * w + py * z - pz * y
@@ -421,39 +422,25 @@ def _polish(q: FloatArray, B: list[list[FloatArray]]) -> tuple[FloatArray, Float
     better[3] = w - px * x - py * y - pz * z
     # For one small eigenvalue, det / (sum of principal minors) is that eigenvalue, and never 3
     # times less.
-    minors = ixx + iyy + izz
+    minors = inverse[0][0] + inverse[1][1] + inverse[2][2]
     curvature = np.where(sound, det, 0.0) / np.where(minors > 0.0, minors, np.inf)
     return _normalise(better), curvature
 
 
-def _information(b: FloatArray, w: FloatArray | None, local: IntArray) -> FloatArray:
-    """Sum of w (I - b b^T), as (xx, yy, zz, xy, xz, yz): (6, d, k)."""
+def _covariance(b: FloatArray, w: FloatArray | None, local: IntArray) -> _Matrix:
+    """Inverse of the sum of w (I - b b^T), its entries (d, k); NaN where it is singular."""
     weighted = b if w is None else b * w
-    xx, yy, zz, xy, xz, yz = (
-        np.add.reduceat(weighted[i] * b[j], local, axis=-1)
-        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    )
-    return np.stack((yy + zz, xx + zz, xx + yy, -xy, -xz, -yz))
-
-
-def _inverse(h: FloatArray) -> FloatArray:
-    """Inverse of symmetric 3x3 matrices given as (xx, yy, zz, xy, xz, yz); NaN where singular."""
-    xx, yy, zz, xy, xz, yz = h
-    inverse = np.stack(
-        (
-            yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy,
-            xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz,
-        )
-    )  # fmt: skip
-    det = xx * inverse[0] + xy * inverse[3] + xz * inverse[4]
-    inverse /= np.where(det > 0.0, det, np.nan)
-    return inverse
-
-
-def _full(h: FloatArray) -> FloatArray:
-    """Symmetric matrices in full, (6, d, k) to (d, k, 3, 3)."""
-    rows = np.moveaxis(h[[0, 3, 4, 3, 1, 5, 4, 5, 2]], 0, -1)
-    return np.ascontiguousarray(rows).reshape(*h.shape[1:], 3, 3)
+    s = {
+        (i, j): np.add.reduceat(weighted[i] * b[j], local, axis=-1)
+        for i in range(3)
+        for j in range(i, 3)
+    }
+    h = [[-s[min(i, j), max(i, j)] for j in range(3)] for i in range(3)]
+    for i, j, k in _AXES:
+        h[i][i] = s[j, j] + s[k, k]
+    inverse = _cofactors(h)
+    det = _dot(h[0], inverse[0])
+    return [[entry / np.where(det > 0.0, det, np.nan) for entry in row] for row in inverse]
 
 
 def _squared_residuals(
