@@ -8,9 +8,7 @@ which component is which; numbered ones do not, and are refused unless the order
 
 from __future__ import annotations
 
-import csv
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +18,12 @@ import numpy as np
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, CatalogueError
-from starcal_uq.core.files import listed, read_parquet, reading, shown, table_ending
+from starcal_uq.core.files import listed, reading, shown, table_ending
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.settings import Scalar, Sense, bounded
+from starcal_uq.core.tables import WHAT, read_cells
 from starcal_uq.core.times import julian_days
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, floats
 
 _UNIT = 1e-6
 _NEARLY_UNIT = 1e-3
@@ -77,7 +76,8 @@ class AttitudeProfile(Shown):
             array.setflags(write=False)
         object.__setattr__(self, "time_s", time)
         object.__setattr__(self, "quaternions", q)
-        far = np.degrees(np.linalg.norm(left_error(q[1:], q[:-1]), axis=1)) > _FAR_DEG
+        steps = np.diff(time)
+        far = self.rate_deg_s * steps > _FAR_DEG
         if far.any():
             messages += (
                 f"{plural(far.sum(), 'step')} of the profile turn the camera by more than "
@@ -85,15 +85,13 @@ class AttitudeProfile(Shown):
                 "attitudes in between are taken on the shortest arc; give more samples if the "
                 "camera went otherwise.",
             )
-        steps = np.diff(time)
         longest = int(np.argmax(steps))
-        if steps[longest] > _GAP * float(np.median(steps)):
+        times = steps[longest] / float(np.median(steps))
+        if times > _GAP:
             messages += (
                 f"the profile has no attitude between {time[longest]:g} and "
-                f"{time[longest + 1]:g} s, "
-                f"{significant(steps[longest] / float(np.median(steps)), 2)} times its usual "
-                "step: what lies in "
-                "between is on the shortest arc.",
+                f"{time[longest + 1]:g} s, {significant(times, 2)} times its usual step: what lies "
+                "in between is on the shortest arc.",
             )
         object.__setattr__(self, "messages", tuple(dict.fromkeys(messages)))
 
@@ -181,13 +179,14 @@ def load_attitude_profile(
         When the file cannot be read, times do not increase, or a quaternion is far from unit
         length.
     """
-    table = read_profile(path, scalar)
-    q = table.quaternions
-    messages = check_samples(f"{path}: ", table.word, table.numbers, table.time_s, q)
+    table = read_columns(path, "a time and a quaternion")
+    q = np.column_stack([table.numbers_of(name) for name in _components(table, scalar)])
+    time_s = table.time_s
+    messages = check_samples(f"{path}: ", table.word, table.numbers, time_s, q)
     if sense == "camera_to_icrs":
         q = q * np.array([-1.0, -1.0, -1.0, 1.0])
     q = q / np.linalg.norm(q, axis=1, keepdims=True)
-    return AttitudeProfile(table.time_s, q, os.path.basename(os.fspath(path)), messages)
+    return AttitudeProfile(time_s, q, os.path.basename(os.fspath(path)), messages)
 
 
 def check_samples(
@@ -245,21 +244,6 @@ _DAY_S = 86_400.0
 
 
 @dataclass(frozen=True)
-class ProfileTable:
-    """What a file says: times (K,), s, of UTC times the seconds since the first, and quaternions
-    (K, 4) as they stand.
-
-    `numbers` (K,) are lines (CSV, ECSV) or rows from 1 (Parquet), which `word` tells: ``"line"`` or
-    ``"row"``.
-    """
-
-    time_s: FloatArray
-    quaternions: FloatArray
-    numbers: IntArray
-    word: str
-
-
-@dataclass(frozen=True)
 class TableColumns:
     """Cells of a file by column, and the line (CSV, ECSV) or row from 1 (Parquet) of each."""
 
@@ -270,12 +254,36 @@ class TableColumns:
 
     def numbers_of(self, name: str) -> FloatArray:
         """One column (K,) as numbers."""
-        return _numbers(self.path, self.word, self.numbers, name, self.cells[name])
+        cells = self.cells[name]
+        if isinstance(cells, np.ndarray):
+            return floats(cells)
+        values = []
+        for number, cell in zip(self.numbers, cells, strict=True):
+            try:
+                values.append(float(cell))
+            except ValueError:
+                raise AttitudeProfileError(
+                    f"{self.path}, {self.word} {number}: {name} is {shown(cell.strip())}, not a "
+                    "number; repair it."
+                ) from None
+        return np.array(values)
 
     @property
     def time_s(self) -> FloatArray:
         """Times (K,), s; of UTC times the seconds since the first."""
-        return _times(self.path, self.word, self.numbers, self.cells)
+        if "time_s" in self.cells:
+            return self.numbers_of("time_s")
+        if "time_utc" not in self.cells:
+            raise AttitudeProfileError(
+                f"{self.path}: column time_s or time_utc is missing; add one of them."
+            )
+        try:
+            tt, _, inverse = julian_days([str(text) for text in self.cells["time_utc"]])
+        except CatalogueError as error:
+            raise AttitudeProfileError(f"{self.path}: {error}") from None
+        days = tt[inverse] - tt[inverse[0]]
+        # Two-part Julian dates are good to 1e-11 s; the text states at most nanoseconds.
+        return floats(np.round(days.sum(axis=1) * _DAY_S, 9))
 
 
 def read_columns(path: PathLike, content: str) -> TableColumns:
@@ -283,117 +291,34 @@ def read_columns(path: PathLike, content: str) -> TableColumns:
     `content`.
     """
     path = Path(path)
-    with reading(
-        path, "a readable table", "check the path, or write it again", AttitudeProfileError
-    ):
+    with reading(path, WHAT, "check the path, or write it again", AttitudeProfileError):
         ending = table_ending(path)
-        if ending == ".parquet":
-            columns, numbers, word = _parquet(path)
-        else:
-            columns, numbers, word = _text(path, ecsv=ending == ".ecsv")
-        if not len(numbers):
+        raw = read_cells(path, path.read_bytes(), ending)
+        for row, why in raw.uneven.items():
+            raise AttitudeProfileError(f"{path}, line {raw.numbers[row]}: holds {why}; repair it.")
+        if not len(raw.numbers):
             raise AttitudeProfileError(
                 f"{path}: holds no rows; give a table with {content} per row."
             )
-        return TableColumns(path, columns, numbers, word)
+        return TableColumns(path, raw.columns, raw.numbers, raw.word)
 
 
-def read_profile(path: PathLike, scalar: str | None) -> ProfileTable:
-    """Read times and quaternions; see `starcal_uq.attitude.profile.load_attitude_profile`."""
-    table = read_columns(path, "a time and a quaternion")
-    names = _components(table.path, table.cells, scalar)
-    q = np.column_stack([table.numbers_of(name) for name in names])
-    return ProfileTable(table.time_s, q, table.numbers, table.word)
-
-
-def _components(path: Path, columns: AnyDict, scalar: str | None) -> tuple[str, ...]:
+def _components(table: TableColumns, scalar: str | None) -> tuple[str, ...]:
     """Names of the columns in the order x, y, z, w."""
-    if all(name in columns for name in NAMED):
-        return NAMED
-    for names in _NUMBERED:
-        if all(name in columns for name in names):
-            if scalar is None:
-                raise AttitudeProfileError(
-                    f"{path}: the columns {', '.join(names)} do not say which is the scalar "
-                    "part; name them "
-                    f"{', '.join(NAMED)} (qw is the scalar), or state scalar='first' or "
-                    "scalar='last'."
-                )
-            return names if scalar == "last" else (*names[1:], names[0])
-    missing = [name for name in NAMED if name not in columns]
-    raise AttitudeProfileError(
-        f"{path}: column {missing[0]} is missing; give {', '.join(NAMED)} beside time_s or "
-        "time_utc (the file has "
-        f"{listed(list(columns)) or 'no columns'})."
-    )
-
-
-def _times(path: Path, word: str, numbers: IntArray, columns: AnyDict) -> FloatArray:
-    if "time_s" in columns:
-        return _numbers(path, word, numbers, "time_s", columns["time_s"])
-    if "time_utc" not in columns:
-        raise AttitudeProfileError(
-            f"{path}: column time_s or time_utc is missing; add one of them."
-        )
-    try:
-        tt, _, inverse = julian_days([str(text) for text in columns["time_utc"]])
-    except CatalogueError as error:
-        raise AttitudeProfileError(f"{path}: {error}") from None
-    days = tt[inverse] - tt[inverse[0]]
-    seconds: FloatArray = days.sum(axis=1) * _DAY_S
-    # Two-part Julian dates are good to 1e-11 s; the text states at most nanoseconds.
-    return np.round(seconds, 9)
-
-
-def _numbers(
-    path: Path, word: str, numbers: IntArray, name: str, cells: Iterable[Any]
-) -> FloatArray:
-    if isinstance(cells, np.ndarray) and cells.dtype.kind in "fiu":
-        return np.asarray(cells, dtype=float)
-    values = []
-    for number, cell in zip(numbers, cells, strict=True):
-        try:
-            values.append(float(cell))
-        except (TypeError, ValueError):
+    for names in (NAMED, *_NUMBERED):
+        if not all(name in table.cells for name in names):
+            continue
+        if names == NAMED or scalar == "last":
+            return names
+        if scalar is None:
             raise AttitudeProfileError(
-                f"{path}, {word} {number}: {name} is {shown(cell)}, not a number; repair it."
-            ) from None
-    return np.array(values, dtype=float)
-
-
-def _text(path: Path, *, ecsv: bool) -> tuple[AnyDict, IntArray, str]:
-    """Cells by column, and the line of each row; an ECSV file's header stands in comments."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise AttitudeProfileError(
-            f"{path}: the text is not UTF-8; save the file in the encoding UTF-8."
-        ) from None
-    delimiter = "," if not ecsv or "# delimiter: ','" in text else " "
-    lines = ("\n" if line.startswith("#") else line for line in text.splitlines(keepends=True))
-    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-    rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    if not rows:
-        return {}, np.empty(0, dtype=np.int64), "line"
-    names = [name.strip() for name in rows[0][1]]
-    for number, row in rows[1:]:
-        if len(row) != len(names):
-            raise AttitudeProfileError(
-                f"{path}, line {number}: holds {len(row)} values under a header of {len(names)} "
-                "columns; repair it."
+                f"{table.path}: the columns {', '.join(names)} do not say which is the scalar part; "
+                f"name them {', '.join(NAMED)} (qw is the scalar), or state scalar='first' or "
+                "scalar='last'."
             )
-    cells = {name: [row[i].strip() for _, row in rows[1:]] for i, name in enumerate(names)}
-    return cells, np.array([number for number, _ in rows[1:]], dtype=np.int64), "line"
-
-
-def _parquet(path: Path) -> tuple[AnyDict, IntArray, str]:
-    import pyarrow as pa
-
-    table = read_parquet(path)
-    columns: AnyDict = {}
-    for name in table.column_names:
-        column = table.column(name)
-        cells = column.to_numpy()
-        stamps = pa.types.is_timestamp(column.type)
-        columns[name] = np.datetime_as_string(cells.astype("datetime64[ns]")) if stamps else cells
-    return columns, np.arange(1, table.num_rows + 1), "row"
+        return (*names[1:], names[0])
+    missing = [name for name in NAMED if name not in table.cells]
+    raise AttitudeProfileError(
+        f"{table.path}: column {missing[0]} is missing; give {', '.join(NAMED)} beside time_s or "
+        f"time_utc (the file has {listed(list(table.cells)) or 'no columns'})."
+    )

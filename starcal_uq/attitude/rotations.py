@@ -8,9 +8,15 @@ about the boresight. Every function takes any number of leading axes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TypeAlias
+
 import numpy as np
 
 from starcal_uq.core.types import FloatArray
+
+# Entries of matrices by rows, each an array over many of them.
+Matrix: TypeAlias = list[list[FloatArray]]
 
 
 def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
@@ -23,30 +29,34 @@ def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
     m = np.asarray(rotation, dtype=float)
     if m.shape[-2:] != (3, 3):
         raise ValueError(f"rotation matrices have shape (..., 3, 3), not {m.shape}.")
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    wx, wy, wz = (
-        m[..., 2, 1] - m[..., 1, 2],
-        m[..., 0, 2] - m[..., 2, 0],
-        m[..., 1, 0] - m[..., 0, 1],
-    )
-    xy, xz, yz = (
-        m[..., 0, 1] + m[..., 1, 0],
-        m[..., 0, 2] + m[..., 2, 0],
-        m[..., 1, 2] + m[..., 2, 1],
-    )
+    rows = [[m[..., i, j] for j in range(3)] for i in range(3)]
+    xx, yy, zz = (rows[i][i] for i in range(3))
     # Four times q q^T: each row is parallel to the quaternion.
     square = (1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz, 1.0 + xx + yy + zz)
     best = np.argmax(square, axis=0)
-    rows = (
-        (square[0], xy, xz, wx),
-        (xy, square[1], yz, wy),
-        (xz, yz, square[2], wz),
-        (wx, wy, wz, square[3]),
-    )
-    x, y, z, w = (np.choose(best, column) for column in zip(*rows, strict=True))
+    x, y, z, w = (np.choose(best, column) for column in davenport(rows, square))
     norm = np.sqrt(x * x + y * y + z * z + w * w)
     norm = np.where(w < 0.0, -norm, norm)
     return np.stack((x / norm, y / norm, z / norm, w / norm), axis=-1)
+
+
+def axial(m: Matrix) -> list[FloatArray]:
+    """Axial vectors of the antisymmetric parts of 3x3 matrices."""
+    return [m[k][j] - m[j][k] for j, k in ((1, 2), (2, 0), (0, 1))]
+
+
+def symmetric(m: Matrix, scale: float = 1.0) -> Matrix:
+    """Scaled sums of 3x3 matrices and their transposes."""
+    return [[scale * (m[i][j] + m[j][i]) for j in range(3)] for i in range(3)]
+
+
+def davenport(m: Matrix, diagonal: Sequence[FloatArray]) -> Matrix:
+    """Rows of the symmetric 4x4 matrices, with this diagonal, whose eigenvectors are quaternions."""
+    turn = axial(m)
+    rows = [[*row, own] for row, own in zip([*symmetric(m), turn], [*turn, turn[0]], strict=True)]
+    for i, value in enumerate(diagonal):
+        rows[i][i] = value
+    return rows
 
 
 def quaternion_to_rotation(quaternion: FloatArray) -> FloatArray:
@@ -63,15 +73,24 @@ def _of_quaternion(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -
     norm2 = x * x + y * y + z * z + w * w
     if np.any(norm2 == 0.0):
         raise ValueError("a quaternion of norm zero is not a rotation.")
-    s = 2.0 / norm2
     matrix = np.empty((*np.shape(norm2), 3, 3))
-    matrix[..., 0, 0] = 1.0 - s * (y * y + z * z)
-    matrix[..., 1, 1] = 1.0 - s * (x * x + z * z)
-    matrix[..., 2, 2] = 1.0 - s * (x * x + y * y)
-    matrix[..., 0, 1], matrix[..., 1, 0] = s * (x * y - z * w), s * (x * y + z * w)
-    matrix[..., 0, 2], matrix[..., 2, 0] = s * (x * z + y * w), s * (x * z - y * w)
-    matrix[..., 1, 2], matrix[..., 2, 1] = s * (y * z - x * w), s * (y * z + x * w)
+    for i, row in enumerate(rotation_rows(x, y, z, w, 2.0 / norm2)):
+        for j, entry in enumerate(row):
+            matrix[..., i, j] = entry
     return matrix
+
+
+def rotation_rows(
+    x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray, s: FloatArray | float = 2.0
+) -> Matrix:
+    """Entries of rotation matrices of quaternions, with s twice the inverse of their norm squared."""
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    xw, yw, zw = x * w, y * w, z * w
+    return [
+        [1.0 - s * (yy + zz), s * (xy - zw), s * (xz + yw)],
+        [s * (xy + zw), 1.0 - s * (xx + zz), s * (yz - xw)],
+        [s * (xz - yw), s * (yz + xw), 1.0 - s * (xx + yy)],
+    ]
 
 
 def quaternion_multiply(left: FloatArray, right: FloatArray) -> FloatArray:

@@ -32,9 +32,16 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.attitude.rotations import (
+    Matrix,
+    axial,
+    davenport,
+    quaternion_to_rotation,
+    rotation_rows,
+    symmetric,
+)
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
 
 # Temporaries of this many stars stay in the processor's cache.
 _BLOCK = 32_768
@@ -44,8 +51,7 @@ DEGENERATE = 1e-12
 _NEWTON_STEPS = 60
 # Frames whose temporaries stay in the processor's cache.
 _PROFILES = 4096
-# Entries of 3x3 matrices, by rows.
-_Matrix: TypeAlias = list[list[FloatArray]]
+_Vector: TypeAlias = Sequence[FloatArray] | FloatArray
 # Each axis with the two others.
 _AXES = (0, 1, 2), (1, 0, 2), (2, 0, 1)
 
@@ -176,7 +182,9 @@ def quest(
         q, lam, gap[part] = _solve(_profile(b3, r3, w_rows, local, total))
         quaternions[:, draws, frames], lambda_max[part], loss[part] = q, lam, 1.0 - lam
         if covariances is not None:
-            covariances[part] = np.moveaxis(_covariance(b3, w_rows, local), (0, 1), (2, 3))
+            covariances[part] = np.moveaxis(
+                np.array(_covariance(b3, w_rows, local)), (0, 1), (2, 3)
+            )
         if chi2 is not None:
             chi2[part] = _squared_residuals(b3, r3, w_rows, local, counts, q)
             loss[part] = 0.5 * chi2[part] / total
@@ -280,7 +288,7 @@ def _profile(
     w: FloatArray | None,
     local: IntArray,
     total: FloatArray | IntArray,
-) -> _Matrix:
+) -> Matrix:
     """Attitude profile matrix B_ij = sum w b_i r_j / sum w, each entry (d, k)."""
     weighted = r if w is None else r * w
     scale = 1.0 / total
@@ -290,7 +298,7 @@ def _profile(
     ]
 
 
-def _solve(B: _Matrix) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _solve(B: Matrix) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Quaternions (4, d, k), largest eigenvalue (d, k) and observability (d, k)."""
     cofactors = _cofactors(B)
     norm2, adjoint2 = (_sum_of_squares(chain(*rows)) for rows in (B, cofactors))
@@ -301,7 +309,7 @@ def _solve(B: _Matrix) -> tuple[FloatArray, FloatArray, FloatArray]:
     return q, lam, np.minimum(curvature, np.sqrt(adjoint2 / np.where(norm2 > 0.0, norm2, 1.0)))
 
 
-def _cofactors(m: _Matrix) -> _Matrix:
+def _cofactors(m: Matrix) -> Matrix:
     """Cofactors of 3x3 matrices, which need no signs in cyclic order."""
     cycle = (1, 2, 0)
     return [
@@ -310,22 +318,12 @@ def _cofactors(m: _Matrix) -> _Matrix:
     ]
 
 
-def _symmetric(m: _Matrix, scale: float = 1.0) -> _Matrix:
-    """Scaled sums of matrices and their transposes."""
-    return [[scale * (m[i][j] + m[j][i]) for j in range(3)] for i in range(3)]
-
-
-def _axial(m: _Matrix) -> list[FloatArray]:
-    """Axial vectors of the antisymmetric parts."""
-    return [m[k][j] - m[j][k] for j, k in ((1, 2), (2, 0), (0, 1))]
-
-
-def _dot(a: Sequence[FloatArray], b: Sequence[FloatArray]) -> FloatArray:
+def _dot(a: _Vector, b: _Vector) -> FloatArray:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _sum_of_squares(parts: Iterable[FloatArray]) -> FloatArray:
-    return reduce(np.add, (part * part for part in parts))
+    return floats(reduce(np.add, (part * part for part in parts)))
 
 
 def _largest_root(norm2: FloatArray, adjoint2: FloatArray, det: FloatArray) -> FloatArray:
@@ -347,13 +345,10 @@ def _largest_root(norm2: FloatArray, adjoint2: FloatArray, det: FloatArray) -> F
     return lam
 
 
-def _adjugate_quaternion(B: _Matrix, lam: FloatArray) -> FloatArray:
+def _adjugate_quaternion(B: Matrix, lam: FloatArray) -> FloatArray:
     """Largest row of adj(K - lambda I), normalised: (4, d, k)."""
-    axial = _axial(B)
-    a = [[*row, turn] for row, turn in zip(_symmetric(B), axial, strict=True)]
-    for i, j, k in _AXES:
-        a[i][i] = B[i][i] - B[j][j] - B[k][k] - lam
-    a.append([*axial, B[0][0] + B[1][1] + B[2][2] - lam])
+    diagonal = [B[i][i] - B[j][j] - B[k][k] - lam for i, j, k in _AXES]
+    a = davenport(B, [*diagonal, B[0][0] + B[1][1] + B[2][2] - lam])
     # 2x2 minors of the upper and of the lower two rows.
     upper, lower = (
         {(i, j): p[i] * q[j] - p[j] * q[i] for i, j in combinations(range(4), 2)}
@@ -363,7 +358,9 @@ def _adjugate_quaternion(B: _Matrix, lam: FloatArray) -> FloatArray:
     def cofactor(i: int, j: int) -> FloatArray:
         other, minors = a[i ^ 1], lower if i < 2 else upper
         x, y, z = (column for column in range(4) if column != j)
-        value = other[x] * minors[y, z] - other[y] * minors[x, z] + other[z] * minors[x, y]
+        value: FloatArray = (
+            other[x] * minors[y, z] - other[y] * minors[x, z] + other[z] * minors[x, y]
+        )
         return -value if (i + j) % 2 else value
 
     d = {(i, j): cofactor(i, j) for i in range(4) for j in range(i + 1)}
@@ -387,26 +384,15 @@ def _normalise(q: FloatArray) -> FloatArray:
     return q
 
 
-def _matrix(q: FloatArray) -> _Matrix:
-    x, y, z, w = q
-    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
-    xw, yw, zw = w * q[:3]
-    return [
-        [1.0 - 2.0 * (yy + zz), 2.0 * (xy - zw), 2.0 * (xz + yw)],
-        [2.0 * (xy + zw), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - xw)],
-        [2.0 * (xz - yw), 2.0 * (yz + xw), 1.0 - 2.0 * (xx + yy)],
-    ]
-
-
-def _polish(q: FloatArray, B: _Matrix) -> tuple[FloatArray, FloatArray]:
+def _polish(q: FloatArray, B: Matrix) -> tuple[FloatArray, FloatArray]:
     """One Newton step of Wahba's loss on the left rotation vector, and the least curvature of the
     loss.
 
     With M = B R^T the gradient is minus the axial vector of M, and the Hessian tr(M) I - (M +
     M^T)/2 has the eigenvalues s_i + s_j (sums of two signed singular values of B).
     """
-    M = [[_dot(row, turned) for turned in _matrix(q)] for row in B]
-    gradient, h = _axial(M), _symmetric(M, -0.5)
+    M = [[_dot(row, turned) for turned in rotation_rows(*q)] for row in B]
+    gradient, h = axial(M), symmetric(M, -0.5)
     for i, j, k in _AXES:
         h[i][i] = M[j][j] + M[k][k]
     inverse = _cofactors(h)
@@ -427,7 +413,7 @@ def _polish(q: FloatArray, B: _Matrix) -> tuple[FloatArray, FloatArray]:
     return _normalise(better), curvature
 
 
-def _covariance(b: FloatArray, w: FloatArray | None, local: IntArray) -> _Matrix:
+def _covariance(b: FloatArray, w: FloatArray | None, local: IntArray) -> Matrix:
     """Inverse of the sum of w (I - b b^T), its entries (d, k); NaN where it is singular."""
     weighted = b if w is None else b * w
     s = {
@@ -455,7 +441,7 @@ def _squared_residuals(
     digits.
     """
     total = np.zeros(b.shape[1:])
-    for i, row in enumerate(_matrix(q)):
+    for i, row in enumerate(rotation_rows(*q)):
         x, y, z = (np.repeat(entry, counts, axis=-1) for entry in row)
         residual = b[i] - x * r[0] - y * r[1] - z * r[2]
         total += residual * residual

@@ -17,7 +17,7 @@ import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -228,33 +228,46 @@ def unpack(packed: bytes) -> Iterator[bytes]:
             yield piece
 
 
-def read_parquet(source: Path | bytes, wanted: Collection[str] | None = None) -> pa.Table:
-    """A Parquet file, or those of its columns that are wanted; one that cannot be what it declares
-    is refused.
-
-    The caller's `reading` makes a sentence of whatever is raised.
+@contextmanager
+def open_parquet(source: Path | bytes) -> Iterator[ParquetFile]:
+    """A Parquet file, or its content; ValueError for two columns of one name, and for more rows than
+    it can hold.
     """
     import pyarrow as pa
     from pyarrow import parquet
 
-    with parquet.ParquetFile(
-        source if isinstance(source, Path) else pa.BufferReader(source)
-    ) as file:
-        check_parquet(file, source.stat().st_size if isinstance(source, Path) else len(source))
+    opened = source if isinstance(source, Path) else pa.BufferReader(source)
+    with parquet.ParquetFile(opened, pre_buffer=False) as file:
         names = file.schema_arrow.names
-        return file.read(
-            [name for name in names if wanted is None or name in wanted], use_threads=False
-        )
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise ValueError(f"column {min(twice)} occurs twice")
+        stored = source.stat().st_size if isinstance(source, Path) else len(source)
+        check_size(file.metadata.num_rows * len(names) * 8, stored)
+        yield file
 
 
-def check_parquet(file: ParquetFile, stored: int) -> None:
-    """Refuse, with ValueError, two columns of one name, and more rows than a file of `stored` bytes
-    can hold.
-    """
-    names = file.schema_arrow.names
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise ValueError(f"column {min(twice)} occurs twice")
-    check_size(file.metadata.num_rows * len(names) * 8, stored)
+def read_parquet(source: Path | bytes) -> pa.Table:
+    """A Parquet file; the caller's `reading` makes a sentence of whatever is raised."""
+    with open_parquet(source) as file:
+        return file.read(use_threads=False)
+
+
+def read_bytes(path: Path, what: str, error: type[StarcalError]) -> bytes:
+    """Content of a file that should be `what`, such as "an image"; `error` where it has none."""
+    if os.path.exists(path) and not os.path.isfile(path):
+        kind = "a directory" if os.path.isdir(path) else "not a regular file"
+        raise error(f"{path}: is {kind}; name {what}.")
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise error(f"{path}: the file does not exist; check the path.") from None
+    except OSError as problem:
+        raise error(
+            f"{path}: cannot be read ({problem.strerror}); check its permissions."
+        ) from problem
+    if not data or data.isspace():
+        raise error(f"{path}: the file is empty; give {what}.")
+    return data
 
 
 # A card of a header that counts something, up to its comment.

@@ -18,17 +18,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain, combinations, pairwise
-from math import exp, log10, pi
+from math import log10, pi
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.identification.growth import Patch, grow
+from starcal_uq.identification.growth import Patch, grow, matched_patch
 from starcal_uq.identification.match import match_frame, start_state
 from starcal_uq.identification.nearby import NearbyStars
-from starcal_uq.identification.pairs import angle_between
+from starcal_uq.identification.pairs import angle_between, remembered
 from starcal_uq.identification.pyramid import (
     SIGMAS,
     CameraTolerance,
@@ -135,7 +135,7 @@ def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntAr
     c[swap] = c[swap, ::-1]
     order[swap, 2:] = order[swap, :1:-1]
     quads = quads[rows, order]
-    codes = np.column_stack([c[:, 0].real, c[:, 0].imag, c[:, 1].real, c[:, 1].imag])
+    codes = np.ascontiguousarray(c).view(np.float64)
     return codes, quads, angle_between(directions[quads[:, 0]], directions[quads[:, 1]])
 
 
@@ -180,13 +180,7 @@ class Levels:
     def __getitem__(self, n: int) -> Level:
         bright = self._directions[:n]
         key = hashlib.sha256(bright.tobytes()).digest()
-        level = _made.pop(key, None)
-        if level is None:
-            level = make_level(bright)
-            while len(_made) >= _KEPT_LEVELS:
-                del _made[next(iter(_made))]
-        _made[key] = level
-        return level
+        return remembered(_made, _KEPT_LEVELS, key, lambda: make_level(bright))
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,16 +240,9 @@ class BlindSearch:
             for part in self._alike(u, quads, sizes, focal, low, high)
         ]
         parts = [self._explained(u, sigma_px, *part) for part in found]
-        if not parts:
-            none = np.empty(0)
-            return _Seen(
-                np.empty((0, 3, 3)),
-                none,
-                none,
-                np.empty((0, 4), dtype=np.int64),
-                np.empty((0, 4, 3)),
-            )
-        return _Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        shapes = (0, 3, 3), 0, 0, (0, 4), (0, 4, 3)
+        columns = zip(*parts, strict=True) if parts else ([np.empty(shape)] for shape in shapes)
+        return _Seen(*map(np.concatenate, columns))
 
     def _focal_steps(self, focal_px: tuple[float, float]) -> Iterator[tuple[float, float, float]]:
         """Focal lengths to look with, each with the range of those that it may find."""
@@ -388,29 +375,19 @@ class BlindSearch:
         )
         if match is None:
             return None
-        log_scale, _, _, kappa = match.state.shared.tolist()
-        directions = self.stars.directions_icrs[match.star]
-        patch = Patch(match.state.rotation, focal * exp(log_scale), match.centroid, directions)
-        return Solved(patch, match.log10_false + _ANYWHERE, kappa)
+        patch = matched_patch(match, focal, self.stars.directions_icrs)
+        return Solved(patch, match.log10_false + _ANYWHERE, float(match.state.shared[3]))
 
     def _grow(self, u: FloatArray, sigma_px: FloatArray, pattern: Patch) -> Solved | None:
         """What a lens that bends explains."""
-        middle = np.array([0.5 * (self.width - 1.0), 0.5 * (self.height - 1.0)])
-        camera = Camera(
-            int(self.width),
-            int(self.height),
-            None,
-            None,
-            middle[0],
-            middle[1],
-            focal_px=pattern.focal_px,
-        )
+        size = int(self.width), int(self.height)
+        middle = 0.5 * (np.array(size) - 1.0)
+        x0, y0 = middle.tolist()
+        camera = Camera(*size, None, None, x0, y0, focal_px=pattern.focal_px)
         grown = grow(u + middle, sigma_px, pattern, self.sky, camera)
-        return (
-            None
-            if grown is None
-            else Solved(grown.patch, grown.log10_false + _ANYWHERE, grown.bend_px)
-        )
+        if grown is None:
+            return None
+        return Solved(grown.patch, grown.log10_false + _ANYWHERE, grown.bend_px)
 
 
 def _frame_quads(u: FloatArray) -> IntArray:
@@ -485,11 +462,8 @@ def _probes(n_stars: Sequence[int]) -> list[int]:
     """Frames to be searched: those with most stars, and others of all kinds, because most may be
     clouds or trees.
     """
-    order = [
-        k
-        for k in sorted(range(len(n_stars)), key=lambda k: -n_stars[k])
-        if n_stars[k] >= _LEAST_STARS
-    ]
+    useful = (k for k, n in enumerate(n_stars) if n >= _LEAST_STARS)
+    order = sorted(useful, key=lambda k: -n_stars[k])
     half = _PROBES // 2
     rest = order[half:]
     return order[:half] + [rest[i * len(rest) // half] for i in range(min(half, len(rest)))]

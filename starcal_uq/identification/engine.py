@@ -8,7 +8,7 @@ pass over all of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -29,7 +29,7 @@ from starcal_uq.identification.blind import (
     BlindSearch,
     find_optics,
 )
-from starcal_uq.identification.growth import GrownField, Patch, grow
+from starcal_uq.identification.growth import GrownField, Patch, grow, matched_patch
 from starcal_uq.identification.match import CameraState, Match
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.outcome import identification, moved
@@ -241,12 +241,8 @@ class _Attempt:
         share_camera: bool,
         mirrored: bool = False,
     ) -> None:
-        self.centroids, self.camera, self.prepare, self.share_camera = (
-            centroids,
-            camera,
-            prepare,
-            share_camera,
-        )
+        self.centroids, self.camera = centroids, camera
+        self.prepare, self.share_camera = prepare, share_camera
         self.nominal, self.stars, self.tolerance = camera, catalogue.for_camera(camera), tolerance
         self.parity: Parity = "mirrored" if mirrored else "normal"
         self.field = FrameTable(centroids, camera, mirrored)
@@ -331,11 +327,8 @@ class _Attempt:
         if not solved:
             return self
         k, match = max(solved, key=lambda one: len(one[1]))
-        focal = self.field.camera.focal_px * float(np.exp(match.state.shared[0]))
-        patch = Patch(
-            match.state.rotation, focal, match.centroid, self.stars.directions_icrs[match.star]
-        )
-        grown = self.grown(k, patch)
+        focal_px = self.field.camera.focal_px
+        grown = self.grown(k, matched_patch(match, focal_px, self.stars.directions_icrs))
         if grown is None:
             return self
         other = self.bent(k, grown, self.nominal)
@@ -349,7 +342,10 @@ class _Attempt:
         return other if other.n_stars > self.n_stars else self
 
     def _failed(self) -> list[int]:
-        return _failed(self.results, self.field)
+        """Frames with enough stars that are not identified, those with most stars first."""
+        sizes = [len(points) for points in self.field.xy]
+        failed = (k for k, found in self.results.items() if found.match is None)
+        return sorted((k for k in failed if sizes[k] >= MIN_STARS), key=lambda k: -sizes[k])
 
     def run(self, progress: Progress | None, stop: bool) -> None:
         """Search every frame, those with most stars first; with `stop`, only while a third of them
@@ -514,12 +510,6 @@ def _relative(found: Found, shared: FloatArray) -> Found:
     return replace(
         found, match=replace(m, state=state, gradient=m.gradient + m.information @ shared)
     )
-
-
-def _failed(results: Mapping[int, Found], field: FrameTable) -> list[int]:
-    """Frames with enough stars that are not identified, those with most stars first."""
-    frames = [k for k, f in results.items() if f.match is None and len(field.xy[k]) >= MIN_STARS]
-    return sorted(frames, key=lambda k: -len(field.xy[k]))
 
 
 def _solved(results: Iterable[Found]) -> int:

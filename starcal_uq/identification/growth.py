@@ -12,7 +12,7 @@ follows from the uncertainty, at each place.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import log, pi
+from math import exp, log, pi
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import before_fold, forward_kernel, unproject_theta
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.identification.match import log10_choices
+from starcal_uq.identification.match import Match, log10_choices, noise_variance
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.pyramid import SIGMAS, FieldGeometry
 from starcal_uq.maths.intervals import median_of
@@ -56,6 +56,12 @@ class Patch:
     focal_px: float
     centroid: IntArray
     directions: FloatArray
+
+
+def matched_patch(match: Match, focal_px: float, directions: FloatArray) -> Patch:
+    """The patch of a match with a camera of this focal length, from the catalogue's directions."""
+    focal = focal_px * exp(match.state.shared[0])
+    return Patch(match.state.rotation, focal, match.centroid, directions[match.star])
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,13 +125,7 @@ def grow(
     if len(centroid) < max(_LEAST_STARS, best // 2):
         return None
     fit = _fitted(fit, xy[centroid], sigma[centroid], r, prior)
-    grown = camera.replace(
-        x0_px=float(fit.theta[0]),
-        y0_px=float(fit.theta[1]),
-        focal_px=float(fit.theta[2]),
-        distortion=_MODEL,
-        coefficients=tuple(fit.theta[3:].tolist()),
-    )
+    grown = camera.replace(distortion=_MODEL).with_theta(fit.theta)
     # No lens shows the detector's corners more than once.
     corners = np.array(
         [[x, y] for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)]
@@ -168,14 +168,7 @@ def _fitted(
         b = np.ascontiguousarray((r @ rotation.T).T)
         place, d_theta, d_phi = forward_kernel(_MODEL, "first")(m, theta, b, np.zeros(2))
         e = (xy.T - place) / sigma
-        noise = max(
-            1.0,
-            float(
-                np.sqrt(
-                    median_of(np.sum(e * e, axis=0)) / (2.0 * log(2.0) * max(1.0 - 4.0 / m, 0.3))
-                )
-            ),
-        )
+        noise = max(1.0, float(np.sqrt(noise_variance(np.sum(e * e, axis=0), 4.0))))
         weight = np.minimum(1.0, SIGMAS * noise / np.maximum(np.hypot(*e), 1e-9)) / noise**2
         j = np.concatenate([d_theta, d_phi]).reshape(p + 3, 2, m) / sigma * scale[:, None, None]
         normal = np.einsum("iam,jam,m->ij", j, j, weight)

@@ -353,14 +353,19 @@ def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
     Less one standard deviation of that, so that chance does not widen the gates: false stars come
     with their area.
     """
+    # Seven parameters were fitted, damped.
     m = len(e)
-    squared = np.sum(e * e, axis=1) / sigma_px**2
-    # Chi-square with two degrees of freedom has the median 2 ln 2; seven parameters were fitted,
-    # damped.
-    share = max(1.0 - 5.0 / (2.0 * m), 0.3)
-    noise = float(np.sqrt(median_of(squared) / (2.0 * np.log(2.0) * share)))
+    noise = float(np.sqrt(noise_variance(np.sum(e * e, axis=1) / sigma_px**2, 2.5)))
     noise /= 1.0 + 0.5 / (np.log(2.0) * np.sqrt(m))
     return min(max(noise, 1.0), 4.0) if m >= 6 else 1.0
+
+
+def noise_variance(squared: FloatArray, fitted: float) -> float:
+    """Variance of the noise, from the median of squared whitened residuals (m,), of which `fitted`
+    stars were used up by a fit: chi-square with two degrees of freedom has the median 2 ln 2.
+    """
+    share = max(1.0 - fitted / len(squared), 0.3)
+    return float(median_of(squared)) / (2.0 * log(2.0) * share)
 
 
 def _mutual(

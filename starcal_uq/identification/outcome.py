@@ -103,11 +103,8 @@ def identification(
         frame=np.repeat([field.ids[k] for k, _ in solved], sizes).astype(np.int64),
         x_px=xy[:, 0],
         y_px=xy[:, 1],
-        ra_deg=stars.ra_deg[star],
-        dec_deg=stars.dec_deg[star],
         sigma_px=sigma,
-        star_id=stars.star_id[star],
-        mag=stars.mag[star],
+        **stars.named(star),
         time_utc=times.astype(str) if len(times) and all(times) else None,
         meta={**origin.plain(), "parity": parity},
     )

@@ -12,10 +12,11 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ from starcal_uq.core.types import FloatArray, IntArray, PathLike
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
+K = TypeVar("K")
+V = TypeVar("V")
 # Stars a field should hold; a star with this many brighter ones within a field's area around it is
 # no pattern star.
 PATTERN_STARS = 18
@@ -199,20 +202,25 @@ def prepared_star_pairs(
     """The pairs that this process has used before, or else those of the file where `cache` is on,
     or new ones.
     """
-    key = _digest(directions, mag, field_sr, max_angle_rad, PATTERN_STARS)
-    pairs = _recent.pop(key, None)
-    if pairs is None:
-        make = partial(cached_star_pairs, cache_dir=cache_dir) if cache else find_star_pairs
-        pairs = make(directions, mag, field_sr, max_angle_rad)
-        while len(_recent) >= _RECENT:
-            del _recent[next(iter(_recent))]
-    _recent[key] = pairs
-    return pairs
+    given = directions, mag, field_sr, max_angle_rad
+    make = partial(cached_star_pairs, cache_dir=cache_dir) if cache else find_star_pairs
+    return remembered(_recent, _RECENT, _digest(*given), partial(make, *given))
+
+
+def remembered(kept: dict[K, V], most: int, key: K, make: Callable[[], V]) -> V:
+    """What was made for a key, of which the last ones are kept."""
+    found = kept.pop(key, None)
+    if found is None:
+        found = make()
+        while len(kept) >= most:
+            del kept[next(iter(kept))]
+    kept[key] = found
+    return found
 
 
 def _digest(directions: FloatArray, mag: FloatArray, *parameters: float) -> str:
     """What pairs are made of, in 24 letters."""
-    digest = hashlib.sha256(repr((_VERSION, *parameters)).encode())
+    digest = hashlib.sha256(repr((_VERSION, *parameters, PATTERN_STARS)).encode())
     for array in (directions, mag):
         digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
     return digest.hexdigest()[:24]
@@ -224,7 +232,6 @@ def cached_star_pairs(
     field_sr: float,
     max_angle_rad: float,
     cache_dir: PathLike | None = None,
-    per_field: int = PATTERN_STARS,
 ) -> StarPairs:
     """`find_star_pairs`, from a file of the cache folder where there is one, leaving one there
     where there is none.
@@ -233,11 +240,11 @@ def cached_star_pairs(
     folder that cannot be written to does no harm.
     """
     folder = default_cache_dir() if cache_dir is None else Path(cache_dir)
-    path = folder / f"star-pairs-{_digest(directions, mag, field_sr, max_angle_rad, per_field)}.npz"
+    path = folder / f"star-pairs-{_digest(directions, mag, field_sr, max_angle_rad)}.npz"
     stored = _read(path)
     if stored is not None:
         return stored
-    pairs = find_star_pairs(directions, mag, field_sr, max_angle_rad, per_field)
+    pairs = find_star_pairs(directions, mag, field_sr, max_angle_rad)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
@@ -272,17 +279,15 @@ def _read(path: Path) -> StarPairs | None:
         archive = read_arrays(path)
         pairs = StarPairs(**{name: archive[name] for name in names})
         n, p = len(pairs.star), len(pairs.angle)
-        sizes = (
-            len(pairs.first),
-            len(pairs.second),
-            len(pairs.neighbour) / 2,
-            len(pairs.neighbour_angle) / 2,
-        )
-        fits = (
-            pairs.directions.shape == (n, 3)
-            and len(pairs.neighbour_start) == n + 1
-            and all(s == p for s in sizes)
-        )
+        sizes = {
+            "directions": n,
+            "first": p,
+            "second": p,
+            "neighbour": 2 * p,
+            "neighbour_angle": 2 * p,
+            "neighbour_start": n + 1,
+        }
+        fits = all(len(getattr(pairs, name)) == size for name, size in sizes.items())
     except Exception:  # whatever is wrong with a file of the cache, the pairs are made again
         return None
     return pairs if fits else None

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.identification.pairs import StarPairs, angle_between
 
 # Tolerances hold this many standard deviations.
@@ -208,11 +208,9 @@ def _look_up(
         )
         bases[key] = a, c, np.concatenate([size, size])
     a, c, scale = bases[key]
-    near = angle[i, k]
-    near_tol = noise * np.hypot(1.0, near / base) + bias * near
+    near, far = angle[i, k], angle[j, k]
+    near_tol, far_tol = (noise * np.hypot(1.0, side / base) + bias * side for side in (near, far))
     row, third = pairs.near_angle(a, scale * near, near_tol)
-    far = angle[j, k]
-    far_tol = noise * np.hypot(1.0, far / base) + bias * far
     second, expected = c[row], scale[row] * far
     keep = (
         np.abs(angle_between(pairs.directions[second], pairs.directions[third]) - expected)
@@ -279,13 +277,12 @@ def unit_directions(u: FloatArray, focal_px: FloatArray) -> FloatArray:
 
 def _triple(directions: FloatArray, triangles: IntArray) -> FloatArray:
     """Triple products (m,) of triangles (m, 3)."""
-    a, b, c = (directions[triangles[:, column]].T for column in range(3))
-    product: FloatArray = (
-        a[0] * (b[1] * c[2] - b[2] * c[1])
-        + a[1] * (b[2] * c[0] - b[0] * c[2])
-        + a[2] * (b[0] * c[1] - b[1] * c[0])
-    )
-    return product
+    a, b, c = (directions[triangles[:, column]] for column in range(3))
+    return floats(np.einsum("mi,mi->m", a, _cross(b, c)))
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def axes_of(v: FloatArray, p: int, q: int) -> FloatArray:
@@ -297,5 +294,4 @@ def axes_of(v: FloatArray, p: int, q: int) -> FloatArray:
     x = v[:, q] - v[:, p]
     x = x - np.einsum("mi,mi->m", x, z)[:, None] * z
     x = x / np.sqrt(np.einsum("mi,mi->m", x, x))[:, None]
-    y = z[:, [1, 2, 0]] * x[:, [2, 0, 1]] - z[:, [2, 0, 1]] * x[:, [1, 2, 0]]
-    return np.stack([x, y, z], axis=1)
+    return np.stack([x, _cross(z, x), z], axis=1)

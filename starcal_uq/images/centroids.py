@@ -6,9 +6,7 @@ It is what passes from the images to the identification.
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,14 +21,14 @@ from starcal_uq.core.files import (
     as_plain,
     atomic_path,
     ensure_new,
-    read_parquet,
+    read_bytes,
     reading,
     table_ending,
 )
 from starcal_uq.core.remedy import Remedy
+from starcal_uq.core.tables import WHAT, read_cells, write_parquet
 from starcal_uq.core.types import (
     AnyDict,
-    AnyMapping,
     BoolArray,
     FloatArray,
     IntArray,
@@ -252,14 +250,7 @@ class Centroids(FrameRows, Shown):
             elif ending == ".ecsv":
                 self._table(text).write(temporary, format="ascii.ecsv", delimiter=",")
             else:
-                import pyarrow as pa
-                from pyarrow import parquet
-
-                arrow = pa.table(self._arrays(COLUMNS))
-                metadata = {_KEY.encode(): text.encode()}
-                parquet.write_table(
-                    arrow.replace_schema_metadata(metadata), temporary, compression="zstd"
-                )
+                write_parquet(self._arrays(COLUMNS), temporary, text, _KEY.encode())
 
     def _table(self, text: str) -> Any:
         with extra("images", "ECSV tables"):
@@ -281,33 +272,30 @@ class Centroids(FrameRows, Shown):
         """
         path = Path(path)
         ending = table_ending(path)
-        if not os.path.isfile(path):
-            raise ObservationError(f"{path}: the file does not exist; check the path.")
-        read = {".csv": _read_csv, ".ecsv": _read_ecsv, ".parquet": _read_parquet}[ending]
-        with reading(path, "a readable table", "write it again", ObservationError):
-            columns, text = read(path)
-            if text is None:
+        data = read_bytes(path, "a table of centroids", ObservationError)
+        with reading(path, WHAT, "write it again", ObservationError):
+            cells = read_cells(path, data, ending, key=_KEY.encode())
+            document: AnyDict = cells.meta
+            if ending == ".csv" and data.startswith(_MARK.encode()):
+                document = json.loads(data.partition(b"\n")[0].removeprefix(_MARK.encode()))
+            elif _KEY in document:
+                document = json.loads(document[_KEY])
+            if not document:
                 raise ObservationError(
                     f"{path}: the list of frames is missing; give a table that "
                     f"`{Remedy('centroid').words}` or Centroids.save wrote."
                 )
-            if missing := [name for name in COLUMNS if name not in columns]:
+            if missing := [name for name in COLUMNS if name not in cells.columns]:
                 raise ObservationError(
                     f"{path}: column {missing[0]} is missing; write the table again.",
                     column=missing[0],
                 )
-            with reading(
-                path,
-                "a table of centroids with its list of frames",
-                "write it again",
-                ObservationError,
-            ):
-                document: AnyDict = json.loads(text)
-                frames: AnyDict = {name: document["frames"][name] for name in FRAME_COLUMNS}
-                messages, meta = tuple(map(str, document["messages"])), dict(document["meta"])
-            return cls(
-                **{name: columns[name] for name in COLUMNS}, **frames, messages=messages, meta=meta
-            )
+            columns = {
+                name: _typed(cells.columns[name], kind) for name, (kind, _) in COLUMNS.items()
+            }
+            frames: AnyDict = {name: document["frames"][name] for name in FRAME_COLUMNS}
+            messages, meta = tuple(map(str, document["messages"])), dict(document["meta"])
+            return cls(**columns, **frames, messages=messages, meta=meta)
 
     def __repr__(self) -> str:
         return (
@@ -334,33 +322,8 @@ _TRUTH = {"True": True, "False": False}
 _MARK = f"# {_KEY} "
 
 
-def _read_csv(path: Path) -> tuple[AnyMapping, str | None]:
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        first = file.readline()
-        if not first.startswith(_MARK):
-            return {}, None
-        names, *rows = [row for row in csv.reader(file, strict=True) if row]
-    cells = dict(zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True))
-    columns: AnyDict = {
-        name: [_TRUTH[cell] for cell in cells[name]]
-        if kind is np.bool_
-        else np.array(cells[name], str).astype(kind)
-        for name, (kind, _) in COLUMNS.items()
-        if name in cells
-    }
-    return columns, first.removeprefix(_MARK)
-
-
-def _read_ecsv(path: Path) -> tuple[AnyMapping, str | None]:
-    with extra("images", "ECSV tables"):
-        from astropy.table import Table
-
-    table = Table.read(path, format="ascii.ecsv")
-    return {name: np.asarray(table[name]) for name in table.colnames}, table.meta.get(_KEY)
-
-
-def _read_parquet(path: Path) -> tuple[AnyMapping, str | None]:
-    table = read_parquet(path)
-    text = (table.schema.metadata or {}).get(_KEY.encode())
-    columns = {name: table.column(name).to_numpy() for name in table.column_names}
-    return columns, None if text is None else text.decode()
+def _typed(cells: Any, kind: type) -> Any:
+    """A column of texts in its type."""
+    if kind is np.bool_ and isinstance(cells, list):
+        return [_TRUTH[cell] for cell in cells]
+    return cells if isinstance(cells, np.ndarray) else np.array(cells, str).astype(kind)

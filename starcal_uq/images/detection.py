@@ -12,7 +12,7 @@ import numpy as np
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.types import AnyDict, BoolArray, IntArray
+from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.images.background import PreparedImage, of_neighbours, prepare_image
 from starcal_uq.images.fits import (
     Stamps,
@@ -136,11 +136,10 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
             "adds to the errors is "
             "not in sigma."
         )
-    counts = {word: int(np.count_nonzero(kind == code)) for code, word in enumerate(_KINDS)}
-    counts["extended"] += n_blobs
-    if any(list(counts.values())[1:]):
-        words = [f"{n} {word}" for word, n in list(counts.items())[1:] if n]
-        total = sum(list(counts.values())[1:])
+    refused = np.bincount(kind, minlength=len(_KINDS))[1:]
+    refused[1] += n_blobs
+    if total := int(refused.sum()):
+        words = [f"{n} {word}" for n, word in zip(refused, _KINDS[1:], strict=True) if n]
         were = "was" if total == 1 else "were"
         messages.append(
             f"{plural(total, 'detection')} {were} left out as no star: {', '.join(words)}."
@@ -230,12 +229,12 @@ def _without_blobs(objects: Any, sigma: float) -> tuple[Any, int]:
     keep = ~large
     for blob in objects[large]:
         margin = 3.0 + 0.3 * float(blob["b"])
-        keep &= (
-            (objects["x"] < blob["xmin"] - margin)
-            | (objects["x"] > blob["xmax"] + margin)
-            | (objects["y"] < blob["ymin"] - margin)
-            | (objects["y"] > blob["ymax"] + margin)
-        )
+        off = [
+            (objects[axis] < blob[f"{axis}min"] - margin)
+            | (objects[axis] > blob[f"{axis}max"] + margin)
+            for axis in "xy"
+        ]
+        keep &= off[0] | off[1]
     return objects[keep], int(np.count_nonzero(~keep))
 
 
@@ -264,29 +263,16 @@ def _classify(
     height, width = frame.counts.shape
     kind = np.zeros(len(objects), dtype=np.int64)
     at_psf = explained(stamps, fit, 1.0)
-    core = _core_is_whole(stamps, fit) & psf_known
+    core = stamps.whole_within(fit.x_px, fit.y_px, 2.0 * fit.sigma_px) & psf_known
     kind[core & (explained(stamps, fit, 2.0) > at_psf + _CHI2_MARGIN)] = 2
     kind[core & (explained(stamps, fit, 0.5) > at_psf + _CHI2_MARGIN)] = 1
-    inside = (np.abs(fit.x_px - 0.5 * (width - 1)) < 0.5 * width) & (
-        np.abs(fit.y_px - 0.5 * (height - 1)) < 0.5 * height
-    )
+    inside = True
+    for place, size in ((fit.x_px, width), (fit.y_px, height)):
+        inside &= np.abs(place - 0.5 * (size - 1)) < 0.5 * size
     moved = np.hypot(fit.x_px - objects["x"], fit.y_px - objects["y"]) > 1.0 + 1.5 * fit.sigma_px
     measured = inside & ~moved & (fit.flux > 0.0) & np.isfinite(fit.covariance).all((1, 2))
     kind[(kind == 0) & ~measured] = 3
     return kind
-
-
-def _core_is_whole(stamps: Stamps, fit: StarFit) -> BoolArray:
-    """Whether all pixels within two widths of the fitted position are used."""
-    whole: BoolArray = np.all(stamps.fine, axis=(1, 2))
-    cut, grid = np.flatnonzero(~whole), np.arange(stamps.counts.shape[1])
-    u, v = (fit.x_px - stamps.x0)[cut, None, None], (fit.y_px - stamps.y0)[cut, None, None]
-    far = (
-        np.hypot(grid[None, None, :] - u, grid[None, :, None] - v)
-        > 2.0 * fit.sigma_px[cut, None, None]
-    )
-    whole[cut] = (stamps.fine[cut] | far).all((1, 2))
-    return whole
 
 
 def _columns(
@@ -300,20 +286,16 @@ def _columns(
     """The columns of the table for the chosen stars."""
     height, width = frame.counts.shape
     x, y, flux, covariance = (
-        fit.x_px[order],
-        fit.y_px[order],
-        fit.flux[order],
-        fit.covariance[order],
+        values[order] for values in (fit.x_px, fit.y_px, fit.flux, fit.covariance)
     )
-    rows, columns = pixel_at(y, height), pixel_at(x, width)
-    box, core = (
-        (
-            (rows[:, None] + steps).clip(0, height - 1)[:, :, None],
-            (columns[:, None] + steps).clip(0, width - 1)[:, None],
-        )
-        for reach in (1, max(1, int(np.ceil(2.0 * sigma))))
-        for steps in (np.arange(-reach, reach + 1),)
-    )
+
+    def box(reach: int) -> tuple[IntArray, IntArray]:
+        """Rows and columns of the pixels around each star."""
+        steps = np.arange(-reach, reach + 1)
+        rows = (pixel_at(y, height)[:, None] + steps).clip(0, height - 1)
+        columns = (pixel_at(x, width)[:, None] + steps).clip(0, width - 1)
+        return rows[:, :, None], columns[:, None]
+
     margin = np.minimum.reduce([x, width - 1 - x, y, height - 1 - y]) + 0.5
     blended = np.zeros(len(order), dtype=np.bool_)
     near = near_pairs(x, y, 6.0 * sigma)
@@ -327,10 +309,10 @@ def _columns(
         "cov_xy_px2": covariance[:, 0, 1],
         "flux": flux * (gain or 1.0),
         "snr": flux / np.sqrt(covariance[:, 2, 2]),
-        "peak": np.nanmax(image.data[box].astype(np.float64), axis=(1, 2), initial=-np.inf),
+        "peak": np.nanmax(image.data[box(1)].astype(np.float64), axis=(1, 2), initial=-np.inf),
         "saturated": np.zeros(len(order), np.bool_)
         if frame.saturated is None
-        else frame.saturated[core].any((1, 2)),
+        else frame.saturated[box(max(1, int(np.ceil(2.0 * sigma))))].any((1, 2)),
         "blended": blended,
         "edge": margin < 3.0 * sigma,
     }

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, floats
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, floats
 from starcal_uq.images.background import PreparedImage
 from starcal_uq.maths.intervals import median_of
 
@@ -47,16 +47,18 @@ class Stamps:
 
     def subset(self, chosen: Any) -> Stamps:
         """The stamps of some of the stars."""
-        counts, good, fine = self.counts[chosen], self.good[chosen], self.fine[chosen]
-        return Stamps(
-            self.x0[chosen],
-            self.y0[chosen],
-            counts,
-            good,
-            fine,
-            self.variance[chosen],
-            self.counts_per_e,
-        )
+        names = ("x0", "y0", "counts", "good", "fine", "variance")
+        changes: AnyDict = {name: getattr(self, name)[chosen] for name in names}
+        return replace(self, **changes)
+
+    def whole_within(self, x: FloatArray, y: FloatArray, radius: FloatArray) -> BoolArray:
+        """Whether all pixels (n,) within a radius of places in the image, px, are good or no loss."""
+        whole: BoolArray = np.all(self.fine, axis=(1, 2))
+        cut, grid = np.flatnonzero(~whole), np.arange(self.counts.shape[1])
+        u, v = grid + (self.x0 - x)[cut, None], grid + (self.y0 - y)[cut, None]
+        far = u[:, None, :] ** 2 + v[:, :, None] ** 2 > radius[cut, None, None] ** 2
+        whole[cut] = (self.fine[cut] | far).all((1, 2))
+        return whole
 
 
 @dataclass(frozen=True)
@@ -131,13 +133,11 @@ def _contracted(x: FloatArray, image: FloatArray, y: FloatArray) -> FloatArray:
     """
     # The star image is a product of two profiles, so that no product with one needs all pixels of
     # all stars at once.
-    total: FloatArray = y @ (image @ x.transpose(0, 2, 1))
-    return total
+    return floats(y @ (image @ x.transpose(0, 2, 1)))
 
 
 def _gaussian(px: FloatArray, py: FloatArray) -> FloatArray:
-    image: FloatArray = py[:, :, None] * px[:, None, :]
-    return image
+    return floats(py[:, :, None] * px[:, None, :])
 
 
 def fit_stars(
@@ -292,8 +292,7 @@ def _derivatives(px: FloatArray, py: FloatArray, flux: FloatArray) -> FloatArray
 def _normal(derivatives: FloatArray, weight: FloatArray) -> FloatArray:
     """Normal matrices (n, p, p) of derivatives and weights (n, m, m)."""
     weighted = derivatives * weight.reshape(len(weight), 1, derivatives.shape[2])
-    normal: FloatArray = weighted @ derivatives.transpose(0, 2, 1)
-    return normal
+    return floats(weighted @ derivatives.transpose(0, 2, 1))
 
 
 def explained(stamps: Stamps, fit: StarFit, scale: float) -> FloatArray:
@@ -403,22 +402,10 @@ def window_positions(
             break
         moving, counts = moving[on], counts[on]
     x, y = at[0] + stamps.x0, at[1] + stamps.y0
-    height, width = shape
     radius = _WINDOW_SIGMAS * window_px
-    good &= (
-        (x - radius >= -0.5)
-        & (x + radius <= width - 0.5)
-        & (y - radius >= -0.5)
-        & (y + radius <= height - 0.5)
-    )
-    cut = np.flatnonzero(good & ~stamps.fine.all((1, 2)))
-    u, v = (
-        (steps + stamps.x0[cut, None]) - x[cut, None],
-        (steps + stamps.y0[cut, None]) - y[cut, None],
-    )
-    far = u[:, None, :] ** 2 + v[:, :, None] ** 2 > radius[cut, None, None] ** 2
-    good[cut] = (stamps.fine[cut] | far).all((1, 2))
-    return x, y, good
+    for place, size in zip((y, x), shape, strict=True):
+        good &= (place - radius >= -0.5) & (place + radius <= size - 0.5)
+    return x, y, good & stamps.whole_within(x, y, radius)
 
 
 def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ImageError
+from starcal_uq.core.files import read_bytes
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR
 from starcal_uq.core.types import PathLike
 from starcal_uq.images.fits_files import read_fits
@@ -119,7 +120,7 @@ def read_images(path: PathLike, camera: Camera | None = None) -> list[Image]:
 
 
 def _read(path: Path, camera: Camera | None, every: bool) -> list[Image]:
-    data = _read_bytes(path)
+    data = read_bytes(path, "an image file", ImageError)
     name = path.name.lower()
     if not name.endswith(IMAGE_ENDINGS):
         raise ImageError(
@@ -167,24 +168,6 @@ def time_in_name_message(name: str) -> str:
     return (
         f"{name}: the time was taken from the name of the file, as UTC; the file itself has none."
     )
-
-
-def _read_bytes(path: Path) -> bytes:
-    if os.path.isdir(path):
-        raise ImageError(f"{path}: is a directory; name an image file.")
-    if os.path.exists(path) and not os.path.isfile(path):
-        raise ImageError(f"{path}: is not a regular file; name an image file.")
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise ImageError(f"{path}: the file does not exist; check the path.") from None
-    except OSError as error:
-        raise ImageError(
-            f"{path}: cannot be read ({error.strerror}); check its permissions."
-        ) from error
-    if not data:
-        raise ImageError(f"{path}: the file is empty; copy it again or leave it out.")
-    return data
 
 
 @cache

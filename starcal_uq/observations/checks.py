@@ -244,10 +244,9 @@ def _repeats(*keys: Any) -> list[tuple[int, int]]:
     if not np.any(hashed[1:] == hashed[:-1]):
         # The common case, at a tenth of the price.
         return []
-    import pandas as pd
-
-    earlier = pd.Series(np.arange(len(hashed))).groupby(list(keys)).shift()
-    return [(late, int(early)) for late, early in enumerate(earlier) if early >= 0.0]
+    order = np.lexsort(keys)
+    same = np.all([key[order[1:]] == key[order[:-1]] for key in keys], axis=0)
+    return sorted(zip(order[1:][same].tolist(), order[:-1][same].tolist(), strict=True))
 
 
 def row_hashes(*keys: Any) -> NDArray[np.uint64]:

@@ -1,36 +1,27 @@
-"""File formats of the observations table, as plain columns and metadata, in and out.
-
-CSV and ECSV are read cell by cell with the line each row stands on, so that an error can name it.
-"""
+"""File formats of the observations table, as plain columns and metadata."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.extras import extra
 from starcal_uq.core.files import (
     ENDINGS,
-    as_plain,
     cell_content,
-    check_parquet,
-    check_size,
     listed,
+    read_bytes,
     reading,
     shown,
     table_ending,
 )
+from starcal_uq.core.tables import REMEDY, WHAT, RawTable, in_unit, opened, own_meta, read_cells
 from starcal_uq.core.types import (
     AnyDict,
     BoolArray,
@@ -51,53 +42,12 @@ from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.matches import read_fits, read_json
 
 if TYPE_CHECKING:
-    from pyarrow.parquet import ParquetFile
-
     from starcal_uq.camera.camera import Camera
 
-META_KEY = b"starcal_uq"
-# What is written, and what is read.
-WRITTEN = (*ENDINGS, ".fits", ".corr")
-READ = (*WRITTEN, ".json")
-
-
-@dataclass(frozen=True)
-class RawTable:
-    """A table as it stands in a file: texts, or numbers where the format has types.
-
-    Of `columns`, by name in the file, Parquet gives only the wanted ones; `names` are those of all.
-    `numbers` (N,) are lines (CSV, ECSV) or rows from 1 (Parquet), as `word` says. `problems` are
-    rows that do not fit the header. Texts of a `spreadsheet` are those of
-    `starcal_uq.core.files.cell_text`; with `decimal_comma`, numbers are written as 0,5.
-    """
-
-    columns: AnyDict
-    names: list[str]
-    numbers: IntArray
-    word: str
-    meta: AnyDict = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
-    problems: list[Problem] = field(default_factory=list)
-    spreadsheet: bool = False
-    decimal_comma: bool = False
-
-
-WHAT, REMEDY = "a readable table", "write it again"
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise ObservationError(f"{path}: the file does not exist; check the path.") from None
-    except OSError as error:
-        reason = error.strerror
-        raise ObservationError(
-            f"{path}: cannot be read ({reason}); check its permissions."
-        ) from error
-    if not data.strip():
-        raise ObservationError(f"{path}: the file is empty; give a table of observations.")
-    return data
+# Formats of other programs, what is written, and what is read.
+_OTHERS = (".fits", ".corr", ".json")
+WRITTEN = (*ENDINGS, *_OTHERS[:2])
+READ = (*ENDINGS, *_OTHERS)
 
 
 def read_table(
@@ -125,13 +75,10 @@ def read_table(
     ending = table_ending(path, READ)
     names = {name: mapping.get(name, name) for name in COLUMNS}
     wanted = columns_for(names[name] for name in only)
-    data = _read_bytes(path)
+    data = read_bytes(path, "a table of observations", ObservationError)
     with reading(path, WHAT, REMEDY, ObservationError):
-        raw = (
-            _read(path, data, ending, wanted)
-            if frames is None
-            else _read_frames(path, data, wanted, names, frames)
-        )
+        chosen = None if frames is None else (names["frame"], frames)
+        raw = (_read if ending in _OTHERS else read_cells)(path, data, ending, wanted, chosen)
         check_names(path, raw, names, mapping)
         if not len(raw.numbers):
             raise ObservationError(
@@ -194,16 +141,13 @@ def _number_frames(raw: RawTable, own: str) -> None:
         raw.meta["frame_names"] = f"0 is {shown(names[0])}, {len(names) - 1} is {shown(names[-1])}"
 
 
-def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
-    if ending == ".parquet":
-        return _read_parquet(path, data, wanted)
-    if ending in (".fits", ".corr", ".json"):
-        columns, meta, units = (
-            (*read_json(path, data), {}) if ending == ".json" else read_fits(path, data)
-        )
-        n = len(next(iter(columns.values()), ()))
-        return RawTable(columns, list(columns), np.arange(1, n + 1), "row", meta, units)
-    return _read_text(path, data, ecsv=ending == ".ecsv")
+def _read(path: Path, data: bytes, ending: str, *_: object) -> RawTable:
+    """A table in a format of other programs."""
+    columns, meta, units = (
+        (*read_json(path, data), {}) if ending == ".json" else read_fits(path, data)
+    )
+    n = len(next(iter(columns.values()), ()))
+    return RawTable(columns, list(columns), np.arange(1, n + 1), "row", meta, units)
 
 
 def check_names(
@@ -241,7 +185,7 @@ def convert_columns(
     """Typed columns, what was wrong with their cells, and the rows whose frame is unknown."""
     columns: AnyDict = {}
     converted: dict[str, tuple[float, float]] = {}
-    problems = list(raw.problems)
+    problems = [Problem(row, None, why) for row, why in raw.uneven.items()]
     unknown_frame = np.zeros(len(raw.numbers), dtype=np.bool_)
     for name, own in names.items():
         own, factor, shift = _linear(own, raw.names)
@@ -295,23 +239,12 @@ def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray
     stands for.
     """
     wanted = COLUMNS[name].unit
-    if unit in ("", wanted) or name == "mag":
-        return values
-    with extra("images", f"{path}: columns in other units", f"give {name} in {wanted}"):
-        from astropy import units as u
-
-    try:
-        try:
-            stated = u.Unit(unit)
-        except ValueError:
-            # Written out, as astrometry.net has its pixels and degrees.
-            stated = u.Unit(unit.lower().removesuffix("s"))
-        converted: FloatArray = stated.to(u.Unit(wanted), values, equivalencies=u.temperature())
-    except (u.UnitConversionError, ValueError, TypeError):
+    found = values if name == "mag" else in_unit(path, values, unit, wanted)
+    if found is None:
         raise ObservationError(
             f"{path}: column {name} has the unit {unit!r}; give it in {wanted}.", column=name
-        ) from None
-    return converted
+        )
+    return found
 
 
 def table_meta(
@@ -337,182 +270,6 @@ def table_meta(
     return meta
 
 
-def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise ObservationError(
-            f"{path}, line {line}: the text is not UTF-8; save the file in the encoding UTF-8.",
-            row=line,
-        ) from None
-    header = _ecsv_header(path, text) if ecsv else {}
-    delimiter = header.get("delimiter", " ") if ecsv else delimiter_of(io.StringIO(text))
-    rows, numbers = _rows(path, text, delimiter)
-    if not rows:
-        raise ObservationError(
-            f"{path}: the file holds comments only; give a table of observations."
-        )
-    names = [name.strip() for name in rows.pop(0)]
-    width = len(names)
-    problems = []
-    for i, row in enumerate(rows):
-        if len(row) != width:
-            reason = (
-                f"{len(row)} value{'s' if len(row) != 1 else ''} under a header of {width} columns"
-            )
-            problems.append(Problem(i, None, reason))
-            rows[i] = [""] * width
-    return RawTable(
-        columns={name: [row[i] for row in rows] for i, name in enumerate(names)},
-        names=names,
-        numbers=np.array(numbers[1:], dtype=np.int64),
-        word="line",
-        meta=_ecsv_meta(header),
-        units={
-            column["name"]: column["unit"]
-            for column in header.get("datatype", [])
-            if column.get("unit")
-        },
-        problems=problems,
-        spreadsheet=not ecsv,
-        decimal_comma=delimiter == ";",
-    )
-
-
-def delimiter_of(lines: Iterable[str]) -> str:
-    """What stands between the columns: a comma, or, if the header has none, what else spreadsheets
-    write.
-    """
-    header = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    return next((other for other in (";", "\t") if other in header and "," not in header), ",")
-
-
-def _rows(path: Path, text: str, delimiter: str) -> tuple[list[list[str]], list[int]]:
-    """Rows that are neither blank nor comments, header first, and the line of each."""
-    # Comments become blank lines before the parser sees them: a quote in one would swallow the
-    # lines after it, and dropping the line would shift the count.
-    lines = ("\n" if line.startswith("#") else line for line in io.StringIO(text, newline=""))
-    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
-    rows, numbers = [], []
-    try:
-        for row in reader:
-            if any(map(str.strip, row)):
-                rows.append(row)
-                numbers.append(reader.line_num)
-    except csv.Error as error:
-        raise ObservationError(
-            (
-                f"{path}, line {reader.line_num}: the row cannot be read ({error}); check its "
-                "quotation marks."
-            ),
-            row=reader.line_num,
-        ) from None
-    return rows, numbers
-
-
-def _ecsv_header(path: Path, text: str) -> AnyDict:
-    """The YAML header of an ECSV file (Astropy Proposal for Enhancement 6)."""
-    if not text.startswith("# %ECSV"):
-        raise ObservationError(
-            (
-                f"{path}, line 1: '# %ECSV 1.0' is missing; name a plain table .csv, or write it "
-                "with astropy."
-            ),
-            row=1,
-        )
-    import yaml
-
-    class Header(yaml.SafeLoader):  # type: ignore[misc]
-        """Astropy's own kinds of values, of which none is used here, are None."""
-
-    for kind in ("!", "tag:yaml.org,2002:python/"):
-        Header.add_multi_constructor(kind, lambda *_: None)
-    lines = []
-    for line in text.splitlines()[1:]:
-        if not line.startswith("#"):
-            break
-        if not line.startswith("##"):
-            lines.append(line[2:])
-    try:
-        header: Any = yaml.load("\n".join(lines), Loader=Header)
-    except (yaml.YAMLError, ValueError, RecursionError):
-        header = None
-    columns = header.get("datatype") if isinstance(header, dict) else None
-    if not isinstance(columns, list) or not all(
-        isinstance(column, dict) and "name" in column for column in columns
-    ):
-        raise ObservationError(
-            f"{path}: the ECSV header is not valid YAML; write the file with astropy."
-        ) from None
-    return dict(header)
-
-
-def _ecsv_meta(header: AnyDict) -> AnyDict:
-    stored = dict(header.get("meta") or {})
-    values = {key: value for key, value in stored.items() if not str(key).startswith("__")}
-    # Piece by piece: a few lines of YAML that name each other can stand for gigabytes.
-    pieces, size = [], 0
-    for piece in json.JSONEncoder(default=as_plain).iterencode(values):
-        size += len(piece)
-        check_size(16 * size, 0)
-        pieces.append(piece)
-    plain: AnyDict = json.loads("".join(pieces))
-    return plain
-
-
-def _read_parquet(path: Path, data: bytes, wanted: set[str]) -> RawTable:
-    table, names, meta = _arrow_table(path, data, wanted)
-    columns = {name: arrow_values(table.column(name)) for name in table.column_names}
-    return RawTable(columns, names, np.arange(1, table.num_rows + 1), "row", meta)
-
-
-def _read_frames(
-    path: Path, data: bytes, wanted: set[str], own: Mapping[str, str], frames: IntArray
-) -> RawTable:
-    table, names, meta = _arrow_table(path, data, wanted)
-    # Before anything becomes Python's: texts of all rows would take longer than the rest.
-    rows = np.flatnonzero(np.isin(table.column(own["frame"]).to_numpy(), frames))
-    table = table.take(rows)
-    columns = {name: arrow_values(table.column(name)) for name in table.column_names}
-    return RawTable(columns, names, rows + 1, "row", meta)
-
-
-def _arrow_table(path: Path, data: bytes, wanted: set[str]) -> tuple[Any, list[str], AnyDict]:
-    """The wanted columns of a Parquet file, the names of all, and our metadata."""
-    with open_parquet(path, data) as file:
-        names = list(file.schema_arrow.names)
-        table = file.read(columns=[name for name in names if name in wanted], use_threads=False)
-        return table, names, own_meta(file.schema_arrow)
-
-
-@contextmanager
-def open_parquet(path: Path, data: bytes | None = None) -> Iterator[ParquetFile]:
-    """A Parquet file that holds no more than it can; whatever is wrong with it is said in an
-    `ObservationError`.
-    """
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    with (
-        reading(path, WHAT, REMEDY, ObservationError),
-        parquet.ParquetFile(
-            path if data is None else pa.BufferReader(data), pre_buffer=False
-        ) as file,
-    ):
-        check_parquet(file, path.stat().st_size if data is None else len(data))
-        yield file
-
-
-def own_meta(schema: Any) -> AnyDict:
-    """Our metadata of a Parquet file."""
-    stored = (schema.metadata or {}).get(META_KEY)
-    meta = json.loads(stored) if stored else {}
-    if not isinstance(meta, dict):
-        raise ValueError("its metadata are no table")
-    return meta
-
-
 @dataclass(frozen=True)
 class ParquetSummary:
     """What a Parquet file says of itself without being read.
@@ -532,7 +289,7 @@ def parquet_summary(path: Path, column: str) -> ParquetSummary:
     """Rows, columns, metadata and the range of one column of whole numbers, from the end of the
     file.
     """
-    with open_parquet(path) as file:
+    with opened(path) as file:
         schema, rows = file.schema_arrow, file.metadata
         names = tuple(schema.names)
         ranges = []
@@ -551,23 +308,10 @@ def parquet_summary(path: Path, column: str) -> ParquetSummary:
 
 def parquet_column(path: Path, column: str) -> IntArray:
     """One column of whole numbers of a Parquet file, (N,)."""
-    with open_parquet(path) as file:
+    with opened(path) as file:
         values = file.read(columns=[column], use_threads=False).column(column).to_numpy()
     if values.dtype.kind not in "iu":
         raise ObservationError(
             f"{path}: column {column} holds no whole numbers; write it again.", column=column
         )
     return np.asarray(values, dtype=np.int64)
-
-
-def arrow_values(column: Any) -> Any:
-    """An arrow column as an array if it holds numbers without nulls, else as texts."""
-    import pyarrow as pa
-
-    kind = column.type
-    if not column.null_count and (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
-        return column.to_numpy()
-    if pa.types.is_timestamp(kind):
-        texts = np.datetime_as_string(column.to_numpy().astype("datetime64[ns]"))
-        return ["" if text == "NaT" else text for text in texts.tolist()]
-    return ["" if value is None else str(value) for value in column.to_pylist()]

@@ -105,11 +105,8 @@ class Observations(FrameRows, Sourced, Shown):
         for name, values in columns.items():
             if len(values) != n:
                 raise ObservationError(
-                    (
-                        f"observations: {name} has {len(values)} rows and frame has {n}; give "
-                        "equal "
-                        "lengths."
-                    ),
+                    f"observations: {name} has {len(values)} rows and frame has {n}; give equal "
+                    "lengths.",
                     column=name,
                 )
         frame = columns["frame"]
@@ -166,14 +163,15 @@ class Observations(FrameRows, Sourced, Shown):
         digest = hashlib.sha256()
         for name, values in self.unweighted.columns.items():
             digest.update(f"{name}:{len(values)};".encode())
-            if values.dtype.kind == "U":
-                # The length before each text: without it ("ab", "c") and ("a", "bc") would agree.
-                for first in range(0, len(values), _ROWS_AT_ONCE):
-                    digest.update(_marked(values[first : first + _ROWS_AT_ONCE]))
-            else:
-                # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
-                for first in range(0, len(values), _ROWS_AT_ONCE):
-                    part = values[first : first + _ROWS_AT_ONCE] + values.dtype.type(0)
+            for first in range(0, len(values), _ROWS_AT_ONCE):
+                part = values[first : first + _ROWS_AT_ONCE]
+                if values.dtype.kind == "U":
+                    # The length before each text: without it ("ab", "c") and ("a", "bc") would
+                    # agree.
+                    digest.update("".join(f"{len(t)}:{t}" for t in part.tolist()).encode())
+                else:
+                    # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
+                    part = part + values.dtype.type(0)
                     digest.update(part.astype(values.dtype.newbyteorder("<"), copy=False))
         return digest.hexdigest()
 
@@ -369,18 +367,15 @@ def load_observations(
     if not tables:
         raise ObservationError("observations: there is no file; give at least one.")
     common = [name for name in tables[0].columns if all(name in table.columns for table in tables)]
-    first = np.cumsum([0, *(table.n_frames for table in tables)])
-    frames = [
-        np.searchsorted(t.frame_ids, t.frame) + start
-        for t, start in zip(tables, first, strict=False)
-    ]
-    joined: AnyDict = {
-        name: np.concatenate([table.columns[name] for table in tables]) for name in common
-    }
+    joined = {name: np.concatenate([table.columns[name] for table in tables]) for name in common}
+    starts = np.cumsum([0, *(table.n_frames for table in tables)])
+    joined["frame"] = np.concatenate(
+        [np.searchsorted(t.frame_ids, t.frame) + n for t, n in zip(tables, starts, strict=False)]
+    )
     kinds = {table.origin.directions for table in tables}
     meta = {**tables[0].meta, "source": [str(one) for one in path]}
     meta["directions"] = kinds.pop() if len(kinds) == 1 else "undeclared"
-    return Observations(**{**joined, "frame": np.concatenate(frames)}, meta=meta)
+    return Observations(**joined, meta=meta)
 
 
 def _array(name: str, values: Any) -> Any:
@@ -413,24 +408,6 @@ def _array(name: str, values: Any) -> Any:
             column=name,
         )
     return array
-
-
-def _marked(texts: StrArray) -> bytes:
-    """Each text behind its length, such as ``3:abc``, one after the other."""
-    n, width = len(texts), texts.dtype.itemsize // 4
-    code = np.ascontiguousarray(texts).view(np.uint32).reshape(n, width)
-    plain = width and width < 1000 and int(code.max(initial=0)) < 128
-    letters = code.astype(np.uint8) if plain else np.empty((n, 0), dtype=np.uint8)
-    there = letters != 0
-    if not plain or (there[:, 1:] > there[:, :-1]).any():
-        return "".join(f"{len(text)}:{text}" for text in texts.tolist()).encode()
-    # Plain letters without a gap: all at once, as rows of bytes in which a zero stands for nothing.
-    rows = np.empty((n, 4 + width), dtype=np.uint8)
-    marks = [f"{length}:".rjust(4, "\0").encode() for length in range(width + 1)]
-    length = (there @ np.ones(width, dtype=np.float32)).astype(np.int64)
-    rows[:, :4] = np.take(np.array([list(mark) for mark in marks], dtype=np.uint8), length, axis=0)
-    rows[:, 4:] = letters
-    return rows.tobytes().replace(b"\0", b"")
 
 
 def _all_missing(values: Any) -> bool:

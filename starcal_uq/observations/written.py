@@ -21,9 +21,10 @@ from starcal_uq.core.files import (
     ensure_new,
     table_ending,
 )
+from starcal_uq.core.tables import write_parquet
 from starcal_uq.core.types import AnyDict, AnyMapping, IntArray, PathLike, StrArray
 from starcal_uq.observations.columns import COLUMNS
-from starcal_uq.observations.files import META_KEY, WRITTEN
+from starcal_uq.observations.files import WRITTEN
 from starcal_uq.observations.matches import corr_content, fits_content
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def write_table(
         if ending == ".ecsv":
             astropy_table(columns, plain).write(temporary, format="ascii.ecsv", delimiter=",")
         else:
-            _write_parquet(columns, temporary, plain)
+            write_parquet(columns, temporary, json.dumps(plain))
 
 
 def _csv_text(columns: AnyMapping) -> str:
@@ -110,35 +111,22 @@ def write_partition(
     different ones.
     """
     import pyarrow as pa
-    from pyarrow import parquet
 
-    arrays = {name: pa.array(values) for name, values in columns.items()}
+    arrays: AnyDict = {name: pa.array(values) for name, values in columns.items()}
     for name, (place, texts) in named.items():
         used, place = np.unique(place, return_inverse=True)
         arrays[name] = pa.DictionaryArray.from_arrays(
             pa.array(place.astype(np.int32)), pa.array(texts[used].tolist())
         )
-    table = pa.table({name: arrays[name] for name in COLUMNS if name in arrays})
-    table = table.replace_schema_metadata({META_KEY: json.dumps(meta, default=as_plain).encode()})
+    arrays = {name: arrays[name] for name in COLUMNS if name in arrays}
     # Pixels repeat nowhere: looking for repeats in them, or compressing them, would take longer
     # than all the rest.
     pixels = {"x_px", "y_px"}
     with atomic_path(path) as temporary:
-        parquet.write_table(
-            table,
+        write_parquet(
+            arrays,
             temporary,
-            compression={name: "none" if name in pixels else "zstd" for name in table.column_names},
-            use_dictionary=[name for name in table.column_names if name not in pixels],
+            json.dumps(meta, default=as_plain),
+            compression={name: "none" if name in pixels else "zstd" for name in arrays},
+            use_dictionary=[name for name in arrays if name not in pixels],
         )
-
-
-def _write_parquet(columns: AnyMapping, path: Path, meta: AnyDict) -> None:
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    arrays = {
-        name: pa.array(values.tolist() if values.dtype.kind == "U" else values)
-        for name, values in columns.items()
-    }
-    table = pa.table(arrays).replace_schema_metadata({META_KEY: json.dumps(meta).encode()})
-    parquet.write_table(table, path, compression="zstd")

@@ -111,10 +111,9 @@ def contaminate(
     wrong = np.zeros(obs.n_stars, dtype=bool)
     wrong[rows] = True
     changes: AnyDict = {}
-    for name in ("ra_deg", "dec_deg", "star_id", "mag"):
+    for name, values in stars.named(replacements).items():
         column = getattr(obs, name)
         if column is not None:
-            values = getattr(stars, name)[replacements]
             # Names may be longer than the table's.
             changed = column.astype(np.result_type(column, values))
             changed[rows] = values

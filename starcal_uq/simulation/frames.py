@@ -142,10 +142,7 @@ def simulate(
         frame=frame,
         x_px=xy[:, 0],
         y_px=xy[:, 1],
-        ra_deg=stars.ra_deg[index],
-        dec_deg=stars.dec_deg[index],
-        star_id=stars.star_id[index],
-        mag=stars.mag[index],
+        **stars.named(index),
         meta=simulated_meta(camera, sigma_px, seed),
     )
 
@@ -170,8 +167,7 @@ def observed(
     _, frames = choose_attitudes(
         sky, rng, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes
     )
-    index = np.concatenate([seen for seen, _ in frames])
-    xy = np.concatenate([xy for _, xy in frames])
+    index, xy = map(np.concatenate, zip(*frames, strict=True))
     xy = xy + sigma_px * rng.standard_normal(xy.shape)
     return np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]), index, xy
 
@@ -233,11 +229,9 @@ class Window:
         self.camera = camera
         self.low = -0.5 + margin_px
         self.high = np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
-        low, high = (
-            min(-0.5, self.low),
-            np.maximum(np.array([camera.width_px, camera.height_px]) - 0.5, self.high),
-        )
-        b = unproject(camera, np.array([(x, y) for x in (low, high[0]) for y in (low, high[1])]))
+        size = np.array([camera.width_px, camera.height_px])
+        low, (right, down) = min(-0.5, self.low), np.maximum(size - 0.5, self.high)
+        b = unproject(camera, np.array([(x, y) for x in (low, right) for y in (low, down)]))
         # A little wider than the farthest corner; the exact cut is made in pixels.
         self.min_cosine = float(np.cos(1.02 * np.max(np.arccos(b[:, 2]))))
         plane = get_model(camera.distortion).plane

@@ -8,6 +8,7 @@ catalogue and magnitude limit.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.formatting import count, plural, significant
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.table import Observations
 from starcal_uq.simulation.frames import Sky, simulate
 
@@ -127,8 +128,14 @@ def profile_frames(
     path = profile if rate_hz is None else profile.at_rate(rate_hz)
     sky = Sky(stars, camera, 0.0)
     rotations = quaternion_to_rotation(path.quaternions)
-    frame, seen, xy = _seen(sky, rotations)
-    counts = np.bincount(frame, minlength=len(rotations))
+    views = [
+        view
+        for first in range(0, len(rotations), _FRAMES_AT_ONCE)
+        for view in sky.views(rotations[first : first + _FRAMES_AT_ONCE])
+    ]
+    counts = np.array([len(seen) for seen, _ in views])
+    frame = np.repeat(np.arange(len(views)), counts)
+    seen, xy = map(np.concatenate, zip(*views, strict=True))
     kept = counts >= min_stars
     if not kept.any():
         raise CatalogueError(
@@ -148,10 +155,7 @@ def profile_frames(
         frame=frame[rows],
         x_px=xy[rows, 0],
         y_px=xy[rows, 1],
-        ra_deg=stars.ra_deg[seen],
-        dec_deg=stars.dec_deg[seen],
-        star_id=stars.star_id[seen],
-        mag=stars.mag[seen],
+        **stars.named(seen),
         meta={
             "source": f"attitude profile {profile.name}".strip(),
             "directions": "apparent",
@@ -164,17 +168,6 @@ def profile_frames(
     return frames if noise_like is None else _with_noise(frames, noise_like)
 
 
-def _seen(sky: Sky, rotations: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """Frame numbers, catalogue indices and noise-free pixels of all stars on the detector."""
-    numbers, indices, pixels = [], [], []
-    for first in range(0, len(rotations), _FRAMES_AT_ONCE):
-        for offset, (seen, xy) in enumerate(sky.views(rotations[first : first + _FRAMES_AT_ONCE])):
-            numbers.append(np.full(len(seen), first + offset))
-            indices.append(seen)
-            pixels.append(xy)
-    return np.concatenate(numbers), np.concatenate(indices), np.concatenate(pixels)
-
-
 def _with_noise(frames: Observations, like: Observations) -> Observations:
     """The frames with stated noise like that of other observations."""
     if like.stated_px is not None and like.unweighted.sigma_px is None:
@@ -184,23 +177,17 @@ def _with_noise(frames: Observations, like: Observations) -> Observations:
     like = like.unweighted
     if like.sigma_px is None:
         raise ObservationError(
-            (
-                "noise_like has no column sigma_px, so that there is no stated noise to carry "
-                "over: "
-                "leave it out."
-            ),
+            "noise_like has no column sigma_px, so that there is no stated noise to carry over: "
+            "leave it out.",
             column="sigma_px",
         )
-    import dataclasses
-
+    rule = "median stated noise by magnitude"
     if like.mag is None or frames.mag is None or not np.any(np.isfinite(like.mag)):
-        sigma, rule = (
-            np.full(frames.n_stars, float(np.median(like.sigma_px))),
-            "median stated noise for every star",
-        )
+        sigma = np.full(frames.n_stars, float(np.median(like.sigma_px)))
+        rule = "median stated noise for every star"
     else:
-        sigma, rule = noise_by_magnitude(like, frames.mag), "median stated noise by magnitude"
-    return dataclasses.replace(frames, sigma_px=sigma).with_meta(noise=rule)
+        sigma = noise_by_magnitude(like, frames.mag)
+    return replace(frames, sigma_px=sigma).with_meta(noise=rule)
 
 
 def noise_by_magnitude(like: Observations, mag: FloatArray) -> FloatArray:

@@ -176,7 +176,7 @@ class _Maker:
         frame, star, xy = observed(
             sky, rng, self.sigma_px, n_frames=meta["n_frames"], min_stars=self.min_stars
         )
-        columns: AnyDict = {
+        columns = {
             "frame": frame + meta["first_frame"],
             "x_px": xy[:, 0],
             "y_px": xy[:, 1],

@@ -19,9 +19,9 @@ from starcal_uq.core.errors import ImageError, SensorError, StarcalError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_bytes, ensure_new
 from starcal_uq.core.provenance import NAME, installed_version
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike, StrArray
+from starcal_uq.core.types import FloatArray, PathLike, StrArray
 from starcal_uq.images.image import Image
-from starcal_uq.observations.table import Observations
+from starcal_uq.observations.table import Observations, joined_columns
 from starcal_uq.simulation.sensor import Sensor
 
 
@@ -227,37 +227,26 @@ def _cards(truth: FrameTruth) -> list[tuple[str, Any, str]]:
             ("DATE-OBS", start.isoformat(timespec="microseconds"), "start of the exposure"),
             ("DATE-AVG", truth.time_utc, "middle of the exposure"),
         ]
-    cards += [
-        (f"Q{axis}", float(value), "attitude R_cam_icrs, scalar-last quaternion")
-        for axis, value in zip("XYZW", rotation_to_quaternion(truth.rotation), strict=True)
-    ]
-    cards += [
-        (f"RATE{axis}", float(value), "[rad/s] angular rate in camera axes")
-        for axis, value in zip("XYZ", truth.rate_rad_s, strict=True)
-    ]
-    cards.append(("CAMNAME", camera.name.encode("ascii", "replace").decode("ascii"), "camera"))
-    table = camera.to_dict()
-    cards += [
-        (keyword, table[key], text) for key, (keyword, text) in _CAMERA_KEYS.items() if key in table
-    ]
-    cards.append(("DISTORT", camera.distortion, "distortion model"))
-    cards += [
-        (coefficient.name.upper(), value, f"[{coefficient.unit}] distortion")
-        for coefficient, value in zip(
-            get_model(camera.distortion).coefficients, camera.coefficients, strict=True
-        )
-    ]
-    cards += [(keyword, getattr(sensor, key), text) for key, (keyword, text) in SENSOR_KEYS.items()]
+    quaternion = rotation_to_quaternion(truth.rotation)
+    table, model = camera.to_dict(), get_model(camera.distortion)
     return [
         *cards,
+        *_numbered("Q", "XYZW", quaternion, "attitude R_cam_icrs, scalar-last quaternion"),
+        *_numbered("RATE", "XYZ", truth.rate_rad_s, "[rad/s] angular rate in camera axes"),
+        ("CAMNAME", camera.name.encode("ascii", "replace").decode("ascii"), "camera"),
+        *((card, table[key], text) for key, (card, text) in _CAMERA_KEYS.items() if key in table),
+        ("DISTORT", camera.distortion, "distortion model"),
+        *((c.name.upper(), table[c.name], f"[{c.unit}] distortion") for c in model.coefficients),
+        *((card, getattr(sensor, key), text) for key, (card, text) in SENSOR_KEYS.items()),
         ("SATURATE", sensor.saturation_counts, "[adu] a pixel with this or more is saturated"),
-        (
-            "CREATOR",
-            f"{NAME} {installed_version(NAME)}",
-            "program that rendered the frame",
-        ),
+        ("CREATOR", f"{NAME} {installed_version(NAME)}", "program that rendered the frame"),
         ("NUMPY", np.__version__, "version of NumPy, which draws the noise"),
     ]
+
+
+def _numbered(name: str, axes: str, values: FloatArray, text: str) -> list[tuple[str, Any, str]]:
+    """A card for each axis."""
+    return [(name + axis, float(value), text) for axis, value in zip(axes, values, strict=True)]
 
 
 def read_truth(path: PathLike) -> FrameTruth:
@@ -282,22 +271,15 @@ def read_truth(path: PathLike) -> FrameTruth:
                 star_id = np.array(table["star_id"], dtype=np.str_)
                 size = header["NAXIS1"], header["NAXIS2"]
         model = get_model(header["DISTORT"])
-        lengths = {"pixel_um": None, "focal_mm": None}
+        optics = {key: header[card] for key, (card, _) in _CAMERA_KEYS.items() if card in header}
         camera = Camera(
             *size,
-            **lengths
-            | {
-                key: header[keyword]
-                for key, (keyword, _) in _CAMERA_KEYS.items()
-                if keyword in header
-            },
+            **{"pixel_um": None, "focal_mm": None, **optics},
             distortion=model.name,
-            coefficients=tuple(
-                header[coefficient.name.upper()] for coefficient in model.coefficients
-            ),
+            coefficients=tuple(header[c.name.upper()] for c in model.coefficients),
             name=header["CAMNAME"],
         )
-        sensor = Sensor(**{key: header[keyword] for key, (keyword, _) in SENSOR_KEYS.items()})
+        sensor = Sensor(**{key: header[card] for key, (card, _) in SENSOR_KEYS.items()})
         quaternion = np.array([header[f"Q{axis}"] for axis in "XYZW"])
         rate = np.array([header[f"RATE{axis}"] for axis in "XYZ"])
         frame = int(header["FRAME"])
@@ -334,17 +316,7 @@ def truth_table(paths: Iterable[PathLike]) -> Observations:
     ImageError
         If there is no file, or one cannot be read.
     """
-    truths = [read_truth(path) for path in paths]
-    if not truths:
+    tables = [read_truth(path).observations for path in paths]
+    if not tables:
         raise ImageError("rendered frames: no file was named; give at least one.")
-    tables = [truth.observations for truth in truths]
-    columns: AnyDict = {}
-    for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg"):
-        columns[name] = np.concatenate([getattr(table, name) for table in tables])
-    columns["star_id"] = np.concatenate([truth.star_id for truth in truths])
-    columns["mag"] = np.concatenate([truth.mag for truth in truths])
-    if all(truth.time_utc is not None for truth in truths):
-        columns["time_utc"] = np.repeat(
-            [str(truth.time_utc) for truth in truths], [len(truth) for truth in truths]
-        )
-    return Observations(**columns, meta=tables[0].meta)
+    return Observations(**joined_columns(tables), meta=tables[0].meta)

@@ -15,7 +15,7 @@ import numpy as np
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.settings import KEYS
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray, StrArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.sky.apparent import aberrate, check_velocity
 from starcal_uq.sky.gaia import (
     BAND,
@@ -106,6 +106,11 @@ class StarCatalogue(Shown):
         """The stars that a mask of shape (n,), or an array of indices, picks, in that order."""
         changes: dict[str, Any] = {name: getattr(self, name)[mask] for name in COLUMNS}
         return replace(self, **changes)
+
+    def named(self, index: Any) -> AnyDict:
+        """Directions, names and magnitudes of some stars, as columns of a table."""
+        names = ("ra_deg", "dec_deg", "star_id", "mag")
+        return {name: getattr(self, name)[index] for name in names}
 
     def at_epoch(self, epoch: float) -> StarCatalogue:
         """The same stars, moved by their proper motion to another Julian year.

@@ -4,6 +4,7 @@ format of the CDS.
 
 from __future__ import annotations
 
+import io
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,85 +16,40 @@ import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.files import check_fits, listed, reading, unpack
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, StrArray, floats
+from starcal_uq.core.files import check_fits, listed, read_bytes, reading, unpack
+from starcal_uq.core.tables import RawTable, in_unit, read_cells
+from starcal_uq.core.types import BoolArray, FloatArray, StrArray, floats
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
-from starcal_uq.sky.cds import CdsFormat, read_cds
+from starcal_uq.sky.cds import LAYOUTS, fk5_to_icrs, read_cds
 from starcal_uq.sky.positions import propagate_proper_motion
 
 Format = Literal["csv", "ecsv", "fits", "hipparcos", "sao", "bsc"]
 
 # Barnard's star, the fastest, moves 10,400 mas/yr.
 MAX_PROPER_MOTION_MAS_YR = 11000.0
+_FAINTEST_BELIEVABLE = 90.0
 
 # Names under which columns are found without being told, first hit wins; compared without regard to
 # case. Columns of equinox B1950 are left out on purpose: their names must not be mistaken.
-_GUESSES: dict[str, tuple[str, ...]] = {
-    "star_id": (
-        "star_id",
-        "source_id",
-        "designation",
-        "hip",
-        "hr",
-        "sao",
-        "hd",
-        "tyc",
-        "name",
-        "id",
-    ),
-    "ra_deg": (
-        "ra_deg",
-        "ra",
-        "raicrs",
-        "ra_icrs",
-        "radeg",
-        "raj2000",
-        "_raj2000",
-        "ra_j2000",
-        "alpha",
-    ),
-    "dec_deg": (
-        "dec_deg",
-        "dec",
-        "deicrs",
-        "de_icrs",
-        "dedeg",
-        "dej2000",
-        "_dej2000",
-        "dec_j2000",
-        "de",
-        "delta",
-    ),
-    "mag": ("mag", "phot_g_mean_mag", "gmag", "g_mag", "vmag", "v_mag", "hpmag", "vtmag", "vt_mag"),
-    "pm_ra_mas_yr": ("pm_ra_mas_yr", "pmra", "pm_ra", "pmra_masyr", "pm_ra_cosdec"),
-    "pm_dec_mas_yr": ("pm_dec_mas_yr", "pmdec", "pm_dec", "pmde", "pm_de", "pmdec_masyr"),
-    "epoch": ("epoch", "ref_epoch", "epoch_yr"),
+_GUESSES = {
+    "star_id": "star_id source_id designation hip hr sao hd tyc name id",
+    "ra_deg": "ra_deg ra raicrs ra_icrs radeg raj2000 _raj2000 ra_j2000 alpha",
+    "dec_deg": "dec_deg dec deicrs de_icrs dedeg dej2000 _dej2000 dec_j2000 de delta",
+    "mag": "mag phot_g_mean_mag gmag g_mag vmag v_mag hpmag vtmag vt_mag",
+    "pm_ra_mas_yr": "pm_ra_mas_yr pmra pm_ra pmra_masyr pm_ra_cosdec",
+    "pm_dec_mas_yr": "pm_dec_mas_yr pmdec pm_dec pmde pm_de pmdec_masyr",
+    "epoch": "epoch ref_epoch epoch_yr",
 }
-_UNITS = {
-    "ra_deg": "deg",
-    "dec_deg": "deg",
-    "pm_ra_mas_yr": "mas/yr",
-    "pm_dec_mas_yr": "mas/yr",
-    "epoch": "yr",
-}
+_UNITS = {"ra_deg": "deg", "dec_deg": "deg", "pm_ra_mas_yr": "mas/yr", "pm_dec_mas_yr": "mas/yr"}
 _BANDS = {
-    "phot_g_mean_mag": "Gaia G",
-    "gmag": "Gaia G",
-    "g_mag": "Gaia G",
-    "vmag": "Johnson V",
-    "v_mag": "Johnson V",
-    "hpmag": "Hipparcos Hp",
-    "vtmag": "Tycho VT",
-    "vt_mag": "Tycho VT",
+    "Gaia G": "phot_g_mean_mag gmag g_mag",
+    "Johnson V": "vmag v_mag",
+    "Hipparcos Hp": "hpmag",
+    "Tycho VT": "vtmag vt_mag",
 }
-_CDS_NAMES: dict[str, Format] = {
-    "hip_main.dat": "hipparcos",
-    "sao.dat": "sao",
-    "catalog": "bsc",
-    "catalog.dat": "bsc",
-    "bsc5.dat": "bsc",
-}
-_ENDINGS: dict[str, Format] = {".csv": "csv", ".ecsv": "ecsv", ".fits": "fits", ".fit": "fits"}
+# Formats by the names of files, or else by their endings.
+_NAMES = {name: kind for kind, layout in LAYOUTS.items() for name in layout["files"]}
+_ENDINGS = {".csv": "csv", ".ecsv": "ecsv", ".fits": "fits", ".fit": "fits"}
 
 
 def read_catalogue(
@@ -166,21 +122,18 @@ def read_catalogue(
         the column and the remedy.
     """
     path = Path(path)
-    if path.is_dir():
-        raise CatalogueError(f"{path}: is a folder; give the catalogue's file.")
-    if not path.exists():
-        raise CatalogueError(f"{path}: does not exist; check the path.")
+    data = read_bytes(path, "the file of a catalogue", CatalogueError)
     kind = _format_of(path) if format is None else format
     with reading(path, f"readable as {kind.upper()}", "check the file", CatalogueError):
-        if kind in ("hipparcos", "sao", "bsc"):
+        if kind in LAYOUTS:
             if columns is not None or file_epoch is not None:
                 raise CatalogueError(
                     f"{path}: the columns and the epoch of format {kind!r} are fixed; leave them "
                     "out."
                 )
-            stars = _checked_cds(path, kind, None if readme is None else Path(readme), band)
-        elif kind in ("csv", "ecsv", "fits"):
-            stars = _read_table(path, kind, dict(columns or {}), file_epoch, epoch, band)
+            stars = _read_cds(path, data, kind, readme, band)
+        elif kind in _ENDINGS.values():
+            stars = _read_table(path, data, kind, dict(columns or {}), file_epoch, epoch, band)
         else:
             raise CatalogueError(
                 f"{path}: unknown format {kind!r}; use csv, ecsv, fits, hipparcos, sao or bsc."
@@ -195,64 +148,134 @@ def read_catalogue(
 
 @dataclass(frozen=True)
 class _Source:
-    """A table with what error messages need: file, format, and the line of the file that each row
-    comes from.
-    """
+    """A table, and names of this package to names in the file."""
 
     path: Path
-    kind: Format
-    table: Any
-    names: dict[str, str]
+    table: RawTable
+    names: Mapping[str, str]
 
     def fail(self, name: str, row: int, what: str, remedy: str) -> CatalogueError:
-        column = self.names[name]
         return CatalogueError(
-            f"{self.path}, {self.place(row)}, column {column!r}: {what}; {remedy}."
+            f"{self.path}, {self.table.word} {self.table.numbers[row]}, column "
+            f"{self.names.get(name, name)!r}: {what}; {remedy}."
         )
-
-    def place(self, row: int) -> str:
-        return f"row {row + 1}" if self.kind == "fits" else f"line {_text_line(self.path, row)}"
 
     def numbers(self, name: str) -> FloatArray:
         """A column as floats in this package's unit; NaN where the file has no value."""
-        column = self.table[self.names[name]]
-        values = np.ma.filled(
-            np.ma.asarray(_as_floats(self, name, column), dtype=np.float64), np.nan
-        )
-        unit, wanted = getattr(column, "unit", None), _UNITS.get(name)
-        if unit is None or wanted is None or name == "epoch":
-            return values
-        with extra("images", "catalogue files"):
-            from astropy.units import Unit, UnitsError
-
-        try:
-            return floats(Unit(unit).to(Unit(wanted), values))
-        except (UnitsError, TypeError, ValueError) as error:
+        own = self.names.get(name, name)
+        cells = self.table.columns.get(own)
+        if cells is None:
+            return np.full(len(self.table.numbers), np.nan)
+        if isinstance(cells, list):
+            values = np.full(len(cells), np.nan)
+            for row, cell in enumerate(map(str.strip, cells)):
+                try:
+                    values[row] = float(cell) if cell else np.nan
+                except ValueError:
+                    what = f"{cell!r} is not a number"
+                    raise self.fail(name, row, what, "write decimal numbers") from None
+            cells = values
+        unit, wanted = self.table.units.get(own, ""), _UNITS.get(name, "")
+        found = in_unit(self.path, floats(cells), unit, wanted) if wanted else floats(cells)
+        if found is None:
             raise CatalogueError(
-                f"{self.path}, column {self.names[name]!r}: the unit {str(unit)!r} cannot be "
-                f"converted to {wanted}; "
+                f"{self.path}, column {own!r}: the unit {unit!r} cannot be converted to {wanted}; "
                 "correct the unit or name another column."
-            ) from error
+            )
+        return found
+
+    def within(self, name: str, values: FloatArray, low: float, high: float, unit: str) -> None:
+        """Refuse values out of range, and those that are missing."""
+        bad = np.flatnonzero(~((values >= low) & (values <= high)))
+        if len(bad):
+            value = values[bad[0]]
+            what = f"{value:g}{unit} is outside [{low:g}, {high:g}]"
+            more = f" ({len(bad) - 1} more such rows)" if len(bad) > 1 else ""
+            what = ("has no value" if np.isnan(value) else what) + more
+            raise self.fail(name, int(bad[0]), what, "correct or remove the row")
+
+    def motions(self) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Both components of the proper motion, zero where it is not known, and where it is."""
+        ra, dec = self.numbers("pm_ra_mas_yr"), self.numbers("pm_dec_mas_yr")
+        known = np.isfinite(ra) & np.isfinite(dec)
+        return np.where(known, ra, 0.0), np.where(known, dec, 0.0), known
+
+
+def _read_cds(
+    path: Path, data: bytes, kind: str, readme: str | Path | None, band: str | None
+) -> StarCatalogue:
+    layout, (table, left_out) = LAYOUTS[kind], read_cds(path, data, kind, readme)
+    names = {
+        "mag": "Vmag",
+        **dict(zip(("pm_ra_mas_yr", "pm_dec_mas_yr"), layout["pm"], strict=True)),
+    }
+    source = _Source(path, table, names)
+
+    def angle(labels: Sequence[str], low: float, high: float, unit: float = 1.0) -> FloatArray:
+        """Degrees from one label, or from sexagesimal parts with an optional sign."""
+        sign = np.ones(len(table.numbers))
+        if labels[0].endswith("-"):
+            # The sign stands in a column of its own, which keeps it for declinations of -00.
+            sign = np.where(np.array(table.columns[labels[0]]) == "-", -1.0, 1.0)
+            labels = labels[1:]
+        parts = [source.numbers(label) for label in labels]
+        for label, part in zip(labels[1:], parts[1:], strict=True):
+            source.within(label, part, 0.0, 60.0, "")
+        total = sign * unit * sum(part / 60.0**place for place, part in enumerate(parts))
+        source.within(labels[0], total, low, high, " deg")
+        return floats(total)
+
+    ra = angle(layout["ra"], 0.0, 360.0, 15.0 if len(layout["ra"]) > 1 else 1.0)
+    dec = angle(layout["dec"], -90.0, 90.0)
+    number = source.numbers(layout["prefix"])
+    source.within(layout["prefix"], number, 0.0, np.inf, "")
+    mag = source.numbers("mag")
+    pm_ra, pm_dec, known = source.motions()
+    if kind != "hipparcos":
+        in_seconds = layout.get("pm_ra_in_seconds", False)
+        ra, dec, pm_ra, pm_dec = fk5_to_icrs(ra, dec, pm_ra, pm_dec, in_seconds)
+    return StarCatalogue(
+        star_id=np.array([f"{layout['prefix']} {n:.0f}" for n in number], dtype=np.str_),
+        ra_deg=ra,
+        dec_deg=dec,
+        mag=np.where(mag > _FAINTEST_BELIEVABLE, np.nan, mag),
+        pm_ra_mas_yr=np.where(known, pm_ra, 0.0),
+        pm_dec_mas_yr=np.where(known, pm_dec, 0.0),
+        has_proper_motion=known,
+        epoch=layout["epoch"],
+        band=band or layout["band"],
+        apparent=False,
+        source=f"{layout['title']}, {path}"
+        + (f" ({left_out} entries without a position left out)" if left_out else ""),
+    )
 
 
 def _read_table(
     path: Path,
-    kind: Format,
+    data: bytes,
+    kind: str,
     columns: dict[str, str],
     file_epoch: float | None,
     epoch: float | None,
     band: str | None,
 ) -> StarCatalogue:
-    table = _load_table(path, kind)
-    source = _Source(path, kind, table, _find_columns(path, list(table.colnames), columns))
-    n = len(table)
-    if n == 0:
+    content = b"".join(unpack(data))
+    table = _fits_table(content) if kind == "fits" else read_cells(path, content, f".{kind}")
+    if table.uneven:
+        raise ValueError(next(iter(table.uneven.values())))
+    source = _Source(path, table, _find_columns(path, table.names, columns))
+    if not len(table.numbers):
         raise CatalogueError(f"{path}: holds no stars.")
     ra, dec = source.numbers("ra_deg"), source.numbers("dec_deg")
-    _check_positions(source, ra, dec)
-    pm_ra, pm_dec = (_motion(source, name) for name in ("pm_ra_mas_yr", "pm_dec_mas_yr"))
-    known = np.isfinite(pm_ra) & np.isfinite(pm_dec)
-    pm_ra, pm_dec = np.where(known, pm_ra, 0.0), np.where(known, pm_dec, 0.0)
+    source.within("ra_deg", ra, 0.0, 360.0, " deg")
+    source.within("dec_deg", dec, -90.0, 90.0, " deg")
+    pm_ra, pm_dec, known = source.motions()
+    for name, motion in (("pm_ra_mas_yr", pm_ra), ("pm_dec_mas_yr", pm_dec)):
+        bad = np.flatnonzero(np.abs(motion) > MAX_PROPER_MOTION_MAS_YR)
+        if len(bad):
+            what = f"a proper motion of {motion[bad[0]]:g} mas/yr is faster than any star's"
+            remedy = "convert it to mas/yr, or state its unit in the table"
+            raise source.fail(name, int(bad[0]), what, remedy)
     epochs = _epochs(source, file_epoch)
     common = check_epoch(float(epochs.max()) if epoch is None else epoch)
     ra, dec, pm_ra, pm_dec = propagate_proper_motion(ra, dec, pm_ra, pm_dec, common - epochs)
@@ -260,7 +283,7 @@ def _read_table(
         star_id=_star_ids(source),
         ra_deg=ra,
         dec_deg=dec,
-        mag=source.numbers("mag") if "mag" in source.names else np.full(n, np.nan),
+        mag=source.numbers("mag"),
         pm_ra_mas_yr=pm_ra,
         pm_dec_mas_yr=pm_dec,
         has_proper_motion=known,
@@ -271,32 +294,26 @@ def _read_table(
     )
 
 
-def _checked_cds(
-    path: Path, kind: CdsFormat, readme: Path | None, band: str | None
-) -> StarCatalogue:
-    stars = read_cds(path, kind, readme)
-    return stars if band is None else StarCatalogue(**{**vars(stars), "band": band})
-
-
-def _load_table(path: Path, kind: Format) -> Any:
+def _fits_table(content: bytes) -> RawTable:
     with extra("images", "catalogue files"):
         from astropy.table import Table
         from astropy.utils.exceptions import AstropyWarning
 
-    options: AnyDict = {
-        "csv": {"format": "ascii.csv", "comment": "#"},
-        "ecsv": {"format": "ascii.ecsv"},
-        "fits": {"format": "fits"},
-    }[kind]
-    content = b"".join(unpack(path.read_bytes()))
-    if kind == "fits":
-        check_fits(content)
+    check_fits(content)
     with warnings.catch_warnings():
         # What is odd matters only in a column that is used, whose conversion complains about it;
         # but a cut-off file is no catalogue.
         warnings.simplefilter("ignore", AstropyWarning)
         warnings.filterwarnings("error", "File may have been truncated", AstropyWarning)
-        return Table.read(path, **options)
+        table = Table.read(io.BytesIO(content), format="fits")
+    columns: dict[str, Any] = {}
+    for name in table.colnames:
+        cells = np.ma.asarray(table[name])
+        plain = cells.dtype.kind in "iuf" and not np.any(cells.mask)
+        columns[name] = cells.data if plain else np.ma.filled(cells.astype(str), "").tolist()
+    units = {name: str(table[name].unit or "") for name in table.colnames}
+    rows = np.arange(1, len(table) + 1)
+    return RawTable(columns, list(table.colnames), rows, "row", dict(table.meta), units)
 
 
 def _find_columns(path: Path, present: list[str], given: dict[str, str]) -> dict[str, str]:
@@ -312,7 +329,7 @@ def _find_columns(path: Path, present: list[str], given: dict[str, str]) -> dict
     lower = {column.lower(): column for column in reversed(present)}
     columns = dict(given)
     for name, guesses in _GUESSES.items():
-        hit = next((lower[guess] for guess in guesses if guess in lower), None)
+        hit = next((lower[guess] for guess in guesses.split() if guess in lower), None)
         if name not in columns and hit is not None:
             columns[name] = hit
     for name in ("ra_deg", "dec_deg"):
@@ -329,53 +346,9 @@ def _find_columns(path: Path, present: list[str], given: dict[str, str]) -> dict
     return columns
 
 
-def _as_floats(source: _Source, name: str, column: Any) -> Any:
-    if getattr(column, "dtype", np.dtype(object)).kind in "iuf":
-        return column
-    text = np.ma.filled(np.ma.asarray(column).astype(str), "")
-    values = np.full(len(text), np.nan)
-    for row, cell in enumerate(text):
-        stripped = str(cell).strip()
-        try:
-            values[row] = float(stripped) if stripped else np.nan
-        except ValueError as error:
-            raise source.fail(
-                name, row, f"{stripped!r} is not a number", "write decimal numbers"
-            ) from error
-    return values
-
-
-def _check_positions(source: _Source, ra: FloatArray, dec: FloatArray) -> None:
-    for name, values, low, high in (("ra_deg", ra, 0.0, 360.0), ("dec_deg", dec, -90.0, 90.0)):
-        bad = np.flatnonzero(~((values >= low) & (values <= high)))
-        if len(bad):
-            value = values[bad[0]]
-            what = (
-                "has no value"
-                if np.isnan(value)
-                else f"{value:g} deg is outside [{low:g}, {high:g}]"
-            )
-            more = f" ({len(bad) - 1} more such rows)" if len(bad) > 1 else ""
-            raise source.fail(name, int(bad[0]), what + more, "correct or remove the row")
-
-
-def _motion(source: _Source, name: str) -> FloatArray:
-    """One component of the proper motion, NaN where it is not known."""
-    if name not in source.names:
-        return np.full(len(source.table), np.nan)
-    values = source.numbers(name)
-    bad = np.flatnonzero(np.abs(values) > MAX_PROPER_MOTION_MAS_YR)
-    if len(bad):
-        what = f"a proper motion of {values[bad[0]]:g} mas/yr is faster than any star's"
-        raise source.fail(
-            name, int(bad[0]), what, "convert it to mas/yr, or state its unit in the table"
-        )
-    return values
-
-
 def _epochs(source: _Source, file_epoch: float | None) -> FloatArray:
     """Julian year of every position."""
-    n = len(source.table)
+    n = len(source.table.numbers)
     if file_epoch is not None:
         return np.full(n, check_epoch(file_epoch))
     if "epoch" in source.names:
@@ -386,10 +359,9 @@ def _epochs(source: _Source, file_epoch: float | None) -> FloatArray:
             raise source.fail("epoch", int(bad[0]), what, "write years, or give file_epoch")
         return epochs
     for key, value in source.table.meta.items():
-        if key.lower() == "epoch":
-            text = str(value).strip().lstrip("Jj")
-            if re.fullmatch(r"\d{4}(\.\d*)?", text):
-                return np.full(n, check_epoch(float(text)))
+        text = str(value).strip().lstrip("Jj")
+        if key.lower() == "epoch" and re.fullmatch(r"\d{4}(\.\d*)?", text):
+            return np.full(n, check_epoch(float(text)))
     raise CatalogueError(
         f"{source.path}: does not say the epoch of its positions; give it as a Julian year, such "
         "as file_epoch=2016.0."
@@ -397,51 +369,28 @@ def _epochs(source: _Source, file_epoch: float | None) -> FloatArray:
 
 
 def _star_ids(source: _Source) -> StrArray:
-    if "star_id" not in source.names:
-        return np.array([f"row {row + 1}" for row in range(len(source.table))], dtype=np.str_)
-    column = source.names["star_id"]
-    values = source.table[column]
-    prefix = (
-        f"{column.upper()} "
-        if column.lower() in ("hip", "hr", "sao", "hd") and values.dtype.kind in "iu"
-        else ""
-    )
-    text: StrArray = np.ma.filled(np.ma.asarray(values).astype(str), "")
-    return np.array([prefix + str(value).strip() if value else "" for value in text], dtype=np.str_)
+    column = source.names.get("star_id")
+    if column is None:
+        return np.array([f"row {n + 1}" for n in range(len(source.table.numbers))], dtype=np.str_)
+    texts = [str(cell).strip() for cell in source.table.columns[column]]
+    numbered = column.lower() in ("hip", "hr", "sao", "hd") and "".join(texts).isdigit()
+    prefix = f"{column.upper()} " if numbered else ""
+    return np.array([prefix + text if text else "" for text in texts], dtype=np.str_)
 
 
 def _band_of(column: str | None) -> str:
     if column is None:
         return "no band (the file has no magnitudes)"
-    return _BANDS.get(column.lower(), f"the file's own band (column {column!r})")
+    known = (band for band, names in _BANDS.items() if column.lower() in names.split())
+    return next(known, f"the file's own band (column {column!r})")
 
 
-def _format_of(path: Path) -> Format:
+def _format_of(path: Path) -> str:
     name = path.name.lower().removesuffix(".gz")
-    kind = _CDS_NAMES.get(name) or _ENDINGS.get(Path(name).suffix)
+    kind = _NAMES.get(name) or _ENDINGS.get(Path(name).suffix)
     if kind is None:
         raise CatalogueError(
             f"{path}: the name does not tell the format; give format='csv', 'ecsv', 'fits', "
-            "'hipparcos' (I/239), "
-            "'sao' (I/131A) or 'bsc' (V/50)."
+            "'hipparcos' (I/239), 'sao' (I/131A) or 'bsc' (V/50)."
         )
     return kind
-
-
-def _text_line(path: Path, row: int) -> int:
-    """Line, from 1, of a data row of a CSV or ECSV file: comments and empty lines count, the header
-    is one line.
-    """
-    with extra("images", "catalogue files"):
-        from astropy.utils.data import get_readable_fileobj
-
-    with get_readable_fileobj(path) as file:
-        lines: IntArray = np.array(
-            [
-                number
-                for number, line in enumerate(file, 1)
-                if line.strip() and not line.startswith("#")
-            ],
-            dtype=np.int64,
-        )
-    return int(lines[min(row + 1, len(lines) - 1)])

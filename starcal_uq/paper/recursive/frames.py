@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import csv
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,20 +15,24 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.files import reading
+from starcal_uq.core.tables import (
+    REMEDY,
+    WHAT,
+    RawTable,
+    arrow_columns,
+    delimiter_of,
+    opened,
+    own_meta,
+    text_rows,
+    uneven,
+)
 from starcal_uq.core.types import AnyDict, IntArray, PathLike
 from starcal_uq.observations.checks import check_columns, check_mapping, raise_problems
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import (
-    REMEDY,
-    WHAT,
-    RawTable,
-    arrow_values,
     check_names,
     columns_for,
     convert_columns,
-    delimiter_of,
-    open_parquet,
-    own_meta,
     table_meta,
 )
 from starcal_uq.observations.partitions import STREAMED
@@ -240,7 +243,7 @@ def _given_out(
 def _parquet_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawTable]:
     import pyarrow as pa
 
-    with open_parquet(path) as file:
+    with opened(path) as file:
         names = list(file.schema_arrow.names)
         meta = own_meta(file.schema_arrow)
         columns = [name for name in names if name in wanted]
@@ -249,10 +252,8 @@ def _parquet_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[
             numbers = np.arange(first, first + batch.num_rows)
             first += batch.num_rows
             if batch.num_rows:
-                arrays = {
-                    name: arrow_values(pa.chunked_array([batch.column(name)])) for name in columns
-                }
-                yield RawTable(arrays, names, numbers, "row", meta)
+                cells = arrow_columns(pa.Table.from_batches([batch]))
+                yield RawTable(cells, names, numbers, "row", meta)
 
 
 def _csv_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawTable]:
@@ -260,22 +261,16 @@ def _csv_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawT
         with path.open(encoding="utf-8-sig", newline="") as text:
             delimiter = delimiter_of(text)
             text.seek(0)
-            # As in whole files: a comment becomes a blank line, so that lines keep their numbers.
-            lines = ("\n" if line.startswith("#") else line for line in text)
-            reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
-            rows = ((reader.line_num, row) for row in reader if any(map(str.strip, row)))
+            rows = text_rows(path, text, delimiter)
             header = next(rows, None)
             if header is None:
                 raise ObservationError(f"{path}: the file is empty; give a table of observations.")
             names = [name.strip() for name in header[1]]
             while batch := list(islice(rows, batch_rows)):
                 for number, row in batch:
-                    if len(row) != len(names):
+                    if why := uneven(row, names):
                         raise ObservationError(
-                            f"{path}, line {number}: {len(row)} values under a header of "
-                            f"{len(names)} columns; "
-                            "correct or remove the row.",
-                            row=number,
+                            f"{path}, line {number}: {why}; correct or remove the row.", row=number
                         )
                 columns = {
                     name: [row[i] for _, row in batch]
@@ -287,12 +282,4 @@ def _csv_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawT
     except UnicodeDecodeError:
         raise ObservationError(
             f"{path}: the text is not UTF-8; save the file in the encoding UTF-8."
-        ) from None
-    except csv.Error as error:
-        raise ObservationError(
-            (
-                f"{path}, line {reader.line_num}: the row cannot be read ({error}); check its "
-                "quotation marks."
-            ),
-            row=reader.line_num,
         ) from None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.files import read_parquet, reading, write_csv
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.observations.files import arrow_values
+from starcal_uq.core.tables import arrow_columns
 from starcal_uq.observations.table import Observations
 from starcal_uq.runs.folder import DIAGNOSIS_TABLES
 from starcal_uq.runs.stored import StoredRun, save_results, writing
@@ -76,7 +76,4 @@ def _frames_of(path: Path) -> Observations:
     """
     again = Remedy("propagate", (RUN,), {"force": True}, "to write it again")
     with reading(path, "a table of frames", again):
-        table = read_parquet(path)
-        return Observations(
-            **{name: arrow_values(table.column(name)) for name in table.column_names}
-        )
+        return Observations(**arrow_columns(read_parquet(path)))
