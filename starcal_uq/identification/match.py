@@ -117,7 +117,8 @@ def match_frame(
     if len(ranks) < 4:
         return None
     r = sky.directions[ranks]
-    prior = _prior(tolerance, radial)
+    # None about the attitude.
+    prior = np.concatenate([np.zeros(3), tolerance.information(radial)])
     bias = g.relative_bias(tolerance)
     # Each centroid has its own gate: a faint star may be farther off than a bright one.
     final = SIGMAS * np.maximum(sigma_px, _LEAST_GATE_SIGMA_PX)
@@ -255,23 +256,6 @@ def log10_false_matches(
 def log10_choices(n: int, m: int) -> float:
     """Log10 of the ways to choose m of n."""
     return (lgamma(n + 1) - lgamma(m + 1) - lgamma(n - m + 1)) / log(10.0)
-
-
-def _prior(tolerance: CameraTolerance, radial: bool) -> FloatArray:
-    """Information (7,) of the tolerances, read as two standard deviations; none about the
-    attitude.
-    """
-    sd = np.array(
-        [
-            tolerance.focal / 2.0,
-            tolerance.centre_px / 2.0,
-            tolerance.centre_px / 2.0,
-            tolerance.distortion_px / 2.0,
-        ]
-    )
-    if not radial:
-        sd[3] = 1e-6
-    return np.concatenate([np.zeros(3), np.maximum(sd, 1e-9) ** -2.0])
 
 
 def _predict(state: CameraState, r: FloatArray, g: FieldGeometry) -> tuple[FloatArray, FloatArray]:

@@ -50,6 +50,22 @@ class CameraTolerance:
     centre_px: float
     distortion_px: float
 
+    def information(self, radial: bool) -> FloatArray:
+        """Information (4,) on ln F, d and kappa, the tolerances being two standard deviations;
+        kappa is known to be zero where it is not `radial`.
+        """
+        last = self.distortion_px if radial else 2e-6
+        sd = 0.5 * np.array([self.focal, self.centre_px, self.centre_px, last])
+        return floats(np.maximum(sd, 1e-9) ** -2.0)
+
+    def at_most(self, focal: float, centre_px: float, distortion_px: float) -> CameraTolerance:
+        """These tolerances where they are smaller."""
+        return CameraTolerance(
+            min(focal, self.focal),
+            min(centre_px, self.centre_px),
+            min(distortion_px, self.distortion_px),
+        )
+
 
 @dataclass(frozen=True)
 class FieldGeometry:

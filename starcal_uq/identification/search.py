@@ -165,12 +165,10 @@ class Search:
         """The same for a camera known from the frames so far."""
         other = copy(self)
         sd = 4.0 * np.sqrt(np.diag(covariance))
-        t = self.tolerance
+        focal, dx, dy, kappa = sd.tolist()
         # Not below what a lens model with few terms leaves over.
-        other.tolerance = CameraTolerance(
-            min(max(float(sd[0]), 2e-4), t.focal),
-            min(max(float(sd[1]), float(sd[2]), 1.0), t.centre_px),
-            min(max(float(sd[3]), 0.3), t.distortion_px),
+        other.tolerance = self.tolerance.at_most(
+            max(focal, 2e-4), max(dx, dy, 1.0), max(kappa, 0.3)
         )
         other.geometry = replace(
             self.geometry, focal_px=camera.focal_px, corner_px=camera.corner_radius_px
@@ -273,10 +271,8 @@ class Search:
         """Shared parameters (4,) from all frames with the tolerances as prior, and their covariance
         (4, 4).
         """
-        t = self.tolerance
-        last = t.distortion_px / 2.0 if self.radial else 1e-6
-        sd = np.array([t.focal / 2.0, t.centre_px / 2.0, t.centre_px / 2.0, last])
-        information = np.diag(sd**-2.0) + np.sum([m.information for m in matches], axis=0)
+        prior = np.diag(self.tolerance.information(self.radial))
+        information = prior + np.sum([m.information for m in matches], axis=0)
         covariance = scaled_inverse(information)
         return covariance @ np.sum([m.gradient for m in matches], axis=0), covariance
 

@@ -75,11 +75,8 @@ def calibrated_tolerance(
     orders = [c.order for c in get_model(camera.distortion).coefficients]
     corner = camera.corner_radius_px ** np.array(orders, dtype=np.float64)
     bend = 4.0 * float(np.sqrt(corner @ covariance[3:, 3:] @ corner)) if orders else 0.0
-    return CameraTolerance(
-        focal=min(max(float(sd[2]) / camera.focal_px, 1e-5), largest.focal),
-        centre_px=min(max(float(sd[0]), float(sd[1]), 0.05), largest.centre_px),
-        distortion_px=min(max(bend, 0.05), largest.distortion_px),
-    )
+    x0, y0, focal = sd[:3].tolist()
+    return largest.at_most(max(focal / camera.focal_px, 1e-5), max(x0, y0, 0.05), max(bend, 0.05))
 
 
 def much_narrower(one: CameraTolerance, other: CameraTolerance) -> bool:

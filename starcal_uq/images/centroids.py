@@ -36,7 +36,7 @@ from starcal_uq.core.types import (
     StrArray,
 )
 from starcal_uq.observations.origin import CentroidsOrigin
-from starcal_uq.observations.rows import FrameRows, locked
+from starcal_uq.observations.rows import FrameRows, check_lengths, locked, typed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -136,16 +136,10 @@ class Centroids(FrameRows, Shown):
     def __post_init__(self) -> None:
         for names, key in ((COLUMNS, "frame"), (FRAME_COLUMNS, "frame_ids")):
             arrays = {
-                name: _array(name, getattr(self, name), kind) for name, (kind, _) in names.items()
+                name: typed("centroids", name, getattr(self, name), kind)
+                for name, (kind, _) in names.items()
             }
-            for name, values in arrays.items():
-                if len(values) != len(arrays[key]):
-                    raise ObservationError(
-                        f"centroids: {name} has {len(values)} entries and {key} has "
-                        f"{len(arrays[key])}; give equal "
-                        "lengths.",
-                        column=name,
-                    )
+            check_lengths("centroids", arrays, key)
             order = np.argsort(arrays[key], kind="stable")
             for name, values in arrays.items():
                 object.__setattr__(self, name, locked(values[order]))
@@ -301,20 +295,6 @@ class Centroids(FrameRows, Shown):
         return (
             f"Centroids({self.n_stars} stars, {self.n_frames} frames, {self.n_left_out} left out)"
         )
-
-
-def _array(name: str, values: Any, kind: type) -> Any:
-    try:
-        array: Any = np.array(values, dtype=kind)
-    except (TypeError, ValueError) as error:
-        raise ObservationError(
-            f"centroids: column {name} cannot be converted ({error}).", column=name
-        ) from None
-    if array.ndim != 1:
-        raise ObservationError(
-            f"centroids: column {name} has shape {array.shape}; give one value each.", column=name
-        )
-    return array
 
 
 _KEY = "starcal_uq_centroids"

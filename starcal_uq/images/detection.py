@@ -99,6 +99,9 @@ class FrameStars:
     measured_gain_e_per_count: float | None = None
     windowed: bool = False
 
+    def __len__(self) -> int:
+        return len(self.columns["x_px"])
+
 
 def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
     """Find and measure the stars of one image; `ImageError` if nothing can be measured."""

@@ -246,7 +246,7 @@ class _Table:
                 continue
             self.messages += frame.messages
             self.stars.append(frame.stars)
-            self.numbers += [number] * len(frame.stars.columns["x_px"])
+            self.numbers += [number] * len(frame.stars)
             self.gains.append(frame.stars.gain_e_per_count)
 
     def centroids(self, options: DetectionOptions, correct_pixel_phase: bool) -> Centroids:
@@ -257,20 +257,19 @@ class _Table:
                 columns[name] = np.concatenate(parts) if parts else np.zeros(0, dtype=kind)
         amplitudes = self._correct_pixel_phase(columns) if correct_pixel_phase else (0.0, 0.0)
         known = [gain for gain in self.gains if gain is not None]
-        if known and len(known) < len(self.gains):
+        all_known = bool(known) and len(known) == len(self.gains)
+        if known and not all_known:
             # One unit for the whole table: counts are what every frame has.
             self.messages.append(
                 "The gain is known for some frames only; give one for all to get comparable fluxes."
             )
-        measured = [
-            s.measured_gain_e_per_count
-            for s in self.stars
-            if s.measured_gain_e_per_count is not None
-        ]
+        gains = (stars.measured_gain_e_per_count for stars in self.stars)
+        measured = [gain for gain in gains if gain is not None]
+        from_noise = float(np.median(measured)) if measured else None
+        sizes = list(map(len, self.stars))
         if measured:
             self.messages.append(
-                "The gain is not given; the noise of the background says "
-                f"{float(np.median(measured)):.3g} electrons "
+                f"The gain is not given; the noise of the background says {from_noise:.3g} electrons "
                 f"per count in {plural(len(measured), 'frame')}, which was taken for the photon "
                 "noise of the stars."
             )
@@ -285,11 +284,9 @@ class _Table:
         optics = common_optics(list(said.values()))
         meta = {
             "settings": asdict(options),
-            "gain_e_per_count": known[0]
-            if len(set(known)) == 1 and len(known) == len(self.gains)
-            else None,
-            "gain_from_noise_e_per_count": float(np.median(measured)) if measured else None,
-            "flux_unit": "electrons" if known and len(known) == len(self.gains) else "counts",
+            "gain_e_per_count": known[0] if all_known and len(set(known)) == 1 else None,
+            "gain_from_noise_e_per_count": from_noise,
+            "flux_unit": "electrons" if all_known else "counts",
             "pixel_phase_px": list(amplitudes),
             "images_sha256": self.digest.hexdigest(),
             # Whether all come from `render_frames`, whose stars shine through no air.
@@ -298,11 +295,8 @@ class _Table:
             "other_sizes": other_sizes(said, optics),
             "place": common_place([entry.get("place", {}) for entry in self.frames]),
         }
-        if known and len(known) < len(self.gains):
-            per_star = np.repeat(
-                [g or 1.0 for g in self.gains], [len(s.columns["x_px"]) for s in self.stars]
-            )
-            columns["flux"] = columns["flux"] / per_star
+        if known and not all_known:
+            columns["flux"] = columns["flux"] / np.repeat([g or 1.0 for g in self.gains], sizes)
         frames: AnyDict = {name: [entry[name] for entry in self.frames] for name in FRAME_COLUMNS}
         return Centroids(**columns, **frames, messages=tuple(self.messages), meta=meta)
 
@@ -311,9 +305,7 @@ class _Table:
         pixels.
         """
         sharp = [stars.windowed and stars.psf_sigma_px < _UNDERSAMPLED_PX for stars in self.stars]
-        rows = np.repeat(
-            np.array(sharp, dtype=np.bool_), [len(stars.columns["x_px"]) for stars in self.stars]
-        )
+        rows = np.repeat(np.array(sharp, dtype=np.bool_), list(map(len, self.stars)))
         clear = (
             rows
             & (columns["snr"] > _PHASE_SNR)
@@ -354,11 +346,8 @@ def _sources(images: Source | Iterable[Source]) -> tuple[list[Source], list[str]
             sources.append(source)
             continue
         inside = sorted(Path(source).iterdir())
-        files = [
-            path
-            for path in inside
-            if path.name.lower().endswith(IMAGE_ENDINGS) and not path.is_dir()
-        ]
+        folders = [path for path in inside if path.is_dir()]
+        files = [p for p in inside if p.name.lower().endswith(IMAGE_ENDINGS) and p not in folders]
         if not files:
             raise ImageError(
                 f"{source}: the folder holds no image ({', '.join(IMAGE_ENDINGS)}); name the "
@@ -366,15 +355,12 @@ def _sources(images: Source | Iterable[Source]) -> tuple[list[Source], list[str]
                 "subfolders are not searched."
             )
         sources += files
-        others = [path for path in inside if path not in files and not path.name.startswith(".")]
-        for reason, names in (
-            ("subfolders are not searched", [path.name for path in others if path.is_dir()]),
-            (
-                "the ending is of no image that is read",
-                [path.name for path in others if not path.is_dir()],
-            ),
+        others = [path for path in inside if path not in files and path not in folders]
+        for reason, paths in (
+            ("subfolders are not searched", folders),
+            ("the ending is of no image that is read", others),
         ):
-            if names:
+            if names := [path.name for path in paths if not path.name.startswith(".")]:
                 more = [f"and {len(names) - _MOST_NAMES} more"] if len(names) > _MOST_NAMES else []
                 listed = ", ".join([*names[:_MOST_NAMES], *more])
                 messages.append(f"{source}: not read, because {reason}: {listed}.")

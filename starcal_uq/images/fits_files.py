@@ -7,6 +7,7 @@ import math
 import re
 import warnings
 import zlib
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -67,26 +68,16 @@ def read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> li
             with fits.open(io.BytesIO(data), memmap=False) as hdus:
                 chosen, images, words = _science_images(hdus, camera)
                 for place in chosen if every else chosen[:1]:
-                    hdu = hdus[place]
-                    check_declared(
-                        path,
-                        math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8,
-                        max(stored, len(data)),
-                    )
-                    pixels, header = np.array(hdu.data), _plain(hdu.header)
-                    unit = next(
-                        (
-                            str(h.comments["GAIN"])
-                            for h in (hdu.header, hdus[0].header)
-                            if "GAIN" in h
-                        ),
-                        "",
-                    )
+                    hdu, first = hdus[place], hdus[0].header
+                    declared = math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8
+                    check_declared(path, declared, max(stored, len(data)))
+                    header = _plain(hdu.header)
+                    units = (str(h.comments["GAIN"]) for h in (hdu.header, first) if "GAIN" in h)
                     if place and header.get("INHERIT", True):
                         # Exposures of several images say in the first header what is common to
                         # them.
-                        header = _plain(hdus[0].header) | header
-                    taken.append((place, pixels, header, unit))
+                        header = _plain(first) | header
+                    taken.append((place, np.array(hdu.data), header, next(units, "")))
         except ImageError:
             raise
         except Exception as error:  # astropy raises whatever the broken bytes lead to
@@ -98,11 +89,9 @@ def read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> li
     shape = taken[0][1].shape
     size = f"{shape[-1]} x {shape[-2]} px"
     if len(images) > len(taken):
-        what = (
-            f"the one of {size} in HDU {chosen[0]} was"
-            if len(taken) == 1
-            else f"{len(taken)} of {size} were"
-        )
+        what = f"{len(taken)} of {size} were"
+        if len(taken) == 1:
+            what = f"the one of {size} in HDU {chosen[0]} was"
         words = [f"of {len(images)} images in the file, {what} taken.", *words]
     found: list[Image] = []
     for place, pixels, header, unit in taken:
@@ -166,30 +155,22 @@ def _science_images(
     best = max(shapes, key=lambda place: (shapes[place] == size, np.prod(shapes[place])))
     alike = [place for place in shapes if shapes[place] == shapes[best]]
     names = {place: str(hdus[place].header.get("EXTNAME", "")).strip().upper() for place in alike}
-    beside = [place for place in alike if place != best and _BESIDES.match(names[place])]
+    beside = {k: name for k, name in names.items() if k != best and _BESIDES.match(name)}
     if beside:
-        words.append(
-            f"{', '.join(names[place] for place in beside)} were not read, being no frames by "
-            "their names."
-        )
+        words.append(f"{', '.join(beside.values())} were not read, being no frames by their names.")
     return [place for place in alike if place not in beside], shapes, words
 
 
 def _plain(header: Any) -> AnyDict:
     plain: AnyDict = {}
     for card in header.cards:
-        try:
-            key, value = card.keyword, card.value
         # astropy raises errors of its own for a value that is none; the others are as good as
         # before
-        except Exception:
-            continue
-        if (
-            key
-            and key not in ("COMMENT", "HISTORY")
-            and isinstance(value, str | bool | int | float)
-        ):
-            plain.setdefault(key, value)
+        with suppress(Exception):
+            if isinstance(card.value, str | bool | int | float):
+                plain.setdefault(card.keyword, card.value)
+    for key in ("", "COMMENT", "HISTORY"):
+        plain.pop(key, None)
     return plain
 
 
@@ -204,15 +185,12 @@ def _planes(pixels: Any, header: AnyMapping) -> tuple[Any, list[str]]:
             COLOURS_WORDS
         ]
     cycle, by = _cycle_s(header, n)
+    how = f", each taken to begin where the one before ends ({by})"
     if cycle is None:
-        return frames, [
-            f"{n} planes were read as frames; the header does not say how they follow in time."
-        ]
-    if by == "EXPTIME":
-        return frames, [
-            f"{n} planes were read as frames, each taken to begin where the one before ends ({by})."
-        ]
-    return frames, [f"{n} planes were read as frames, {cycle:g} s apart ({by})."]
+        how = "; the header does not say how they follow in time"
+    elif by != "EXPTIME":
+        how = f", {cycle:g} s apart ({by})"
+    return frames, [f"{n} planes were read as frames{how}."]
 
 
 def _cycle_s(header: AnyMapping, n: int) -> tuple[float | None, str]:

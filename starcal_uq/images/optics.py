@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.types import AnyDict, AnyMapping
+from starcal_uq.core.types import AnyDict, AnyMapping, floats
 
 # Exif's names, as the header of a picture has them.
 EXIF = {
@@ -44,13 +44,10 @@ def optics_of(header: AnyMapping, width_px: int, height_px: int) -> AnyDict:
     found: AnyDict = {"width_px": int(width_px), "height_px": int(height_px)}
     pixel = _within(_PIXEL_UM, header, "XPIXSZ", "PIXSIZE1", "PIXSIZE")
     focal = _within(_FOCAL_MM, header, "FOCALLEN", "FocalLength")
-    per_unit, unit = (
-        _number(header, "FocalPlaneXResolution"),
-        _number(header, "FocalPlaneResolutionUnit"),
-    )
+    per_unit = _number(header, "FocalPlaneXResolution")
     if pixel is None and per_unit and per_unit > 0.0:
-        pixel = _UNIT_UM.get(unit or 2.0, 0.0) / per_unit
-        pixel = pixel if _PIXEL_UM[0] <= pixel <= _PIXEL_UM[1] else None
+        unit = _number(header, "FocalPlaneResolutionUnit")
+        pixel = _within(_PIXEL_UM, {"": _UNIT_UM.get(unit or 2.0, 0.0) / per_unit}, "")
     scale = _within((1e-3, 3600.0), header, "PIXSCALE", "SECPIX")
     focal_px = ARCSEC / scale if scale else None
     if focal_px is None and "TAN" in str(header.get("CTYPE1", "")):
@@ -60,10 +57,8 @@ def optics_of(header: AnyMapping, width_px: int, height_px: int) -> AnyDict:
     film = _number(header, "FocalLengthIn35mmFilm")
     if focal_px is None and not (pixel and focal) and film and film > 0.0:
         focal_px = film / _DIAGONAL_35_MM * float(np.hypot(width_px, height_px))
-    for name, value in (("pixel_um", pixel), ("focal_mm", focal), ("focal_px", focal_px)):
-        if value is not None:
-            found[name] = float(value)
-    return found
+    lengths = {"pixel_um": pixel, "focal_mm": focal, "focal_px": focal_px}
+    return found | {name: float(value) for name, value in lengths.items() if value is not None}
 
 
 def place_of(header: AnyMapping) -> AnyDict:
@@ -73,28 +68,20 @@ def place_of(header: AnyMapping) -> AnyDict:
     Of FITS: OBSGEO-B, -L, -H or OBSGEO-X, -Y, -Z (m), SITELAT and SITELONG, LAT-OBS and LONG-OBS
     with ALT-OBS; degrees as a number or as "52 13 04.5".
     """
-    xyz = [_number(header, f"OBSGEO-{axis}") for axis in "XYZ"]
     for north, east, up in _PLACES:
         latitude, longitude = _angle(header, north), _angle(header, east)
-        if (
-            latitude is not None
-            and longitude is not None
-            and abs(latitude) <= 90.0
-            and abs(longitude) <= 360.0
-        ):
+        if latitude is None or longitude is None:
+            continue
+        if abs(latitude) <= 90.0 and abs(longitude) <= 360.0:
             return _place(latitude, longitude, _number(header, up) or 0.0, f"{north}, {east}")
-    if (
-        all(value is not None for value in xyz)
-        and 6.3e6 < float(np.linalg.norm(np.array(xyz, dtype=float))) < 6.4e6
-    ):
+    # NaN where one is missing.
+    xyz = floats([_number(header, f"OBSGEO-{axis}") for axis in "XYZ"])
+    if 6.3e6 < np.linalg.norm(xyz) < 6.4e6:
         import erfa
 
-        longitude, latitude, height = (
-            float(value) for value in erfa.gc2gd(1, np.array(xyz, dtype=float))
-        )
-        return _place(
-            float(np.degrees(latitude)), float(np.degrees(longitude)), height, "OBSGEO-X, -Y, -Z"
-        )
+        *angles, height = erfa.gc2gd(1, xyz)
+        longitude, latitude = np.degrees(angles).tolist()
+        return _place(latitude, longitude, float(height), "OBSGEO-X, -Y, -Z")
     return {}
 
 
@@ -142,12 +129,8 @@ def common_optics(optics: Sequence[AnyDict]) -> AnyDict:
         return {}
     sizes = [(said["width_px"], said["height_px"]) for said in optics]
     most = Counter(sizes).most_common(1)[0][0]
-    alike = (
-        tuple(sorted(said.items()))
-        for said, size in zip(optics, sizes, strict=True)
-        if size == most
-    )
-    return dict(Counter(alike).most_common(1)[0][0])
+    alike = (said for said, size in zip(optics, sizes, strict=True) if size == most)
+    return dict(Counter(tuple(sorted(said.items())) for said in alike).most_common(1)[0][0])
 
 
 def exif_of(picture: Any) -> AnyDict:

@@ -140,9 +140,8 @@ def _with_named_time(image: Image) -> Image:
     time = time_in_name(image.name)
     if image.time_utc is not None or time is None:
         return image
-    return replace(
-        image, time_utc=time, messages=(*image.messages, time_in_name_message(image.name))
-    )
+    messages = (*image.messages, time_in_name_message(image.name))
+    return replace(image, time_utc=time, messages=messages)
 
 
 def _few(names: list[str]) -> list[str]:
@@ -152,14 +151,11 @@ def _few(names: list[str]) -> list[str]:
 def time_in_name(name: str) -> str | None:
     """The UTC time in a file's name, such as 2019-07-29T204726, as ISO 8601 text."""
     for match in _TIME_IN_NAME.finditer(name):
-        year, month, day, hour, minute, second = (int(group) for group in match.groups()[:6])
-        try:
-            time = datetime(year, month, day, hour, minute, second)
-        except ValueError:
-            continue
-        if not FIRST_YEAR <= year <= LAST_YEAR:
-            continue
-        return f"{time.isoformat()}{'.' + match[7] if match[7] else ''}"
+        *parts, fraction = match.groups()
+        with suppress(ValueError):
+            time = datetime.fromisoformat("{}-{}-{}T{}:{}:{}".format(*parts))
+            if FIRST_YEAR <= time.year <= LAST_YEAR:
+                return f"{time.isoformat()}{'.' + fraction if fraction else ''}"
     return None
 
 
@@ -220,10 +216,7 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
                     "read; save it as FITS "
                     "or as a grey TIFF or PNG."
                 )
-            pages = [
-                grey([np.ascontiguousarray(page[..., k]) for k in range(3)], 65535.0)
-                for page in deep
-            ]
+            pages = [_of_colours(page, 65535.0) for page in deep]
             n_pages = len(pages)
         else:
             declared = 0
@@ -244,10 +237,7 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
     best = max(sizes, key=lambda shape: (shape == size, np.prod(shape)))
     chosen = [k for k, shape in enumerate(sizes) if shape == best][: None if every else 1]
     words = []
-    if (picture is not None and picture.format == "JPEG") or path.suffix.lower() in (
-        ".jpg",
-        ".jpeg",
-    ):
+    if "JPEG" in (picture and picture.format, path.suffix.upper().replace("JPG", "JPEG")[1:]):
         words.append("JPEG compression changes the noise; use FITS, TIFF or PNG where you can.")
     if n_pages > 1 and not every:
         words.append(f"the first of {n_pages} planes was taken.")
@@ -293,5 +283,9 @@ def _page(picture: Any) -> tuple[Any, float | None, list[str]]:
         picture = picture.convert("L")
     pixels = np.array(picture)
     if pixels.ndim == 3:
-        return grey([np.ascontiguousarray(pixels[..., k]) for k in range(3)], 255.0)
+        return _of_colours(pixels, 255.0)
     return pixels, full_scale_of(pixels), []
+
+
+def _of_colours(pixels: Any, full_scale: float) -> tuple[Any, float | None, list[str]]:
+    return grey([np.ascontiguousarray(pixels[..., k]) for k in range(3)], full_scale)

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import unit_vectors
+from starcal_uq.attitude.rotations import ra_dec_deg, unit_vectors
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import as_plain, check_fits, check_size
-from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
+from starcal_uq.core.types import AnyDict, AnyMapping, floats
 from starcal_uq.observations.columns import COLUMNS
 
 if TYPE_CHECKING:
@@ -37,11 +37,14 @@ _UNITS = {"pix": "pixel", "deg_C": ""}
 # Ours to those of a .corr file, which has no column for the others.
 _CORR = {"x_px": "field_x", "y_px": "field_y", "ra_deg": "index_ra", "dec_deg": "index_dec"}
 _CORR_NAMES = (
-    *_CORR.values(),
+    "field_x",
+    "field_y",
     "field_ra",
     "field_dec",
     "index_x",
     "index_y",
+    "index_ra",
+    "index_dec",
     "index_id",
     "field_id",
     "match_weight",
@@ -63,29 +66,23 @@ def corr_content(columns: AnyMapping, meta: AnyDict, camera: Camera | None) -> b
     ``index_id`` numbers the stars of this file.
     """
     n = len(columns["frame"])
+    measured, sky = (
+        np.column_stack([columns[name] for name in names])
+        for names in (("x_px", "y_px"), ("ra_deg", "dec_deg"))
+    )
     seen_deg, expected_px = (np.full((n, 2), np.nan) for _ in range(2))
     if camera is not None:
-        b = unproject(camera, np.column_stack([columns["x_px"], columns["y_px"]]))
-        r = unit_vectors(columns["ra_deg"], columns["dec_deg"])
+        b, r = unproject(camera, measured), unit_vectors(*sky.T)
         rotation = quest(b, r, np.array([0, n]), covariance=False).rotations[0]
         expected_px = project(camera, r @ rotation.T)
-        seen = b @ rotation
-        seen_deg[:, 0] = np.degrees(np.arctan2(seen[:, 1], seen[:, 0])) % 360.0
-        seen_deg[:, 1] = np.degrees(np.arcsin(np.clip(seen[:, 2], -1.0, 1.0)))
+        seen_deg = np.column_stack(ra_dec_deg(b @ rotation))
+    pairs = ((measured, "pixel"), (seen_deg, "deg"), (expected_px, "pixel"), (sky, "deg"))
+    table: dict[str, tuple[Any, str]] = {}
+    for values, unit in pairs:
+        for column in (values + (_FITS_PIXEL if unit == "pixel" else 0.0)).T:
+            table[_CORR_NAMES[len(table)]] = column, unit
     number = np.arange(n, dtype=np.int32)
-    table = {
-        "field_x": (columns["x_px"] + _FITS_PIXEL, "pixel"),
-        "field_y": (columns["y_px"] + _FITS_PIXEL, "pixel"),
-        "field_ra": (seen_deg[:, 0], "deg"),
-        "field_dec": (seen_deg[:, 1], "deg"),
-        "index_x": (expected_px[:, 0] + _FITS_PIXEL, "pixel"),
-        "index_y": (expected_px[:, 1] + _FITS_PIXEL, "pixel"),
-        "index_ra": (columns["ra_deg"], "deg"),
-        "index_dec": (columns["dec_deg"], "deg"),
-        "index_id": (number, ""),
-        "field_id": (number, ""),
-        "match_weight": (np.ones(n), ""),
-    }
+    table |= {"index_id": (number, ""), "field_id": (number, ""), "match_weight": (np.ones(n), "")}
     table |= {name: (columns[name], "") for name in _OTHERS if name in columns}
     return _written(table, meta, FRAME=int(columns["frame"][0]) if n else 0)
 
@@ -206,45 +203,24 @@ def matched_columns(
     `starcal_uq.observations.table.Observations.from_matches`. `where` is what errors name.
     """
     given = [solutions] if isinstance(solutions, Mapping | tuple) else list(solutions)
-    parts: dict[str, list[Any]] = {
-        name: [] for name in ("frame", "xy", "sky", "mag", "star_id", "time_utc")
-    }
+    parts: list[AnyDict] = []
     unsolved = []
     for number, solution in enumerate(given):
         found = _matches(f"{where}: solution {number}", solution, size_px)
         if found is None:
             unsolved.append(number)
             continue
-        xy, sky, mag, names = found
-        time = (
-            times[number]
-            if times is not None
-            else solution.get("time_utc")
-            if isinstance(solution, Mapping)
-            else ""
-        )
-        parts["frame"] += [number] * len(xy)
-        parts["xy"].append(xy)
-        parts["sky"].append(sky)
-        parts["mag"].append(mag)
-        parts["star_id"] += names
-        parts["time_utc"] += [str(time or "")] * len(xy)
-    if not parts["frame"]:
+        time = solution.get("time_utc") if isinstance(solution, Mapping) else ""
+        time = str((time if times is None else times[number]) or "")
+        n = len(found["mag"])
+        parts.append({"frame": np.full(n, number), **found, "time_utc": np.full(n, time)})
+    if not any(len(part["frame"]) for part in parts):
         raise ObservationError(
             f"{where}: no solution has matched stars; give solutions that were found."
         )
-    xy, sky = np.concatenate(parts["xy"]), np.concatenate(parts["sky"])
-    columns = {
-        "frame": np.array(parts["frame"], dtype=np.int64),
-        "x_px": xy[:, 0],
-        "y_px": xy[:, 1],
-        "ra_deg": sky[:, 0],
-        "dec_deg": sky[:, 1],
-        "mag": np.concatenate(parts["mag"]),
-        "star_id": parts["star_id"],
-    }
-    if all(parts["time_utc"]):
-        columns["time_utc"] = parts["time_utc"]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if (columns["time_utc"] == "").any():
+        del columns["time_utc"]
     return columns, {"source": "matches", "frames_without_matches": unsolved}
 
 
@@ -256,12 +232,8 @@ _HOW = {
 }
 
 
-def _matches(
-    where: str, solution: Any, size_px: tuple[int, int] | None
-) -> tuple[FloatArray, FloatArray, FloatArray, list[str]] | None:
-    """Pixels (n, 2), directions (n, 2) in degrees, magnitudes and names (n,) of a solution; None
-    for a failed one.
-    """
+def _matches(where: str, solution: Any, size_px: tuple[int, int] | None) -> AnyDict | None:
+    """Columns (n,) of a solution; None for a failed one."""
     if isinstance(solution, tuple):
         solution = _of_tetra3rs(*solution)
     if not solution:
@@ -281,12 +253,11 @@ def _matches(
             [[*map(float, star), np.nan][:3] for star in solution["matched_stars"]]
         ).reshape(-1, 3)
         if by_place:
-            width, height = size_px or (int(solution["image_width"]), int(solution["image_height"]))
+            size = size_px or (int(solution["image_width"]), int(solution["image_height"]))
             places = np.array(solution["matched_centroids"], dtype=np.int64)
-            xy = np.array(solution["centroids"], dtype=np.float64)[places, :2]
-            xy = xy + 0.5 * np.array([width, height]) - _CORNER_PIXEL
+            xy = floats(solution["centroids"])[places, :2] + 0.5 * np.array(size) - _CORNER_PIXEL
         else:
-            rows_first = np.array(solution["matched_centroids"], dtype=np.float64).reshape(-1, 2)
+            rows_first = floats(solution["matched_centroids"]).reshape(-1, 2)
             xy = rows_first[:, ::-1] - _CORNER_PIXEL
     except (KeyError, TypeError, ValueError, IndexError) as error:
         what = (
@@ -298,12 +269,10 @@ def _matches(
     ids = solution.get("matched_catID", solution.get("matched_catalog_ids"))
     if len(xy) != len(stars) or (ids is not None and len(ids) != len(stars)):
         raise ObservationError(f"{where} pairs {len(xy)} centroids with {len(stars)} stars; {how}.")
-    names = (
-        [""] * len(xy)
-        if ids is None
-        else ["-".join(map(str, np.ravel(name).tolist())) for name in ids]
-    )
-    return xy, stars[:, :2], stars[:, 2], names
+    texts = [""] * len(xy) if ids is None else ids
+    names = ["-".join(map(str, np.ravel(name).tolist())) for name in texts]
+    values = zip(("x_px", "y_px", "ra_deg", "dec_deg", "mag"), (*xy.T, *stars.T), strict=True)
+    return {**dict(values), "star_id": np.array(names, dtype=np.str_)}
 
 
 def _of_tetra3rs(result: Any, centroids: Any, database: Any) -> AnyDict | None:

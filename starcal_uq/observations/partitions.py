@@ -187,22 +187,15 @@ class PartitionedObservations(Sourced):
         return self._sampled(SAMPLE_FRAMES)
 
     def _sampled(self, n_frames: int) -> Observations:
-        place = (
-            np.linspace(0, len(self.parts) - 1, min(len(self.parts), _SAMPLE_PARTS))
-            .round()
-            .astype(int)
-        )
-        chosen = [self.parts[i] for i in place]
+        last = len(self.parts) - 1
+        places = np.linspace(0, last, min(last + 1, _SAMPLE_PARTS)).round().astype(int)
+        chosen = [self.parts[place] for place in places]
         numbers = [frame_numbers(part, self.reader) for part in chosen]
         n = sum(map(len, numbers))
         tables = []
         for part, own in zip(chosen, numbers, strict=True):
-            share = max(1, round(n_frames * len(own) / n))
-            kept = (
-                own
-                if share >= len(own)
-                else own[((np.arange(share) + 0.5) * len(own) / share).astype(int)]
-            )
+            share = min(max(1, round(n_frames * len(own) / n)), len(own))
+            kept = own[((np.arange(share) + 0.5) * len(own) / share).astype(int)]
             tables.append(self.reader.load(part, check=True, frames=kept))
         return Observations(**joined_columns(tables), meta=tables[0].meta)
 
@@ -247,11 +240,10 @@ def open_partitions(
     reader = PartitionReader(camera, dict(columns or {}))
     frame = reader.columns.get("frame", "frame")
     summaries = [parquet_summary(path, frame) for path in paths]
+    parts = []
     for path, summary in zip(paths, summaries, strict=True):
         _check_alike(path, summary, paths[0], summaries[0], reader)
-    parts = [
-        _partition(path, summary, frame) for path, summary in zip(paths, summaries, strict=True)
-    ]
+        parts.append(_partition(path, summary, frame))
     parts.sort(key=lambda part: (part.first_frame, part.path))
     _check_frames(parts, reader)
     meta = {"directions": "undeclared", **summaries[0].meta, "source": str(folder)}
@@ -298,11 +290,8 @@ def _check_alike(
         if (own in summary.names) != (own in first.names):
             there, missing = (path, first_path) if own in summary.names else (first_path, path)
             raise ObservationError(
-                (
-                    f"{missing}: column {own} is missing, and {there} has it; write it to all "
-                    "files, "
-                    "or to none."
-                ),
+                f"{missing}: column {own} is missing, and {there} has it; write it to all files, "
+                "or to none.",
                 column=own,
             )
     if not summary.n_rows:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 
 _Array = TypeVar("_Array", bound="np.ndarray[Any, Any]")
 
@@ -73,6 +73,32 @@ class FrameRows:
                 f"{table}: there is no frame {missing[0]}; choose among frame_ids."
             )
         return wanted
+
+
+def typed(table: str, name: str, values: Any, kind: type) -> Any:
+    """A one-dimensional copy of a column in its type; `table` is what messages call the table."""
+    try:
+        array: Any = np.array(values, dtype=kind)
+    except (TypeError, ValueError) as error:
+        raise ObservationError(
+            f"{table}: column {name} cannot be converted ({error}); convert it first.", column=name
+        ) from None
+    if array.ndim != 1:
+        raise ObservationError(
+            f"{table}: column {name} has shape {array.shape}; give one value per row.", column=name
+        )
+    return array
+
+
+def check_lengths(table: str, columns: AnyDict, key: str) -> None:
+    """Refuse columns that are not as long as that of the key."""
+    n = len(columns[key])
+    for name, values in columns.items():
+        if len(values) != n:
+            raise ObservationError(
+                f"{table}: {name} has {len(values)} rows and {key} has {n}; give equal lengths.",
+                column=name,
+            )
 
 
 def locked(array: _Array) -> _Array:

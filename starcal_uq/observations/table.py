@@ -24,7 +24,7 @@ from starcal_uq.observations.checks import check_columns, raise_problems
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import read_table
 from starcal_uq.observations.origin import Sourced
-from starcal_uq.observations.rows import FrameRows, locked
+from starcal_uq.observations.rows import FrameRows, check_lengths, locked, typed
 from starcal_uq.observations.written import astropy_table, write_table
 
 if TYPE_CHECKING:
@@ -102,13 +102,7 @@ class Observations(FrameRows, Sourced, Shown):
     def __post_init__(self) -> None:
         columns = {name: _array(name, values) for name, values in self.columns.items()}
         n = len(columns["frame"])
-        for name, values in columns.items():
-            if len(values) != n:
-                raise ObservationError(
-                    f"observations: {name} has {len(values)} rows and frame has {n}; give equal "
-                    "lengths.",
-                    column=name,
-                )
+        check_lengths("observations", columns, "frame")
         frame = columns["frame"]
         if np.any(frame[1:] < frame[:-1]):
             order = np.argsort(frame, kind="stable")
@@ -395,19 +389,7 @@ def _array(name: str, values: Any) -> Any:
         raise ObservationError(
             f"observations: {name} holds fractions; give whole numbers.", column=name
         )
-    try:
-        array = np.array(array, dtype=_DTYPES[kind])
-    except (TypeError, ValueError) as error:
-        raise ObservationError(
-            f"observations: column {name} is not of kind {kind!r} ({error}); convert it first.",
-            column=name,
-        ) from None
-    if array.ndim != 1:
-        raise ObservationError(
-            f"observations: column {name} has shape {array.shape}; give one value per row.",
-            column=name,
-        )
-    return array
+    return typed("observations", name, array, _DTYPES[kind])
 
 
 def _all_missing(values: Any) -> bool:

@@ -97,25 +97,23 @@ def record_images(
     calibrated = images if isinstance(images, ImageCalibration) else None
     last = images.identification if isinstance(images, ImageCalibration) else images
     first = last if calibrated is None else calibrated.rounds[0][0]
-    counted = (
-        {frame.frame: frame.n_identified for frame in first.frames} if first is not None else {}
-    )
-    by_frame = {frame.frame: frame for frame in last.frames} if last is not None else {}
+    counted = {} if first is None else {one.frame: one.n_identified for one in first.frames}
+    by_frame = {} if last is None else {one.frame: one for one in last.frames}
     rows = []
-    for k, number in enumerate(centroids.frame_ids.tolist()):
+    for number, image, time, n, problem in zip(
+        centroids.frame_ids.tolist(),
+        centroids.image.tolist(),
+        centroids.time_utc.tolist(),
+        centroids.stars_per_frame.tolist(),
+        centroids.problem.tolist(),
+        strict=True,
+    ):
         frame = by_frame.get(number)
-        problem = str(centroids.problem[k])
-        rows.append(
-            ImageRow(
-                frame=number,
-                image=str(centroids.image[k]),
-                time_utc=str(centroids.time_utc[k]),
-                n_centroids=int(centroids.stars_per_frame[k]),
-                outcome=problem or ("not searched" if frame is None else frame.status),
-                n_first=counted.get(number, 0),
-                n_last=0 if frame is None else frame.n_identified,
-            )
+        status, n_last = (
+            ("not searched", 0) if frame is None else (frame.status, frame.n_identified)
         )
+        outcome = problem or status
+        rows.append(ImageRow(number, image, time, n, outcome, counted.get(number, 0), n_last))
     rounds, before = [], None
     for identification, obs, calibration in () if calibrated is None else calibrated.rounds:
         rounds.append(_recorded(identification, obs, calibration, before))

@@ -97,18 +97,17 @@ def _proper_motion_table() -> NDArray[np.void]:
     by identifier.
     """
     data = files("starcal_uq.sky") / "data"
-    bright_type = [("hip", "<i8"), ("pm_ra", "<f8"), ("pm_dec", "<f8"), ("epoch", "<f8")]
-    with (data / "bright_star_pm.csv").open(encoding="ascii") as file:
-        bright = np.loadtxt(_rows(file), dtype=bright_type, delimiter=",", usecols=range(4))
-    gaia_type = [("id", "<i8"), ("pm_ra", "<f8"), ("pm_dec", "<f8")]
-    with (data / "gaia_star_pm.csv").open(encoding="ascii") as file:
-        gaia = np.loadtxt(_rows(file), dtype=gaia_type, delimiter=",")
-    table = np.empty(len(bright) + len(gaia), dtype=[*gaia_type, ("epoch", "<f8")])
-    table["id"] = np.concatenate([-bright["hip"], gaia["id"]])
-    table["epoch"] = np.concatenate([bright["epoch"], np.full(len(gaia), CATALOGUE_EPOCH)])
-    for name in ("pm_ra", "pm_dec"):
-        table[name] = np.concatenate([bright[name], gaia[name]])
-    return np.sort(table, order="id")
+    kinds = [("id", "<i8"), ("pm_ra", "<f8"), ("pm_dec", "<f8"), ("epoch", "<f8")]
+    tables = []
+    for name, kind in (("bright_star_pm.csv", kinds), ("gaia_star_pm.csv", kinds[:3])):
+        with (data / name).open(encoding="ascii") as file:
+            rows = np.loadtxt(_rows(file), dtype=kind, delimiter=",", usecols=range(len(kind)))
+        table = np.full(len(rows), CATALOGUE_EPOCH, dtype=kinds)
+        for field, _ in kind:
+            table[field] = rows[field]
+        tables.append(table)
+    tables[0]["id"] *= -1
+    return np.sort(np.concatenate(tables), order="id")
 
 
 def _rows(file: IO[str]) -> list[str]:

@@ -4,21 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import ra_dec_deg as ra_dec_deg
 from starcal_uq.attitude.rotations import unit_vectors as unit_vectors
 from starcal_uq.core.types import FloatArray, floats
-
-
-def ra_dec_deg(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Right ascension in [0, 360) and declination, deg, of vectors (n, 3) of any length.
-
-    The declination comes from the arc tangent, which keeps its digits at the poles where the arc
-    sine loses half.
-    """
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    ra = np.degrees(np.arctan2(y, x)) % 360.0
-    # A right ascension of -1e-17 becomes exactly 360 under the modulo.
-    return np.where(ra >= 360.0, 0.0, ra), np.degrees(np.arctan2(z, np.hypot(x, y)))
-
 
 _RAD_PER_MAS = np.pi / (180.0 * 3600.0 * 1000.0)
 
