@@ -9,10 +9,15 @@ the totals then say "at least".
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from starcal_uq.budgeting.file import BudgetFile, checked_confidence, load_budget_file
+import numpy as np
+
+from starcal_uq.budgeting.behaviour import Behaviour
+from starcal_uq.budgeting.file import BudgetFile, Requirement, checked_confidence, load_budget_file
+from starcal_uq.budgeting.indices import Behaviours, Index, seen_by
 from starcal_uq.budgeting.posterior import (
     alignment_rows,
     effect_rows,
@@ -20,18 +25,20 @@ from starcal_uq.budgeting.posterior import (
     posterior_rows,
     stated_instead,
 )
-from starcal_uq.budgeting.result import Budget, by_contributor, judge
+from starcal_uq.budgeting.result import Budget, Outcome, by_contributor, judge
 from starcal_uq.budgeting.rows import (
     AXIS_LABELS,
     FROM_FILE,
+    NEA,
     OF_EFFECTS,
+    REST,
     UNTESTED,
     Contributor,
     Expected,
     not_assessed,
 )
 from starcal_uq.budgeting.sampling import N_SAMPLES
-from starcal_uq.budgeting.totals import totals
+from starcal_uq.budgeting.totals import Total, totals
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import join_words, significant
@@ -42,10 +49,12 @@ from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.propagation.thermal import thermal_error
 
 if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
     from starcal_uq.diagnostics.diagnose import Diagnosis
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.spectrum import ErrorSpectrum
     from starcal_uq.propagation.thermal import TemperatureProfile
 
 _CONFIDENCE = 0.997
@@ -65,6 +74,8 @@ def budget(
     confidence: float | None = None,
     misfit: Diagnosis | None = None,
     temperature_profile: TemperatureProfile | PathLike | None = None,
+    spectrum: ErrorSpectrum | None = None,
+    indices: Sequence[Index] = (),
     n_samples: int = N_SAMPLES,
     seed: int = 0,
 ) -> Budget:
@@ -90,6 +101,11 @@ def budget(
     temperature_profile : TemperatureProfile or path, optional
         Temperatures of the optics over an orbit, from which the row *thermo-elastic of the optics*
         is filled; those with which `attitude` was propagated by default.
+    spectrum : ErrorSpectrum, optional
+        Spectrum of the calibration's error along an attitude profile, from which indices know how
+        *calibration, rest* and the centroid noise behave in time.
+    indices : sequence of Index
+        Error indices beside those of the file.
     n_samples, seed : int
         Number and seed of the sampled totals.
 
@@ -139,7 +155,20 @@ def budget(
         *beside,
         *(row for row in filled if row.name not in ours),
     )
-    found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
+    behaviours = _in_time(rows, stated, post.camera, spectrum)
+    rows = tuple(_described(row, behaviours, stated.rate_deg_s) for row in rows)
+    index_totals: list[Total] = []
+    outcomes: dict[Requirement, Outcome] = {}
+    asked = (Index("AKE"), *indices, *stated.indices, *(one.limited for one in stated.requirements))
+    for label, index in {index.label: index for index in asked}.items():
+        seen, at_most = seen_by(index, rows, behaviours)
+        made, samples = totals(
+            *(seen, chosen), of_index=label, at_most=at_most, n_samples=n_samples, seed=seed
+        )
+        index_totals += made
+        for one in stated.requirements:
+            if one.limited.label == label:
+                outcomes[one] = judge(one, seen, samples, stated.frames, at_most)
     settings: AnyDict = {
         "confidence": chosen,
         "n_samples": n_samples,
@@ -152,8 +181,8 @@ def budget(
         settings["frames"] = {name: rotation.tolist() for name, rotation in stated.frames.items()}
     return Budget(
         rows=rows,
-        totals=found,
-        outcomes=judge(stated.requirements, rows, samples, stated.frames),
+        totals=tuple(entry for entry in index_totals if entry.of_index == "AKE"),
+        outcomes=tuple(outcomes[one] for one in stated.requirements),
         confidence=chosen,
         title=stated.title or "Attitude error budget",
         notes=(
@@ -163,7 +192,52 @@ def budget(
             *_notes(rows),
         ),
         provenance=provenance(seed, settings, post.provenance.data_sha256),
+        index_totals=tuple(entry for entry in index_totals if entry.of_index != "AKE"),
     )
+
+
+def _in_time(
+    rows: Sequence[Contributor],
+    stated: BudgetFile,
+    camera: Camera,
+    spectrum: ErrorSpectrum | None,
+) -> dict[tuple[str, str], Behaviour]:
+    """Behaviour in time of the rows: as stated, from the spectrum, or by class and rate."""
+    found = dict(stated.behaviours)
+    step = stated.frame_seconds or (None if spectrum is None else spectrum.step_s)
+    if step is not None:
+        found |= {(NEA, axis): Behaviour("white", step) for axis in AXES} | found
+    if spectrum is not None:
+        f = spectrum.frequency_hz
+        for axis, density in zip(AXES, spectrum.psd_arcsec2_hz.T, strict=True):
+            if np.any(density > 0.0):
+                lines = Behaviour("series", spectrum.step_s, f, density * f[0])
+                found.setdefault((REST, axis), lines)
+    rate = stated.rate_deg_s
+    if rate is None:
+        return found
+    extent_deg = {
+        "FOV spatial": float(max(camera.fov_deg)),
+        "pixel spatial": float(np.degrees(1.0 / camera.focal_px)),
+    }
+    for row in rows:
+        if row.interpretation == "mixed" and row.ecss_class in extent_deg:
+            crossing = Behaviour("constant")
+            if rate > 0.0:
+                crossing = Behaviour("periodic", extent_deg[row.ecss_class] / rate)
+            found.setdefault((row.name, row.axis), crossing)
+    return found
+
+
+def _described(row: Contributor, behaviours: Behaviours, rate_deg_s: float | None) -> Contributor:
+    """A row with its behaviour in time; at rest, a spatial error is a bias."""
+    behaviour = behaviours.get((row.name, row.axis))
+    if behaviour is None:
+        return row
+    if rate_deg_s == 0.0 and behaviour.kind == "constant" and row.interpretation == "mixed":
+        row = replace(row, ecss_class="bias", interpretation="ensemble")
+    time = "" if math.isnan(behaviour.seconds) else f", {behaviour.seconds:.4g} s"
+    return replace(row, behaviour=behaviour.kind + time)
 
 
 def _from_file(

@@ -5,14 +5,19 @@ TOML file.
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.budgeting.behaviour import KEYS as TIME_KEYS
+from starcal_uq.budgeting.behaviour import Behaviour, load_series, load_spectrum
+from starcal_uq.budgeting.indices import NAMES, Behaviours, Index
 from starcal_uq.budgeting.rows import (
     ABSORBED,
     DISTRIBUTIONS,
@@ -22,6 +27,7 @@ from starcal_uq.budgeting.rows import (
     INTERACTING,
     INTERPRETATIONS,
     OF_EFFECTS,
+    PARTS,
     SCOPES,
     Contributor,
     Expected,
@@ -29,7 +35,7 @@ from starcal_uq.budgeting.rows import (
 from starcal_uq.budgeting.shapes import HALF_WIDTHS, RAYLEIGH_MEAN
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError
-from starcal_uq.core.files import atomic_write_text, ensure_new
+from starcal_uq.core.files import atomic_write_text, ensure_new, listed
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_toml
@@ -59,7 +65,18 @@ _TEXT = Key(str, "text in quotes")
 _NAME = Key(str, "text in quotes", required=True, pattern=r"\S")
 _SIZE = Key(float, f"a number of arcsec from 0 to {_TURN:.0f}, a full turn", ge=0.0, le=_TURN)
 _CONFIDENCE = Key(float, "a share between 0 and 1, such as 0.997", lt=1e9)
-BUDGET_KEYS = {"title": _TEXT, "confidence": _CONFIDENCE}
+_SECONDS = Key(float, "a positive number of seconds, at most 1e10", gt=0.0, le=1e10)
+_RATE = Key(float, "a rate from 0 to 360, in degrees per second", ge=0.0, le=360.0)
+BUDGET_KEYS = {
+    "title": _TEXT,
+    "confidence": _CONFIDENCE,
+    "frame_seconds": _SECONDS,
+    "rate_deg_s": _RATE,
+}
+_BEHAVIOUR_KEYS = {
+    key: _SECONDS if key.endswith("_seconds") else _TEXT for key in TIME_KEYS.values()
+}
+_TIMES = {"window_seconds": _SECONDS, "stability_seconds": _SECONDS}
 CONTRIBUTOR_KEYS = {
     "name": _NAME,
     "ecss_class": Key.choice(ECSS_CLASSES),
@@ -78,7 +95,11 @@ CONTRIBUTOR_KEYS = {
         str, "where the number is from, because a budget is signed", required=True, pattern=r"\S"
     ),
     "applies": Key(bool, "true or false, without quotes"),
+    "part": Key.choice(PARTS),
+    **_BEHAVIOUR_KEYS,
 }
+BEHAVIOUR_KEYS = {"name": _NAME, "axis": Key.choice(tuple(_AXIS_NAMES)), **_BEHAVIOUR_KEYS}
+INDEX_KEYS = {"kind": Key.choice(tuple(NAMES), required=True), **_TIMES}
 REQUIREMENT_KEYS = {
     "name": _NAME,
     "axis": Key.choice(tuple(_REQUIREMENT_AXES), required=True),
@@ -94,14 +115,20 @@ REQUIREMENT_KEYS = {
     "interpretation": Key.choice(INTERPRETATIONS),
     "judged_by": Key.choice(JUDGED_BY),
     "frame": _TEXT,
+    "index": Key.choice(tuple(NAMES)),
+    **_TIMES,
 }
 SENSOR = "sensor"
 _FRAME = Section(
     {"rotation": Key(Any, "a matrix of three rows, or a quaternion", required=True)}, BudgetError
 )
-_HEAD, _CONTRIBUTOR, _REQUIREMENT = (
-    Section(keys, BudgetError) for keys in (BUDGET_KEYS, CONTRIBUTOR_KEYS, REQUIREMENT_KEYS)
+_HEAD, _CONTRIBUTOR, _REQUIREMENT, _BEHAVIOUR, _INDEX = (
+    Section(keys, BudgetError)
+    for keys in (BUDGET_KEYS, CONTRIBUTOR_KEYS, REQUIREMENT_KEYS, BEHAVIOUR_KEYS, INDEX_KEYS)
 )
+_LISTS = ("contributor", "behaviour", "index", "requirement")
+# Distributions of errors that behave so in time, unless the file states another.
+_SHAPES = {"periodic": "arcsine", "drift": "uniform"}
 # Rows of a matrix that people round to six digits.
 _ORTHONORMAL = 1e-5
 # Parts of a quaternion, which need not have unit length.
@@ -132,6 +159,10 @@ class Requirement:
         ``rule``, ``sampling``, or ``both``: the larger of the two bounds.
     frame : str
         Frame whose axes are meant: ``sensor``, or one that the file names.
+    index : str
+        Error index that is limited, one of `starcal_uq.budgeting.indices.NAMES`.
+    window_seconds, stability_seconds : float
+        Times of the index, as of an `Index`; NaN where it has none.
     """
 
     name: str
@@ -142,6 +173,14 @@ class Requirement:
     interpretation: str = "mixed"
     judged_by: str = "both"
     frame: str = SENSOR
+    index: str = "AKE"
+    window_seconds: float = math.nan
+    stability_seconds: float = math.nan
+
+    @property
+    def limited(self) -> Index:
+        """The index with its times."""
+        return Index(self.index, self.window_seconds, self.stability_seconds)
 
 
 @dataclass(frozen=True)
@@ -162,6 +201,12 @@ class BudgetFile:
         Path that it was read from.
     frames : dict of str to (3, 3) array
         Rotations R of the frames that requirements may name, with v_frame = R v_sensor.
+    indices : tuple of Index
+        Error indices to be shown beside the totals.
+    behaviours : dict
+        Behaviour in time by name and axis of a contributor.
+    frame_seconds, rate_deg_s : float or None
+        Time between frames, s; angular rate of the sensor, deg/s. None where not stated.
     """
 
     contributors: tuple[Contributor, ...] = field(default=())
@@ -170,13 +215,18 @@ class BudgetFile:
     confidence: float | None = None
     path: str = ""
     frames: Mapping[str, FloatArray] = field(default_factory=dict)
+    indices: tuple[Index, ...] = field(default=())
+    behaviours: Behaviours = field(default_factory=dict)
+    frame_seconds: float | None = None
+    rate_deg_s: float | None = None
 
 
 def _read(data: Any, where: str, section: Section) -> AnyDict:
     """Checked values of one table, texts without the space around them."""
     if not isinstance(data, Mapping):
         raise BudgetError(
-            f"{where}: is no table; write [[contributor]] or [[requirement]] above its keys."
+            f"{where}: is no table; write {listed([f'[[{name}]]' for name in _LISTS])} above its "
+            "keys."
         )
     for key in data:
         if key in _GONE:
@@ -214,19 +264,26 @@ def load_budget_file(path: PathLike) -> BudgetFile:
     missing = f"check the path, or write a starter with `{starter.words}`"
     content = read_toml(path, "budget", BudgetError, missing)
     for key in content:
-        if key not in ("budget", "contributor", "requirement", "frame"):
+        if key not in ("budget", "frame", *_LISTS):
             raise BudgetError(
-                f"{path}: {key} is not known; write [budget], [frame.NAME], [[contributor]] and "
-                "[[requirement]] tables "
-                "only."
+                f"{path}: {key} is not known; write [budget], [frame.NAME], "
+                f"{listed([f'[[{name}]]' for name in _LISTS])} tables only."
             )
     frames = _frames(content.get("frame", {}), path)
     head = _read(content.get("budget", {}), f"{path}, [budget]", _HEAD)
-    rows = [
-        row
-        for table, where in _tables(content, "contributor", path)
-        for row in _contributor(table, where)
-    ]
+    rows: list[Contributor] = []
+    behaviours: dict[tuple[str, str], Behaviour] = {}
+    for table, where in _tables(content, "contributor", path):
+        found, behaviour = _contributor(table, where, Path(path).parent)
+        rows += found
+        if behaviour is not None:
+            behaviours |= {(row.name, row.axis): behaviour for row in found}
+    for table, where in _tables(content, "behaviour", path):
+        behaviours |= _of_known(table, where, Path(path).parent)
+    indices = tuple(
+        _index(_read(table, where, _INDEX), where)
+        for table, where in _tables(content, "index", path)
+    )
     _no_doubles([(row.name, row.axis) for row in rows], f"{path}: contributor")
     asked: AnyDict = {"confidence": 0.997} | head
     requirements = tuple(
@@ -235,8 +292,56 @@ def load_budget_file(path: PathLike) -> BudgetFile:
     )
     _no_doubles([(requirement.name,) for requirement in requirements], f"{path}: requirement")
     return BudgetFile(
-        tuple(rows), requirements, head.get("title", ""), head.get("confidence"), str(path), frames
+        contributors=tuple(rows),
+        requirements=requirements,
+        title=head.pop("title", ""),
+        path=str(path),
+        frames=frames,
+        indices=indices,
+        behaviours=behaviours,
+        **head,
     )
+
+
+def _index(table: AnyMapping, where: str) -> Index:
+    try:
+        return Index(**table)
+    except BudgetError as error:
+        raise BudgetError(f"{where}: {error}") from None
+
+
+def _behaviour(table: AnyMapping, where: str, folder: Path) -> Behaviour | None:
+    """The behaviour in time that a table states; files are beside the budget file."""
+    stated = [(kind, key) for kind, key in TIME_KEYS.items() if key in table]
+    if len(stated) > 1:
+        raise BudgetError(
+            f"{where}: keys {stated[0][1]} and {stated[1][1]} both state a behaviour in time; "
+            "write one."
+        )
+    for kind, key in stated:
+        if kind == "spectrum":
+            return load_spectrum(folder / table[key])
+        return load_series(folder / table[key]) if kind == "series" else Behaviour(kind, table[key])
+    return None
+
+
+def _of_known(data: Any, where: str, folder: Path) -> dict[tuple[str, str], Behaviour]:
+    """Behaviour of rows that the calibration fills."""
+    table = _read(data, where, _BEHAVIOUR)
+    behaviour = _behaviour(table, where, folder)
+    if behaviour is None:
+        raise BudgetError(
+            f"{where}: no key states a behaviour in time; write one of "
+            f"{listed(list(TIME_KEYS.values()))}."
+        )
+    name, close = _known_name(table["name"])
+    if name not in {entry.name for entry in (*_STATED, *FROM_POSTERIOR, INTERACTING)}:
+        hint = f"did you mean {close!r}? " if close else ""
+        raise BudgetError(
+            f"{where}: key name: {hint}The budget has no such row of its own; state the behaviour "
+            "of yours in its [[contributor]]."
+        )
+    return {(name, axis): behaviour for axis in _AXIS_NAMES[table.get("axis", "all")]}
 
 
 def _frames(tables: Any, path: PathLike) -> dict[str, FloatArray]:
@@ -294,7 +399,7 @@ def _no_doubles(names: Sequence[tuple[str, ...]], where: str) -> None:
             )
 
 
-def _contributor(data: Any, where: str) -> list[Contributor]:
+def _contributor(data: Any, where: str, folder: Path) -> tuple[list[Contributor], Behaviour | None]:
     table = _read(data, where, _CONTRIBUTOR)
     name, close = _known_name(table["name"])
     if name in {entry.name for entry in (*FROM_POSTERIOR, INTERACTING)}:
@@ -308,20 +413,37 @@ def _contributor(data: Any, where: str) -> list[Contributor]:
         _check_own(table, where, name, close)
     stated: AnyDict = {
         key: table[key]
-        for key in ("correlation_group", "conditions", "provenance", "applies")
+        for key in ("correlation_group", "conditions", "provenance", "applies", "part")
         if key in table
     }
+    behaviour = _behaviour(table, where, folder)
+    shape = _SHAPES.get("" if behaviour is None else behaviour.kind)
     for key in ("distribution", *_OWN_KEYS):
-        stated[key] = table.get(key, getattr(known or _OWN, key))
-    mean, sigma = (
-        _moments(table, where, stated["distribution"]) if table.get("applies", True) else (0.0, 0.0)
-    )
-    return [
+        usual = shape if key == "distribution" and shape else getattr(known or _OWN, key)
+        stated[key] = table.get(key, usual)
+    if not table.get("applies", True):
+        mean, sigma = 0.0, 0.0
+    elif behaviour is not None and not math.isnan(behaviour.sigma_arcsec):
+        mean, sigma = _measured(table, where, behaviour)
+    else:
+        mean, sigma = _moments(table, where, stated["distribution"])
+    rows = [
         Contributor(
             name=name, axis=axis, mean_arcsec=mean, sigma_arcsec=sigma, source="file", **stated
         )
         for axis in _AXIS_NAMES[table["axis"]]
     ]
+    return rows, behaviour
+
+
+def _measured(table: AnyDict, where: str, behaviour: Behaviour) -> tuple[float, float]:
+    """Mean and standard deviation of a spectrum or a time series."""
+    for key in ("sigma_arcsec", "half_width_arcsec"):
+        if key in table:
+            raise BudgetError(
+                f"{where}: key {key}: the {behaviour.kind} states the size; delete the line."
+            )
+    return table.get("mean_arcsec", behaviour.mean_arcsec), behaviour.sigma_arcsec
 
 
 def _known_name(written: str) -> tuple[str, str]:
@@ -403,9 +525,12 @@ def _requirement(data: Any, where: str, confidence: float, frames: tuple[str, ..
             "rotation."
         )
     axis = table.pop("axis")
-    return Requirement(
+    asked = Requirement(
         axis=axis if axis == CROSS_BORESIGHT else _REQUIREMENT_AXES[axis][0], **table
     )
+    times = {name: table[name] for name in _TIMES if name in table}
+    _index({"kind": asked.index, **times}, where)
+    return asked
 
 
 _LETTERS = dict(zip(AXES, "XYZ", strict=True))

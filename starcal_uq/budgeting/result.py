@@ -8,14 +8,15 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.file import SENSOR, Requirement
 from starcal_uq.budgeting.rows import AXIS_LABELS, ECSS_CLASSES, SCOPES, Contributor
-from starcal_uq.budgeting.sampling import Samples
+from starcal_uq.budgeting.sampling import Samples, draw
 from starcal_uq.budgeting.totals import Difference, Total, grouped_sigma, read_difference, total
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
@@ -153,6 +154,9 @@ class Budget(Shown):
         Sentences that the reader has to know: inflations, what stays open.
     provenance : Provenance
         Seed, settings, versions, time and data hash.
+    index_totals : tuple of Total
+        The same totals of every other error index that was asked for; `totals` are those of the
+        absolute knowledge error.
     """
 
     rows: tuple[Contributor, ...]
@@ -162,6 +166,7 @@ class Budget(Shown):
     title: str
     notes: tuple[str, ...]
     provenance: Provenance
+    index_totals: tuple[Total, ...] = ()
 
     @property
     def violations(self) -> tuple[Outcome, ...]:
@@ -182,6 +187,7 @@ class Budget(Shown):
             outcome
             for outcome in self.outcomes
             if outcome.requirement.interpretation == "mixed"
+            and outcome.requirement.index == "AKE"
             and outcome.requirement.frame == SENSOR
             and math.isclose(
                 1.0 - outcome.requirement.confidence, 1.0 - self.confidence, rel_tol=1e-9
@@ -193,8 +199,17 @@ class Budget(Shown):
         """Contributors that are not assessed on some axis."""
         return tuple(dict.fromkeys(row.name for row in self.rows if not row.assessed))
 
+    @property
+    def indices(self) -> tuple[str, ...]:
+        """Labels of the error indices that have totals, the absolute knowledge error first."""
+        return tuple(dict.fromkeys(entry.of_index for entry in (*self.totals, *self.index_totals)))
+
     def total(
-        self, axis: str, scope: str = "after alignment", interpretation: str = "mixed"
+        self,
+        axis: str,
+        scope: str = "after alignment",
+        interpretation: str = "mixed",
+        index: str = "AKE",
     ) -> Total:
         """One of the totals.
 
@@ -207,22 +222,24 @@ class Budget(Shown):
             ``before alignment`` or ``after alignment``.
         interpretation : str
             ``mixed``, ``ensemble`` or ``temporal``.
+        index : str
+            One of `indices`, such as ``RKE 300 s``.
 
         Raises
         ------
         ValueError
-            For an unknown axis, scope or interpretation.
+            For an unknown axis, scope, interpretation or index.
         """
         name = _AXIS_NAMES.get(axis.strip().lower(), axis)
-        for found in self.totals:
-            if (found.axis, found.scope, found.interpretation) == (name, scope, interpretation):
+        wanted = (name, scope, interpretation, index)
+        for found in (*self.totals, *self.index_totals):
+            if (found.axis, found.scope, found.interpretation, found.of_index) == wanted:
                 return found
         raise ValueError(
-            f"a budget has no total for {axis!r}, {scope!r}, {interpretation!r}; the axis is one "
-            "of X, Y, Z (pitch, "
-            f"yaw, roll) or {CROSS_BORESIGHT}, the scope {' or '.join(SCOPES)}, the "
-            "interpretation mixed, ensemble or "
-            "temporal"
+            f"this budget has no total for {axis!r}, {scope!r}, {interpretation!r}, {index!r}; "
+            f"the axis is one of X, Y, Z (pitch, yaw, roll) or {CROSS_BORESIGHT}, the scope "
+            f"{' or '.join(SCOPES)}, the interpretation mixed, ensemble or temporal, the index "
+            f"one of {', '.join(self.indices)}"
         )
 
     def to_dataframe(self) -> pd.DataFrame:
@@ -247,11 +264,13 @@ class Budget(Shown):
         import pandas as pd
 
         rows = [
-            {name: getattr(entry, name) for name in (*_TOTAL, "at_least")} for entry in self.totals
+            {
+                **{name: getattr(entry, name) for name in (*_TOTAL, "at_least")},
+                **{name: "; ".join(getattr(entry, name)) for name in ("not_assessed", "at_most")},
+            }
+            for entry in (*self.totals, *self.index_totals)
         ]
-        return pd.DataFrame(rows).assign(
-            not_assessed=["; ".join(entry.not_assessed) for entry in self.totals]
-        )
+        return pd.DataFrame(rows)
 
     def classes_dataframe(self, scope: str = "after alignment") -> pd.DataFrame:
         """Standard deviations by class of the standard: ``ecss_class``, ``axis``, ``sigma_arcsec``,
@@ -332,6 +351,7 @@ class Budget(Shown):
             for row in self.rows
         ]
         records += [{"record": "total", **_plain(entry)} for entry in self.totals]
+        records += [{"record": "index total", **_plain(entry)} for entry in self.index_totals]
         records += [
             {
                 "record": "requirement",
@@ -407,6 +427,7 @@ class Budget(Shown):
                 title=settings["title"],
                 notes=tuple(settings["notes"]),
                 provenance=Provenance(settings["provenance"]),
+                index_totals=tuple(_made(Total, one) for one in by_kind.get("index total", [])),
             )
 
 
@@ -415,27 +436,34 @@ def _unknown(value: Any) -> bool:
 
 
 def judge(
-    requirements: Sequence[Requirement],
+    asked: Requirement,
     rows: Sequence[Contributor],
     samples: Samples,
     rotations: Mapping[str, FloatArray] = MappingProxyType({}),
-) -> tuple[Outcome, ...]:
-    """Every requirement against the total at its own confidence, in its own frame."""
-    return tuple(
-        Outcome(
-            asked,
-            total(
-                rows,
-                samples,
-                scope=asked.scope,
-                axis=asked.axis,
-                interpretation=asked.interpretation,
-                confidence=asked.confidence,
-                rotation=rotations.get(asked.frame),
-            ),
-        )
-        for asked in requirements
+    at_most: Sequence[str] = (),
+) -> Outcome:
+    """A requirement against the total of its index at its own confidence, in its own frame.
+
+    Rows that are taken `at_most` do not violate it: at the least, they are nothing.
+    """
+    of_rows = partial(
+        total,
+        scope=asked.scope,
+        axis=asked.axis,
+        interpretation=asked.interpretation,
+        confidence=asked.confidence,
+        rotation=rotations.get(asked.frame),
     )
+    found = replace(of_rows(rows, samples), of_index=asked.limited.label, at_most=tuple(at_most))
+    if at_most:
+        certain = [row for row in rows if row.name not in at_most]
+        n_samples = next(iter(samples.sums.values())).shape[1]
+        least = of_rows(certain, draw(certain, n_samples))
+        bounds = (least.rule_least_arcsec, least.sampled_least_arcsec)
+        if math.isnan(bounds[0]):
+            bounds = (0.0, 0.0)
+        found = replace(found, rule_least_arcsec=bounds[0], sampled_least_arcsec=bounds[1])
+    return Outcome(asked, found)
 
 
 def by_contributor(rows: Sequence[Contributor]) -> dict[str, dict[str, Contributor]]:

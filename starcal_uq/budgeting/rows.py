@@ -28,6 +28,7 @@ ABSORBED = ("yes", "no", "in part", "caused by it")
 SCOPES = ("before alignment", "after alignment")
 # After an alignment that absorbs all of what it absorbs in part.
 AFTER_AT_LEAST = "after alignment, at the least"
+KNOWLEDGE, CONTROL = PARTS = ("knowledge", "control")
 SOURCES = ("posterior", "file", "not assessed")
 ECSS_CLASSES = (
     "bias",
@@ -93,6 +94,10 @@ class Contributor:
     applies : bool
         False where the file states that there is no such error: it then counts as zero, with that
         as its reason.
+    part : str
+        ``knowledge``, or ``control``: an error of pointing that is no error of knowledge.
+    behaviour : str
+        How it changes in time, with the time of that; empty if nobody stated it.
     """
 
     DOCUMENTED: ClassVar = ("assessed", "combination")
@@ -114,6 +119,8 @@ class Contributor:
     if_model_holds_arcsec: float = _NAN
     with_misfit_found_arcsec: float = _NAN
     applies: bool = True
+    part: str = KNOWLEDGE
+    behaviour: str = ""
 
     @property
     def assessed(self) -> bool:
@@ -138,6 +145,8 @@ class Contributor:
             return "not in the totals"
         if not self.applies:
             return "none"
+        if self.part == CONTROL:
+            return "in errors of pointing alone"
         if self.distribution == "constant":
             return "mean: linear"
         group = (

@@ -96,6 +96,10 @@ class Total:
         Share of the dominant row; of the largest row if none has more than half.
     difference : Finding, optional
         Why the two bounds differ, or that they agree.
+    of_index : str
+        Error index with its times, such as ``AKE`` or ``RPE 300 s``.
+    at_most : tuple of str
+        Contributors whose behaviour in time nobody stated: the index takes them at their largest.
     """
 
     DOCUMENTED: ClassVar = ("at_least",)
@@ -118,6 +122,8 @@ class Total:
     dominant: str = ""
     dominant_share: float = math.nan
     difference: Finding | None = None
+    of_index: str = "AKE"
+    at_most: tuple[str, ...] = field(default=())
 
     @property
     def explanation(self) -> str:
@@ -548,16 +554,22 @@ def _dominant(
 
 
 def totals(
-    rows: Sequence[Contributor], confidence: float, *, n_samples: int = N_SAMPLES, seed: int = 0
+    rows: Sequence[Contributor],
+    confidence: float,
+    *,
+    of_index: str = "AKE",
+    at_most: Sequence[str] = (),
+    n_samples: int = N_SAMPLES,
+    seed: int = 0,
 ) -> tuple[tuple[Total, ...], Samples]:
-    """All totals: both scopes, three axes and the two across the boresight together, three
-    interpretations.
+    """All totals of an index: both scopes, three axes and the two across the boresight together,
+    three interpretations.
     """
     samples = draw(rows, n_samples, seed)
-    found = tuple(
+    found = (
         total(rows, samples, scope=scope, axis=axis, interpretation=kind, confidence=confidence)
         for scope in SCOPES
         for axis in TOTAL_AXES
         for kind in ("mixed", "ensemble", "temporal")
     )
-    return found, samples
+    return tuple(replace(one, of_index=of_index, at_most=tuple(at_most)) for one in found), samples

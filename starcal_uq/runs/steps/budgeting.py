@@ -65,6 +65,7 @@ def budget(
         file=stated,
         confidence=confidence,
         temperature_profile=temperature_profile,
+        spectrum=run.spectrum if run.has("spectrum") else None,
         seed=seed,
     )
     settings = {"file": file, "confidence": confidence}

@@ -1,0 +1,228 @@
+"""How a row of a budget behaves in time: what a mean over a window keeps of its error, and what
+changes between two windows.
+
+An error e(t) of variance S, whose mean over a window dt is m(t), is described by the share of its
+variance that the mean keeps, K(dt) = var(m) / S. For a one-sided spectrum S(f), K(dt) = int
+sinc(f dt)^2 S(f) df / int S(f) df, and the windows dt of which the second begins dt_s later than
+the first differ by
+
+    var(m(t + dt_s) - m(t)) dt^2 / S = 2 V(dt) + 2 V(dt_s) - V(dt + dt_s) - V(dt - dt_s),
+
+with V(T) = T^2 K(T), the variance of an integral over T. That is the integral of sinc(f dt)^2 2 (1 -
+cos(2 pi f dt_s)) S(f) of ECSS-E-ST-60-10C, without an integral where K is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+
+from starcal_uq.attitude.profile import check_order, read_columns
+from starcal_uq.core.errors import BudgetError
+from starcal_uq.core.files import listed
+from starcal_uq.core.types import FloatArray, PathLike
+
+Kind = Literal["constant", "white", "periodic", "correlated", "drift", "spectrum", "series"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+# The key of a budget file that states each behaviour.
+KEYS: dict[Kind, str] = {
+    "white": "sample_seconds",
+    "periodic": "period_seconds",
+    "correlated": "correlation_seconds",
+    "drift": "drift_seconds",
+    "spectrum": "psd",
+    "series": "series",
+}
+_UNEVEN = 0.05
+# Arguments below which the first terms of a series are exact to rounding.
+_SMALL = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Behaviour:
+    """Behaviour of an error in time, whatever its size.
+
+    Attributes
+    ----------
+    kind : str
+        ``constant``; ``white`` (samples, each independent of the others); ``periodic`` (a sinusoid
+        at a random moment); ``correlated`` (first-order Gauss-Markov); ``drift`` (linear, over a
+        stated time); ``spectrum`` (power spectral density); ``series`` (a time series).
+    seconds : float
+        Time between samples, period, correlation time, or time of the drift, s.
+    frequency_hz : array (n,)
+        Frequencies of a spectrum, or of the lines of a series, Hz.
+    power : array (n,)
+        One-sided density, linear in between, arcsec^2 / Hz; mean squares of lines, arcsec^2.
+    mean_arcsec : float
+        Mean of a series, arcsec.
+    """
+
+    kind: Kind
+    seconds: float = math.nan
+    frequency_hz: FloatArray = field(default_factory=lambda: np.empty(0))
+    power: FloatArray = field(default_factory=lambda: np.empty(0))
+    mean_arcsec: float = 0.0
+
+    @property
+    def sigma_arcsec(self) -> float:
+        """Standard deviation of a spectrum or a series, arcsec; NaN where it is stated apart."""
+        if self.kind == "spectrum":
+            return math.sqrt(float(np.trapezoid(self.power, self.frequency_hz)))
+        return math.sqrt(float(np.sum(self.power))) if self.kind == "series" else math.nan
+
+    @property
+    def longest_s(self) -> float:
+        """Longest window about which the behaviour says something, s."""
+        if self.kind == "drift":
+            return self.seconds
+        return 0.25 / float(self.frequency_hz[0]) if self.kind == "series" else math.inf
+
+    def kept(self, window_s: float) -> float:
+        """Share of the variance that the mean over a window keeps."""
+        if self.kind == "constant" or window_s == 0.0:
+            return 1.0
+        t = window_s / self.seconds
+        if self.kind == "white":
+            return min(1.0, 1.0 / t)
+        if self.kind == "periodic":
+            return float(np.sinc(t) ** 2)
+        if self.kind == "correlated":
+            # 2 (t - 1 + exp(-t)) / t^2, where rounding leaves it.
+            return 2.0 * (t + math.expm1(-t)) / t**2 if t > _SMALL else 1.0 - t / 3.0
+        if self.kind == "drift":
+            return max(1.0 - t, 0.0) ** 2
+        if self.kind == "series":
+            return float(self._response(window_s) @ self.power) / float(np.sum(self.power))
+        return _passed(self.frequency_hz, self.power, window_s) / self.sigma_arcsec**2
+
+    def _response(self, window_s: float) -> FloatArray:
+        """Share of the power of each line that a mean of the samples of a window keeps."""
+        f = self.frequency_hz
+        kept = np.sinc(f * max(window_s, self.seconds)) / np.sinc(f * self.seconds)
+        return np.asarray(kept**2)
+
+    def left(self, window_s: float) -> float:
+        """Share of the variance around the mean of the window."""
+        if self.kind == "drift":
+            return (window_s / self.seconds) ** 2
+        return max(1.0 - self.kept(window_s), 0.0)
+
+    def changed(self, window_s: float, later_s: float) -> float:
+        """Variance of the difference of the means over two windows that begin `later_s` apart, over
+        the variance.
+        """
+        if self.kind == "constant":
+            return 0.0
+        if self.kind == "drift":
+            return 12.0 * (later_s / self.seconds) ** 2
+        if self.kind == "white" and later_s >= window_s:
+            return 2.0 * self.kept(window_s)
+        if self.kind == "series":
+            passed = self._response(window_s)
+            passed *= 4.0 * np.sin(np.pi * self.frequency_hz * later_s) ** 2
+            return float(passed @ self.power) / float(np.sum(self.power))
+        if self.kind == "periodic":
+            return self.kept(window_s) * 4.0 * math.sin(math.pi * later_s / self.seconds) ** 2
+        one, other, both, apart = (
+            t * t * self.kept(t)
+            for t in (window_s, later_s, window_s + later_s, abs(window_s - later_s))
+        )
+        return max(2.0 * (one + other) - both - apart, 0.0) / window_s**2
+
+
+def _passed(frequency: FloatArray, density: FloatArray, window_s: float) -> float:
+    """Integral of sinc(f T)^2 S(f), exact for a density that is linear between its frequencies."""
+    from scipy.special import sici
+
+    c = 2.0 * np.pi * window_s
+    u = c * frequency
+    sine, cosine = sici(np.maximum(u, _SMALL))
+    near = u < _SMALL
+    # Integrals of 2 (1 - cos u) / u^2 and of 2 (1 - cos u) / u from 0.
+    safe = np.where(near, 1.0, u)
+    flat = np.where(near, u - u**3 / 36.0, 2.0 * (sine - 2.0 * np.sin(0.5 * safe) ** 2 / safe))
+    rising = np.where(
+        near, 0.5 * u**2 - u**4 / 48.0, 2.0 * (np.euler_gamma + np.log(safe) - cosine)
+    )
+    slope = np.diff(density) / np.diff(frequency)
+    level = density[:-1] - slope * frequency[:-1]
+    return float(np.sum(level / c * np.diff(flat) + slope / c**2 * np.diff(rising)))
+
+
+def load_spectrum(path: PathLike) -> Behaviour:
+    """Read a power spectral density: a table with ``frequency_hz`` and ``psd_arcsec2_hz``.
+
+    Raises
+    ------
+    BudgetError
+        When the file cannot be read, a column is missing, frequencies do not increase from 0 or
+        more, or a density is negative.
+    """
+    frequency, density, where = _columns(path, "frequency_hz", "psd_arcsec2_hz")
+    if frequency[0] < 0.0 or np.any(np.diff(frequency) <= 0.0):
+        i = int(np.argmax(np.append(frequency[0] < 0.0, np.diff(frequency) <= 0.0)))
+        raise BudgetError(f"{where(i)}: frequency_hz must increase from 0 or more; sort the rows.")
+    if np.any(density < 0.0) or not np.any(density > 0.0):
+        i = int(np.argmin(density))
+        raise BudgetError(
+            f"{where(i)}: psd_arcsec2_hz is {density[i]:g}; give densities that are not negative, "
+            "some of them positive."
+        )
+    return Behaviour("spectrum", frequency_hz=frequency, power=density)
+
+
+def load_series(path: PathLike) -> Behaviour:
+    """Read a time series of an error: a table with ``time_s``, evenly spaced, and
+    ``error_arcsec``.
+
+    Raises
+    ------
+    BudgetError
+        When the file cannot be read, a column is missing, times are not evenly spaced, or the
+        error never changes.
+    """
+    time, error, where = _columns(path, "time_s", "error_arcsec")
+    check_order("", "row", np.arange(1, len(time) + 1), time)
+    step = float((time[-1] - time[0]) / (len(time) - 1))
+    off = np.abs((time - time[0]) / step - np.arange(len(time)))
+    if np.any(off > _UNEVEN):
+        raise BudgetError(
+            f"{where(int(np.argmax(off > _UNEVEN)))}: time_s is not evenly spaced (steps of "
+            f"{step:g} s); interpolate the series."
+        )
+    n, mean = len(error), float(error.mean())
+    amplitude = np.abs(np.fft.rfft(error - mean)[1:]) / n
+    power = 2.0 * amplitude**2
+    if n % 2 == 0:
+        power[-1] *= 0.5
+    if not np.any(power > 0.0):
+        raise BudgetError(f"{path}: error_arcsec never changes; state it as a constant.")
+    return Behaviour("series", step, np.arange(1, len(power) + 1) / (n * step), power, mean)
+
+
+def _columns(path: PathLike, *names: str) -> tuple[FloatArray, FloatArray, Callable[[int], str]]:
+    """Two columns of numbers with two rows or more, and how messages call a row."""
+    table = read_columns(path, f"{names[0]} and {names[1]}")
+    for name in names:
+        if name not in table.cells:
+            raise BudgetError(
+                f"{path}: column {name} is missing (the file has {listed(list(table.cells))}); "
+                "name it in the header."
+            )
+    columns = [table.numbers_of(name) for name in names]
+
+    def where(row: int) -> str:
+        return f"{path}, {table.word} {table.numbers[row]}"
+
+    for name, values in zip(names, columns, strict=True):
+        if not np.isfinite(values).all():
+            row = int(np.argmin(np.isfinite(values)))
+            raise BudgetError(f"{where(row)}: {name} is not finite; repair it.")
+    if len(columns[0]) < 2:
+        raise BudgetError(f"{path}: holds a single row; give two or more.")
+    return columns[0], columns[1], where
