@@ -39,7 +39,7 @@ from starcal_uq.budgeting.rows import (
 )
 from starcal_uq.budgeting.sampling import N_SAMPLES
 from starcal_uq.budgeting.totals import Total, totals
-from starcal_uq.core.constants import AXES
+from starcal_uq.core.constants import AXES, INTERACTION
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import join_words, significant
 from starcal_uq.core.provenance import provenance
@@ -206,7 +206,9 @@ def _in_time(
     found = dict(stated.behaviours)
     step = stated.frame_seconds or (None if spectrum is None else spectrum.step_s)
     if step is not None:
-        found |= {(NEA, axis): Behaviour("white", step) for axis in AXES} | found
+        # What noise and calibration do together is as new in every frame as the noise.
+        noise = Behaviour("white", step)
+        found = {(name, axis): noise for name in (NEA, INTERACTION) for axis in AXES} | found
     if spectrum is not None:
         f = spectrum.frequency_hz
         for axis, density in zip(AXES, spectrum.psd_arcsec2_hz.T, strict=True):

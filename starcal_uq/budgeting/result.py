@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.file import SENSOR, Requirement
-from starcal_uq.budgeting.rows import AXIS_LABELS, ECSS_CLASSES, SCOPES, Contributor
+from starcal_uq.budgeting.rows import AXIS_LABELS, ECSS_CLASSES, KNOWLEDGE, SCOPES, Contributor
 from starcal_uq.budgeting.sampling import Samples, draw
 from starcal_uq.budgeting.totals import Difference, Total, grouped_sigma, read_difference, total
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
@@ -278,7 +278,9 @@ class Budget(Shown):
         """
         import pandas as pd
 
-        counted = [row for row in self.rows if row.counts(scope) and row.applies]
+        counted = [
+            row for row in self.rows if row.counts(scope) and row.applies and row.part == KNOWLEDGE
+        ]
         classes = [name for name in ECSS_CLASSES if any(row.ecss_class == name for row in counted)]
         records = []
         for name, axis in itertools.product(classes, AXES):

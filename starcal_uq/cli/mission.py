@@ -99,11 +99,14 @@ def show_budget(found: Budget) -> None:
     from starcal_uq.presentation.words.budgeting import (
         contributors_table,
         explanations,
+        indices_table,
         totals_table,
     )
 
     print_table(contributors_table(found))
     print_table(totals_table(found))
+    if found.index_totals:
+        print_table(indices_table(found))
     for sentence in (*explanations(found), *found.notes):
         say(sentence)
     for outcome in found.outcomes:

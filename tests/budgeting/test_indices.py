@@ -57,6 +57,8 @@ def test_control_errors_are_in_pointing_alone(tmp_path: Path) -> None:
     found, without = made(path), made()
     assert found.total("X").rule_arcsec == without.total("X").rule_arcsec
     assert found.total("X", index="APE").rule_arcsec > 80.0
+    classes = found.classes_dataframe()
+    assert classes.loc[classes["ecss_class"] == "other", "sigma_arcsec"].tolist() in ([], [0.0] * 3)
 
 
 def test_an_index_of_a_budget_is_that_of_simulated_sensors(tmp_path: Path) -> None:
@@ -93,10 +95,8 @@ def test_an_index_of_a_budget_is_that_of_simulated_sensors(tmp_path: Path) -> No
         assert stated.sigma_arcsec == pytest.approx(sigma, rel=0.02), label
         control = found.total("X", "before alignment")
         assert abs(control.sigma_arcsec / sigma - 1.0) > 0.05 or label.startswith("MKE")
-    # The rest and the interaction are mixed: nobody stated how they change.
-    assert found.total("X", index="RKE 300 s").at_most == (REST,) + tuple(
-        name for name in found.total("X", index="RKE 300 s").at_most if name != REST
-    )
+    # The rest is mixed, and nobody stated how it changes.
+    assert REST in found.total("X", index="RKE 300 s").at_most
 
 
 def test_what_is_taken_at_most_leaves_a_requirement_open(tmp_path: Path) -> None:
@@ -114,6 +114,7 @@ def test_what_is_taken_at_most_leaves_a_requirement_open(tmp_path: Path) -> None
     )
     (outcome,) = made(written(tmp_path, stated, asked("limit_arcsec = 2.0"))).outcomes
     assert outcome.verdict == "violated"
+    assert "RKE 9 s, X (pitch)" in outcome.text
 
 
 def test_a_rate_moves_spatial_rows_between_classes(tmp_path: Path) -> None:
@@ -205,8 +206,9 @@ def test_a_wrong_index_or_behaviour_is_refused(tmp_path: Path, text: str, words:
 
 
 def test_every_kind_has_its_times() -> None:
-    times = {kind: () if kind in ("APE", "AKE") else (9.0,) for kind in NAMES}
-    times |= {kind: (9.0, 3.0) for kind in ("PDE", "KDE", "PRE", "KRE")}
+    times: dict[str, tuple[float, ...]] = dict.fromkeys(NAMES, (9.0,))
+    times |= dict.fromkeys(("APE", "AKE"), ())
+    times |= dict.fromkeys(("PDE", "KDE", "PRE", "KRE"), (9.0, 3.0))
     assert {Index(kind, *given).label for kind, given in times.items()} == {
         *("APE", "AKE", "MPE 9 s", "MKE 9 s", "RPE 9 s", "RKE 9 s"),
         *(f"{kind} 9 s / 3 s" for kind in ("PDE", "KDE", "PRE", "KRE")),

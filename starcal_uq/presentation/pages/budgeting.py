@@ -37,6 +37,8 @@ _HEADS = {
     "sampled_least_arcsec": "sampling at the least_arcsec",
     "sampled_se_arcsec": "standard error of sampling_arcsec",
     "explanation": "rule against sampling",
+    "of_index": "error index",
+    "at_most": "taken at most",
 }
 _RED, _AMBER, _GREEN, _GROUND = "FFFDE6DB", "FFFDF1D6", "FFE3F4EE", "FFDFE4E9"
 
@@ -90,7 +92,7 @@ def write_xlsx(budget: Budget, path: PathLike) -> None:
     marks = [not row.assessed or row.inflated for row in budget.rows]
     _sheet(book, "Contributors", contributors, [_AMBER if mark else "" for mark in marks])
     totals = _totals(budget)
-    _sheet(book, "Totals", totals, [_AMBER if row.at_least else "" for row in budget.totals])
+    _sheet(book, "Totals", totals, [_AMBER if mark else "" for mark in totals["at_least"]])
     if budget.outcomes:
         requirements = budget.requirements_dataframe()
         requirements["in_words"] = [told("outcome", outcome) for outcome in budget.outcomes]
@@ -119,7 +121,8 @@ def _contributors(budget: Budget) -> pd.DataFrame:
 def _totals(budget: Budget) -> pd.DataFrame:
     table = budget.totals_dataframe().astype(object)
     names = ["mean_arcsec", "sigma_arcsec", "rule_arcsec", "sampled_arcsec"]
-    words = [NOT_RESOLVED if row.unresolved else NOT_ASSESSED for row in budget.totals]
+    every = (*budget.totals, *budget.index_totals)
+    words = [NOT_RESOLVED if row.unresolved else NOT_ASSESSED for row in every]
     for name in names:
         table[name] = table[name].where(table[name].notna(), words)
     return table

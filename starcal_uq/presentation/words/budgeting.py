@@ -44,6 +44,7 @@ def tables(budget: Budget) -> AnyDict:
         "has_means": any(row.assessed and row.mean_arcsec != 0.0 for row in budget.rows),
         "classes": class_rows(budget),
         "totals": total_rows(budget),
+        "indices": index_rows(budget),
         "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
         "requirements": [_requirement_row(outcome) for outcome in budget.outcomes],
         "headline": told("budget", budget),
@@ -91,6 +92,7 @@ def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
         "interpretation": listed([row.interpretation for row in every]),
         "absorbed": listed([row.absorbed_by_alignment for row in every]),
         "combination": listed([row.combination for row in every]),
+        "behaviour": listed([row.behaviour for row in every]),
         "group": listed([row.correlation_group for row in every]),
         "conditions": listed([row.conditions for row in every]),
         "provenance": listed([row.provenance for row in stated]),
@@ -190,6 +192,23 @@ def total_rows(budget: Budget) -> list[Row]:
                 }
             )
     return rows
+
+
+def index_rows(budget: Budget) -> list[Row]:
+    """One row per error index and axis after alignment; empty where no index was asked for."""
+    return [
+        {
+            "index": label if axis == TOTAL_AXES[0] else "",
+            "axis": AXIS_LABELS[axis],
+            "sigma": bound(mixed.sigma_arcsec, mixed.at_least),
+            **_pair(mixed),
+            "others": [_pair(budget.total(axis, SCOPES[1], kind, label)) for kind in _OTHERS],
+            "at_most": join_words(mixed.at_most) if axis == TOTAL_AXES[0] else "",
+        }
+        for label in (budget.indices if budget.index_totals else ())
+        for axis in TOTAL_AXES
+        for mixed in [budget.total(axis, SCOPES[1], index=label)]
+    ]
 
 
 def _sampled(total: Total) -> str:
@@ -297,4 +316,15 @@ def totals_table(budget: Budget) -> TextTable:
     heads = ("scope", "axis", "sigma", "rule", "sampled")
     rows = tuple(tuple(row[name] for name in heads) for row in total_rows(budget))
     title = f"Totals at {confidence_text(budget.confidence)}, mixed interpretation, arcsec"
+    return TextTable(heads, rows, title, "lllll")
+
+
+def indices_table(budget: Budget) -> TextTable:
+    """One row per error index and axis after alignment, in the mixed interpretation."""
+    heads = ("index", "axis", "sigma", "rule", "sampled")
+    rows = tuple(tuple(row[name] for name in heads) for row in index_rows(budget))
+    title = f"Error indices at {confidence_text(budget.confidence)} after alignment, arcsec"
+    taken = dict.fromkeys(name for entry in budget.index_totals for name in entry.at_most)
+    if taken:
+        title += f"; nobody stated how these change, they are taken at most: {join_words([*taken])}"
     return TextTable(heads, rows, title, "lllll")

@@ -87,9 +87,11 @@ def bound(value: float, at_least: bool, n: int = 3) -> str:
 
 
 def axis_label(asked: Requirement) -> str:
-    """Axis of a requirement, with the frame where it is not the sensor's."""
+    """Axis of a requirement, with its index and frame where these are not the usual ones."""
     label = AXIS_LABELS[asked.axis]
-    return label if asked.frame == SENSOR else f"{label.split(' (')[0]} of {asked.frame}"
+    if asked.frame != SENSOR:
+        label = f"{label.split(' (')[0]} of {asked.frame}"
+    return label if asked.index == "AKE" else f"{asked.limited.label}, {label}"
 
 
 def frames(number: int | None) -> str:
