@@ -5,3 +5,5 @@ from .file import write_budget_template as write_budget_template
 from .indices import Index as Index
 from .result import Budget as Budget
 from .rows import Contributor as Contributor
+from .whatif import allocation as allocation
+from .whatif import budget_difference as budget_difference

@@ -10,3 +10,5 @@ from .spectrum import error_spectrum as error_spectrum
 from .thermal import TemperatureProfile as TemperatureProfile
 from .thermal import ThermalError as ThermalError
 from .thermal import load_temperature_profile as load_temperature_profile
+from .tolerance import Sensitivities as Sensitivities
+from .tolerance import sensitivities as sensitivities

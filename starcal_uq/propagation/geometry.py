@@ -56,7 +56,8 @@ class FrameGeometry:
         obs = weighed(obs, post)
         noise_px, weights = _noise(post, obs)
         model, xy, starts = post.camera.distortion, obs.xy, obs.frame_starts
-        b, per_theta = unproject_jacobian(model, post.mean, xy)
+        w = np.ones(obs.n_stars) if weights is None else weights
+        b, inverse, response = responses(model, post.mean, obs, w)
         steps = _STEP_PX * np.eye(2)
         per_pixel = [
             (
@@ -66,13 +67,6 @@ class FrameGeometry:
             / (2.0 * _STEP_PX)
             for step in steps
         ]
-        w = np.ones(obs.n_stars) if weights is None else weights
-        inverse = np.linalg.inv(
-            _frame_sums(w[:, None, None] * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts)
-        )
-        by_theta = _frame_sums(
-            w[:, None, None] * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts
-        )
         root = np.eye(2) if obs.noise_axes is None else np.linalg.cholesky(obs.noise_axes)
         torque = np.stack([(w * noise_px)[:, None] * np.cross(b, column) for column in per_pixel])
         torque = np.einsum("anj,ab->bnj", torque, root)
@@ -82,7 +76,7 @@ class FrameGeometry:
             obs=obs,
             weights=weights,
             noise_px=noise_px,
-            response=inverse @ np.swapaxes(by_theta, 1, 2),
+            response=response,
             noise_response=turns,
             noise_covariance=_frame_sums(np.einsum("ani,anj->nij", turns, turns), starts),
         )
@@ -151,6 +145,19 @@ class FrameGeometry:
             products = np.einsum("jan,ani->nij", found, turns[:, rows])
             turned.append(np.add.reduceat(products, part.frames.starts[:-1], axis=0))
         return np.concatenate(turned)
+
+
+def responses(
+    model: str, theta: FloatArray, obs: Observations, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Directions (N, 3) of the stars, inverse information (K, 3, 3) of each attitude, and its turn
+    (K, 3, p) by one unit of each parameter, rad per px unit.
+    """
+    b, per_theta = unproject_jacobian(model, theta, obs.xy)
+    starts, w = obs.frame_starts, weights[:, None, None]
+    inverse = np.linalg.inv(_frame_sums(w * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts))
+    by_theta = _frame_sums(w * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts)
+    return b, inverse, inverse @ np.swapaxes(by_theta, 1, 2)
 
 
 def _noise(post: Posterior, obs: Observations) -> tuple[FloatArray, FloatArray | None]:
