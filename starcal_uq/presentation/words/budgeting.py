@@ -15,7 +15,7 @@ from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.findings import Finding
-from starcal_uq.core.formatting import decimals_for, fixed, significant
+from starcal_uq.core.formatting import decimals_for, fixed, join_words, significant
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.numbers import axis_label, bound
