@@ -1,4 +1,4 @@
-"""Hipparcos, SAO and the Bright Star Catalogue as the CDS distributes them.
+"""Hipparcos, SAO and the Bright Star Catalogue as the CDS distributes them, read through astropy.
 
 The layout of a file is given by the "Byte-by-byte Description" of the ReadMe that comes with it.
 Where that is not at hand, the published places of the few needed columns are used (`layouts.toml`).
@@ -16,9 +16,10 @@ import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CatalogueError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import unpack
 from starcal_uq.core.tables import RawTable
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike, StrArray
 
 CdsFormat = Literal["hipparcos", "sao", "bsc"]
 LAYOUTS: dict[str, AnyDict] = tomllib.loads(
@@ -52,12 +53,9 @@ def read_cds(
             raise CatalogueError(
                 f"{readme}: does not describe {layout['title']}; leave it out or give its own."
             )
-        places = found or places
+        places = {label: (found or places)[label] for label in places}
     lines = [(n, line) for n, line in enumerate(_text(content).split("\n"), 1) if line.strip()]
-    cells = {
-        label: np.array([line[first - 1 : last].strip() for _, line in lines], dtype=np.str_)
-        for label, (first, last) in places.items()
-    }
+    cells = _cells(places, [line for _, line in lines])
     needed = [label for label in (*layout["ra"], *layout["dec"]) if not label.endswith("-")]
     present = np.all([cells[label] != "" for label in needed], axis=0)
     if "deleted" in layout:
@@ -70,6 +68,29 @@ def read_cds(
     columns = {label: texts[present].tolist() for label, texts in cells.items()}
     table = RawTable(columns, list(columns), numbers[present], "line")
     return table, int((~present).sum())
+
+
+def _cells(places: AnyDict, lines: list[str]) -> dict[str, StrArray]:
+    """The needed columns as texts, through astropy's reader of the CDS format.
+
+    Every column is described as text, because a ReadMe may say of a number that it is blank in ways
+    that the reader takes for numbers which are never blank.
+    """
+    with extra("images", "catalogue files"):
+        from astropy.io import ascii
+
+    rule = "-" * 80
+    described = [
+        f"{first:>5}-{last:>5}  A{last - first + 1}  ---  {label}  -"
+        for label, (first, last) in places.items()
+    ]
+    head = ["Byte-by-byte Description of file: data", rule]
+    head += ["   Bytes Format Units   Label    Explanations", rule, *described, rule]
+    table = ascii.get_reader(ascii.Cds).read([*head, *lines])
+    return {
+        label: np.char.strip(np.ma.filled(np.ma.asarray(table[label]).astype(str), ""))
+        for label in table.colnames
+    }
 
 
 def _described(section: str) -> dict[str, tuple[int, int]]:
