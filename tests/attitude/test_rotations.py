@@ -104,8 +104,9 @@ def test_random_rotations_are_proper_and_uniform() -> None:
         (attitude.exp_rotation, (2,)),
     ],
 )
-def test_wrong_shapes_are_named(function, shape):
-    function(np.zeros(shape))
+def test_wrong_shapes_are_named(function, shape) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=r"shape \(\.\.\."):
+        function(np.zeros(shape))
 
 
 def test_zero_quaternion_is_refused() -> None:
