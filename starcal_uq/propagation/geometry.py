@@ -155,7 +155,8 @@ def responses(
     """
     b, per_theta = unproject_jacobian(model, theta, obs.xy)
     starts, w = obs.frame_starts, weights[:, None, None]
-    inverse = np.linalg.inv(_frame_sums(w * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts))
+    information = _frame_sums(w * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts)
+    inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
     by_theta = _frame_sums(w * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts)
     return b, inverse, inverse @ np.swapaxes(by_theta, 1, 2)
 
