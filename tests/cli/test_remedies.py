@@ -565,6 +565,10 @@ def written():
                 ]
             expression = ast.fix_missing_locations(ast.Expression(call))
             yield eval(compile(expression, module, "eval"), dict(CAPITALS))
+    for path in (*PACKAGE.rglob("*.j2"), *PACKAGE.rglob("*.toml")):
+        text = path.read_text(encoding="utf-8")
+        for call in re.findall(r'Remedy\("\w+"(?:, \([^()]*\))?(?:, \{[^}]*\})?\)', text):
+            yield eval(call, dict(CAPITALS))
 
 
 def test_every_command_in_a_sentence_can_be_executed(execute, root):
