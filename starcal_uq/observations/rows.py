@@ -79,9 +79,11 @@ def typed(table: str, name: str, values: Any, kind: type) -> Any:
     """A one-dimensional copy of a column in its type; `table` is what messages call the table."""
     try:
         array: Any = np.array(values, dtype=kind)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError):
+        words = "text" if kind is str else "numbers"
         raise ObservationError(
-            f"{table}: column {name} cannot be converted ({error}); convert it first.", column=name
+            f"{table}: column {name} holds other things than {words}; convert it first.",
+            column=name,
         ) from None
     if array.ndim != 1:
         raise ObservationError(

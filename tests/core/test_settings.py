@@ -224,6 +224,8 @@ def test_odd_numbers_in_a_budget_are_refused_in_a_sentence_or_make_sense(tmp_pat
             if key == "half_width_arcsec":
                 del row["sigma_arcsec"]
                 row["distribution"] = "uniform"
+            if key.startswith(("window", "stability")):
+                row |= {"index": "KDE", "window_seconds": 9.0, "stability_seconds": 9.0}
             row[key] = odd
             path.write_text(tomli_w.dumps(content))
             try:

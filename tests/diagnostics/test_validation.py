@@ -15,6 +15,7 @@ from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import (
     CatalogueError,
+    ClusterError,
     PriorError,
     RunFolderError,
     SamplingError,
@@ -338,7 +339,7 @@ def test_interrupt_before_the_first_result_is_an_interrupt(stars, monkeypatch):
 
 
 def test_a_local_function_cannot_go_to_workers(stars):
-    with pytest.raises(SamplingError, match="top level, or use workers=0"):
+    with pytest.raises(ClusterError, match="top level, or use workers=0"):
         validate_study(study(likelihood=lambda obs, cal: cal.compressed), stars, 20, workers=2)
 
 

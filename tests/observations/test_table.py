@@ -123,7 +123,7 @@ def test_html_escapes_names():
         ({"y_px": np.zeros(3)}, "y_px has 3 rows and frame has 20"),
         ({"frame": np.full(20, 1.5)}, "frame holds fractions"),
         ({"frame": np.full(20, np.nan)}, "frame holds fractions"),
-        ({"x_px": ["a"] * 20}, "column x_px is not of kind 'number'"),
+        ({"x_px": ["a"] * 20}, "column x_px holds other things than numbers"),
         ({"x_px": np.zeros((20, 2))}, r"column x_px has shape \(20, 2\)"),
     ],
 )

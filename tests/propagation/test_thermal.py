@@ -137,7 +137,7 @@ def test_the_table_the_words_and_the_figure() -> None:
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        ("", "p.csv: holds no rows; give a table with a time and a temperature per row."),
+        ("", "p.csv: the file holds comments only; give a table."),
         ("time_s,t\n0,1\n", "p.csv: column temperature_c is missing; give it, in degrees Celsius,"),
         ("temperature_c\n1\n2\n", "p.csv: column time_s or time_utc is missing; add one of them."),
         (
