@@ -49,9 +49,18 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
 def plot_correlations(coupling: Coupling) -> Figure:
     """Both matrices side by side: the camera parameters alone, and with the boresight."""
     p, q = len(coupling.parameter_names), len(coupling.extended_names)
-    figure = style.new_figure(11.0, 5.2)
-    for extended, ax in enumerate(figure.subplots(1, 2, width_ratios=(p, q))):
-        plot_correlation(coupling, ax, extended=bool(extended))
+    width, margins, across, bar = 11.0, (0.45, 0.75, 0.1, 0.62), 0.65, 0.35
+    # Cells of both maps have one size.
+    cell = (width - margins[0] - margins[1] - 2.0 * across) / (p + q + bar)
+    figure = style.new_figure(width, q * cell + margins[2] + margins[3])
+    grid = style.panels(figure, 1, 3, margins, (across, 0.0), width_ratios=(p, q, bar))
+    left, right, scale = (figure.add_subplot(place) for place in grid)
+    heat_map(left, coupling.correlation, coupling.parameter_names)
+    left.set_anchor("N")
+    image = _extended(right, coupling)
+    style.label(left, "Camera parameters", pad=24)
+    style.label(right, "With the constant attitude error they cause", pad=24)
+    style.dress_bar(figure.colorbar(image, cax=scale), "correlation")
     return figure
 
 

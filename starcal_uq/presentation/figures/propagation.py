@@ -115,7 +115,10 @@ def plot_glance(
     away.
     """
     figure = style.new_figure(11.0, 3.3)
-    bars, stars, rest = figure.subplots(1, 3, width_ratios=(1.2, 1.0, 1.15))
+    grid = style.panels(
+        figure, 1, 3, (0.66, 0.55, 0.75, 0.4), (0.75, 0.0), width_ratios=(4.0, 2.15, 2.33)
+    )
+    bars, stars, rest = (figure.add_subplot(place) for place in grid)
     plot_attitude(error, bars)
     style.legend_on_top(bars, columnspacing=0.8, handlelength=1.2)
     plot_residual_map(cal, obs, stars)
