@@ -54,7 +54,7 @@ def plot_correlations(coupling: Coupling) -> Figure:
     cell = (width - margins[0] - margins[1] - 2.0 * across) / (p + q + bar)
     figure = style.new_figure(width, q * cell + margins[2] + margins[3])
     grid = style.panels(figure, 1, 3, margins, (across, 0.0), width_ratios=(p, q, bar))
-    left, right, scale = (figure.add_subplot(place) for place in grid)
+    left, right, scale = (figure.add_subplot(grid[i]) for i in range(3))
     heat_map(left, coupling.correlation, coupling.parameter_names)
     left.set_anchor("N")
     image = _extended(right, coupling)

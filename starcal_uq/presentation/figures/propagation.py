@@ -118,7 +118,7 @@ def plot_glance(
     grid = style.panels(
         figure, 1, 3, (0.66, 0.55, 0.75, 0.4), (0.75, 0.0), width_ratios=(4.0, 2.15, 2.33)
     )
-    bars, stars, rest = (figure.add_subplot(place) for place in grid)
+    bars, stars, rest = (figure.add_subplot(grid[i]) for i in range(3))
     plot_attitude(error, bars)
     style.legend_on_top(bars, columnspacing=0.8, handlelength=1.2)
     plot_residual_map(cal, obs, stars)
