@@ -367,7 +367,7 @@ ONCE = [
         _meta(b"starcal_uq_centroids", None),
         "the list of frames is missing; give a table",
     ),
-    ("centroids.parquet", _meta(b"starcal_uq_centroids", b"{}"), r"\(frames is missing\)"),
+    ("centroids.parquet", _meta(b"starcal_uq_centroids", b"{}"), "list of frames is missing"),
     ("profile.parquet", lambda d: b"", r"\(the file is empty\)"),
     (
         "observations.ecsv",
@@ -380,7 +380,7 @@ ONCE = [
         "the ECSV header is not valid YAML",
     ),
     ("catalogue.ecsv", _header_only, "holds no stars"),
-    ("centroids.ecsv", lambda d: d.split(b"\n")[0] + b"\n", "is not a readable table"),
+    ("centroids.ecsv", lambda d: d.split(b"\n")[0] + b"\n", "is not valid YAML"),
     ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"of those in the file \(\\x07, x\)"),
     ("catalogue.csv.gz", lambda d: d[:100], "is not readable as CSV"),
     (
