@@ -15,19 +15,17 @@ cos(2 pi f dt_s)) S(f) of ECSS-E-ST-60-10C, without an integral where K is known
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
-from starcal_uq.attitude.profile import check_order, read_columns
+from starcal_uq.attitude.profile import TableColumns, check_order, read_columns
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import listed
-from starcal_uq.core.types import FloatArray, PathLike
+from starcal_uq.core.types import BoolArray, FloatArray, PathLike
 
 Kind = Literal["constant", "white", "periodic", "correlated", "drift", "spectrum", "series"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 # The key of a budget file that states each behaviour.
 KEYS: dict[Kind, str] = {
     "white": "sample_seconds",
@@ -160,18 +158,22 @@ def load_spectrum(path: PathLike) -> Behaviour:
     Raises
     ------
     BudgetError
-        When the file cannot be read, a column is missing, frequencies do not increase from 0 or
-        more, or a density is negative.
+        When a column is missing, frequencies do not increase from 0 or more, or a density is
+        negative.
+    AttitudeProfileError
+        When the table cannot be read.
     """
-    frequency, density, where = _columns(path, "frequency_hz", "psd_arcsec2_hz")
-    if frequency[0] < 0.0 or np.any(np.diff(frequency) <= 0.0):
-        i = int(np.argmax(np.append(frequency[0] < 0.0, np.diff(frequency) <= 0.0)))
-        raise BudgetError(f"{where(i)}: frequency_hz must increase from 0 or more; sort the rows.")
-    if np.any(density < 0.0) or not np.any(density > 0.0):
-        i = int(np.argmin(density))
+    table, (frequency, density) = _columns(path, "frequency_hz", "psd_arcsec2_hz")
+    back = np.diff(frequency, prepend=-np.inf) <= 0.0
+    back[0] = frequency[0] < 0.0
+    if back.any():
         raise BudgetError(
-            f"{where(i)}: psd_arcsec2_hz is {density[i]:g}; give densities that are not negative, "
-            "some of them positive."
+            f"{_row(table, back)}: frequency_hz must increase from 0 or more; sort the rows."
+        )
+    if np.any(density < 0.0) or not np.any(density > 0.0):
+        raise BudgetError(
+            f"{_row(table, density == density.min())}: psd_arcsec2_hz is {density.min():g}; give "
+            "densities that are not negative, some of them positive."
         )
     return Behaviour("spectrum", frequency_hz=frequency, power=density)
 
@@ -183,17 +185,18 @@ def load_series(path: PathLike) -> Behaviour:
     Raises
     ------
     BudgetError
-        When the file cannot be read, a column is missing, times are not evenly spaced, or the
-        error never changes.
+        When a column is missing, times are not evenly spaced, or the error never changes.
+    AttitudeProfileError
+        When the table cannot be read, or times do not increase.
     """
-    time, error, where = _columns(path, "time_s", "error_arcsec")
-    check_order("", "row", np.arange(1, len(time) + 1), time)
+    table, (time, error) = _columns(path, "time_s", "error_arcsec")
+    check_order(f"{path}, ", table.word, table.numbers, time)
     step = float((time[-1] - time[0]) / (len(time) - 1))
-    off = np.abs((time - time[0]) / step - np.arange(len(time)))
-    if np.any(off > _UNEVEN):
+    off = np.abs((time - time[0]) / step - np.arange(len(time))) > _UNEVEN
+    if off.any():
         raise BudgetError(
-            f"{where(int(np.argmax(off > _UNEVEN)))}: time_s is not evenly spaced (steps of "
-            f"{step:g} s); interpolate the series."
+            f"{_row(table, off)}: time_s is not evenly spaced (steps of {step:g} s); interpolate "
+            "the series."
         )
     n, mean = len(error), float(error.mean())
     amplitude = np.abs(np.fft.rfft(error - mean)[1:]) / n
@@ -205,24 +208,25 @@ def load_series(path: PathLike) -> Behaviour:
     return Behaviour("series", step, np.arange(1, len(power) + 1) / (n * step), power, mean)
 
 
-def _columns(path: PathLike, *names: str) -> tuple[FloatArray, FloatArray, Callable[[int], str]]:
-    """Two columns of numbers with two rows or more, and how messages call a row."""
+def _columns(path: PathLike, *names: str) -> tuple[TableColumns, list[FloatArray]]:
+    """A table, and columns of two finite numbers or more."""
     table = read_columns(path, f"{names[0]} and {names[1]}")
+    columns = []
     for name in names:
         if name not in table.cells:
             raise BudgetError(
                 f"{path}: column {name} is missing (the file has {listed(list(table.cells))}); "
                 "name it in the header."
             )
-    columns = [table.numbers_of(name) for name in names]
-
-    def where(row: int) -> str:
-        return f"{path}, {table.word} {table.numbers[row]}"
-
-    for name, values in zip(names, columns, strict=True):
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values)))
-            raise BudgetError(f"{where(row)}: {name} is not finite; repair it.")
+        columns.append(table.numbers_of(name))
+        if not np.isfinite(columns[-1]).all():
+            odd = ~np.isfinite(columns[-1])
+            raise BudgetError(f"{_row(table, odd)}: {name} is not finite; repair it.")
     if len(columns[0]) < 2:
         raise BudgetError(f"{path}: holds a single row; give two or more.")
-    return columns[0], columns[1], where
+    return table, columns
+
+
+def _row(table: TableColumns, which: BoolArray) -> str:
+    """The first of some rows, as messages call it."""
+    return f"{table.path}, {table.word} {table.numbers[int(np.argmax(which))]}"

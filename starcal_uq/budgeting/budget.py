@@ -166,9 +166,9 @@ def budget(
             *(seen, chosen), of_index=label, at_most=at_most, n_samples=n_samples, seed=seed
         )
         index_totals += made
-        for one in stated.requirements:
-            if one.limited.label == label:
-                outcomes[one] = judge(one, seen, samples, stated.frames, at_most)
+        limits = [one for one in stated.requirements if one.limited.label == label]
+        judged = judge(limits, seen, samples, stated.frames, at_most)
+        outcomes |= dict(zip(limits, judged, strict=True))
     settings: AnyDict = {
         "confidence": chosen,
         "n_samples": n_samples,

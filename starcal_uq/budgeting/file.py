@@ -99,7 +99,7 @@ CONTRIBUTOR_KEYS = {
     **_BEHAVIOUR_KEYS,
 }
 BEHAVIOUR_KEYS = {"name": _NAME, "axis": Key.choice(tuple(_AXIS_NAMES)), **_BEHAVIOUR_KEYS}
-INDEX_KEYS = {"kind": Key.choice(tuple(NAMES), required=True), **_TIMES}
+INDEX_KEYS = {"kind": Key.choice(NAMES, required=True), **_TIMES}
 REQUIREMENT_KEYS = {
     "name": _NAME,
     "axis": Key.choice(tuple(_REQUIREMENT_AXES), required=True),
@@ -115,7 +115,7 @@ REQUIREMENT_KEYS = {
     "interpretation": Key.choice(INTERPRETATIONS),
     "judged_by": Key.choice(JUDGED_BY),
     "frame": _TEXT,
-    "index": Key.choice(tuple(NAMES)),
+    "index": Key.choice(NAMES),
     **_TIMES,
 }
 SENSOR = "sensor"

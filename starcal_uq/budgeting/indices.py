@@ -25,18 +25,7 @@ from starcal_uq.budgeting.behaviour import Behaviour
 from starcal_uq.budgeting.rows import CONTROL, Contributor
 from starcal_uq.core.errors import BudgetError, check_known
 
-NAMES = {
-    "APE": "absolute performance error",
-    "AKE": "absolute knowledge error",
-    "MPE": "mean performance error",
-    "MKE": "mean knowledge error",
-    "RPE": "relative performance error",
-    "RKE": "relative knowledge error",
-    "PDE": "performance drift error",
-    "KDE": "knowledge drift error",
-    "PRE": "performance reproducibility error",
-    "KRE": "knowledge reproducibility error",
-}
+NAMES = ("APE", "AKE", "MPE", "MKE", "RPE", "RKE", "PDE", "KDE", "PRE", "KRE")
 _ABSOLUTE, _MEAN, _RELATIVE = ("APE", "AKE"), ("MPE", "MKE"), ("RPE", "RKE")
 _KNOWLEDGE = ("AKE", "MKE", "RKE", "KDE", "KRE")
 _CONSTANT = Behaviour("constant")
@@ -63,12 +52,15 @@ class Index:
     stability_seconds: float = math.nan
 
     def __post_init__(self) -> None:
-        check_known("an error index", self.kind, tuple(NAMES), BudgetError)
+        check_known("an error index", self.kind, NAMES, BudgetError)
         for name, wanted in (("window_seconds", self.windowed), ("stability_seconds", self.later)):
             value = getattr(self, name)
-            if wanted != (not math.isnan(value)) or value <= 0.0 or math.isinf(value):
-                rule = "needs a positive, finite" if wanted else "has no"
-                raise BudgetError(f"the index {self.kind} {rule} {name}; it is {value:g}.")
+            if wanted and not 0.0 < value < math.inf:
+                raise BudgetError(
+                    f"the index {self.kind} needs {name}; give a positive number of seconds."
+                )
+            if not (wanted or math.isnan(value)):
+                raise BudgetError(f"the index {self.kind} takes no {name}; leave it out.")
 
     @property
     def windowed(self) -> bool:

@@ -438,34 +438,39 @@ def _unknown(value: Any) -> bool:
 
 
 def judge(
-    asked: Requirement,
+    requirements: Sequence[Requirement],
     rows: Sequence[Contributor],
     samples: Samples,
     rotations: Mapping[str, FloatArray] = MappingProxyType({}),
     at_most: Sequence[str] = (),
-) -> Outcome:
-    """A requirement against the total of its index at its own confidence, in its own frame.
+) -> tuple[Outcome, ...]:
+    """Every requirement of one index against the total at its own confidence, in its own frame.
 
     Rows that are taken `at_most` do not violate it: at the least, they are nothing.
     """
-    of_rows = partial(
-        total,
-        scope=asked.scope,
-        axis=asked.axis,
-        interpretation=asked.interpretation,
-        confidence=asked.confidence,
-        rotation=rotations.get(asked.frame),
-    )
-    found = replace(of_rows(rows, samples), of_index=asked.limited.label, at_most=tuple(at_most))
-    if at_most:
-        certain = [row for row in rows if row.name not in at_most]
-        n_samples = next(iter(samples.sums.values())).shape[1]
-        least = of_rows(certain, draw(certain, n_samples))
-        bounds = (least.rule_least_arcsec, least.sampled_least_arcsec)
-        if math.isnan(bounds[0]):
-            bounds = (0.0, 0.0)
-        found = replace(found, rule_least_arcsec=bounds[0], sampled_least_arcsec=bounds[1])
-    return Outcome(asked, found)
+    n_samples = next(iter(samples.sums.values())).shape[1]
+    certain = [row for row in rows if row.name not in at_most]
+    least_samples = draw(certain, n_samples) if requirements and at_most else samples
+    outcomes = []
+    for asked in requirements:
+        of_rows = partial(
+            total,
+            scope=asked.scope,
+            axis=asked.axis,
+            interpretation=asked.interpretation,
+            confidence=asked.confidence,
+            rotation=rotations.get(asked.frame),
+        )
+        found = of_rows(rows, samples)
+        if at_most:
+            least = of_rows(certain, least_samples)
+            bounds = (least.rule_least_arcsec, least.sampled_least_arcsec)
+            if math.isnan(bounds[0]):
+                bounds = (0.0, 0.0)
+            found = replace(found, rule_least_arcsec=bounds[0], sampled_least_arcsec=bounds[1])
+        found = replace(found, of_index=asked.limited.label, at_most=tuple(at_most))
+        outcomes.append(Outcome(asked, found))
+    return tuple(outcomes)
 
 
 def by_contributor(rows: Sequence[Contributor]) -> dict[str, dict[str, Contributor]]:

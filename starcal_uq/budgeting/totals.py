@@ -99,7 +99,7 @@ class Total:
     of_index : str
         Error index with its times, such as ``AKE`` or ``RPE 300 s``.
     at_most : tuple of str
-        Contributors whose behaviour in time nobody stated: the index takes them at their largest.
+        Contributors whose behaviour in time is not stated: the index takes them at their largest.
     """
 
     DOCUMENTED: ClassVar = ("at_least",)

@@ -160,6 +160,7 @@ def test_a_spectrum_is_read_with_its_size(tmp_path: Path) -> None:
         (load_spectrum, "frequency_hz,psd_arcsec2_hz\n0,1\n1,-1\n", "line 3"),
         (load_spectrum, "frequency_hz,psd_arcsec2_hz\n0,1\n", "single row"),
         (load_series, "time_s,error_arcsec\n0,1\n1,nan\n", "line 3"),
+        (load_series, "time_s,error_arcsec\n0,1\n2,1\n1,2\n", r"broken\.csv, line 4"),
         (load_series, "time_s,error_arcsec\n0,1\n1,2\n5,3\n", "line 3"),
         (load_series, "time_s,error_arcsec\n0,1\n1,1\n2,1\n", "never changes"),
         (load_series, "time_s,error_arcsec\n0,1\n1,x\n2,1\n", "line 3"),

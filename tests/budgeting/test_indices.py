@@ -180,10 +180,16 @@ def test_budgets_with_indices_are_read_as_they_were_written(tmp_path: Path) -> N
     [
         (
             '[[index]]\nkind = "RKE"\n',
-            r"\[\[index\]\] 1: .*RKE needs a positive, finite window_sec",
+            r"\[\[index\]\] 1: .*RKE needs window_seconds; give a positive",
         ),
-        ('[[index]]\nkind = "AKE"\nwindow_seconds = 3.0\n', "AKE has no window_seconds"),
-        ('[[index]]\nkind = "KDE"\nwindow_seconds = 3.0\n', "KDE needs .* stability_seconds"),
+        (
+            '[[index]]\nkind = "AKE"\nwindow_seconds = 3.0\n',
+            "AKE takes no window_seconds; leave it out",
+        ),
+        (
+            '[[index]]\nkind = "KDE"\nwindow_seconds = 3.0\n',
+            "KDE needs stability_seconds; give a positive",
+        ),
         ('[[behaviour]]\nname = "calibration, rest"\n', "no key states a behaviour"),
         ('[[behaviour]]\nname = "calibration, rst"\nperiod_seconds = 3.0\n', "did you mean"),
         (

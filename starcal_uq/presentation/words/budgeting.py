@@ -326,5 +326,5 @@ def indices_table(budget: Budget) -> TextTable:
     title = f"Error indices at {confidence_text(budget.confidence)} after alignment, arcsec"
     taken = dict.fromkeys(name for entry in budget.index_totals for name in entry.at_most)
     if taken:
-        title += f"; nobody stated how these change, they are taken at most: {join_words([*taken])}"
+        title += f"; at most, as their behaviour in time is not stated: {join_words([*taken])}"
     return TextTable(heads, rows, title, "lllll")
