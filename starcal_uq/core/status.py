@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from functools import cached_property
+from operator import ge, gt, le, lt
 from typing import Any, ClassVar
 
 from starcal_uq.core.findings import Finding, worded
@@ -332,11 +333,25 @@ def worst(checks: Iterable[Check]) -> Level:
     return max((check.level for check in checks), key=lambda level: level.rank, default=Level.PASS)
 
 
-def pass_or_fail(good: bool) -> Level:
-    """For checks that decide whether the numbers may be used at all."""
-    return Level.PASS if good else Level.FAIL
+_HOLDS = {"least": ge, "most": le, "above": gt, "below": lt}
 
 
-def pass_or_warn(good: bool) -> Level:
-    """For checks whose outcome a reader may accept."""
-    return Level.PASS if good else Level.WARN
+def judged(
+    code: Code,
+    values: dict[str, Any],
+    bounds: dict[str, Any],
+    remedies: Remedies = (),
+    orders: tuple[Order, ...] = (),
+    otherwise: Level = Level.WARN,
+    good: bool | None = None,
+) -> Check:
+    """A check that passes where every value lies within the bound of its name, such as
+    ``share_least`` for ``share``, or by `good` where that is not the question; remedies, orders and
+    the level `otherwise` are for what did not pass.
+    """
+    if good is None:
+        named = [(*name.rpartition("_"), bound) for name, bound in bounds.items()]
+        good = all(_HOLDS[how](values[of], bound) for of, _, how, bound in named)
+    if good:
+        return Check(code, values, bounds=bounds)
+    return Check(code, values, otherwise, bounds, remedies, orders)

@@ -166,6 +166,11 @@ class Diagnosis(Shown, Saved):
         """Names of the effects that the data would take up."""
         return () if self.extended is None else self.extended.effects.names
 
+    @property
+    def better(self) -> str | None:
+        """The model that the comparison prefers, empty if none; None without a comparison."""
+        return None if self.comparison is None else self.comparison.better
+
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
         same_data = self.provenance.data_sha256 == cal.provenance.data_sha256

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,8 +25,7 @@ from starcal_uq.core.status import (
     Code,
     Level,
     Order,
-    pass_or_fail,
-    pass_or_warn,
+    judged,
 )
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.inference.derived import derived_quantities
@@ -285,7 +285,8 @@ def _rhat(post: Posterior) -> Check:
         "disagreeing": bad,
         "n_ensembles": post.n_ensembles,
     }
-    return _sampling(post, Code.R_HAT, not bad, found, {"rhat_below": RHAT_BOUND})
+    bounds = {"rhat_below": RHAT_BOUND}
+    return judged(Code.R_HAT, found, bounds, _longer(post), (), Level.FAIL, not bad)
 
 
 def _effective_draws(post: Posterior) -> Check:
@@ -297,9 +298,9 @@ def _effective_draws(post: Posterior) -> Check:
     fewest = np.minimum(bulk, tail)
     bad = _names(post, ~(fewest > ESS_BOUND))
     found = {"bulk": float(np.min(bulk)), "tail": float(np.min(tail)), "too_few": bad}
-    longer = ESS_BOUND / float(np.min(fewest))
+    longer = _longer(post, ESS_BOUND / float(np.min(fewest)))
     bounds = {"draws_above": ESS_BOUND}
-    return _sampling(post, Code.EFFECTIVE_DRAWS, not bad, found, bounds, longer)
+    return judged(Code.EFFECTIVE_DRAWS, found, bounds, longer, (), Level.FAIL, not bad)
 
 
 def _acceptance(post: Posterior) -> Check:
@@ -307,12 +308,13 @@ def _acceptance(post: Posterior) -> Check:
     low, high = ACCEPTANCE_RANGE
     rates = post.diagnostics.acceptance
     good = bool(np.all((rates > low) & (rates < high)))
-    return Check(
+    return judged(
         Code.ACCEPTANCE,
         {"least": float(np.min(rates)), "most": float(np.max(rates))},
-        pass_or_fail(good),
         {"above": low, "below": high},
-        () if good else resample(post, moves="stretch", n_steps=10 * post.n_steps),
+        resample(post, moves="stretch", n_steps=10 * post.n_steps),
+        otherwise=Level.FAIL,
+        good=good,
     )
 
 
@@ -340,14 +342,8 @@ def _digits(post: Posterior) -> Check:
         share = float(d.mcse[i]) / scale / unit
         if share > largest:
             worst, largest = names[i], share
-    good = largest <= 1.0
-    return Check(
-        Code.DIGITS,
-        {"last_digits": largest, "parameter": worst},
-        pass_or_warn(good),
-        {"last_digits_most": 1.0},
-        () if good else _longer(post, largest**2),
-    )
+    found = {"last_digits": largest, "parameter": worst}
+    return judged(Code.DIGITS, found, {"last_digits_most": 1.0}, _longer(post, largest**2))
 
 
 def _degrees_of_freedom(post: Posterior) -> Check | None:
@@ -380,12 +376,10 @@ def _bounds(post: Posterior) -> Check:
         [(post.mean[:2] + 0.5) / sd[:2], (edges - post.mean[:2]) / sd[:2], post.mean[2:3] / sd[2:3]]
     )
     good = outside <= _BOUNDS_SHARE and folded == 0.0
-    remedies, orders = () if good else PLAN, () if good else MORE
-    if folded > 0.0:
-        remedies, orders = _simpler(post), ()
     found = {"outside": outside, "folded": folded, "nearest_sigma": float(np.min(room))}
     bounds = {"outside_most": _BOUNDS_SHARE}
-    return Check(Code.BOUNDS, found, pass_or_fail(good), bounds, remedies, orders)
+    remedies, orders = (_simpler(post), ()) if folded > 0.0 else (PLAN, MORE)
+    return judged(Code.BOUNDS, found, bounds, remedies, orders, Level.FAIL, good)
 
 
 def _independent(post: Posterior) -> Check:
@@ -395,13 +389,7 @@ def _independent(post: Posterior) -> Check:
     d = post.diagnostics
     fewest = float(np.min(d.ess_bulk[list(post.sampled)]))
     tolerance = AGREEMENT_BOUND + AGREEMENT_ERRORS * math.sqrt(1.0 / fewest + 1.0 / d.psis_ess)
-    light, agree = d.psis_khat < KHAT_BOUND, max(d.agreement_mean, d.agreement_sd) <= tolerance
-    remedies: Remedies = ()
-    if not light:
-        remedies = _simpler(post)
-    elif not agree:
-        remedies = _longer(post)
-    return Check(
+    return judged(
         Code.INDEPENDENT_POSTERIOR,
         {
             "means_sigma": d.agreement_mean,
@@ -409,9 +397,9 @@ def _independent(post: Posterior) -> Check:
             "khat": d.psis_khat,
             "mode_found": post.laplace.converged,
         },
-        pass_or_fail(light and agree),
         {"means_sigma_most": tolerance, "sigmas_most": tolerance, "khat_below": KHAT_BOUND},
-        remedies,
+        _longer(post) if d.psis_khat < KHAT_BOUND else _simpler(post),
+        otherwise=Level.FAIL,
     )
 
 
@@ -451,11 +439,15 @@ def _likelihood(post: Posterior, about: AnyDict) -> Check | None:
     kind = post.diagnostics.likelihood
     if kind == "marginal":
         return None
-    good = kind != "pairs_naive"
-    remedies = () if good else resample(post, likelihood="pairs")
-    found = {"likelihood": kind, **about}
-    bounds = {"refused": "pairs_naive"}
-    return Check(Code.KIND_OF_LIKELIHOOD, found, pass_or_fail(good), bounds, remedies)
+    refused = "pairs_naive"
+    return judged(
+        Code.KIND_OF_LIKELIHOOD,
+        {"likelihood": kind, **about},
+        {"refused": refused},
+        resample(post, likelihood="pairs"),
+        otherwise=Level.FAIL,
+        good=kind != refused,
+    )
 
 
 def _priors(post: Posterior) -> Check:
@@ -466,12 +458,8 @@ def _priors(post: Posterior) -> Check:
     pull = np.abs(post.draws.mean(axis=0)[: len(names)] - prior_mean) / prior_sd
     limited, pulled = _names(post, share > _PRIOR_SHARE), _names(post, pull > _PRIOR_PULL)
     largest = int(np.argmax(share))
-    remedies: Remedies = ()
-    orders: tuple[Order, ...] = ()
-    if limited:
-        remedies, orders = PLAN, MORE
-    elif pulled:
-        orders = (Order(Advice.ANOTHER_PRIOR),)
+    another = (Order(Advice.ANOTHER_PRIOR),)
+    remedies, orders = (PLAN, MORE) if limited else ((), another)
     found = {
         "share": float(share[largest]),
         "parameter": names[largest],
@@ -479,8 +467,8 @@ def _priors(post: Posterior) -> Check:
         "pulled": pulled,
         "furthest_sd": float(np.max(pull)),
     }
-    level, bounds = pass_or_warn(not limited and not pulled), {"share_most": _PRIOR_SHARE}
-    return Check(Code.INFLUENCE_OF_THE_PRIORS, found, level, bounds, remedies, orders)
+    bounds, good = {"share_most": _PRIOR_SHARE}, not limited and not pulled
+    return judged(Code.INFLUENCE_OF_THE_PRIORS, found, bounds, remedies, orders, good=good)
 
 
 def _simpler(post: Posterior) -> Remedies:
@@ -492,24 +480,13 @@ def _simpler(post: Posterior) -> Remedies:
 
 
 def _names(post: Posterior, which: BoolArray) -> tuple[str, ...]:
-    return tuple(
-        post.parameter_names[i] for i, flag in zip(post.sampled, which, strict=True) if flag
-    )
+    return tuple(post.parameter_names[i] for i in compress(post.sampled, which))
 
 
 def _converged(post: Posterior, code: Code, rhat: float, ess: float, found: AnyDict) -> Check:
-    good, bounds = (
-        rhat < RHAT_BOUND and ess > ESS_BOUND,
-        {"rhat_below": RHAT_BOUND, "draws_above": ESS_BOUND},
-    )
     found = {"rhat": rhat, "draws": ess, **found}
-    return _sampling(post, code, good, found, bounds, ESS_BOUND / ess)
-
-
-def _sampling(
-    post: Posterior, code: Code, good: bool, found: AnyDict, bounds: AnyDict, longer: float = 1.0
-) -> Check:
-    return Check(code, found, pass_or_fail(good), bounds, () if good else _longer(post, longer))
+    bounds = {"rhat_below": RHAT_BOUND, "draws_above": ESS_BOUND}
+    return judged(code, found, bounds, _longer(post, ESS_BOUND / ess), otherwise=Level.FAIL)
 
 
 def _longer(post: Posterior, factor: float = 1.0) -> Remedies:

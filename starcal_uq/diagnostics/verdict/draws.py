@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.status import Check, Code, pass_or_fail, pass_or_warn
+from starcal_uq.core.status import Check, Code, Level, judged
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -22,29 +22,27 @@ PROPAGATION_SLACK, PROPAGATION_ERRORS = 0.03, 4.0
 
 def same_data(post: Posterior, data_hash: str) -> Check:
     """Was the posterior sampled from the observations of this hash?"""
-    good = post.provenance.data_sha256 == data_hash
-    return Check(
+    sampled = post.provenance.data_sha256
+    return judged(
         Code.DATA_OF_THE_POSTERIOR,
-        {"sampled_sha256": str(post.provenance.data_sha256)},
-        pass_or_fail(good),
+        {"sampled_sha256": str(sampled)},
         {"at_hand_sha256": data_hash},
-        () if good else (Remedy("sample", (RUN,), {"force": True}),),
+        (Remedy("sample", (RUN,), {"force": True}),),
+        otherwise=Level.FAIL,
+        good=sampled == data_hash,
     )
 
 
 def propagation(error: AttitudeError) -> Check:
     """Do draws through QUEST and first-order propagation give the same attitude error?"""
-    largest = propagation_difference(error)
     # A standard deviation from n draws has a relative error of at most 1 / sqrt(2 n).
     bound = PROPAGATION_SLACK + PROPAGATION_ERRORS / float(np.sqrt(2.0 * error.n_draws))
-    good = largest <= bound
     more = {"force": True, "n_draws": 4 * error.n_draws}
-    return Check(
+    return judged(
         Code.PROPAGATION_TO_ATTITUDE,
-        {"difference": largest},
-        pass_or_warn(good),
+        {"difference": propagation_difference(error)},
         {"difference_most": bound},
-        () if good else (Remedy("propagate", (RUN,), more, form="command"),),
+        (Remedy("propagate", (RUN,), more, form="command"),),
     )
 
 

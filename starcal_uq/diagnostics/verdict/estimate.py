@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +19,7 @@ from starcal_uq.core.status import (
     Level,
     Order,
     Status,
-    pass_or_fail,
-    pass_or_warn,
+    judged,
 )
 from starcal_uq.core.types import AnyDict, BoolArray
 from starcal_uq.diagnostics.beside import has_effects
@@ -92,7 +94,7 @@ def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
             "n_iterations": sum(len(stage.trajectory) - 1 for stage in cal.stages),
             "by_priors": cal.undetermined if by_priors else (),
         },
-        Level.WARN if by_priors else pass_or_fail(cal.status.ok),
+        Level.WARN if by_priors else Level.PASS if cal.status.ok else Level.FAIL,
         remedies=() if cal.solver == "filter" else known.get(cal.status, ()),
         orders=() if cal.status.ok else (Order(Advice.MEND_THE_ESTIMATE, status),),
     )
@@ -103,12 +105,10 @@ def determined(cal: Calibration) -> Check | None:
     noise?
     """
     found = fallback_facts(cal)
+    if not found:
+        return None
     # To ask for what was fitted would determine nothing.
-    return (
-        Check(Code.MODEL_THAT_THE_DATA_DETERMINE, found, Level.WARN, remedies=PLAN)
-        if found
-        else None
-    )
+    return Check(Code.MODEL_THAT_THE_DATA_DETERMINE, found, Level.WARN, remedies=PLAN)
 
 
 def estimators_agree(cal: Calibration) -> Check | None:
@@ -120,17 +120,7 @@ def estimators_agree(cal: Calibration) -> Check | None:
     # The pair estimator is the less efficient one, so its own covariance bounds that of the
     # difference.
     z = difference / np.sqrt(np.diag(cal.pair_covariance))
-    good = float(np.max(z)) < (limit := _largest_z(ESTIMATORS_P, cal))
-    return Check(
-        Code.TWO_ESTIMATORS,
-        {
-            "difference_sigma": float(np.max(z)),
-            "parameter": cal.parameter_names[int(np.argmax(z))],
-        },
-        pass_or_fail(good),
-        {"below_sigma": limit},
-        () if good else SCREEN,
-    )
+    return _largest_error(Code.TWO_ESTIMATORS, z, ESTIMATORS_P, cal, SCREEN)
 
 
 def rotations_agree(cal: Calibration) -> Check | None:
@@ -138,41 +128,34 @@ def rotations_agree(cal: Calibration) -> Check | None:
     ties = cal.ties
     if ties is None:
         return None
-    good, bounds = ties.p_value >= ROTATIONS_P, {"p_least": ROTATIONS_P}
-    facts = {"chi2": ties.chi2, "dof": ties.dof, "p_value": ties.p_value}
-    if good:
-        return Check(Code.KNOWN_ROTATIONS, facts, bounds=bounds)
-    facts |= {"error_factor": ties.error_factor}
     wider = float(f"{np.max(ties.known.sigma_arcsec) * ties.error_factor:.3g}")
-    return Check(
+    return judged(
         Code.KNOWN_ROTATIONS,
-        facts,
-        Level.FAIL,
-        bounds,
+        {name: getattr(ties, name) for name in ("chi2", "dof", "p_value", "error_factor")},
+        {"p_value_least": ROTATIONS_P},
         calibrated(mount="fixed", mount_sigma_arcsec=wider) if ties.known.of_mount else (),
         (Order(Advice.WITHOUT_ROTATIONS),),
+        Level.FAIL,
     )
 
 
-def _largest_z(size: float, cal: Calibration) -> float:
-    """What the largest of the parameters' errors in sigma exceeds with this probability (Student,
-    Bonferroni).
+def _largest_error(
+    code: Code, z: FloatArray, size: float, cal: Calibration, remedies: Remedies
+) -> Check:
+    """The largest of the parameters' errors in sigma (p,) against what it exceeds with probability
+    `size` (Student, Bonferroni).
     """
-    return student_quantile(1.0 - size / len(cal.theta), cal.dof)
+    worst = int(np.argmax(z))
+    facts = {"error_sigma": float(z[worst]), "parameter": cal.parameter_names[worst]}
+    bounds = {"error_sigma_below": student_quantile(1.0 - size / len(cal.theta), cal.dof)}
+    return judged(code, facts, bounds, remedies, otherwise=Level.FAIL)
 
 
 def against_truth(cal: Calibration, truth: Camera, post: Posterior | None = None) -> Check:
     """Errors in units of sigma, where the truth is known."""
-    z = truth_z(cal, truth, post)
-    largest, limit = float(np.max(np.abs(z))), _largest_z(TRUTH_P, cal)
-    good = largest < limit
-    return Check(
-        Code.KNOWN_TRUTH,
-        {"error_sigma": largest, "parameter": cal.parameter_names[int(np.argmax(np.abs(z)))]},
-        pass_or_fail(good),
-        {"below_sigma": limit},
-        () if good else (Remedy("validate", (CAMERA,), form="command"),),
-    )
+    z = np.abs(truth_z(cal, truth, post))
+    validate = (Remedy("validate", (CAMERA,), form="command"),)
+    return _largest_error(Code.KNOWN_TRUTH, z, TRUTH_P, cal, validate)
 
 
 def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> FloatArray:
@@ -202,17 +185,19 @@ def model_checks(
     attitude: AttitudeError | None = None,
 ) -> list[Check]:
     """Every check that a diagnosis allows."""
-    better = None if diagnosis.comparison is None else diagnosis.comparison.better
     moving = EFFECTS if _OF_FRAMES_APART & set(diagnosis.effects) else ()
     checks = [
-        misfit(diagnosis.misfit, cal, attitude, better, diagnosis.extended),
+        misfit(diagnosis.misfit, cal, attitude, diagnosis.better, diagnosis.extended),
         even_noise(diagnosis.misfit, EFFECTS if diagnosis.effects else ()),
     ]
-    checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
-    checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife, moving)]
-    checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
-    checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison, attitude)]
-    return [*checks, predictive(diagnosis.predictive)]
+    asked: list[tuple[Callable[..., Check], object]] = [
+        (one_camera, diagnosis.cameras),
+        (partial(jackknife, moving=moving), diagnosis.jackknife),
+        (stars, diagnosis.stars),
+        (partial(comparison, attitude=attitude), diagnosis.comparison),
+        (predictive, diagnosis.predictive),
+    ]
+    return [*checks, *(check(found) for check, found in asked if found is not None)]
 
 
 def one_camera(found: MixedCameras) -> Check:
@@ -239,7 +224,7 @@ def misfit(
     """
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
     facts: AnyDict = {"p_value": min(patterns, default=1.0), "n_tests": len(found.tests)}
-    code, bounds = Code.UNEXPLAINED_STRUCTURE, {"p_least": MISFIT_P}
+    code, bounds = Code.UNEXPLAINED_STRUCTURE, {"p_value_least": MISFIT_P}
     rejected = [test for test in found.found(MISFIT_P) if not test.is_of_noise]
     if not rejected:
         return Check(code, facts, bounds=bounds)
@@ -291,7 +276,7 @@ def even_noise(found: Misfit, helping: Remedies = ()) -> Check:
     elif rejected:
         level, remedies = Level.WARN, helping
         orders = () if helping else (Order(_OF_FRAMES),)
-    bounds = {"p_least": MISFIT_P}
+    bounds = {"p_value_least": MISFIT_P}
     return Check(Code.EVENNESS_OF_THE_NOISE, facts, level, bounds, remedies, orders)
 
 
@@ -306,21 +291,18 @@ def jackknife(found: Jackknife, moving: Remedies = ()) -> Check:
     """Do frames scatter as their formal errors say? `moving`: what takes up how they differ."""
     worst, bad = int(np.argmax(found.ratio)), disagreeing(found)
     chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(bad))[1]
-    good = not np.any(bad)
-    return Check(
+    return judged(
         Code.JACKKNIFE_OVER_FRAMES,
         {
             "least": float(found.ratio.min()),
             "most": float(found.ratio.max()),
             "parameter": found.parameter_names[worst],
-            "disagreeing": tuple(
-                name for name, flag in zip(found.parameter_names, bad, strict=True) if flag
-            ),
+            "disagreeing": tuple(compress(found.parameter_names, bad)),
         },
-        pass_or_warn(good),
         {"ratio_most": max(float(chance[worst]), JACKKNIFE_RATIO)},
-        () if good else moving,
-        () if good or moving else (Order(_OF_FRAMES),),
+        moving,
+        () if moving else (Order(_OF_FRAMES),),
+        good=not np.any(bad),
     )
 
 
@@ -335,7 +317,7 @@ def stars(found: StarTest) -> Check:
         # field.
         bounds = {"error_most_px": PLAUSIBLE_NOISE_PX[1]}
         return Check(code, facts, Level.FAIL, bounds, (), (Order(Advice.WITHOUT_STAR_ERRORS),))
-    bounds = {"p_least": STAR_P}
+    bounds = {"p_value_least": STAR_P}
     if not found.applicable or found.p_value >= STAR_P or found.included_px > 0.0:
         return Check(code, facts, bounds=bounds)
     widening = float(np.max(found.widening))
@@ -416,12 +398,12 @@ def predictive(found: PredictiveCheck) -> Check:
     """Do replicated data look like the measured ones?"""
     extreme = tuple(s.name for s in found.statistics if s.extreme)
     low = min(found.statistics, key=lambda s: min(s.p_value, 1.0 - s.p_value))
-    return Check(
+    return judged(
         Code.POSTERIOR_PREDICTIVE_CHECK,
         {"p_value": low.p_value, "n_draws": found.n_draws, "extreme": extreme},
-        pass_or_warn(not extreme),
-        dict(zip(("p_least", "p_most"), EXTREME_P, strict=True)),
-        ROBUST if extreme else (),
+        dict(zip(("p_value_least", "p_value_most"), EXTREME_P, strict=True)),
+        ROBUST,
+        good=not extreme,
     )
 
 

@@ -133,28 +133,25 @@ def judge(
     With its place, remedies are commands that name its files. The requirements of its budget are
     checks like the others.
     """
-    checks: list[Check | None] = [estimate.estimation(cal, post), estimate.determined(cal)]
-    checks += [estimate.estimators_agree(cal), estimate.rotations_agree(cal)]
+    used = weighed(obs, cal)
+    known = [getattr(diagnosis, name, None) for name in ("air", "times", "aberration", "better")]
+    air, times, aberration, better = known
+    rests = observed.rests_on_aberration(used, aberration if times is None else None)
+    checks: list[Check | None] = [
+        estimate.estimation(cal, post),
+        estimate.determined(cal),
+        estimate.estimators_agree(cal),
+        estimate.rotations_agree(cal),
+    ]
     if diagnosis is not None and diagnosis.starts is not None:
         checks += [estimate.starts(diagnosis.starts)]
     if post is not None:
         checks += [draws.same_data(post, cal.data_hash_of(obs)), *post.diagnostics.checks]
-    used = weighed(obs, cal)
-    asked = (None, None) if diagnosis is None else (diagnosis.air, diagnosis.times)
-    better = (
-        None if diagnosis is None or diagnosis.comparison is None else diagnosis.comparison.better
-    )
-    unseen = None if diagnosis is None or diagnosis.times is not None else diagnosis.aberration
-    rests = observed.rests_on_aberration(used, unseen)
-    checks += [observed.directions(used, cal, *asked, rests)]
     checks += [
-        observed.residual_pattern(
-            used, cal, better, () if diagnosis is None else diagnosis.effects
-        ),
+        observed.directions(used, cal, air, times, rests),
+        observed.residual_pattern(used, cal, better, getattr(diagnosis, "effects", ())),
         observed.outliers(used, cal),
         observed.screening(obs),
-    ]
-    checks += [
         observed.noise(used, cal),
         observed.partitions(cal),
         observed.terms(cal),

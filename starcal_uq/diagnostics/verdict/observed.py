@@ -28,7 +28,7 @@ from starcal_uq.core.status import (
     Level,
     Note,
     Order,
-    pass_or_warn,
+    judged,
 )
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
@@ -259,7 +259,7 @@ def residual_pattern(
         "pattern_arcsec": pattern / cal.camera.focal_px * ARCSEC,
         "n_cells": len(binned.counts),
     }
-    code, bounds = Code.PATTERN_IN_THE_RESIDUALS, {"p_least": PATTERN_P}
+    code, bounds = Code.PATTERN_IN_THE_RESIDUALS, {"p_value_least": PATTERN_P}
     if binned.p_value >= PATTERN_P:
         return Check(code, facts, bounds=bounds)
     seen = 2.0 * float(binned.counts.sum()) * (pattern / _noise_px(obs, cal)) ** 2
@@ -298,14 +298,9 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     expected = n_stars * 2.0 * float(erfc(OUTLIER_SIGMA / np.sqrt(2.0)))
     # Probability of at least `found` where `expected` are expected (Poisson).
     p_value = 1.0 if found == 0 else float(pdtrc(found - 1, expected))
-    good = p_value >= OUTLIER_P
-    return Check(
-        Code.OUTLIERS,
-        {"n_beyond": found, "largest_sigma": largest, "frame": frame},
-        pass_or_warn(good),
-        {"beyond_sigma": OUTLIER_SIGMA, "expected": expected},
-        () if good else SCREEN,
-    )
+    facts = {"n_beyond": found, "largest_sigma": largest, "frame": frame, "p_value": p_value}
+    facts |= {"beyond_sigma": OUTLIER_SIGMA, "expected": expected}
+    return judged(Code.OUTLIERS, facts, {"p_value_least": OUTLIER_P}, SCREEN)
 
 
 def screening(obs: Observations) -> Check | None:
@@ -353,7 +348,7 @@ def noise(obs: Observations, cal: Calibration) -> Check:
         facts["unlike"], orders = unlike
         remedies = ()
     bounds = {f"least{unit}": low, f"most{unit}": high}
-    return Check(code, facts, pass_or_warn(good), bounds, remedies, orders)
+    return judged(code, facts, bounds, remedies, orders, good=good)
 
 
 def _stated_unit(obs: Observations, cal: Calibration) -> tuple[Finding, tuple[Order, ...]] | None:
@@ -391,8 +386,7 @@ def partitions(cal: Calibration) -> Check | None:
     z = (np.cbrt(found.chi2 / cal.sigma**2 / dof) - (1.0 - spread)) / np.sqrt(spread)
     worst = int(np.argmax(np.abs(z)))
     p_value = min(1.0, len(z) * float(erfc(abs(z[worst]) / np.sqrt(2.0))))
-    good = p_value >= PATTERN_P
-    return Check(
+    return judged(
         Code.NOISE_OF_THE_FILES,
         {
             "p_value": p_value,
@@ -400,9 +394,8 @@ def partitions(cal: Calibration) -> Check | None:
             "n_files": len(z),
             "times": float(np.sqrt(found.chi2[worst] / dof[worst])) / cal.sigma,
         },
-        pass_or_warn(good),
-        {"p_least": PATTERN_P},
-        orders=() if good else (Order(Advice.LOOK_AT_THE_FILE),),
+        {"p_value_least": PATTERN_P},
+        orders=(Order(Advice.LOOK_AT_THE_FILE),),
     )
 
 
@@ -415,14 +408,12 @@ def terms(cal: Calibration) -> Check | None:
     richer = cal.partitions.richer
     single = [float(gammaincc(0.5 * other.n_terms, 0.5 * max(other.gain, 0.0))) for other in richer]
     best = int(np.argmin(single))
-    name, p_value = richer[best].model, min(1.0, len(single) * single[best])
-    good = p_value >= PATTERN_P
-    return Check(
+    name = richer[best].model
+    return judged(
         Code.TERMS_OF_THE_DISTORTION,
-        {"p_value": p_value, "model": name},
-        pass_or_warn(good),
-        {"p_least": PATTERN_P},
-        () if good else calibrated("command", model=name),
+        {"p_value": min(1.0, len(single) * single[best]), "model": name},
+        {"p_value_least": PATTERN_P},
+        calibrated("command", model=name),
     )
 
 
@@ -431,14 +422,12 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
     binned = bin_residuals(cal, obs)
     share = len(binned.counts) / max(len(binned.counts) + binned.n_empty, 1)
     n_frames = obs.n_frames if cal.partitions is None else cal.n_frames
-    good = share >= COVERED_SHARE and n_frames >= MIN_FRAMES
-    return Check(
+    return judged(
         Code.COVERAGE_OF_THE_FIELD,
         {"share": share, "n_frames": n_frames},
-        pass_or_warn(good),
         {"share_least": COVERED_SHARE, "n_frames_least": MIN_FRAMES},
-        () if good else PLAN,
-        () if good else MORE,
+        PLAN,
+        MORE,
     )
 
 
