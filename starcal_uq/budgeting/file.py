@@ -12,9 +12,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
-import numpy as np
-
-from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.attitude.heads import ROTATION, stated_rotation
 from starcal_uq.budgeting.behaviour import KEYS as TIME_KEYS
 from starcal_uq.budgeting.behaviour import Behaviour, load_series, load_spectrum
 from starcal_uq.budgeting.indices import NAMES, Behaviours, Index
@@ -119,9 +117,7 @@ REQUIREMENT_KEYS = {
     **_TIMES,
 }
 SENSOR = "sensor"
-_FRAME = Section(
-    {"rotation": Key(Any, "a matrix of three rows, or a quaternion", required=True)}, BudgetError
-)
+_FRAME = Section({"rotation": ROTATION}, BudgetError)
 _HEAD, _CONTRIBUTOR, _REQUIREMENT, _BEHAVIOUR, _INDEX = (
     Section(keys, BudgetError)
     for keys in (BUDGET_KEYS, CONTRIBUTOR_KEYS, REQUIREMENT_KEYS, BEHAVIOUR_KEYS, INDEX_KEYS)
@@ -129,10 +125,6 @@ _HEAD, _CONTRIBUTOR, _REQUIREMENT, _BEHAVIOUR, _INDEX = (
 _LISTS = ("contributor", "behaviour", "index", "requirement")
 # Distributions of errors that behave so in time, unless the file states another.
 _SHAPES = {"periodic": "arcsine", "drift": "uniform"}
-# Rows of a matrix that people round to six digits.
-_ORTHONORMAL = 1e-5
-# Parts of a quaternion, which need not have unit length.
-_LARGE = 1e6
 # Keys of earlier versions, and why to delete them.
 _GONE = {"time_class": "interpretation alone decides how a row is combined"}
 
@@ -356,23 +348,8 @@ def _frames(tables: Any, path: PathLike) -> dict[str, FloatArray]:
         table = _read(data, where, _FRAME)
         if name == SENSOR:
             raise BudgetError(f"{where}: this is the frame of the rows; give yours another name.")
-        try:
-            values = np.array(table["rotation"], dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            values = np.zeros(0)
-        if values.size and not np.abs(values).max() < _LARGE:
-            values = np.zeros(0)
-        if values.shape == (4,) and np.any(values):
-            values = quaternion_to_rotation(values / np.linalg.norm(values))
-        if values.shape != (3, 3) or not np.abs(values @ values.T - np.eye(3)).max() < _ORTHONORMAL:
-            raise BudgetError(
-                f"{where}: key rotation is no rotation; write three rows of three numbers "
-                f"(v_{name} = R v_sensor), or "
-                "the four of a quaternion, scalar last."
-            )
-        if np.linalg.det(values) < 0.0:
-            raise BudgetError(f"{where}: key rotation mirrors; change the sign of one row.")
-        frames[name] = values
+        words = f"v_{name} = R v_sensor"
+        frames[name] = stated_rotation(table["rotation"], where, words, BudgetError)
     return frames
 
 

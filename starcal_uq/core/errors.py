@@ -113,6 +113,10 @@ class AttitudeProfileError(StarcalError):
     """A profile over time is unreadable, or its times, quaternions or temperatures cannot be used."""
 
 
+class HeadError(StarcalError):
+    """Heads of a star tracker, or their mountings, cannot be used as they are given."""
+
+
 class CatalogueError(StarcalError):
     """A star catalogue cannot be read or does not hold what was asked for."""
 

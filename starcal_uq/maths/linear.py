@@ -140,3 +140,15 @@ def inverses(information: FloatArray) -> FloatArray:
     with np.errstate(invalid="ignore"):
         inverse = inverse * scale[..., :, None] * scale[..., None, :]
     return np.where(good[..., None, None], inverse, np.inf)
+
+
+def mean_weights(covariances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weights (..., n, k, k) of n estimates, whose sum is the identity, and the covariance (..., k,
+    k) of their mean.
+
+    An estimate whose covariance is NaN has no weight.
+    """
+    information = np.linalg.inv(covariances)
+    information = np.where(np.isnan(information), 0.0, information)
+    covariance: FloatArray = np.linalg.inv(information.sum(axis=-3))
+    return covariance[..., None, :, :] @ information, covariance

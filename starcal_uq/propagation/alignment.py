@@ -15,7 +15,6 @@ import numpy as np
 from starcal_uq.camera.projection import cannot_fold, unproject_theta
 from starcal_uq.core.errors import DistortionError, ObservationError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
@@ -103,12 +102,3 @@ def random_sky(post: Posterior, like: Observations, n_frames: int, seed: int) ->
         mag=None if like.mag is None else like.mag[star],
         meta={"frames": f"{plural(n_frames, 'frame')} of random sky"},
     )
-
-
-def alignment_weights(noise_covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weights (n, 3, 3) of the frames' attitudes, whose sum is the identity, and the covariance (3,
-    3) of the mean.
-    """
-    information = np.linalg.inv(noise_covariance)
-    covariance: FloatArray = np.linalg.inv(information.sum(axis=0))
-    return covariance @ information, covariance

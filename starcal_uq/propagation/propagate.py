@@ -39,8 +39,8 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.settings import OnboardModel, bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, PathLike
+from starcal_uq.maths.linear import mean_weights
 from starcal_uq.propagation.alignment import alignment_frames as _alignment_frames
-from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.attitude_error import (
     OBSERVED,
     AttitudeError,
@@ -129,7 +129,7 @@ def propagate(
     frames = FrameGeometry.of(post, obs)
     aligning, told = _alignment_frames(post, obs, alignment, alignment_frames, seed)
     aligned = frames if aligning is obs else FrameGeometry.of(post, aligning)
-    weights, alignment_covariance = alignment_weights(aligned.noise_covariance)
+    weights, alignment_covariance = mean_weights(aligned.noise_covariance)
     aboard = Aboard(post, obs if calibrated is None else calibrated)
     turns = aboard.turns(frames, obs)
     split = _Split.of(
@@ -401,7 +401,7 @@ def extended_error(
     aligning = seen if error.aligned is None else error.aligned
     frames = FrameGeometry.of(post, seen)
     aligned = frames if aligning is seen else FrameGeometry.of(post, aligning)
-    weights, _ = alignment_weights(aligned.noise_covariance)
+    weights, _ = mean_weights(aligned.noise_covariance)
     aboard = Aboard(extended, obs, post.mean)
     turns = aboard.turns(frames, seen)
     there = None if aligned is frames else aboard.turns(aligned, aligning)

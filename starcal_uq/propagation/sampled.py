@@ -9,8 +9,8 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.maths.linear import mean_weights
 from starcal_uq.observations.splits import frame_sample
-from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.geometry import FrameGeometry
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def through_quest(
         aligned = (
             every_aligned if aligning is every_aligned.obs else FrameGeometry.of(post, aligning)
         )
-    weights, _ = alignment_weights(aligned.noise_covariance)
+    weights, _ = mean_weights(aligned.noise_covariance)
     common, constant = np.empty((len(draws), 3)), np.empty((len(draws), 3))
     # Where the same frames align and are propagated to, their attitudes are found once.
     if aligned is not frames:

@@ -22,9 +22,9 @@ from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import DistortionError, ObservationError, RunFolderError, SamplingError
 from starcal_uq.estimation.result import Calibration
+from starcal_uq.maths.linear import mean_weights
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_start
-from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, AttitudeError
 from starcal_uq.propagation.geometry import FrameGeometry
 from starcal_uq.propagation.onboard_error import OnboardError
@@ -61,7 +61,7 @@ def propagate(post: Any, obs: Observations, **options: Any) -> AttitudeError:
 
 def aligned(post: Any, obs: Observations, phi: np.ndarray) -> np.ndarray:
     """What an alignment on these frames finds of rotations (d, K, 3)."""
-    weights, _ = alignment_weights(FrameGeometry.of(post, obs).noise_covariance)
+    weights, _ = mean_weights(FrameGeometry.of(post, obs).noise_covariance)
     return np.einsum("kij,dkj->di", weights, phi)
 
 

@@ -1,0 +1,307 @@
+"""Several heads of one star tracker: one attitude of the body from theirs, and how they are mounted.
+
+A head measures R_head_icrs with a left error phi of covariance P about its own axes. Its mounting
+R_body_head turns vectors of the head into those of the body, so that it measures the attitude of
+the body with the error R_body_head phi. The heads together, each with the inverse of its covariance
+as its weight, have
+
+    P_body = (sum R_body_head P^-1 R_body_head^T)^-1.
+
+What a head knows badly, the turn about its boresight, another one knows well that looks elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import (
+    exp_rotation,
+    left_error,
+    quaternion_multiply,
+    quaternion_to_rotation,
+    rotation_to_quaternion,
+)
+from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.errors import HeadError, StarcalError, require
+from starcal_uq.core.toml import Key, Section, read_toml
+from starcal_uq.core.types import FloatArray, IntArray, PathLike
+from starcal_uq.maths.linear import mean_weights
+
+if TYPE_CHECKING:
+    pass
+
+# Rows of a matrix that people round to six digits.
+_ORTHONORMAL = 1e-5
+# Parts of a quaternion, which need not have unit length.
+_LARGE = 1e6
+# References, each nearer to what is sought: errors of a degree leave nothing after three.
+_PASSES = 4
+ROTATION = Key(Any, "a matrix of three rows, or a quaternion", required=True)
+_HEAD = Section(
+    {
+        "name": Key(str, "text in quotes", required=True, pattern=r"\S"),
+        "rotation": ROTATION,
+        "run": Key(str, "the run folder of its calibration, beside this file", pattern=r"\S"),
+    },
+    HeadError,
+)
+
+
+@dataclass(frozen=True)
+class HeadTest:
+    """How far heads differ from each other, beside what their covariances say.
+
+    Attributes
+    ----------
+    chi_square : float
+        Sum of squared differences, in stated covariances.
+    dof : int
+        Its degrees of freedom.
+    """
+
+    chi_square: float
+    dof: int
+
+    @property
+    def ratio(self) -> float:
+        """Chi-square per degree of freedom: 1 where covariances and mountings are right."""
+        return self.chi_square / self.dof if self.dof else float("nan")
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a ratio as far from 1, either way, if they are; NaN where one head is
+        alone.
+        """
+        from scipy.special import chdtr, chdtrc
+
+        if not self.dof:
+            return float("nan")
+        tails = (float(tail(self.dof, self.chi_square)) for tail in (chdtr, chdtrc))
+        return min(1.0, 2.0 * min(tails))
+
+
+@dataclass(frozen=True, eq=False)
+class FusedAttitudes:
+    """Attitudes of the body from those of all heads.
+
+    Attributes
+    ----------
+    quaternions : (K, 4) array
+        Of R_body_icrs, scalar last.
+    covariance : (K, 3, 3) array
+        Covariance of the left error about the axes of the body, rad^2.
+    heads : (K,) array of int
+        Heads that gave an attitude.
+    squares : (K,) array
+        Squared differences of the heads from the fused attitude, in their covariances.
+    """
+
+    quaternions: FloatArray
+    covariance: FloatArray
+    heads: IntArray
+    squares: FloatArray
+
+    @property
+    def sigma_arcsec(self) -> FloatArray:
+        """Standard deviation (3,) about X, Y and Z of the body, root mean square over frames."""
+        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
+        return np.asarray(ARCSEC * np.sqrt(variances.mean(axis=0)))
+
+    @property
+    def test(self) -> HeadTest:
+        """Whether heads differ as their covariances say. It sees a wrong weight along axes on which
+        heads differ in it; the errors of two heads with one boresight cannot be told apart.
+        """
+        return HeadTest(float(self.squares.sum()), 3 * int(np.sum(self.heads - 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class HeadArray:
+    """Heads of one star tracker and their mountings.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The heads.
+    R_body_head : (H, 3, 3) array
+        Rotations that turn vectors of a head into those of the body.
+    runs : tuple of str
+        Run folders of their calibrations, empty where none is stated.
+    """
+
+    names: tuple[str, ...]
+    R_body_head: FloatArray
+    runs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        rotations = np.array(self.R_body_head, dtype=float)
+        known = len(set(self.names)) == len(self.names) > 0
+        require(
+            HeadError,
+            (known, f"heads are called {', '.join(self.names)}: give each a name of its own."),
+            (
+                rotations.shape == (len(self.names), 3, 3),
+                f"there are mountings of shape {rotations.shape} for {len(self.names)} heads: give "
+                "a 3 x 3 matrix for each.",
+            ),
+        )
+        rotations.setflags(write=False)
+        object.__setattr__(self, "R_body_head", rotations)
+
+    def gains(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How errors of the heads turn the fused attitude, and its covariance.
+
+        Parameters
+        ----------
+        covariance : (..., H, 3, 3) array
+            Covariances that weigh the heads, each about the axes of its head; NaN for a head that
+            gives no attitude.
+
+        Returns
+        -------
+        (..., H, 3, 3) array, (..., 3, 3) array
+            Turn about the axes of the body by a unit error about those of a head, and the
+            covariance of the sum if those that weigh are right, in their unit.
+        """
+        weights, fused = self._weights(covariance)
+        return weights @ self.R_body_head, fused
+
+    def fuse(self, quaternions: FloatArray, covariance: FloatArray) -> FusedAttitudes:
+        """Attitudes of the body from those of the heads.
+
+        Parameters
+        ----------
+        quaternions : (H, K, 4) array
+            R_head_icrs of each head in K frames, scalar last; NaN where a head has no attitude.
+        covariance : (H, K, 3, 3) or (H, 1, 3, 3) array
+            Covariances of their left errors, rad^2, as of `starcal_uq.attitude.quest`.
+
+        Raises
+        ------
+        HeadError
+            For arrays of another shape, and frames without any attitude.
+        """
+        q, cov, seen = self._frames(quaternions, covariance)
+        weights, fused = self._weights(cov)
+        reference = _first(self._of_body(q, self.R_body_head), seen)
+        for _ in range(_PASSES):
+            apart = self._apart(q, self.R_body_head, reference, seen)
+            mean = np.einsum("khij,khj->ki", weights, apart)
+            reference = quaternion_multiply(rotation_to_quaternion(exp_rotation(mean)), reference)
+        apart = self._apart(q, self.R_body_head, reference, seen)
+        information = np.linalg.inv(fused)[:, None] @ weights
+        squares = np.einsum("khi,khij,khj->k", apart, information, apart)
+        return FusedAttitudes(reference, fused, seen.sum(axis=1), squares)
+
+    def _frames(
+        self, quaternions: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Quaternions (K, H, 4), covariances (K, H, 3, 3), NaN where there is no attitude, and
+        where there is one.
+        """
+        q = np.asarray(quaternions, dtype=float)
+        right = q.ndim == 3 and q.shape[0] == len(self.names) and q.shape[2] == 4
+        text = f"quaternions have shape {q.shape}: give (heads, frames, 4), with "
+        require(HeadError, (right, f"{text}{len(self.names)} heads."))
+        q = np.swapaxes(q, 0, 1)
+        try:
+            cov = np.broadcast_to(covariance, (len(self.names), len(q), 3, 3)).swapaxes(0, 1)
+        except ValueError:
+            raise HeadError(
+                f"covariances have shape {np.shape(covariance)}: give (heads, frames, 3, 3), or "
+                "(heads, 1, 3, 3)."
+            ) from None
+        seen = np.isfinite(q).all(axis=2) & np.isfinite(cov).all(axis=(2, 3))
+        none = ~seen.any(axis=1)
+        text = f"frame {int(np.argmax(none))} has an attitude of no head: leave it out."
+        positive = np.linalg.eigvalsh(cov[seen])[:, 0] > 0.0
+        require(
+            HeadError,
+            (not none.any(), text),
+            (
+                bool(positive.all()),
+                "a covariance is not positive: give the noise of each head about its three axes, "
+                "rad^2.",
+            ),
+        )
+        return q, np.where(seen[:, :, None, None], cov, np.nan), seen
+
+    def _weights(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Weights of errors about the axes of the body, and the covariance of their mean."""
+        turns = self.R_body_head
+        return mean_weights(turns @ covariance @ np.swapaxes(turns, -1, -2))
+
+    @staticmethod
+    def _of_body(q: FloatArray, rotations: FloatArray) -> FloatArray:
+        """Attitudes of the body (K, H, 4) as every head has them."""
+        return quaternion_multiply(rotation_to_quaternion(rotations), q)
+
+    def _apart(
+        self, q: FloatArray, rotations: FloatArray, reference: FloatArray, seen: FloatArray
+    ) -> FloatArray:
+        """Left errors (K, H, 3) from a reference, rad; zero where there is no attitude."""
+        found = left_error(self._of_body(q, rotations), reference[:, None])
+        return np.where(seen[:, :, None], found, 0.0)
+
+
+def _first(attitudes: FloatArray, seen: FloatArray) -> FloatArray:
+    """The attitude (K, 4) of the first head that has one."""
+    return np.asarray(attitudes[np.arange(len(attitudes)), np.argmax(seen, axis=1)])
+
+
+def load_heads(path: PathLike) -> HeadArray:
+    """Read heads and their mountings: ``[[head]]`` tables of a TOML file.
+
+    Each has ``name``, ``rotation`` (v_body = R v_head: three rows of three numbers, or a quaternion
+    with its scalar last) and, for a budget, ``run``: the run folder of its calibration, beside the
+    file. Other tables are those of a budget of the array.
+
+    Raises
+    ------
+    HeadError
+        When the file cannot be read, has no head, or a key is unknown, missing or wrong.
+    """
+    tables = read_toml(path, "heads", HeadError).get("head", [])
+    good = isinstance(tables, list) and len(tables) > 0
+    require(HeadError, (good, f"{path}: holds no head; write [[head]] above the keys of each."))
+    names, rotations, runs = [], [], []
+    for number, table in enumerate(tables, start=1):
+        where = f"{path}, [[head]] {number}"
+        good = isinstance(table, Mapping)
+        require(HeadError, (good, f"{where}: is no table; write [[head]] above its keys."))
+        read = _HEAD.check(table, where)
+        names.append(read["name"].strip())
+        words = "v_body = R v_head"
+        rotations.append(stated_rotation(read["rotation"], where, words, HeadError))
+        runs.append(str(Path(path).parent / read["run"]) if "run" in read else "")
+    try:
+        return HeadArray(tuple(names), np.stack(rotations), tuple(runs))
+    except HeadError as error:
+        raise HeadError(f"{path}: {error}") from None
+
+
+def stated_rotation(value: Any, where: str, words: str, error: type[StarcalError]) -> FloatArray:
+    """The matrix (3, 3) of a rotation that a file states as one, or as a quaternion; `words` say
+    what it turns.
+    """
+    try:
+        values = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        values = np.zeros(0)
+    if values.size and not np.abs(values).max() < _LARGE:
+        values = np.zeros(0)
+    if values.shape == (4,) and np.any(values):
+        values = quaternion_to_rotation(values / np.linalg.norm(values))
+    if values.shape != (3, 3) or not np.abs(values @ values.T - np.eye(3)).max() < _ORTHONORMAL:
+        raise error(
+            f"{where}: key rotation is no rotation; write three rows of three numbers "
+            f"({words}), or the four of a quaternion, scalar last."
+        )
+    if np.linalg.det(values) < 0.0:
+        raise error(f"{where}: key rotation mirrors; change the sign of one row.")
+    return values
