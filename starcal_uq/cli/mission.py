@@ -211,7 +211,8 @@ def plan_command(
     deepest = min(forecast.max_mag + 1.0, KEYS["magnitude"].high)
     deep = sc.load_catalogue(max_mag=deepest, epoch=campaign.epoch)
     stars = deep.select(deep.mag <= forecast.max_mag)
-    common: AnyDict = {"min_stars": forecast.min_stars, "seed": forecast.seed}
+    names = ("min_stars", "max_stars", "seed")
+    common: AnyDict = {name: getattr(forecast, name) for name in names}
     sizes = tuple(campaign.frames or N_FRAMES)
     with progress_bar("points of the sweeps") as progress:
         found = sc.plan(

@@ -181,6 +181,7 @@ class MissionSettings:
     epoch: float = 2026.9
     n_frames: int = 1000
     min_stars: int | None = None
+    max_stars: int | None = None
     rate_hz: float | None = None
     scalar: settings.Scalar | None = None
     sense: settings.Sense = "icrs_to_camera"
@@ -215,6 +216,7 @@ class SimulationSettings:
     n_frames: int = 1000
     sigma_px: float = 0.05
     min_stars: int = 10
+    max_stars: int | None = None
     seed: int = 0
 
 
@@ -261,6 +263,7 @@ class ForecastSettings:
     scope: settings.Scope = "common"
     max_mag: float = 6.0
     min_stars: int = 10
+    max_stars: int | None = None
     distortion_percent: tuple[float, float] | None = None
     seed: int = 0
 

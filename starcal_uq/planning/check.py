@@ -20,7 +20,7 @@ from starcal_uq.core.types import BoolArray, FloatArray, Progress
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import N_FRAMES, Forecast, Forecaster, Outlook, spreads
 from starcal_uq.planning.information import random_frames
-from starcal_uq.simulation.frames import Campaign
+from starcal_uq.simulation.frames import Campaign, Tracker
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -161,6 +161,7 @@ def check_forecast(
     sigma_px: float = 0.05,
     n_frames: Sequence[int] = N_FRAMES,
     min_stars: int = 10,
+    max_stars: int | None = None,
     n_campaigns: int = 50,
     n_geometries: int = 3000,
     seed: int = 0,
@@ -175,7 +176,7 @@ def check_forecast(
 
     Parameters
     ----------
-    camera, stars, sigma_px, n_frames, min_stars, n_geometries
+    camera, stars, sigma_px, n_frames, min_stars, max_stars, n_geometries
         Sheet, sky and settings as `plan` takes them; one noise for all stars, px.
     n_campaigns : int
         Campaigns of each number of frames.
@@ -200,11 +201,10 @@ def check_forecast(
         raise PlanningError(
             f"n_campaigns is {n_campaigns}: give at least 2, and at least one number of frames."
         )
-    mission = random_frames(
-        stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed
-    )
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    mission = random_frames(stars, tracker, n_frames=n_geometries, seed=seed)
     forecaster = Forecaster(mission, Outlook(seed=seed))
-    campaigns = [Campaign(n, min_stars, sigma_px) for n in n_frames]
+    campaigns = [Campaign(n, min_stars, sigma_px, max_stars=max_stars) for n in n_frames]
     task = partial(_campaign, _Campaigns(camera, stars, campaigns, n_campaigns, seed))
     outcomes, interrupted = run_tasks(
         task,

@@ -29,8 +29,10 @@ from starcal_uq.core.settings import Criterion, bounded
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import quantities, spreads
-from starcal_uq.planning.information import FrameSet, Noise, look_at, random_frames
+from starcal_uq.planning.information import FrameSet, look_at, random_frames
 from starcal_uq.planning.plan import HasInformation, start_information
+from starcal_uq.simulation.frames import Tracker
+from starcal_uq.simulation.noise import Noise
 from starcal_uq.sky.positions import ra_dec_deg
 
 if TYPE_CHECKING:
@@ -56,6 +58,7 @@ def choose_frames(
     candidates: FloatArray | int = 3000,
     sigma_px: Noise = 0.05,
     min_stars: int = 10,
+    max_stars: int | None = None,
     criterion: str = "A",
     scope: str = "common",
     after: HasInformation | None = None,
@@ -79,6 +82,8 @@ def choose_frames(
         Centroid noise, as for `plan`.
     min_stars : int
         Candidates with fewer stars are refused.
+    max_stars : int, optional
+        Stars that the tracker uses of a frame, the brightest ones; all on the detector by default.
     criterion : {"A", "D"}
         ``A`` for the attitude error of `scope`, ``D`` for the parameters as a whole.
     scope : {"common", "rest", "calibration"}
@@ -98,10 +103,9 @@ def choose_frames(
         When the field is too narrow for the catalogue to show `min_stars`.
     """
     _check(min_stars, criterion, scope)
-    mission = random_frames(
-        stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed
-    )
-    pool = _pool(stars, camera, candidates, sigma_px, min_stars, seed)
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    mission = random_frames(stars, tracker, n_frames=n_geometries, seed=seed)
+    pool = _pool(stars, tracker, candidates, seed)
     if pool.n_frames < n_frames:
         raise PlanningError(
             f"{pool.n_frames} candidate attitudes show {min_stars} stars, fewer than the "
@@ -145,12 +149,7 @@ def choose_frames(
 
 
 def _pool(
-    stars: StarCatalogue,
-    camera: Camera,
-    candidates: FloatArray | int,
-    noise: Noise,
-    min_stars: int,
-    seed: int,
+    stars: StarCatalogue, tracker: Tracker, candidates: FloatArray | int, seed: int
 ) -> FrameSet:
     if isinstance(candidates, int):
         rotations = random_rotations(max(candidates, 1), np.random.default_rng([seed, 3]))
@@ -161,7 +160,7 @@ def _pool(
                 f"candidates have the shape {rotations.shape}: give rotation matrices R_cam_icrs "
                 "(M, 3, 3)."
             )
-    return look_at(stars, camera, rotations, noise, min_stars)
+    return look_at(stars, tracker, rotations)
 
 
 def _weights(mission: FrameSet, scope: str) -> FloatArray:

@@ -9,7 +9,6 @@ the camera's own parameters and without noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -17,20 +16,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.errors import PlanningError
-from starcal_uq.core.types import FloatArray, IntArray, floats
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.effects import JointMatrices, PlannedEffects, SeenEffects
-from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
+from starcal_uq.simulation.frames import Tracker
+from starcal_uq.simulation.noise import noise_of
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.sky.catalogue import StarCatalogue
-
-# Centroid noise, px per axis: one number, a function from magnitudes (n,) to (n,), or the model of
-# a calibration.
-Noise = float | Callable[[FloatArray], FloatArray] | NoiseModel
 
 # An attitude needs this many stars before it says anything about the camera.
 LEAST_STARS = 3
@@ -129,84 +125,45 @@ class FrameSet:
         )
 
 
-def look_at(
-    stars: StarCatalogue, camera: Camera, rotations: FloatArray, noise: Noise, min_stars: int
-) -> FrameSet:
+def look_at(stars: StarCatalogue, tracker: Tracker, rotations: FloatArray) -> FrameSet:
     """The frames at given attitudes that show enough stars; the others are left out, and none is an
     error.
     """
-    views = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera)).views(
-        rotations
-    )
-    enough = np.array([len(seen) >= min_stars for seen, _ in views], dtype=np.bool_)
+    views = tracker.sky(stars).views(rotations)
+    enough = np.array([len(seen) >= tracker.min_stars for seen, _ in views], dtype=np.bool_)
     if not enough.any():
         raise PlanningError(
-            f"none of the {len(rotations)} candidate attitudes shows {min_stars} stars: give "
-            "others, lower min_stars "
-            "or use a deeper catalogue."
+            f"none of the {len(rotations)} candidate attitudes shows {tracker.min_stars} stars: "
+            "give others, lower min_stars or use a deeper catalogue."
         )
-    return _frame_set(
-        stars,
-        camera,
-        rotations[enough],
-        [v for v, good in zip(views, enough, strict=True) if good],
-        noise,
-    )
+    kept = [view for view, good in zip(views, enough, strict=True) if good]
+    return _frame_set(stars, tracker, rotations[enough], kept)
 
 
 def random_frames(
     stars: StarCatalogue,
-    camera: Camera,
-    noise: Noise,
+    tracker: Tracker,
     *,
     n_frames: int,
-    min_stars: int,
     seed: int,
     effects: PlannedEffects | None = None,
 ) -> FrameSet:
-    """Frames at uniformly random attitudes that show at least `min_stars` stars, as `simulate`
-    takes them; for a calibration with `effects`, at random temperatures and times.
+    """Frames of a tracker at uniformly random attitudes, as `simulate` takes them; for a
+    calibration with `effects`, at random temperatures and times.
     """
-    sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera))
     rng = np.random.default_rng(seed)
-    found = _frame_set(
-        stars, camera, *choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars), noise
-    )
+    found = _frame_set(stars, tracker, *tracker.frames(stars, rng, n_frames))
     return found if effects is None else found.with_effects(effects.seen(n_frames, seed))
-
-
-def noise_of(noise: Noise, mag: FloatArray, pixel: FloatArray) -> FloatArray:
-    """Noise of stars with magnitudes (n,) at pixels (2, n), px per axis, (n,); refused unless
-    positive and finite.
-    """
-    if isinstance(noise, NoiseModel):
-        return noise.at(pixel[0], pixel[1], mag)
-    values = floats(noise(mag)) if callable(noise) else np.full(mag.shape, float(noise))
-    if values.shape != mag.shape or not np.all((values > 0.0) & np.isfinite(values)):
-        raise PlanningError(
-            "sigma_px must be a noise above zero in px, or a function that gives one for every "
-            "magnitude of an array."
-        )
-    return values
-
-
-def largest_noise(noise: Noise, mag: FloatArray, camera: Camera) -> float:
-    """The noise of the faintest star at the edge, px per axis: stars this near to the edge are left
-    out.
-    """
-    edge = np.array([[camera.width_px - 1.0], camera.centre_px[1:]]) * np.ones(len(mag))
-    return float(np.max(noise_of(noise, mag, edge), initial=0.0))
 
 
 def _frame_set(
     stars: StarCatalogue,
-    camera: Camera,
+    tracker: Tracker,
     rotations: FloatArray,
     views: list[tuple[IntArray, FloatArray]],
-    noise: Noise,
 ) -> FrameSet:
     index = np.concatenate([seen for seen, _ in views])
-    mag = stars.mag[index]
+    camera, noise, mag = tracker.camera, tracker.noise, stars.mag[index]
     pixel = np.ascontiguousarray(np.concatenate([xy for _, xy in views]).T)
     frames = StarFrames(
         pixel=pixel,

@@ -27,7 +27,8 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import DistortionError, PlanningError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.planning.forecast import SCOPES, Forecaster, Outlook, edges
-from starcal_uq.planning.information import FrameSet, Noise, random_frames
+from starcal_uq.planning.information import FrameSet, random_frames
+from starcal_uq.simulation.frames import Tracker
 from starcal_uq.sky.catalogue import StarCatalogue
 
 # Cubic term of an f-theta lens, as k1 f^2.
@@ -171,12 +172,11 @@ def nodes(camera: Camera, bounds: tuple[float, float]) -> FloatArray:
 def distortion_range(
     base: FrameSet,
     stars: StarCatalogue,
-    noise: Noise,
+    tracker: Tracker,
     bounds: tuple[float, float],
     outlook: Outlook,
     *,
     n_frames: Sequence[int],
-    min_stars: int,
     target_arcsec: float | None,
 ) -> DistortionRange:
     """Forecast over a range of distortions, `bounds` on the displacement of the corner, per cent.
@@ -195,10 +195,8 @@ def distortion_range(
         if other.coefficients != camera.coefficients:
             seen = random_frames(
                 stars,
-                other,
-                noise,
+                replace(tracker, camera=other),
                 n_frames=_GEOMETRIES if effects is None else min(_GEOMETRIES, base.n_frames),
-                min_stars=min_stars,
                 seed=outlook.seed,
                 effects=effects,
             )

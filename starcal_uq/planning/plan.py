@@ -34,7 +34,7 @@ from starcal_uq.planning.forecast import (
     nea_arcsec,
     start_with,
 )
-from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
+from starcal_uq.planning.information import FrameSet, random_frames
 from starcal_uq.planning.open_distortion import (
     distortion_range,
     open_range,
@@ -42,7 +42,8 @@ from starcal_uq.planning.open_distortion import (
 )
 from starcal_uq.planning.planned import SWEEP_FRAMES, Need, Plan
 from starcal_uq.planning.ties import PlannedTies
-from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
+from starcal_uq.simulation.frames import Tracker
+from starcal_uq.simulation.noise import Noise, noise_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,6 +79,7 @@ def plan(
     sigma_px: Noise = 0.05,
     n_frames: Sequence[int] = N_FRAMES,
     min_stars: int = 10,
+    max_stars: int | None = None,
     max_mag: float | None = None,
     target_arcsec: float | None = None,
     confidence: float = 0.997,
@@ -108,6 +110,8 @@ def plan(
         Sizes of campaigns to forecast.
     min_stars : int
         Frames with fewer stars are not used (at least 3).
+    max_stars : int, optional
+        Stars that the tracker uses of a frame, the brightest ones; all on the detector by default.
     max_mag : float, optional
         The sensor's limit, where `stars` is deeper: the sweep then goes beyond it.
     target_arcsec : float, optional
@@ -176,15 +180,8 @@ def plan(
         raise PlanningError(
             f"no star is brighter than max_mag={limit:g}: raise it or use another catalogue."
         )
-    frames = random_frames(
-        seen,
-        camera,
-        sigma_px,
-        n_frames=n_geometries,
-        min_stars=min_stars,
-        seed=seed,
-        effects=effects,
-    )
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    frames = random_frames(seen, tracker, n_frames=n_geometries, seed=seed, effects=effects)
     # A posterior does not say how many data it rests on; its noise is then as uncertain as the new
     # frames make it.
     outlook = Outlook(
@@ -209,6 +206,7 @@ def plan(
         "n_campaigns": n_campaigns,
         "stars": stars.source,
         "band": stars.band,
+        **({} if max_stars is None else {"max_stars": max_stars}),
         "after": None if after is None else type(after).__name__,
         **({} if ties is None else {"ties": asdict(ties)}),
         "distortion_percent": None if bounds is None else list(bounds),
@@ -219,16 +217,15 @@ def plan(
         spread = distortion_range(
             frames,
             seen,
-            sigma_px,
+            tracker,
             bounds,
             outlook,
             n_frames=n_frames,
-            min_stars=min_stars,
             target_arcsec=target_arcsec,
         )
     table = None
     if sweeps:
-        base = _Base(stars, camera, sigma_px, limit, min_stars, seed, effects)
+        base = _Base(stars, tracker, limit, seed, effects)
         table = _sweep(
             base,
             frames,
@@ -248,7 +245,7 @@ def plan(
         max_mag=limit,
         min_stars=min_stars,
         mean_stars=frames.mean_stars,
-        sky_fraction=_sky_fraction(seen, camera, sigma_px, min_stars, seed),
+        sky_fraction=_sky_fraction(seen, tracker, seed),
         forecast=forecast,
         nea_arcsec=nea_arcsec(frames),
         confidence=confidence,
@@ -273,10 +270,8 @@ class _Base(NamedTuple):
     """What the sweeps vary around."""
 
     stars: StarCatalogue
-    camera: Camera
-    noise: Noise
+    tracker: Tracker
     max_mag: float
-    min_stars: int
     seed: int
     effects: PlannedEffects | None
 
@@ -337,21 +332,19 @@ def _points(
         if limit > deepest + 0.1:
             break
         stars = base.stars.select(base.stars.mag <= limit)
-        sky = _sky_fraction(stars, base.camera, base.noise, base.min_stars, base.seed)
+        sky = _sky_fraction(stars, base.tracker, base.seed)
         if sky < _LEAST_SKY:
             continue
         some = random_frames(
             stars,
-            base.camera,
-            base.noise,
+            base.tracker,
             n_frames=min(_SWEEP_GEOMETRIES, frames.n_frames) if base.effects else _SWEEP_GEOMETRIES,
-            min_stars=base.min_stars,
             seed=base.seed,
             effects=base.effects,
         )
         yield "magnitude limit", limit, some.information, some, sky
     seen = base.stars.select(base.stars.mag <= base.max_mag)
-    sky = _sky_fraction(seen, base.camera, base.noise, base.min_stars, base.seed)
+    sky = _sky_fraction(seen, base.tracker, base.seed)
     for factor in _NOISE_FACTORS:
         scaled = frames.with_noise(factor)
         yield "noise", factor * noise_px, scaled.information, scaled, sky
@@ -359,15 +352,13 @@ def _points(
         yield "part of the detector", part, frames.seen_within(part), frames, sky
 
 
-def _sky_fraction(
-    stars: StarCatalogue, camera: Camera, noise: Noise, min_stars: int, seed: int
-) -> float:
+def _sky_fraction(stars: StarCatalogue, tracker: Tracker, seed: int) -> float:
     """Part of random attitudes that show enough stars."""
     if len(stars) == 0:
         return 0.0
-    sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera))
-    views = sky.views(random_rotations(_TRIED_ATTITUDES, np.random.default_rng([seed, 1])))
-    return float(np.mean([len(seen) >= min_stars for seen, _ in views]))
+    tried = random_rotations(_TRIED_ATTITUDES, np.random.default_rng([seed, 1]))
+    views = tracker.sky(stars).views(tried)
+    return float(np.mean([len(seen) >= tracker.min_stars for seen, _ in views]))
 
 
 def start_information(after: HasInformation | None, camera: Camera) -> FloatArray | None:

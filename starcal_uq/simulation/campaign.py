@@ -15,7 +15,8 @@ from starcal_uq.core.files import ensure_new
 from starcal_uq.core.manifest import alone
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray, PathLike, Progress, floats
-from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
+from starcal_uq.simulation.frames import Tracker
+from starcal_uq.simulation.noise import Noise
 from starcal_uq.simulation.rendering import Scene
 from starcal_uq.simulation.sensor import Sensor
 from starcal_uq.simulation.truth import check_time, write_frame
@@ -39,15 +40,16 @@ def render_frames(
     attitudes: FloatArray | None = None,
     rates_rad_s: ArrayLike | None = None,
     times_utc: Sequence[str] | None = None,
-    sigma_px: float = 0.05,
+    sigma_px: Noise = 0.05,
+    max_stars: int | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Render frames at random attitudes into FITS files ``frame_00000.fits``, ``frame_00001.fits``,
     ...
 
-    The attitudes are those of `simulate` with the same catalogue, camera, `seed`, `min_stars` and
-    `sigma_px`.
+    The attitudes are those of `simulate` with the same catalogue, camera, `seed`, `min_stars`,
+    `max_stars` and `sigma_px`.
 
     Parameters
     ----------
@@ -73,9 +75,9 @@ def render_frames(
         Angular rate of the camera in its own axes, rad/s, of all frames or of each.
     times_utc : sequence of str, optional
         Middle of each exposure, UTC, ISO 8601; recorded only, the stars are not moved.
-    sigma_px : float
-        The noise of the `simulate` to be matched: stars within six times this of the edge do not
-        count for `min_stars`. It adds no noise.
+    sigma_px, max_stars
+        Noise and stars of a frame of the `simulate` to be matched: stars within six times the noise
+        of the edge do not count for `min_stars`. They add no noise, and leave out no star.
     force : bool
         Whether existing files may be replaced.
     progress : callable, optional
@@ -96,13 +98,9 @@ def render_frames(
     SensorError
         For arguments that do not fit together.
     """
-    rotations, _ = choose_attitudes(
-        Sky(stars, camera, EDGE_SIGMAS * sigma_px),
-        np.random.default_rng(seed),
-        n_frames=n_frames,
-        min_stars=min_stars,
-        attitudes=None if attitudes is None else floats(attitudes).reshape(-1, 3, 3),
-    )
+    given = None if attitudes is None else floats(attitudes).reshape(-1, 3, 3)
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    rotations, _ = tracker.frames(stars, np.random.default_rng(seed), n_frames, given)
     n = len(rotations)
     rates = np.zeros(3) if rates_rad_s is None else floats(rates_rad_s)
     if rates.shape not in ((3,), (n, 3)):

@@ -18,6 +18,7 @@ from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.origin import SIMULATED, Origin
 from starcal_uq.observations.table import Observations
+from starcal_uq.simulation.noise import Noise, largest_noise, noise_of, one_noise
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -45,14 +46,15 @@ _TREE_COSINE = 0.5
 class Campaign:
     """Data of one calibration, as simulated studies take them.
 
-    Frames, the least stars in each (3 or more), centroid noise in px per axis, and the sensor's
-    magnitude limit.
+    Frames, the least stars in each (3 or more), centroid noise in px per axis, the sensor's
+    magnitude limit, and the most stars that are used of a frame, the brightest ones.
     """
 
     n_frames: int
     min_stars: int = 10
     sigma_px: float = 0.05
     max_mag: float = 6.0
+    max_stars: int | None = None
 
     def check(self, error: type[StarcalError]) -> None:
         """Raise `error` for a number that cannot work."""
@@ -75,12 +77,119 @@ class Campaign:
             n_frames=self.n_frames,
             min_stars=self.min_stars,
             sigma_px=self.sigma_px,
+            max_stars=self.max_stars,
             seed=int(seed),
         )
 
     def settings(self, stars: StarCatalogue | None) -> AnyDict:
         """Entries of a provenance; `stars` are None where the embedded catalogue is used."""
-        return {**asdict(self), "stars": "embedded" if stars is None else stars.source}
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        return {**given, "stars": "embedded" if stars is None else stars.source}
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """What takes frames: a camera, its centroid noise, and the stars that it uses.
+
+    Attributes
+    ----------
+    camera : Camera
+        Optics and detector.
+    noise : float, callable or NoiseModel
+        Centroid noise, px per axis.
+    min_stars : int
+        Frames with fewer stars are not taken.
+    max_stars : int or None
+        Stars that are used of a frame, the brightest ones; all of them where it is None.
+
+    Raises
+    ------
+    SettingError
+        If fewer stars are used than a frame must have.
+    """
+
+    camera: Camera
+    noise: Noise = 0.05
+    min_stars: int = 10
+    max_stars: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_stars is not None and self.max_stars < self.min_stars:
+            raise SettingError(
+                f"max_stars is {self.max_stars} and min_stars {self.min_stars}: use at least as "
+                "many stars of a frame as it must have."
+            )
+
+    def sky(self, stars: StarCatalogue) -> Sky:
+        """The stars of a catalogue on the detector, so far from the edge that noise does not decide
+        which of them are seen.
+        """
+        margin_px = EDGE_SIGMAS * largest_noise(self.noise, stars.mag, self.camera)
+        return Sky(stars, self.camera, margin_px, self.max_stars)
+
+    def frames(
+        self,
+        stars: StarCatalogue,
+        rng: np.random.Generator,
+        n_frames: int,
+        attitudes: FloatArray | None = None,
+    ) -> tuple[FloatArray, list[tuple[IntArray, FloatArray]]]:
+        """Attitudes (n, 3, 3), random or given, that show enough stars, and their `Sky.views`.
+
+        CatalogueError when a given attitude shows fewer stars, or random ones nearly always do.
+        """
+        sky = self.sky(stars)
+        if attitudes is not None:
+            frames = sky.views(attitudes)
+            for number, (seen, _) in enumerate(frames):
+                if len(seen) < self.min_stars:
+                    raise CatalogueError(
+                        f"the attitude with index {number} shows {len(seen)} stars, fewer than "
+                        f"min_stars={self.min_stars}: "
+                        "choose other attitudes, a deeper catalogue or a smaller min_stars."
+                    )
+            return attitudes, frames
+        chosen: list[FloatArray] = []
+        frames = []
+        tries = 0
+        while len(frames) < n_frames:
+            rotations = random_rotations(_BATCH, rng)
+            views = sky.views(rotations)
+            enough = [number for number, view in enumerate(views) if len(view[0]) >= self.min_stars]
+            frames += [views[number] for number in enough]
+            chosen.append(rotations[enough])
+            tries += _BATCH
+            hopeless = tries >= _MAX_TRIES_PER_FRAME and n_frames * tries > _MAX_TRIES * (
+                len(frames) + 1
+            )
+            if hopeless or tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
+                raise CatalogueError(
+                    f"only {len(frames)} of {tries} random attitudes show {self.min_stars} stars of the "
+                    "catalogue: "
+                    "raise max_mag (--max-mag), or lower min_stars (--min-stars)."
+                )
+        return np.concatenate(chosen)[:n_frames], frames[:n_frames]
+
+    def observe(
+        self,
+        stars: StarCatalogue,
+        rng: np.random.Generator,
+        n_frames: int,
+        attitudes: FloatArray | None = None,
+    ) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """Frame (N,), catalogue index (N,), noisy pixels (N, 2) and noise (N,) of the stars of
+        `frames`.
+        """
+        _, frames = self.frames(stars, rng, n_frames, attitudes)
+        index, xy = map(np.concatenate, zip(*frames, strict=True))
+        sigma = noise_of(self.noise, stars.mag[index], xy.T)
+        xy = xy + sigma[:, None] * rng.standard_normal(xy.shape)
+        return (
+            np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]),
+            index,
+            xy,
+            sigma,
+        )
 
 
 @bounded
@@ -90,7 +199,8 @@ def simulate(
     *,
     n_frames: int = 1000,
     min_stars: int = 10,
-    sigma_px: float = 0.05,
+    sigma_px: Noise = 0.05,
+    max_stars: int | None = None,
     seed: int = 0,
     attitudes: FloatArray | None = None,
 ) -> Observations:
@@ -106,8 +216,11 @@ def simulate(
         Number of frames.
     min_stars : int
         Attitudes with fewer stars in the field are drawn again (at least 3).
-    sigma_px : float
-        Gaussian centroid noise, px per axis.
+    sigma_px : float, callable or NoiseModel
+        Gaussian centroid noise, px per axis; a function from magnitudes (n,) to noise (n,), or the
+        noise model of a calibration, is stated star by star in the table.
+    max_stars : int, optional
+        Stars of a frame, the brightest ones; all on the detector by default.
     seed : int
         Repeats bit for bit.
     attitudes : (n_frames, 3, 3) array, optional
@@ -134,87 +247,21 @@ def simulate(
             f"n_frames={n_frames}, min_stars={min_stars}", _BYTES_PER_STAR * n_frames * min_stars
         )
     rng = np.random.default_rng(seed)
-    sky = Sky(stars, camera, EDGE_SIGMAS * sigma_px)
-    frame, index, xy = observed(
-        sky, rng, sigma_px, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes
-    )
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    frame, index, xy, sigma = tracker.observe(stars, rng, n_frames, attitudes)
     return Observations(
         frame=frame,
         x_px=xy[:, 0],
         y_px=xy[:, 1],
         **stars.named(index),
+        sigma_px=None if one_noise(sigma_px) is not None else sigma,
         meta=simulated_meta(camera, sigma_px, seed),
     )
 
 
-def simulated_meta(camera: Camera, sigma_px: float, seed: int) -> AnyDict:
+def simulated_meta(camera: Camera, noise: Noise, seed: int) -> AnyDict:
     """What a simulated table says of itself."""
-    return Origin(SIMULATED, "apparent", seed, sigma_px, camera.to_dict()).plain()
-
-
-def observed(
-    sky: Sky,
-    rng: np.random.Generator,
-    sigma_px: float,
-    *,
-    n_frames: int,
-    min_stars: int,
-    attitudes: FloatArray | None = None,
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Frame (N,), catalogue index (N,) and noisy pixels (N, 2) of the stars in frames chosen by
-    `choose_attitudes`.
-    """
-    _, frames = choose_attitudes(
-        sky, rng, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes
-    )
-    index, xy = map(np.concatenate, zip(*frames, strict=True))
-    xy = xy + sigma_px * rng.standard_normal(xy.shape)
-    return np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]), index, xy
-
-
-def choose_attitudes(
-    sky: Sky,
-    rng: np.random.Generator,
-    *,
-    n_frames: int,
-    min_stars: int,
-    attitudes: FloatArray | None = None,
-) -> tuple[FloatArray, list[tuple[IntArray, FloatArray]]]:
-    """Attitudes (n, 3, 3), random or given, that show at least `min_stars` stars, and their
-    `Sky.views`.
-
-    CatalogueError when a given attitude shows fewer stars, or random ones nearly always do.
-    """
-    if attitudes is not None:
-        frames = sky.views(attitudes)
-        for number, (seen, _) in enumerate(frames):
-            if len(seen) < min_stars:
-                raise CatalogueError(
-                    f"the attitude with index {number} shows {len(seen)} stars, fewer than "
-                    f"min_stars={min_stars}: "
-                    "choose other attitudes, a deeper catalogue or a smaller min_stars."
-                )
-        return attitudes, frames
-    chosen: list[FloatArray] = []
-    frames = []
-    tries = 0
-    while len(frames) < n_frames:
-        rotations = random_rotations(_BATCH, rng)
-        views = sky.views(rotations)
-        enough = [number for number, view in enumerate(views) if len(view[0]) >= min_stars]
-        frames += [views[number] for number in enough]
-        chosen.append(rotations[enough])
-        tries += _BATCH
-        hopeless = tries >= _MAX_TRIES_PER_FRAME and n_frames * tries > _MAX_TRIES * (
-            len(frames) + 1
-        )
-        if hopeless or tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
-            raise CatalogueError(
-                f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the "
-                "catalogue: "
-                "raise max_mag (--max-mag), or lower min_stars (--min-stars)."
-            )
-    return np.concatenate(chosen)[:n_frames], frames[:n_frames]
+    return Origin(SIMULATED, "apparent", seed, one_noise(noise), camera.to_dict()).plain()
 
 
 class Window:
@@ -248,12 +295,30 @@ class Window:
         return xy, np.all((xy > self.low) & (xy < self.high), axis=1)
 
 
-class Sky(Window):
-    """Finds the stars of a catalogue on the detector (`Window`)."""
+def brightest(mag: FloatArray, starts: IntArray, n: int) -> IntArray:
+    """Places, ascending, of the n brightest stars of each frame; `starts` (M + 1,) bounds their
+    stars.
+    """
+    sizes = np.diff(starts)
+    order = np.lexsort((mag, np.repeat(np.arange(len(sizes)), sizes)))
+    rank = np.arange(len(order)) - np.repeat(starts[:-1], sizes)
+    return np.sort(order[rank < n])
 
-    def __init__(self, stars: StarCatalogue, camera: Camera, margin_px: float) -> None:
+
+class Sky(Window):
+    """Finds the stars of a catalogue on the detector (`Window`), the brightest `max_stars` of
+    each frame.
+    """
+
+    def __init__(
+        self,
+        stars: StarCatalogue,
+        camera: Camera,
+        margin_px: float,
+        max_stars: int | None = None,
+    ) -> None:
         super().__init__(camera, margin_px)
-        self.directions = stars.directions_icrs
+        self.directions, self.mag, self.max_stars = stars.directions_icrs, stars.mag, max_stars
 
     def views(self, rotations: FloatArray) -> list[tuple[IntArray, FloatArray]]:
         """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector, for
@@ -262,8 +327,13 @@ class Sky(Window):
         frame, star = self._near(rotations[:, 2])
         b = np.einsum("nij,nj->ni", rotations[frame], self.directions[star])
         xy, inside = self.seen(b)
-        edges = np.searchsorted(frame[inside], np.arange(len(rotations) + 1))
-        star, xy = star[inside], xy[inside]
+        frame, star, xy = frame[inside], star[inside], xy[inside]
+        number = np.arange(len(rotations) + 1)
+        edges = np.searchsorted(frame, number)
+        if self.max_stars is not None:
+            kept = brightest(self.mag[star], edges, self.max_stars)
+            star, xy = star[kept], xy[kept]
+            edges = np.searchsorted(frame[kept], number)
         return [(star[i:j], xy[i:j]) for i, j in pairwise(edges)]
 
     def _near(self, axes: FloatArray) -> tuple[IntArray, IntArray]:

@@ -19,7 +19,7 @@ from starcal_uq.core.formatting import count, plural, significant
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.table import Observations
-from starcal_uq.simulation.frames import Sky, simulate
+from starcal_uq.simulation.frames import Tracker, simulate
 
 if TYPE_CHECKING:
     from starcal_uq.attitude.profile import AttitudeProfile
@@ -40,6 +40,7 @@ def mission_frames(
     *,
     n_frames: int = 1000,
     min_stars: int = 5,
+    max_stars: int | None = None,
     seed: int = 0,
     noise_like: Observations | None = None,
 ) -> Observations:
@@ -56,6 +57,8 @@ def mission_frames(
     min_stars : int
         Attitudes with fewer stars in the field are drawn again (at least 3): what the mission calls
         a valid frame.
+    max_stars : int, optional
+        Stars that the tracker uses of a frame, the brightest ones; all on the detector by default.
     seed : int
         Repeats bit for bit.
     noise_like : Observations, optional
@@ -72,7 +75,12 @@ def mission_frames(
         When `noise_like` states no noise.
     """
     frames = simulate(
-        stars, camera, n_frames=n_frames, min_stars=min_stars, sigma_px=0.0, seed=seed
+        *(stars, camera),
+        n_frames=n_frames,
+        min_stars=min_stars,
+        max_stars=max_stars,
+        sigma_px=0.0,
+        seed=seed,
     )
     faintest = float(np.nanmax(frames.mag)) if frames.mag is not None else float("nan")
     words = (
@@ -94,6 +102,7 @@ def profile_frames(
     rate_hz: float | None = None,
     *,
     min_stars: int = 3,
+    max_stars: int | None = None,
     noise_like: Observations | None = None,
 ) -> Observations:
     """Noise-free frames along an attitude profile, for `propagate` and
@@ -101,8 +110,8 @@ def profile_frames(
 
     Parameters
     ----------
-    stars, camera, noise_like
-        Catalogue, camera and observations as `mission_frames` takes them.
+    stars, camera, max_stars, noise_like
+        Catalogue, camera, stars of a frame and observations as `mission_frames` takes them.
     profile : AttitudeProfile
         Attitudes of the camera over time.
     rate_hz : float, optional
@@ -126,7 +135,7 @@ def profile_frames(
     if min_stars < 2:
         raise ValueError(f"min_stars={min_stars}: an attitude needs at least 2 stars.")
     path = profile if rate_hz is None else profile.at_rate(rate_hz)
-    sky = Sky(stars, camera, 0.0)
+    sky = Tracker(camera, 0.0, min_stars, max_stars).sky(stars)
     rotations = quaternion_to_rotation(path.quaternions)
     views = [
         view

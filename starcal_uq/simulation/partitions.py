@@ -19,7 +19,8 @@ from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.observations.files import parquet_summary
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
 from starcal_uq.observations.written import write_partition
-from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, observed, simulated_meta
+from starcal_uq.simulation.frames import Tracker, simulated_meta
+from starcal_uq.simulation.noise import Noise, one_noise
 
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
@@ -39,7 +40,8 @@ def simulate_partitions(
     n_frames: int,
     partition_frames: int = PARTITION_FRAMES,
     min_stars: int = 10,
-    sigma_px: float = 0.05,
+    sigma_px: Noise = 0.05,
+    max_stars: int | None = None,
     seed: int = 0,
     force: bool = False,
     scheduler: Scheduler = None,
@@ -54,7 +56,7 @@ def simulate_partitions(
 
     Parameters
     ----------
-    stars, camera, min_stars, sigma_px
+    stars, camera, min_stars, sigma_px, max_stars
         As for `simulate`.
     folder : path
         Folder, made if it does not exist.
@@ -85,11 +87,10 @@ def simulate_partitions(
     CatalogueError, DistortionError
         As for `simulate`.
     """
-    if n_frames < 1 or partition_frames < 1 or min_stars < 3 or not sigma_px >= 0.0:
+    if n_frames < 1 or partition_frames < 1 or min_stars < 3:
         raise ValueError(
-            f"n_frames={n_frames}, partition_frames={partition_frames}, min_stars={min_stars}, "
-            f"sigma_px={sigma_px}: "
-            "give at least one frame, 3 stars, and no negative noise."
+            f"n_frames={n_frames}, partition_frames={partition_frames}, min_stars={min_stars}: "
+            "give at least one frame, and 3 stars."
         )
     folder = Path(folder).resolve()
     known = {
@@ -98,11 +99,14 @@ def simulate_partitions(
         "n_stars": len(stars),
         "epoch": stars.epoch,
     }
+    if max_stars is not None:
+        known["max_stars"] = max_stars
+    if one_noise(sigma_px) is None:
+        known["noise"] = repr(sigma_px)
     meta = simulated_meta(camera, sigma_px, seed) | known
     unfinished = folder / UNFINISHED
-    make = _Maker(
-        stars, camera, unfinished, n_frames, partition_frames, min_stars, sigma_px, seed, meta
-    )
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    make = _Maker(stars, tracker, unfinished, n_frames, partition_frames, seed, meta)
     names = [_NAME.format(number) for number in range(-(-n_frames // partition_frames))]
     with alone(folder):
         others = _others(folder, names)
@@ -143,12 +147,10 @@ class _Maker:
     """Makes the file of a number."""
 
     stars: StarCatalogue
-    camera: Camera
+    tracker: Tracker
     folder: Path
     n_frames: int
     partition_frames: int
-    min_stars: int
-    sigma_px: float
     seed: int
     meta: AnyDict
 
@@ -172,10 +174,7 @@ class _Maker:
     def __call__(self, number: int) -> None:
         stars, meta = self.stars, self._meta(number)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
-        sky = Sky(stars, self.camera, EDGE_SIGMAS * self.sigma_px)
-        frame, star, xy = observed(
-            sky, rng, self.sigma_px, n_frames=meta["n_frames"], min_stars=self.min_stars
-        )
+        frame, star, xy, sigma = self.tracker.observe(stars, rng, meta["n_frames"])
         columns = {
             "frame": frame + meta["first_frame"],
             "x_px": xy[:, 0],
@@ -184,6 +183,8 @@ class _Maker:
             "dec_deg": stars.dec_deg[star],
             "mag": stars.mag[star],
         }
+        if one_noise(self.tracker.noise) is None:
+            columns["sigma_px"] = sigma
         write_partition(
             columns, {"star_id": (star, stars.star_id)}, meta, self.folder / _NAME.format(number)
         )

@@ -27,7 +27,7 @@ from starcal_uq.likelihood.terms import add_by_group
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.effects import JointMatrices, PlannedEffects
 from starcal_uq.planning.information import frame_matrices
-from starcal_uq.simulation.frames import EDGE_SIGMAS, Window
+from starcal_uq.simulation.frames import EDGE_SIGMAS, Window, brightest
 from starcal_uq.simulation.pointing import pattern_rotations
 from starcal_uq.studies.axes import CAMERA_AXES, EFFECT_AXES
 from starcal_uq.studies.definition import Cell
@@ -227,10 +227,7 @@ class Geometry:
         """The same frames with their n brightest stars."""
         if n is None:
             return self
-        frame = np.repeat(np.arange(self.n_frames), np.diff(self.starts))
-        order = np.lexsort((self.mag, frame))
-        rank = np.arange(len(order)) - self.starts[:-1][frame]
-        kept = np.sort(order[rank < n])
+        kept = brightest(self.mag, self.starts, n)
         sizes = np.minimum(np.diff(self.starts), n)
         return self._with(self.rotations, _starts(sizes), kept)
 

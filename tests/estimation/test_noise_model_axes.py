@@ -16,6 +16,7 @@ from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.noise_model import NoiseModel
 from starcal_uq.likelihood.shapes import View, shapes
 from starcal_uq.planning.information import random_frames
+from starcal_uq.simulation.frames import Tracker
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers.outside import Campaign, attitude_errors, campaign
 
@@ -116,8 +117,8 @@ def test_axes_go_with_compressed_likelihoods_and_plans():
     # A plan with the fitted noise expects what stars with such axes tell.
     stars = load_catalogue(max_mag=6.0)
     model = whole.noise_model
-    frames = random_frames(stars, whole.camera, model, n_frames=10, min_stars=8, seed=0)
-    alike = random_frames(stars, whole.camera, model.level_px, n_frames=10, min_stars=8, seed=0)
+    frames = random_frames(stars, Tracker(whole.camera, model, 8), n_frames=10, seed=0)
+    alike = random_frames(stars, Tracker(whole.camera, model.level_px, 8), n_frames=10, seed=0)
     nea = [np.sqrt(np.einsum("kii->i", found.noise)[:2]) for found in (frames, alike)]
     # An error along x turns about y.
     assert nea[0][1] / nea[0][0] == pytest.approx(model.axis_ratio, rel=0.3)

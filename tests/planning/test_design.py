@@ -70,13 +70,15 @@ def test_greedy_with_exchange_finds_the_best_of_all_sets():
     from starcal_uq.maths.linear import inverses
     from starcal_uq.planning.forecast import quantities, spreads
     from starcal_uq.planning.information import look_at, random_frames
+    from starcal_uq.simulation.frames import Tracker
 
     rotations = random_rotations(16, np.random.default_rng(4))
     found = choose_frames(
         camera(), sky(), n_frames=4, candidates=rotations, min_stars=6, n_geometries=100
     )
-    pool = look_at(sky(), camera(), rotations, 0.05, 6)
-    mission = random_frames(sky(), camera(), 0.05, n_frames=100, min_stars=6, seed=0)
+    tracker = Tracker(camera(), min_stars=6)
+    pool = look_at(sky(), tracker, rotations)
+    mission = random_frames(sky(), tracker, n_frames=100, seed=0)
     forms = {q.name: q.form for q in quantities(mission)}
     weights = forms["common_pitch_arcsec"] + forms["common_yaw_arcsec"]
     sets = np.array(list(combinations(range(pool.n_frames), 4)))

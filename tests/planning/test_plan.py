@@ -35,6 +35,7 @@ from starcal_uq.planning.planned import Plan
 from starcal_uq.presentation.pages.planning import render_plan, write_plan
 from starcal_uq.presentation.words.numbers import frames as frames_words
 from starcal_uq.presentation.words.sentences import told
+from starcal_uq.simulation.frames import Tracker
 from tests.helpers.outside import attitude_errors, campaign
 from tests.helpers.scenes import COEFFICIENTS, camera, observations
 
@@ -59,7 +60,7 @@ def sky(max_mag: float = 6.0) -> sc.StarCatalogue:
 
 @lru_cache
 def some_frames(n_frames: int = 1000) -> FrameSet:
-    return random_frames(sky(), camera(), 0.05, n_frames=n_frames, min_stars=10, seed=1)
+    return random_frames(sky(), Tracker(camera()), n_frames=n_frames, seed=1)
 
 
 @lru_cache
@@ -118,9 +119,8 @@ def test_a_confidence_that_is_no_probability_is_refused():
 def test_information_is_that_of_a_calibration(model):
     obs = observations(model)
     cal = sc.calibrate(obs, camera(model))
-    found = look_at(
-        sc.load_catalogue(max_mag=6.0, epoch=2026.9), cal.camera, _rotations(cal), cal.sigma, 3
-    )
+    tracker = Tracker(cal.camera, cal.sigma, 3)
+    found = look_at(sc.load_catalogue(max_mag=6.0, epoch=2026.9), tracker, _rotations(cal))
     # The stars are the same but for a few at the edge, which noise has moved.
     assert found.n_stars.sum() == pytest.approx(obs.n_stars, rel=0.005)
     assert np.sqrt(np.diag(inverses(found.information.sum(axis=0)))) == pytest.approx(
@@ -165,7 +165,7 @@ def test_noise_by_magnitude_weights_the_stars():
         return 0.05 * 10.0 ** (0.2 * (mag - 6.0))
 
     flat = some_frames(200)
-    found = random_frames(sky(), camera(), noise, n_frames=200, min_stars=10, seed=1)
+    found = random_frames(sky(), Tracker(camera(), noise), n_frames=200, seed=1)
     assert found.frames.weight == pytest.approx(1.0 / noise(found.mag))
     # Brighter stars are better than the faintest: more information than with 0.05 px for all.
     assert np.trace(found.information.sum(axis=0) @ np.diag([1, 1, 0, 0, 0])) > 1.2 * np.trace(
@@ -372,7 +372,7 @@ def test_first_order_law_of_the_target():
     """Half the error takes four times the frames, and so does twice the noise."""
 
     def needed(target_arcsec: float, sigma_px: float = 0.05) -> int | None:
-        frames = random_frames(sky(), camera(), sigma_px, n_frames=500, min_stars=10, seed=0)
+        frames = random_frames(sky(), Tracker(camera(), sigma_px), n_frames=500, seed=0)
         return Forecaster(frames, Outlook(n_campaigns=100)).frames_needed(target_arcsec)
 
     needs = [needed(10.0), needed(5.0)]
@@ -463,7 +463,7 @@ def test_the_noise_model_of_a_calibration_gives_stars_the_noise_of_their_place()
         ),
         *(np.zeros(2), 0.0, None, nothing, empty, 1.0),
     )
-    frames = random_frames(sky(), camera(), model, n_frames=50, min_stars=10, seed=1)
+    frames = random_frames(sky(), Tracker(camera(), model), n_frames=50, seed=1)
     radius = np.hypot(*(frames.frames.pixel - np.array(camera().centre_px)[:, None])) / corner
     assert 1.0 / frames.frames.weight == pytest.approx(0.05 * np.exp(radius), rel=1e-9)
     noisy = plan(camera(), sky(), sigma_px=model, n_geometries=100, n_campaigns=20, sweeps=False)
@@ -625,7 +625,7 @@ def test_settings_that_cannot_work_are_refused_in_one_sentence(options, words):
 
 def test_no_attitude_with_enough_stars():
     with pytest.raises(PlanningError, match="none of the 1 candidate attitudes shows 400 stars"):
-        look_at(sky(), camera(), np.eye(3)[None], 0.05, 400)
+        look_at(sky(), Tracker(camera(), min_stars=400), np.eye(3)[None])
 
 
 def test_words():

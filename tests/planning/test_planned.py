@@ -11,6 +11,7 @@ from starcal_uq.planning.costs import EffectCosts
 from starcal_uq.planning.effects import PlannedEffects
 from starcal_uq.planning.information import random_frames
 from starcal_uq.planning.plan import plan
+from starcal_uq.simulation.frames import Tracker
 from tests.helpers.effects import breathing, moving, smooth, together
 from tests.helpers.scenes import camera, nominal
 
@@ -136,10 +137,8 @@ def test_a_wider_range_of_temperatures_tells_the_slope(sky) -> None:
 def test_noise_and_window_keep_the_effects(sky) -> None:
     frames = random_frames(
         sky,
-        camera(),
-        0.05,
+        Tracker(camera()),
         n_frames=50,
-        min_stars=10,
         seed=1,
         effects=PlannedEffects.parsed("axes,frame=0.1"),
     )

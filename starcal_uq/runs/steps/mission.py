@@ -41,6 +41,8 @@ class MissionSky:
     min_stars : int or None
         Least stars of a frame that gives an attitude; 5 at random attitudes and 3 along a profile
         by default.
+    max_stars : int or None
+        Stars that the tracker uses of a frame, the brightest ones; all where it is None.
     rate_hz : float or None
         Frames per second along the profile; its own instants where it is None.
     scalar, sense
@@ -53,6 +55,7 @@ class MissionSky:
     epoch: float = 2026.9
     n_frames: int = 1000
     min_stars: int | None = None
+    max_stars: int | None = None
     rate_hz: float | None = None
     scalar: Scalar | None = None
     sense: Sense = "icrs_to_camera"
@@ -75,12 +78,16 @@ class MissionSky:
                 camera,
                 n_frames=self.n_frames,
                 min_stars=self.min_stars or 5,
+                max_stars=self.max_stars,
                 seed=seed,
                 noise_like=like,
             )
         profile = load_attitude_profile(self.profile, scalar=self.scalar, sense=self.sense)
         frames = profile_frames(
-            stars, camera, profile, self.rate_hz, min_stars=self.min_stars or 3, noise_like=like
+            *(stars, camera, profile, self.rate_hz),
+            min_stars=self.min_stars or 3,
+            max_stars=self.max_stars,
+            noise_like=like,
         )
         return frames.with_origin(messages=[*profile.messages])
 
