@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +42,8 @@ from starcal_uq.budgeting.sampling import N_SAMPLES
 from starcal_uq.budgeting.totals import Total, totals
 from starcal_uq.core.constants import AXES, INTERACTION
 from starcal_uq.core.errors import BudgetError
-from starcal_uq.core.formatting import join_words, significant
+from starcal_uq.core.findings import clause
+from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import one_thread
@@ -58,6 +60,8 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.thermal import TemperatureProfile
 
 _CONFIDENCE = 0.997
+# What to know of the rows.
+Remark = Enum("Remark", "REPLACED TWICE NOT_ASSESSED IN_PART")
 # A row of the file that may hold what effects fill rows with.
 _DRIFT = "drift of focal length and distortion"
 _OF_TIME_OR_WARMTH = [OF_EFFECTS[name].name for name in ("temperature", "time", "epoch")]
@@ -286,44 +290,24 @@ def _effect_notes(
     """What the file states in place of computed rows, and what may be stated twice."""
     notes = []
     for name, axes in by_contributor(replaced).items():
-        sizes = [
-            f"{significant(math.hypot(row.mean_arcsec, row.sigma_arcsec))} arcsec about "
-            f"{AXIS_LABELS[axis]}"
+        sizes = {
+            AXIS_LABELS[axis]: math.hypot(row.mean_arcsec, row.sigma_arcsec)
             for axis, row in axes.items()
-        ]
-        notes.append(
-            f"{name!r} is as the file states it; the calibration gives {join_words(sizes)}, "
-            "which is in no total."
-        )
+        }
+        notes.append(clause(Remark.REPLACED, name=name, sizes_arcsec=sizes))
     computed = {row.name for row in effects if row.applies} & set(_OF_TIME_OR_WARMTH)
     if computed and any(row.name == _DRIFT and row.applies for row in stated.contributors):
-        notes.append(
-            f"{_DRIFT!r} is stated in the file, and {join_words(sorted(map(repr, computed)))} "
-            "computed from the calibration: state in the first what the calibration does not hold."
-        )
+        notes.append(clause(Remark.TWICE, name=_DRIFT, computed=sorted(computed)))
     return tuple(notes)
 
 
 def _notes(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
-    notes = []
-    missing = _missing(rows)
-    if missing:
-        notes.append(
-            f"Not assessed, and in no total: {join_words(missing)}. The totals say at least how "
-            "large the error is."
-        )
-    part = tuple(
-        dict.fromkeys(
-            row.name for row in rows if row.absorbed_by_alignment == "in part" and row.assessed
-        )
-    )
-    if part:
-        notes.append(
-            f"Absorbed by alignment in part: {join_words(part)}. It counts in full in bounds "
-            "after alignment, and not "
-            "at all where these would violate a requirement."
-        )
-    return tuple(notes)
+    part = [row.name for row in rows if row.absorbed_by_alignment == "in part" and row.assessed]
+    named = {
+        Remark.NOT_ASSESSED: _missing(rows),
+        Remark.IN_PART: tuple(dict.fromkeys(part)),
+    }
+    return tuple(clause(code, names=names) for code, names in named.items() if names)
 
 
 def _missing(rows: tuple[Contributor, ...]) -> tuple[str, ...]:

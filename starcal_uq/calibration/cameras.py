@@ -9,6 +9,7 @@ values of one camera.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.planes import PINHOLE, Plane
-from starcal_uq.core.formatting import join_words, plural
+from starcal_uq.core.findings import clause
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.consensus import focal_lengths, ideal_frames
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -34,7 +35,8 @@ _LEAST_APART, _SIGMAS_APART = 3e-3, 6.0
 _LEAST_FRAMES, _LEAST_STARS, _FRAMES, _DRAWS, _STEPS = 4, 4, 300, 4000, 6
 # Groups that are looked for together; each may fall into more.
 _MOST_AT_ONCE = 4
-_WORDS = 12
+# What the frames say of cameras.
+Mixed = Enum("Mixed", "CAMERAS")
 # Of the sample of frames, and of the draws that a split is held against.
 _SEED = 0
 
@@ -67,17 +69,13 @@ class FrameFocals:
         """Each group's focal length and frames, in one clause, with the option that selects a
         group.
         """
-        told = []
+        groups = []
         for number in range(self.n_groups):
             mine = self.group == number
             focal = camera.length_text(float(np.median(self.focal_px[mine])), 4)
-            told.append(f"{focal} in {_listed(self.frame_ids[mine])}")
-        chosen = self.largest if self.largest.count(",") < _WORDS else "LIST"
-        return (
-            f"the frames are of {plural(self.n_groups, 'camera')}, or some are wrong: focal "
-            f"length {join_words(told)}; "
-            f"calibrate each by itself (--only-frames {chosen})"
-        )
+            ids = self.frame_ids[mine]
+            groups.append((focal, len(ids), frame_ranges(ids)))
+        return clause(Mixed.CAMERAS, groups=groups, largest=self.largest)
 
 
 @dataclass(frozen=True)
@@ -95,13 +93,6 @@ class MixedCameras:
         if found.n_groups < 2:
             return None
         return cls(found.n_groups, found.words(camera), found.largest)
-
-
-def _listed(frames: IntArray) -> str:
-    text = frame_ranges(frames)
-    if text.count(",") >= _WORDS:
-        return plural(len(frames), "frame")
-    return f"{'frame' if len(frames) == 1 else 'frames'} {text}"
 
 
 def frame_ranges(frames: IntArray) -> str:

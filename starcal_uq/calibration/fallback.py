@@ -19,15 +19,16 @@ from starcal_uq.calibration.plausibility import find_reason
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, simpler_models
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.findings import clause
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.undetermined import (
     COMA_MATTERS,
     EXPLAINED,
+    Open,
     open_parameters,
     remedy_of,
-    what_is_open,
 )
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -103,10 +104,7 @@ def _conditional(
     """The calibration with the record of the richer model that the data do not determine, and
     why.
     """
-    because = (
-        "the stars are too few" if status is Status.SINGULAR else f"the fit ended in {status.name}"
-    )
-    because = f"{what_is_open(names) if names else because} with the latter"
+    because = clause(Open.RICHER, names=names, status=status)
     record: AnyDict = {"model": model, "used": cal.camera.distortion, "status": status.name}
     record |= {"undetermined": list(names), "because": because}
     return replace(cal, provenance=cal.provenance.adding(fallback=record))

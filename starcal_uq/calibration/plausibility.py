@@ -12,6 +12,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from enum import Enum
 from functools import wraps
 from itertools import islice, pairwise
 from typing import ParamSpec, TypeVar
@@ -24,7 +25,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.planes import Plane
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.findings import Finding, clause
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, Remedy
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
@@ -54,9 +55,12 @@ _NEIGHBOURS = 8
 # anything.
 _NOISY, _QUIET = 0.2, 0.1
 _FEW_WRONG = 0.02
-_ONE_FRAME_NUMBER = (
-    "all rows have one frame number, but are stars of several images: give each image its own in "
-    "column frame"
+# What is wrong with table or camera file.
+Slip = Enum(
+    "Slip",
+    "HOURS RADIANS RA_IN_RADIANS DEC_IN_RADIANS SWAPPED MIRRORED OFF_CENTRE ONE_FRAME_NUMBER "
+    "MIXED_UP FAR_APART MICROMETRES PITCH_IN_MILLIMETRES METRES PIXELS INCHES OTHER_CAMERA "
+    "NO_ATTITUDE WRONG_STARS SCATTER",
 )
 
 
@@ -92,8 +96,8 @@ class _Table:
         return 2.0 * self.plane.angle(0.5 * float(np.hypot(*self.detector)) / self.focal_px)
 
 
-# Tables without a slip, each with a clause that names slip and remedy.
-_Slips = Iterator[tuple[str, _Table]]
+# Tables without some slips, which stand before each.
+_Slips = Iterator[tuple[tuple[Finding, ...], _Table]]
 
 
 @dataclass(frozen=True)
@@ -183,14 +187,16 @@ def find_reason(
     if plain.cost > _EXPLAINED:
         enough = min(_EXPLAINED, _CLEARLY * plain.cost)
         for slips in (_one_slip(table, obs), _two_slips(table)):
-            tried = [(_fit(other), text) for text, other in slips]
+            tried = [(_fit(other), found) for found, other in slips]
             good = [one for one in tried if one[0].cost < enough]
             if good:
-                fit, text = min(good, key=lambda one: one[0].badness)
-                focal = _wrong_focal(fit, camera)
-                return text if focal is None else f"{text}; and {focal}"
+                fit, found = min(good, key=lambda one: one[0].badness)
+                parts = (*(one.sentence for one in found), _wrong_focal(fit, camera))
+                return "; and ".join(filter(None, parts))
         if _far_apart(table):
-            return _far_apart_words(obs, table)
+            field_deg = float(np.degrees(table.field_rad))
+            code = Slip.ONE_FRAME_NUMBER if obs.n_frames == 1 else Slip.FAR_APART
+            return clause(code, field_deg=field_deg)
     # Distortion bends attitudes and focal lengths less than slips and other cameras do.
     numbers, frames = frames_with_focals(obs)
     pinhole = replace(frames, pixel=frames.pixel - table.centre[:, None])
@@ -260,50 +266,32 @@ def _one_slip(table: _Table, obs: Observations) -> _Slips:
 
 def _two_slips(table: _Table) -> _Slips:
     """Two of them at once."""
-    for text, other in _units(table):
+    for first, other in _units(table):
         second, both = _mirrored(other)
-        yield f"{text}; and {second}", both
+        yield (*first, *second), both
         if other.dec is table.dec and _dec_in_radians(table):
-            second, both = _dec_words(table, ""), replace(other, dec=np.degrees(table.dec))
-            yield f"{text}; and {second}", both
+            dec = Finding(Slip.DEC_IN_RADIANS, {"most": np.abs(table.dec).max(), "alone": False})
+            yield (*first, dec), replace(other, dec=np.degrees(table.dec))
 
 
 def _units(table: _Table) -> _Slips:
     """Columns in other units or exchanged."""
     ra, dec, most = table.ra, table.dec, table.ra.max()
     in_radians = most <= 2.0 * np.pi
-    slips = (
-        (
-            most <= 24.0,
-            f"ra_deg looks like hours ({ra.min():.3g} to {most:.3g}): multiply it by 15",
-            (15.0 * ra, dec),
-        ),
-        (
-            in_radians and _within_radians(dec),
-            f"ra_deg and dec_deg look like radians (ra_deg up to {most:.3g}): multiply them by "
-            "180/pi",
-            (np.degrees(ra), np.degrees(dec)),
-        ),
-        (
-            in_radians,
-            f"ra_deg looks like radians (up to {most:.3g}), dec_deg does not: multiply ra_deg by "
-            "180/pi",
-            (np.degrees(ra), dec),
-        ),
-        (
-            _dec_in_radians(table),
-            _dec_words(table, ", ra_deg does not"),
-            (ra, np.degrees(dec)),
-        ),
-        (
-            most <= 90.0,
-            "ra_deg and dec_deg look swapped: exchange the two columns",
-            (dec % 360.0, ra),
-        ),
+    of_ra: AnyDict = {"least": ra.min(), "most": most}
+    of_dec = {"most": np.abs(dec).max(), "alone": True}
+    ra_turned, dec_turned = np.degrees(ra), np.degrees(dec)
+    both_in_radians = in_radians and _within_radians(dec)
+    slips: tuple[tuple[bool, Slip, AnyDict, FloatArray, FloatArray], ...] = (
+        (most <= 24.0, Slip.HOURS, of_ra, 15.0 * ra, dec),
+        (both_in_radians, Slip.RADIANS, of_ra, ra_turned, dec_turned),
+        (in_radians, Slip.RA_IN_RADIANS, of_ra, ra_turned, dec),
+        (_dec_in_radians(table), Slip.DEC_IN_RADIANS, of_dec, ra, dec_turned),
+        (most <= 90.0, Slip.SWAPPED, {}, dec % 360.0, ra),
     )
-    for possible, text, (right_ra, right_dec) in slips:
+    for possible, code, facts, right_ra, right_dec in slips:
         if possible:
-            yield text, replace(table, ra=right_ra, dec=right_dec)
+            yield (Finding(code, facts),), replace(table, ra=right_ra, dec=right_dec)
 
 
 def _within_radians(dec: FloatArray) -> bool:
@@ -314,28 +302,17 @@ def _dec_in_radians(table: _Table) -> bool:
     return _within_radians(table.dec) and bool(table.ra.max() > 0.5 * np.pi)
 
 
-def _dec_words(table: _Table, but: str) -> str:
-    most = np.abs(table.dec).max()
-    return f"dec_deg looks like radians (up to {most:.3g}){but}: multiply it by 180/pi"
-
-
-def _mirrored(table: _Table) -> tuple[str, _Table]:
+def _mirrored(table: _Table) -> tuple[tuple[Finding, ...], _Table]:
     (x, y), (width, height) = table.pixel, table.detector
-    ways = f"count x_px from the right edge ({width - 1} - x_px), or y_px from the bottom"
-    if x.max() <= height - 0.5 and y.max() <= width - 0.5:
-        ways += ", or exchange x_px and y_px"
-    text = f"the image is mirrored: {ways}; a wrong sign of ra_deg or dec_deg looks the same"
-    return text, replace(table, pixel=np.array([width - 1.0 - x, y]))
+    exchanged = x.max() <= height - 0.5 and y.max() <= width - 0.5
+    found = Finding(Slip.MIRRORED, {"last_px": width - 1, "exchanged": exchanged})
+    return (found,), replace(table, pixel=np.array([width - 1.0 - x, y]))
 
 
-def _off_centre(table: _Table) -> tuple[str, _Table]:
+def _off_centre(table: _Table) -> tuple[tuple[Finding, ...], _Table]:
     middle: FloatArray = (table.detector - 1) / 2.0
-    (x0, y0), (x, y) = table.centre, middle
-    text = (
-        f"the principal point of the camera, ({x0:g}, {y0:g}) px, is far off: start from the "
-        f"detector's centre, ({x:g}, {y:g})"
-    )
-    return text, replace(table, centre=middle)
+    found = Finding(Slip.OFF_CENTRE, {"given_px": table.centre, "middle_px": middle})
+    return (found,), replace(table, centre=middle)
 
 
 def _regrouped(table: _Table, obs: Observations) -> _Slips:
@@ -349,14 +326,8 @@ def _regrouped(table: _Table, obs: Observations) -> _Slips:
     sky = cKDTree(obs.directions_icrs)
     seeds = np.unique(np.linspace(0, obs.n_stars - 1, _FRAMES).astype(np.int64))
     near = [np.sort(rows) for rows in sky.query(obs.directions_icrs[seeds], k=_NEIGHBOURS)[1]]
-    text = (
-        "the stars fit each other but not their frame numbers: check column frame, which is "
-        "mixed up"
-    )
-    yield (
-        _ONE_FRAME_NUMBER if obs.n_frames == 1 else text,
-        replace(table, **_columns(obs, near)),
-    )
+    code = Slip.ONE_FRAME_NUMBER if obs.n_frames == 1 else Slip.MIXED_UP
+    yield (Finding(code),), replace(table, **_columns(obs, near))
 
 
 def _far_apart(table: _Table) -> bool:
@@ -369,16 +340,6 @@ def _far_apart(table: _Table) -> bool:
     return float(np.median(spans)) > 2.0 * table.field_rad
 
 
-def _far_apart_words(obs: Observations, table: _Table) -> str:
-    if obs.n_frames == 1:
-        return _ONE_FRAME_NUMBER
-    field = significant(float(np.degrees(table.field_rad)), 2)
-    return (
-        f"frames hold stars that lie farther apart in the sky than the camera sees ({field} "
-        "degrees): their frame numbers or directions belong to other rows"
-    )
-
-
 def _wrong_focal(plain: _Fit, camera: Camera) -> str | None:
     """A focal length that the stars contradict, with the unit that would explain it."""
     if plain.cost > _EXPLAINED:
@@ -386,31 +347,31 @@ def _wrong_focal(plain: _Fit, camera: Camera) -> str | None:
     ratio = plain.focal_ratio
     if 1.0 / _SAME_CAMERA < ratio < _SAME_CAMERA:
         return None
-    for unit, reason in _other_units(camera).items():
-        if 1.0 / _SAME_UNIT < ratio / unit < _SAME_UNIT:
-            return reason
-    return (
-        f"the stars ask for a focal length of about {camera.length_text(ratio * camera.focal_px, 3)}, not "
-        f"{camera.length_text(camera.focal_px, 6)}: start from that, or give the camera that "
-        "took the images"
+    lengths = {
+        name: camera.length_text(px, digits)
+        for name, px, digits in (
+            ("found", ratio * camera.focal_px, 3),
+            ("given", camera.focal_px, 6),
+        )
+    }
+    close = (
+        code
+        for factor, code in _other_units(camera).items()
+        if 1.0 / _SAME_UNIT < ratio / factor < _SAME_UNIT
     )
+    sizes = {"focal_mm": camera.focal_mm, "pixel_um": camera.pixel_um}
+    return clause(next(close, Slip.OTHER_CAMERA), **lengths, **sizes)
 
 
-def _other_units(camera: Camera) -> dict[float, str]:
+def _other_units(camera: Camera) -> dict[float, Slip]:
     """What the lengths of a camera file look like when they are off by these factors."""
     if camera.pixel_um is None or camera.focal_mm is None:
         return {}
-    short = f"focal_mm looks like micrometres ({camera.focal_mm:g}): divide it by 1000"
-    if camera.pixel_um < 0.5:
-        short = f"pixel_um looks like millimetres ({camera.pixel_um:g}): multiply it by 1000"
     return {
-        1e-3: short,
-        1e3: f"focal_mm looks like metres ({camera.focal_mm:g}): multiply it by 1000",
-        1e-3 * camera.pixel_um: (
-            f"focal_mm looks like pixels ({camera.focal_mm:g}): multiply it by the pixel pitch, "
-            f"{1e-3 * camera.pixel_um:g} mm"
-        ),
-        25.4: f"focal_mm looks like inches ({camera.focal_mm:g}): multiply it by 25.4",
+        1e-3: Slip.PITCH_IN_MILLIMETRES if camera.pixel_um < 0.5 else Slip.MICROMETRES,
+        1e3: Slip.METRES,
+        1e-3 * camera.pixel_um: Slip.PIXELS,
+        25.4: Slip.INCHES,
     }
 
 
@@ -418,21 +379,11 @@ def _as_it_is(plain: _Fit, quiet: bool, status: Status, screened: bool) -> str |
     """What is known of stars that no slip explains."""
     wrong = 1.0 - plain.share
     if wrong > 0.8:
-        return (
-            "the stars of a frame fit no common attitude, whatever units, axes and focal length: "
-            "check their identification and the frame numbers"
-        )
+        return clause(Slip.NO_ATTITUDE)
     if wrong > _FEW_WRONG:
-        told = f"about {100.0 * wrong:.0f} % of the stars do not fit the others of their frame"
-        if screened or wrong > 0.6:
-            return f"{told}: identify them again"
-        screened_out = Remedy("calibrate", (OBS, CAMERA), {"out": RUN, "screening": True})
-        return f"{told}: leave out wrong identifications (`{screened_out.words}`)"
+        screen = Remedy("calibrate", (OBS, CAMERA), {"out": RUN, "screening": True})
+        again = screened or wrong > 0.6
+        return clause(Slip.WRONG_STARS, share=wrong, screen=None if again else screen)
     if quiet or status in (Status.SINGULAR, Status.FOLDED, Status.OUTSIDE_DETECTOR):
         return None
-    return (
-        f"the stars scatter by about {significant(plain.scatter_px, 2)} px around their "
-        "attitudes, by noise or by "
-        "distortion that the model lacks: measure the centroids again, or choose another "
-        "distortion model"
-    )
+    return clause(Slip.SCATTER, scatter_px=plain.scatter_px)

@@ -23,6 +23,7 @@ them:
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,6 +47,7 @@ from starcal_uq.comparison.significance import (
 )
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import ComparisonError
+from starcal_uq.core.findings import clause
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
@@ -61,6 +63,8 @@ if TYPE_CHECKING:
 
 # A prior that is less than so many times wider than the posterior has a say in it.
 _WIDE_PRIOR = 5.0
+# What to know when reading a comparison.
+Differs = Enum("Differs", "MODELS OUTSIDE PITCH EQUALLY_CERTAIN MAP_ALONE NOT_CONVERGED BY_PRIOR")
 
 
 @bounded
@@ -256,39 +260,23 @@ def _messages(
     a: Any, b: Any, labels: tuple[str, str], rule: Rule, tests: DifferenceTests
 ) -> tuple[str, ...]:
     """What should be known when reading the result."""
-    messages = []
     cameras = a.camera, b.camera
-    if cameras[0].distortion != cameras[1].distortion:
-        messages.append(
-            f"The distortion models differ ({cameras[0].distortion}, {cameras[1].distortion}): "
-            "what the simpler one "
-            "cannot follow shows here as a difference."
-        )
-        if tests.outside > 0.0 and tests.outside > 0.1 * tests.expected:
-            messages.append(
-                f"{tests.outside:.2g} arcsec rms of the difference cannot come from errors of "
-                "the parameters: the "
-                "two models cannot agree that well."
-            )
-    pitches = [camera.pixel_um for camera in cameras if camera.pixel_um is not None]
-    if len(set(pitches)) > 1:
-        messages.append(
-            f"The pixel pitch differs ({pitches[0]:g} and {pitches[1]:g} µm): directions are "
-            "compared pixel by pixel, in which the pitch has no part."
-        )
-    if rule.signs is not None and np.isnan(tests.p_map):
-        messages.append(
-            "The two estimates are equally certain, so that no noise explains a difference and "
-            "nothing is tested: "
-            "compare estimates from different frames."
-        )
-    elif rule.signs is not None and np.isnan(tests.p_parameters):
-        messages.append(
-            "The covariance of an inefficient estimate is known from the scatter of its frames "
-            "only: well enough for "
-            "the mean square over the detector, not for single directions. So only the map is "
-            "tested."
-        )
+    models = tuple(camera.distortion for camera in cameras)
+    differ, told = models[0] != models[1], rule.signs is not None
+    outside, pitches = tests.outside, [c.pixel_um for c in cameras if c.pixel_um is not None]
+    equal, by_frames = np.isnan(tests.p_map), np.isnan(tests.p_parameters)
+    rows: tuple[tuple[Any, Differs, AnyDict], ...] = (
+        (differ, Differs.MODELS, {"models": models}),
+        (
+            differ and outside > 0.0 and outside > 0.1 * tests.expected,
+            Differs.OUTSIDE,
+            {"outside_arcsec": outside},
+        ),
+        (len(set(pitches)) > 1, Differs.PITCH, {"pitches_um": pitches}),
+        (told and equal, Differs.EQUALLY_CERTAIN, {}),
+        (told and not equal and by_frames, Differs.MAP_ALONE, {}),
+    )
+    messages = [clause(code, **facts) for holds, code, facts in rows if holds]
     for result, name in zip((a, b), labels, strict=True):
         messages += _posterior_messages(result, name, rule)
     return tuple(messages)
@@ -298,20 +286,12 @@ def _posterior_messages(result: Any, name: str, rule: Rule) -> list[str]:
     priors, diagnostics = getattr(result, "priors", None), getattr(result, "diagnostics", None)
     messages = []
     if diagnostics is not None and not diagnostics.ok:
-        messages.append(
-            f"{name}: the draws miss a criterion of convergence, so its mean and covariance may "
-            "be off."
-        )
+        messages.append(clause(Differs.NOT_CONVERGED, name=name))
     if priors is None or rule.signs is None:
         return messages
     ratio = priors.sd(result.camera_names) / np.sqrt(np.diag(result.covariance))
     least = int(np.argmin(ratio))
     if ratio[least] < _WIDE_PRIOR:
-        messages.append(
-            f"{name}: the prior has a say in {result.camera_names[least]} (only "
-            f"{ratio[least]:.1f} times as wide as "
-            "the posterior): if both runs share it, their estimates differ by less than their "
-            "covariances say, and the "
-            "p-values err to the safe side."
-        )
+        narrow = {"parameter": result.camera_names[least], "times": ratio[least]}
+        messages.append(clause(Differs.BY_PRIOR, name=name, **narrow))
     return messages

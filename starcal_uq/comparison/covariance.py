@@ -12,12 +12,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.camera.distortion import is_special_case
-from starcal_uq.core.formatting import plural
+from starcal_uq.core.findings import clause
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.inference.priors import GaussianPriors
 from starcal_uq.observations.repeats import shared
@@ -33,6 +34,12 @@ INDEPENDENT, SAME, A_IN_B, B_IN_A, OVERLAP = (
     "A within B",
     "B within A",
     "overlapping",
+)
+# What the covariance of a difference rests on, or why there is none.
+Basis = Enum(
+    "Basis",
+    "UNCHECKED INDEPENDENT OVERLAPPING SAME WITHIN NONE_EFFICIENT NONE_WITHIN ONE_ESTIMATE "
+    "RICHER_OR_FEWER",
 )
 
 
@@ -66,47 +73,17 @@ def difference_rule(
     """
     data, seen = _relation(a, b, same_data, observations, fingerprints)
     if data == INDEPENDENT:
-        if seen is None:
-            return Rule(
-                data,
-                (1.0, 1.0),
-                "The data are taken for independent, so the two covariances add: their hashes "
-                "differ, but whether they "
-                "share frames cannot be checked without fingerprints or observations: calibrate "
-                "again to have it so.",
-            )
-        return Rule(data, (1.0, 1.0), "The data are independent, so the two covariances add.")
+        code = Basis.UNCHECKED if seen is None else Basis.INDEPENDENT
+        return Rule(data, (1.0, 1.0), clause(code))
     if data == OVERLAP:
-        count = f" ({plural(seen, 'frame')})" if seen else ""
-        why = (
-            f"both rest in part on the same data{count}, and how their errors correlate is not "
-            "known"
-        )
-        return Rule(
-            data, None, f"There is no p-value: {why}; compare runs that share all frames, or none."
-        )
+        return Rule(data, None, clause(Basis.OVERLAPPING, n_frames=seen))
     signs = _hausman(a, b, data)
     if signs is None:
-        return Rule(data, None, f"There is no p-value: {_why_none(a, b, data)}.")
+        return Rule(data, None, clause(_why_none(a, b, data)))
     efficient, other = labels if signs == (-1.0, 1.0) else labels[::-1]
-    if data == SAME:
-        reason = "is the efficient estimate"
-        if is_efficient(a) and is_efficient(b):
-            reason = "has the simpler model and is efficient if that holds"
-        return Rule(
-            data,
-            signs,
-            f"Both rest on the same data. {efficient[:1].upper()}{efficient[1:]} {reason}, so "
-            "the difference has the "
-            f"covariance of {other} minus that of {efficient} (Hausman 1978).",
-        )
-    return Rule(
-        data,
-        signs,
-        f"All data of {other} are in {efficient} too, which is efficient, so the difference has "
-        "the covariance of "
-        f"{other} minus that of {efficient} (Hausman 1978).",
-    )
+    both = is_efficient(a) and is_efficient(b)
+    code = Basis.SAME if data == SAME else Basis.WITHIN
+    return Rule(data, signs, clause(code, efficient=efficient, other=other, both=both))
 
 
 def _relation(
@@ -187,19 +164,11 @@ def is_efficient(result: Any) -> bool:
     return bool(result.method == "efficient" and result.provenance.likelihood == "marginal")
 
 
-def _why_none(a: Any, b: Any, data: str) -> str:
+def _why_none(a: Any, b: Any, data: str) -> Basis:
     if not (is_efficient(a) or is_efficient(b)):
-        return (
-            "they share data, and neither estimate is efficient, so how their errors correlate "
-            "is not known"
-        )
+        return Basis.NONE_EFFICIENT
     if not (_within(a, b) or _within(b, a)):
-        return "they share data, and neither distortion model is contained in the other"
+        return Basis.NONE_WITHIN
     if data == SAME and a.camera.distortion == b.camera.distortion:
-        return (
-            "both are the efficient estimate from the same data, so that no noise explains a "
-            "difference"
-        )
-    return (
-        "they share data, and the efficient one of the two has the richer model or the fewer frames"
-    )
+        return Basis.ONE_ESTIMATE
+    return Basis.RICHER_OR_FEWER

@@ -44,6 +44,11 @@ def register_wording(load: Callable[[], Callable[[Finding], Any]]) -> None:
     _wordings.append(load)
 
 
+def clause(code: Enum, **values: Any) -> str:
+    """The words of a code with values, for an error or a file that keeps words."""
+    return str(worded(Finding(code, values)))
+
+
 def worded(finding: Finding) -> Any:
     """The words of a finding: a sentence, and of a check value, bound and sentence."""
     return _wordings[-1]()(finding)

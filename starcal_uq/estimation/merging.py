@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from itertools import combinations
 from time import perf_counter
 from typing import TYPE_CHECKING, get_args
@@ -21,6 +22,7 @@ from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError, check_known
+from starcal_uq.core.findings import clause
 from starcal_uq.core.provenance import Provenance, data_hashes, provenance
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.settings import MergedNoise
@@ -44,6 +46,8 @@ NOISES = get_args(MergedNoise)
 # Up to this many sigmas of a run, its quadratic expansion was never wrong by more than 0.15 nat,
 # even with five frames. Runs of one camera stay within five.
 MAX_DISTANCE = 8.0
+# How runs differ.
+Apart = Enum("Apart", "ODD CAMERAS NOISES UNCHECKED")
 
 
 @one_thread()
@@ -446,10 +450,7 @@ class Consistency(Shown):
         run = int(np.argmin(self.run_p_value))
         # Jointly: strongly coupled parameters can each stay within their sigma while their
         # combination does not.
-        return (
-            f"{self.names[run]} deviates most, by {self.distance_sigma[run]:.1f} of its own "
-            "sigmas jointly"
-        )
+        return clause(Apart.ODD, name=self.names[run], distance_sigma=self.distance_sigma[run])
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per run: noise, distance, probability, and the deviation of every parameter in
@@ -557,30 +558,13 @@ def welch_james(
 
 
 def _with_messages(consistency: Consistency, noise: str, unchecked: Sequence[str]) -> Consistency:
-    messages = []
-    if consistency.p_value < ALPHA:
-        messages.append(
-            f"The runs do not show the same camera (p = {consistency.p_value:.2g}): "
-            f"{consistency.odd_one_out}; the "
-            "merged sigmas are too small by a factor of about "
-            f"{np.sqrt(consistency.statistic):.2g}."
-        )
-    if noise == "common" and consistency.noise_p_value < ALPHA:
-        values = ", ".join(
-            f"{name} {sigma:.3g}"
-            for name, sigma in zip(consistency.names, consistency.sigma, strict=True)
-        )
-        messages.append(
-            f"The runs differ in noise (p = {consistency.noise_p_value:.2g}; {values}): merge "
-            "with noise 'own', which "
-            "weights each run by its own."
-        )
-    if unchecked:
-        messages.append(
-            f"Whether frames are shared cannot be checked for {', '.join(unchecked)}, whose "
-            "calibration holds no "
-            "fingerprints of its frames: calibrate again to have it checked."
-        )
+    noisy = noise == "common" and consistency.noise_p_value < ALPHA
+    rows = (
+        (consistency.p_value < ALPHA, Apart.CAMERAS),
+        (noisy, Apart.NOISES),
+        (bool(unchecked), Apart.UNCHECKED),
+    )
+    messages = [clause(code, it=consistency, unchecked=unchecked) for holds, code in rows if holds]
     return replace(consistency, messages=tuple(messages))
 
 

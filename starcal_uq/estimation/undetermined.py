@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from copy import copy
+from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model, undistorted
-from starcal_uq.core.formatting import join_words
+from starcal_uq.core.findings import clause
 from starcal_uq.core.status import Status
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
@@ -155,44 +156,12 @@ def coma_record(camera: Camera, factors: FloatArray) -> AnyDict:
     return {"without_coma": dict(zip(camera.parameter_names, factors.tolist(), strict=True))}
 
 
-def what_is_open(names: tuple[str, ...]) -> str:
-    """One clause: what the data leave open."""
-    apart = len(names) > 1 and not set(names) <= {"x0", "y0"}
-    return (
-        f"the data do not tell {join_words(names)} apart"
-        if apart
-        else f"the data do not determine {join_words(names)}"
-    )
-
-
-def what_is_missing(names: tuple[str, ...]) -> str:
-    """One clause: what the data leave open, and what would determine it."""
-    if set(names) <= {"x0", "y0"}:
-        return f"{what_is_open(names)}: more frames, or stars over a wider field, are needed"
-    where = (
-        "over the whole field, along both axes,"
-        if set(names) & {"x0", "y0", "p1", "p2", "stretch", "skew"}
-        else "at more radii"
-    )
-    fewer = (
-        ", or a distortion model with fewer coefficients" if set(names) - {"x0", "y0", "f"} else ""
-    )
-    return f"{what_is_open(names)}: stars {where} are needed{fewer}"
-
-
-# A filter has no solver to choose and no iterations to raise: it saw the frames one by one.
-_ASTRAY = {
-    Status.OUTSIDE_DETECTOR: "the principal point left the detector",
-    Status.FOLDED: "the distortion folds over inside the field",
-    Status.MAX_ITERATIONS: "its first frames lead to no optimum",
-    Status.SINGULAR: "its frames, one by one, do not determine the optics",
-}
+# What the data leave open, and what would determine it.
+Open = Enum("Open", "PARAMETERS RICHER REMEDY")
 
 
 def remedy_of(status: Status, names: tuple[str, ...], solver: str = "") -> str:
     """The remedy of a status, in terms of the parameters that the data leave open, where there are
     some.
     """
-    if solver == "filter" and status in _ASTRAY and not names:
-        return f"{_ASTRAY[status]}: use method='efficient', which weighs all frames together"
-    return what_is_missing(names) if names else status.remedy
+    return clause(Open.REMEDY, status=status, names=names, solver=solver)

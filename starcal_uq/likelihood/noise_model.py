@@ -5,11 +5,12 @@ magnitude, times a factor per frame, with axes that may differ.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.formatting import fixed, significant
+from starcal_uq.core.findings import clause
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 
 QUANTITIES = ("radius", "magnitude")
+Noise = Enum("Noise", "MODEL")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,43 +102,17 @@ class NoiseModel:
         return np.asarray(matrix / np.sqrt(1.0 - self.axis_correlation**2))
 
     def __str__(self) -> str:
-        if not self.varies:
-            return "the same for all stars"
-        unit = " times what the stars state" if self.multiplies else " px per axis"
-        middle, edge = (self._noise(r) for r in (0.0, self.radius_range[1]))
-        parts = []
-        if "radius" in self.terms:
-            parts.append(
-                f"{significant(middle)}{unit} in the centre of the field and {significant(edge)} "
-                "at its edge"
-            )
-        if "magnitude" in self.terms:
-            low, high = (float(mag) for mag in self.mag_range)
-            bright, faint = (self._noise(0.0, mag) for mag in (low, high))
-            least, most = sorted(((bright, fixed(low, 1)), (faint, fixed(high, 1))))
-            parts.append(
-                (
-                    f"{significant(most[0] / least[0])} times as much at magnitude {most[1]} as at "
-                    f"{least[1]}"
-                )
-                if parts
-                else f"{significant(bright)}{unit} at magnitude {fixed(low, 1)} and "
-                f"{significant(faint)} at "
-                f"{fixed(high, 1)}"
-            )
-        if self.frame_dof is not None:
-            parts.append("a factor of its own in every frame" + self._frame_words())
-        if self.axis_ratio != 1.0:
-            parts.append(f"{significant(self.axis_ratio)} times as much along x as along y")
-        if self.axis_correlation != 0.0:
-            parts.append(f"a correlation of {fixed(self.axis_correlation, 2)} between x and y")
-        return ", and ".join(filter(None, (", ".join(parts[:-1]), parts[-1])))
-
-    def _frame_words(self) -> str:
-        if not len(self.frame_factors):
-            return ""
-        low, high = np.sqrt(np.quantile(self.frame_factors, (0.05, 0.95)) / self.frame_mean)
-        return f" ({significant(low)} to {significant(high)} in 90 % of them)"
+        ends = self.mag_range if "magnitude" in self.terms else ()
+        mags = [(self._noise(0.0, float(mag)), float(mag)) for mag in ends]
+        shares = np.quantile(self.frame_factors, (0.05, 0.95)) if len(self.frame_factors) else ()
+        return clause(
+            Noise.MODEL,
+            it=self,
+            middle=self._noise(0.0),
+            edge=self._noise(self.radius_range[1]),
+            mags=mags,
+            factors=np.sqrt(np.asarray(shares) / self.frame_mean),
+        )
 
     def _noise(self, radius: float, mag: float | None = None) -> float:
         x = np.array([self.centre_px[0] + radius * self.corner_px])

@@ -14,17 +14,31 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from starcal_uq.budgeting.budget import Remark
 from starcal_uq.budgeting.totals import Difference
+from starcal_uq.calibration.cameras import Mixed
+from starcal_uq.calibration.plausibility import Slip
+from starcal_uq.calibration.screening.result import Rejections
+from starcal_uq.comparison.compare import Differs
+from starcal_uq.comparison.covariance import Basis
 from starcal_uq.core import status
 from starcal_uq.diagnostics.verdict.limits import Limit
 from starcal_uq.diagnostics.verdict.remedies import Refusal
+from starcal_uq.estimation.merging import Apart
+from starcal_uq.estimation.undetermined import Open
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
+from starcal_uq.likelihood.noise_model import Noise
 from starcal_uq.presentation.words.sentences import templates, told
+from starcal_uq.propagation.coupling import Trade
 
 PACKAGE = Path(status.__file__).parents[1]
 # Wings that show findings, or stand above those that do.
 ABOVE = ("presentation", "runs", "paper", "cli")
-MAKERS = ("Check", "Order", "Finding")
+MAKERS = ("Check", "judged", "Order", "Finding", "clause")
+KINDS = {
+    *(status.Code, status.Advice, status.Note, Difference, Limit, Refusal, Slip, Mixed, Open),
+    *(Basis, Differs, Apart, Rejections, Trade, Noise, Remark),
+}
 
 
 def made(tree: ast.AST) -> Iterator[ast.Call]:
@@ -55,11 +69,10 @@ def worded(tree: ast.AST) -> list[str]:
 
 
 def test_every_code_has_a_sentence() -> None:
-    kinds = {status.Code, status.Advice, status.Note, Difference, Limit, Refusal}
-    codes = {f"{kind.__name__}.{code.name}" for kind in kinds for code in kind}
+    codes = {f"{kind.__name__}.{code.name}" for kind in KINDS for code in kind}
     assert codes - templates().keys() == set()
     # Nor does the table hold a code that is gone.
-    own = {name for name in templates() if name.partition(".")[0] in {k.__name__ for k in kinds}}
+    own = {name for name in templates() if name.partition(".")[0] in {k.__name__ for k in KINDS}}
     assert own == codes
     # Codes of an enumeration of which none is worded.
     names = {
@@ -71,8 +84,8 @@ def test_every_code_has_a_sentence() -> None:
         and isinstance(node.value, ast.Name)
         and node.attr.isupper()
     }
-    assert names - {kind.__name__ for kind in kinds} <= {"Level", "Status"}
-    assert {kind.__name__ for kind in kinds} <= names
+    assert names - {kind.__name__ for kind in KINDS} <= {"Level", "Status"}
+    assert {kind.__name__ for kind in KINDS} <= names
 
 
 def test_a_code_without_words_is_noticed() -> None:

@@ -5,13 +5,14 @@ files.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import ensure_new, write_csv
-from starcal_uq.core.formatting import percent
+from starcal_uq.core.findings import clause
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike
 from starcal_uq.estimation.consensus import MIN_STARS
 from starcal_uq.estimation.outliers import StarResiduals, star_threshold
@@ -36,6 +37,8 @@ COLUMNS = (
     "row", "frame", "star_id", "x_px", "y_px", "residual_px", "offset_deg", "statistic", "threshold", "reason",
 )  # fmt: skip
 _MANY_REJECTED = 0.25
+# What rejected stars say together.
+Rejections = Enum("Rejections", "MANY AT_THE_EDGE")
 _PATTERN_P, _PATTERN_ROWS = 1e-3, 5
 # Wrong identifications are rarely this near: statistics below this many thresholds are noise with
 # heavy tails.
@@ -261,21 +264,13 @@ def warnings_about(
     warnings = []
     share = 1.0 - np.count_nonzero(kept) / len(kept)
     if share > _MANY_REJECTED:
-        warnings.append(
-            f"{percent(share)} of the stars were rejected: look for a cause other than single "
-            "wrong identifications."
-        )
+        warnings.append(clause(Rejections.MANY, share=share))
     displaced = rejected[rejected["reason"] == "displaced"]
     if len(displaced) < _PATTERN_ROWS:
         return tuple(warnings)
     radius = np.hypot(*(obs.xy - camera.theta[:2]).T)
     if _farther_p_value(radius[displaced["row"].to_numpy()], radius[kept]) < _PATTERN_P:
-        warnings.append(
-            "the displaced stars lie farther from the principal point than the others: the "
-            "distortion model may be "
-            "too poor, so that right stars are rejected; compare models before trusting the "
-            "screening."
-        )
+        warnings.append(clause(Rejections.AT_THE_EDGE))
     return tuple(warnings)
 
 

@@ -33,7 +33,6 @@ from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, model_facts, star_facts
 from starcal_uq.estimation.merging import ALPHA
-from starcal_uq.estimation.undetermined import remedy_of, what_is_open
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.planning.open_distortion import AFTER_FRAMES
@@ -98,8 +97,8 @@ def _environment() -> jinja2.Environment:
         "typed": lambda options: shlex.join(words_of(options)),
     }
     environment.filters |= own
-    known: list[Any] = [Counter, fallback_facts, model_facts, propagation_difference, remedy_of]
-    known += [say, star_facts, what_is_open, with_cross]
+    known: list[Any] = [Counter, fallback_facts, model_facts, propagation_difference]
+    known += [say, star_facts, with_cross]
     environment.globals |= {one.__name__: one for one in known}
     environment.globals |= {
         "AFTER_FRAMES": AFTER_FRAMES,
