@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypedDict, TypeVar
 
 from starcal_uq.core.errors import ClusterError
 from starcal_uq.core.extras import extra
@@ -26,6 +26,19 @@ T = TypeVar("T")
 # Address of a Dask scheduler (``tcp://host:8786``), a client of one, or None for processes of this
 # machine.
 Scheduler: TypeAlias = "str | Client | None"
+
+
+class ClusterOptions(TypedDict, total=False):
+    """Where work is done, and who is told of it; keywords of functions that spread it.
+
+    `scheduler` and `workers` are those of `cluster`; `progress` is called with what is done and
+    what there is.
+    """
+
+    scheduler: Scheduler
+    workers: int | None
+    progress: Progress | None
+
 
 # Results that are added up at once.
 _FAN_IN = 16

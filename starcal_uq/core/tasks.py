@@ -48,9 +48,10 @@ def run_tasks(
     workers: int | None = None,
     progress: Progress | None = None,
     kept: Kept | None = None,
+    whole: bool = False,
 ) -> tuple[list[T], bool]:
     """Run task 0 .. n_tasks - 1; the results in order, and whether Ctrl-C was pressed before all
-    were complete.
+    were complete, which is a KeyboardInterrupt where they are to be `whole`.
 
     `task`: from the number of a task to its result, which depends on the number alone. `caller`:
     function that users call, for messages.
@@ -75,7 +76,7 @@ def run_tasks(
         with processes(workers, caller) as executor:
             spread(task, todo, take, executor, chunk)
     except KeyboardInterrupt:
-        if not results:
+        if whole or not results:
             raise
         return [results[number] for number in sorted(results)], True
     return [results[number] for number in sorted(results)], False

@@ -113,7 +113,7 @@ def extract_centroids(
             keep, ["centroids", _files(sources), camera, detection, bayer], (_Frame, FrameStars)
         )
     table = _Table(messages=messages)
-    frames, interrupted = run_tasks(
+    frames, _ = run_tasks(
         task,
         len(sources),
         caller="starcal_uq.images.extract_centroids",
@@ -121,9 +121,8 @@ def extract_centroids(
         workers=workers,
         progress=progress,
         kept=kept,
+        whole=True,
     )
-    if interrupted:
-        raise KeyboardInterrupt
     for found in frames:
         table.add(found)
     return table.centroids(detection, correct_pixel_phase)

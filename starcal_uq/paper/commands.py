@@ -1,23 +1,18 @@
-"""What the paper's commands share: one progress bar for several parts, tasks, and the folder that
-they write.
+"""What the paper's commands share: one progress bar for several parts, and the folder that they
+write.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from starcal_uq.core.files import atomic_write_bytes, new_folder, write_csv
-from starcal_uq.core.tasks import run_tasks
 from starcal_uq.core.types import Progress
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from starcal_uq.core.store import Kept
-
-T = TypeVar("T")
 
 
 class Bar:
@@ -43,25 +38,6 @@ class Bar:
     def finish(self, name: str) -> None:
         """A part that has no steps is done."""
         self.part(name)(1, 1)
-
-
-def run_or_stop(
-    task: Callable[[int], T],
-    n_tasks: int,
-    *,
-    chunk: int,
-    workers: int | None,
-    progress: Progress | None,
-    caller: str = "field_experiment",
-    kept: Kept | None = None,
-) -> list[T]:
-    """Every result of the tasks of an experiment (`run_tasks`); Ctrl-C is an interrupt."""
-    found, interrupted = run_tasks(
-        task, n_tasks, caller=caller, chunk=chunk, workers=workers, progress=progress, kept=kept
-    )
-    if interrupted:
-        raise KeyboardInterrupt
-    return found
 
 
 def write_tables(

@@ -23,7 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import product
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import numpy as np
 
@@ -35,15 +35,14 @@ from starcal_uq.core.files import cell_content, reading, write_csv
 from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import run_tasks
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.recursive.start import RecursionOptions
 from starcal_uq.paper.replicates import check_settings, crlb_sigmas
 from starcal_uq.paper.statistics import chi_interval
 from starcal_uq.simulation.frames import Campaign
+from starcal_uq.simulation.replicates import ReplicateOptions, Trials, campaign_of
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
@@ -360,7 +359,6 @@ class Plan(NamedTuple):
 
     stars: StarCatalogue
     conditions: tuple[Condition, ...]
-    seed: int
 
 
 class Outcome(NamedTuple):
@@ -386,13 +384,8 @@ def interaction_study(
     max_mags: Sequence[float] = MAX_MAGS,
     n_replicates: int = 16,
     n_frames: int = 100,
-    min_stars: int = 10,
-    sigma_px: float = 0.05,
-    max_mag: float = 6.0,
     seed: int = 2017,
-    workers: int | None = None,
-    progress: Progress | None = None,
-    keep: PathLike | None = None,
+    **options: Unpack[ReplicateOptions],
 ) -> InteractionStudy:
     """Bias and spread of x0, y0 and f for methods that ignore, decouple or couple optics and
     distortion.
@@ -414,9 +407,9 @@ def interaction_study(
     n_replicates : int
         Designs at every point; 16 know a spread to 18 %, 50 to 10 %.
     n_frames, min_stars, sigma_px, max_mag
-        Data of one calibration where an axis does not say otherwise.
+        Data of one calibration where an axis does not say otherwise, as in `starcal_uq.validate`.
     seed, workers, progress, keep
-        As in `replicate`; the seed repeats the study bit for bit for any number of processes.
+        As there; the seed repeats the study bit for bit for any number of processes.
 
     Returns
     -------
@@ -434,13 +427,14 @@ def interaction_study(
 
     truth = paper_camera() if truth is None else truth
     start = paper_start() if start is None else start
-    campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
+    campaign, run = campaign_of(n_frames, **options)
+    least, max_mag = campaign.min_stars, campaign.max_mag
     check_settings(
         (
             bool(truth.coefficients),
             "the truth has no distortion: give both the same model, with coefficients.",
         ),
-        (min_stars >= LEAST_STARS, f"min_stars is {min_stars}: give at least {LEAST_STARS}."),
+        (least >= LEAST_STARS, f"min_stars is {least}: give at least {LEAST_STARS}."),
         cameras=(truth, start),
         n_replicates=n_replicates,
         campaign=campaign,
@@ -450,39 +444,26 @@ def interaction_study(
     points = study_points(base, sky, distortion_scales, fields_deg, frames, max_mags)
     # Where the axes cross they share their data.
     conditions = tuple(dict.fromkeys(point.condition for point in points))
-    plan = Plan(sky, conditions, seed)
-    kept = None
-    if keep is not None:
-        told = [[c.truth, c.start, dataclasses.asdict(c.campaign)] for c in conditions]
-        kept = Kept(keep, ["interaction", told, seed, sky.source], (Outcome,))
-    outcomes, interrupted = run_tasks(
-        partial(run_one, plan),
-        n_replicates * len(conditions),
-        caller="interaction_study",
-        chunk=1,
-        workers=workers,
-        progress=progress,
-        kept=kept,
-    )
+    n, trial = len(conditions), partial(run_one, Plan(sky, conditions))
+    # All conditions of one replicate come before the next replicate, so that a study that is
+    # interrupted has every point, and have common random numbers.
+    trials = Trials(trial, "interaction_study", 1, (Outcome,), common=n, fatal=(StarcalError,))
+    found = trials.run(n_replicates * n, seed, **run)
     rows: list[AnyDict] = []
     for point in points:
-        some = [outcome for outcome in outcomes if conditions[outcome.condition] == point.condition]
+        some = [one for one in found.good if conditions[one.condition] == point.condition]
         if some:
             rows += summary_rows(_head(point, some, seed), some)
     settings: AnyDict = {"n_replicates": n_replicates, **dataclasses.asdict(campaign)}
-    return InteractionStudy(pd.DataFrame(rows), interrupted, provenance(seed, settings, None))
+    return InteractionStudy(pd.DataFrame(rows), found.interrupted, provenance(seed, settings, None))
 
 
-def run_one(plan: Plan, index: int) -> Outcome:
-    """Task number `index`: condition ``index % n`` of n, replicate ``index // n``.
-
-    All conditions of one replicate come before the next replicate, so that a study that is
-    interrupted has every point.
-    """
-    replicate, number = divmod(index, len(plan.conditions))
+def run_one(plan: Plan, index: int, seeds: np.random.SeedSequence) -> Outcome:
+    """Task number `index`: condition ``index % n`` of n."""
+    number = index % len(plan.conditions)
     condition = plan.conditions[number]
     campaign, sigma_px = condition.campaign, condition.campaign.sigma_px
-    design, noise = np.random.SeedSequence(plan.seed, spawn_key=(replicate,)).spawn(2)
+    design, noise = seeds.spawn(2)
     stars = plan.stars.select(plan.stars.mag <= campaign.max_mag)
     exact = dataclasses.replace(campaign, sigma_px=0.0)
     clean = exact.simulate(stars, condition.truth, design.generate_state(1, np.uint64)[0])

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Unpack
 
 import numpy as np
 
@@ -22,13 +22,11 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.status import Status
-from starcal_uq.core.store import Kept
-from starcal_uq.core.types import FloatArray, IntArray, PathLike, Progress, floats
+from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.estimation.stages import Search, distortion_stage, joint_stage, optics_stage
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
-from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.errors import MAXIMUM, REPROJECTION, error_sizes, undistorted
 from starcal_uq.paper.published import (
     LEAST_SQUARES,
@@ -42,6 +40,7 @@ from starcal_uq.paper.published import (
 from starcal_uq.paper.recursive.start import RecursionOptions
 from starcal_uq.paper.replicates import pinhole
 from starcal_uq.simulation.frames import Campaign
+from starcal_uq.simulation.replicates import TrialOptions, Trials
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
@@ -93,9 +92,7 @@ def run_readings(
     n_draws: int = 24,
     n_frames: int = N_FRAMES,
     seed: int = 2017,
-    workers: int | None = None,
-    progress: Progress | None = None,
-    keep: PathLike | None = None,
+    **run: Unpack[TrialOptions],
 ) -> Readings:
     """Repeat the experiment over seeds under every reading; parameters as in `replicate`.
 
@@ -105,16 +102,9 @@ def run_readings(
     stars = load_catalogue(max_mag=MAX_MAG)
     # As many as the paper's, by the embedded catalogue's band.
     sparse = stars.select(np.sort(np.argsort(stars.mag, kind="stable")[:N_STARS]))
-    plan = Plan(stars, sparse, convention, Campaign(n_frames), seed)
-    task = partial(draw, plan)
-    kept = (
-        None
-        if keep is None
-        else Kept(keep, ["readings", convention, n_frames, seed, stars.source], (Key,))
-    )
-    found = run_or_stop(
-        task, n_draws, caller="reproduce", chunk=1, workers=workers, progress=progress, kept=kept
-    )
+    plan = Plan(stars, sparse, convention, Campaign(n_frames))
+    trials = Trials(partial(draw, plan), "reproduce", 1, (Key,), fatal=(StarcalError,))
+    found = trials.run(n_draws, seed, whole=True, **run).good
     keys = tuple(found[0])
     return Readings(keys, np.array([[one.get(key, np.nan) for one in found] for key in keys]))
 
@@ -172,7 +162,6 @@ class Plan(NamedTuple):
     sparse: StarCatalogue
     convention: str
     campaign: Campaign
-    seed: int
 
 
 class Scene(NamedTuple):
@@ -188,11 +177,10 @@ class Scene(NamedTuple):
     noise_px: FloatArray
 
 
-def draw(plan: Plan, index: int) -> dict[Key, float]:
+def draw(plan: Plan, _number: int, sequence: np.random.SeedSequence) -> dict[Key, float]:
     """One seed under every reading; a method without a result leaves its keys out."""
-    # The last number keeps these seeds apart from those of `replicate`.
-    sequence = np.random.SeedSequence(plan.seed, spawn_key=(index, 1))
-    seeds = [int(s) for s in sequence.generate_state(4, np.uint64)]
+    # The second branch keeps these seeds apart from those of `replicate`.
+    seeds = [int(s) for s in sequence.spawn(2)[1].generate_state(4, np.uint64)]
     rng = np.random.default_rng(seeds[3])
     other = next(name for name in CONVENTIONS if name != plan.convention)
     found: dict[Key, float] = {}

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Unpack
 
 import numpy as np
 
@@ -30,9 +30,7 @@ from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import run_tasks
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Progress, Shapes
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.maths.intervals import holm
@@ -43,6 +41,7 @@ from starcal_uq.paper.errors import map_error, reprojection_error_px
 from starcal_uq.paper.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.paper.statistics import FAMILY_LEVEL, classical_words, summarise, words
 from starcal_uq.simulation.frames import Campaign
+from starcal_uq.simulation.replicates import ReplicateOptions, Trials, campaign_of
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
@@ -302,7 +301,6 @@ class Experiment(NamedTuple):
     truth: Camera
     start: Camera
     campaign: Campaign
-    seed: int
     n_slow: int
 
 
@@ -319,15 +317,10 @@ def replicate(
     start: Camera | None = None,
     n_replicates: int = 200,
     n_frames: int = 1000,
-    min_stars: int = 10,
-    sigma_px: float = 0.05,
-    max_mag: float = 6.0,
     seed: int = 2017,
-    workers: int | None = None,
-    progress: Progress | None = None,
     stars: StarCatalogue | None = None,
     share_slow: bool = False,
-    keep: PathLike | None = None,
+    **options: Unpack[ReplicateOptions],
 ) -> Replicates:
     """Calibrate many simulated data sets with every method, and set their errors against their
     claims.
@@ -340,24 +333,13 @@ def replicate(
         The camera that is simulated, and the start of every method; the paper's by default.
     n_replicates : int
         Data sets; 200 know a spread to 5 % and a coverage of 95 % to 1.5 %.
-    n_frames, min_stars, sigma_px, max_mag
-        Data of one calibration: frames, least stars in each, centroid noise in px per axis, and
-        limiting magnitude.
-    seed : int
-        The same seed gives the same result, bit for bit, for any number of processes; the first
-        replicates of a longer run are those of a shorter one.
-    workers : int, optional
-        Processes; as many as there are processors by default. With 0, everything happens in this
-        process, where a BLAS with several threads can change the last digits.
-    progress : callable, optional
-        Called as ``progress(done, total)``.
+    n_frames, seed, min_stars, sigma_px, max_mag, workers, progress, keep
+        As in `starcal_uq.validate`, and with the same defaults but for the first two.
     stars : StarCatalogue, optional
         The sky, instead of the embedded catalogue to `max_mag`.
     share_slow : bool
         Run the filter that forms every pair in the first quarter of the replicates only, at least
         8; the others hold NaN for it.
-    keep : path, optional
-        Folder in which replicates are kept as they are made; a later call goes on from them.
 
     Returns
     -------
@@ -378,7 +360,7 @@ def replicate(
     start = paper_start() if start is None else start
     labels = [method.label for method in methods]
     twice = sorted({label for label in labels if labels.count(label) > 1})
-    campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
+    campaign, run = campaign_of(n_frames, **options)
     check_settings(
         (bool(methods), "there are no methods to compare: give at least one."),
         (
@@ -389,31 +371,12 @@ def replicate(
         n_replicates=n_replicates,
         campaign=campaign,
     )
-    sky = load_catalogue(max_mag=max_mag) if stars is None else stars
+    sky = load_catalogue(max_mag=campaign.max_mag) if stars is None else stars
     n_slow = max(_LEAST, n_replicates // SHARE) if share_slow else n_replicates
-    experiment = Experiment(sky, methods, truth, start, campaign, seed, n_slow)
-    kept = None
-    if keep is not None:
-        identity = [
-            "replicates",
-            methods,
-            truth,
-            start,
-            campaign.settings(stars),
-            seed,
-            n_slow,
-            sky.source,
-        ]
-        kept = Kept(keep, identity)
-    outcomes, interrupted = run_tasks(
-        partial(run_replicate, experiment),
-        n_replicates,
-        caller="replicate",
-        chunk=_CHUNK,
-        workers=workers,
-        progress=progress,
-        kept=kept,
-    )
+    experiment = Experiment(sky, methods, truth, start, campaign, n_slow)
+    trial = partial(run_replicate, experiment)
+    found = Trials(trial, "replicate", _CHUNK, fatal=(StarcalError,)).run(n_replicates, seed, **run)
+    outcomes = found.good
     arrays = {
         name: np.stack([one[name] for one in outcomes], axis=int(name in _BY_METHOD))
         for name in _ARRAYS
@@ -431,7 +394,7 @@ def replicate(
         start=start,
         failures=failures,
         n_requested=n_replicates,
-        interrupted=interrupted,
+        interrupted=found.interrupted,
         provenance=provenance(seed, settings, None),
         **arrays,
     )
@@ -463,16 +426,13 @@ def check_settings(
     campaign.check(SamplingError)
 
 
-def run_replicate(experiment: Experiment, index: int) -> AnyDict:
+def run_replicate(experiment: Experiment, index: int, seeds: np.random.SeedSequence) -> AnyDict:
     """Replicate number `index`, by the names of the arrays of `Replicates`.
 
     A calibration that fails is an outcome, a sky without stars an error.
     """
-    noise = np.random.SeedSequence(experiment.seed, spawn_key=(index,))
-    truth = experiment.truth
-    obs = experiment.campaign.simulate(
-        experiment.stars, truth, noise.generate_state(1, np.uint64)[0]
-    )
+    truth, noise = experiment.truth, seeds.generate_state(1, np.uint64)[0]
+    obs = experiment.campaign.simulate(experiment.stars, truth, noise)
     frames = StarFrames.from_observations(obs)
     p, m = len(truth.theta), len(experiment.methods)
     estimates, claimed, classical = (np.full((m, p), np.nan) for _ in range(3))

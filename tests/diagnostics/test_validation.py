@@ -106,8 +106,9 @@ def good(stars, remembered):
 def test_draws_are_those_that_users_get(stars):
     """A replicate's moments agree with those of `sample` on its data."""
     settings = study(n_frames=40, n_steps=200)
-    outcome = run_replicate(settings, stars, 3)
-    noise = np.random.SeedSequence(settings.seed, spawn_key=(3,)).spawn(3)[1]
+    seeds, again = (np.random.SeedSequence(settings.seed, spawn_key=(3,)) for _ in range(2))
+    outcome = run_replicate(settings, stars, 3, seeds)
+    noise = again.spawn(3)[1]
     obs = sc.simulate(
         stars,
         settings.camera,

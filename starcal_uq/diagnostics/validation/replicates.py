@@ -19,7 +19,7 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.constants import ARCSEC, AXES
-from starcal_uq.core.errors import CatalogueError, PriorError, SamplingError, StarcalError
+from starcal_uq.core.errors import PriorError, SamplingError
 from starcal_uq.core.settings import Truth
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.inference.ensemble import EnsembleSettings, run_ensembles
@@ -106,7 +106,6 @@ class TrialOutcome(NamedTuple):
     """One replicate, over Q quantities and p parameters."""
 
     replicate: int  # Number of the replicate
-    failure: str  # Why there is no result; empty otherwise
     truth: FloatArray  # (p+1,): camera parameters and noise
     ranks: IntArray  # (Q,): draws below the truth, of `Replication.n_ranked`
     covered: BoolArray  # (Q,): the truth lies between the 2.5 % and 97.5 % quantiles of all draws
@@ -120,22 +119,17 @@ class TrialOutcome(NamedTuple):
     dof: int  # Degrees of freedom of the calibration
 
 
-def run_replicate(study: Replication, stars: StarCatalogue, index: int) -> TrialOutcome:
-    """Replicate number `index`; a calibration or posterior that fails is an outcome, a sky without
-    stars an error.
-    """
-    truths, noise, sampler = np.random.SeedSequence(study.seed, spawn_key=(index,)).spawn(3)
+def run_replicate(
+    study: Replication, stars: StarCatalogue, index: int, seeds: np.random.SeedSequence
+) -> TrialOutcome:
+    """Replicate number `index`."""
+    truths, noise, sampler = seeds.spawn(3)
     camera, sigma_px = _truth(study, np.random.default_rng(truths))
     truth = np.append(camera.theta, sigma_px)
-    try:
-        campaign = replace(study.campaign, sigma_px=sigma_px)
-        obs = campaign.simulate(stars, camera, noise.generate_state(1, np.uint64)[0])
-        cal = calibrate(obs, study.nominal, model=study.nominal.distortion)
-        draws, likelihood = _sample(study, obs, cal, sampler)
-    except CatalogueError:
-        raise
-    except StarcalError as error:
-        return _no_result(study, truth, index, str(error))
+    campaign = replace(study.campaign, sigma_px=sigma_px)
+    obs = campaign.simulate(stars, camera, noise.generate_state(1, np.uint64)[0])
+    cal = calibrate(obs, study.nominal, model=study.nominal.distortion)
+    draws, likelihood = _sample(study, obs, cal, sampler)
     return _compare(study, obs, cal, draws, likelihood, truth, index)
 
 
@@ -237,7 +231,6 @@ def _compare(
         )
     return TrialOutcome(
         replicate=index,
-        failure="",
         truth=truth,
         ranks=np.sum(ranked[: study.n_ranked] < 0.0, axis=0),
         covered=(low <= 0.0) & (high >= 0.0),
@@ -247,14 +240,6 @@ def _compare(
         nees_calibration=_nees(cal.theta - truth[:-1], cal.covariance),
         compression_error=float(level[-1]) - exact,
         dof=cal.dof,
-    )
-
-
-def _no_result(study: Replication, truth: FloatArray, index: int, reason: str) -> TrialOutcome:
-    q = len(study.quantities)
-    nothing, nowhere = np.full(q, np.nan), np.zeros(q, dtype=np.int64)
-    return TrialOutcome(
-        index, reason, truth, nowhere, nowhere > 0, nothing, nothing, np.nan, np.nan, np.nan, 0
     )
 
 

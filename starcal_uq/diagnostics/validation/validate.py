@@ -17,19 +17,17 @@ it holds as far as the data, and not the prior, decide.
 
 from __future__ import annotations
 
-from collections import Counter
 from functools import partial
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Unpack, get_args
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError, check_known
+from starcal_uq.core.errors import PriorError, SamplingError, check_known
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import Truth, bounded
-from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import one_thread, run_tasks
-from starcal_uq.core.types import AnyDict, PathLike, Progress
+from starcal_uq.core.tasks import one_thread
+from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.validation.replicates import (
     MARGINAL,
     LikelihoodMaker,
@@ -39,12 +37,18 @@ from starcal_uq.diagnostics.validation.replicates import (
 )
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.inference.priors import Priors
-from starcal_uq.simulation.frames import Campaign
+from starcal_uq.simulation.replicates import (
+    ReplicateOptions,
+    TrialOptions,
+    Trials,
+    campaign_of,
+)
 
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 TRUTHS = get_args(Truth)
+_CHUNK = 8
 # Student t is for stars that are not where they should be; its sigma is not the noise that is
 # simulated here.
 LIKELIHOODS = (MARGINAL, "pairs", "pairs_naive")
@@ -76,18 +80,13 @@ def validate(
     *,
     n_replicates: int = 1000,
     n_frames: int = 50,
-    min_stars: int = 10,
-    sigma_px: float = 0.05,
-    max_mag: float = 6.0,
     seed: int = 0,
-    workers: int | None = None,
     truth: Truth = "fixed",
-    progress: Progress | None = None,
     priors: Priors | None = None,
     stars: StarCatalogue | None = None,
     assumed_sigma_px: float | None = None,
     likelihood: str | LikelihoodMaker = MARGINAL,
-    keep: PathLike | None = None,
+    **options: Unpack[ReplicateOptions],
 ) -> Validation:
     """Check intervals, ranks and errors of calibration and posterior for a sensor and its volume of
     data.
@@ -99,20 +98,14 @@ def validate(
         starts as from its data sheet: principal point in the centre, no distortion.
     n_replicates : int
         Data sets to simulate; 1000 know a coverage to 1.4 %.
-    n_frames, min_stars, sigma_px, max_mag
-        Data of one calibration: frames, least stars in each, centroid noise in px per axis, and
-        limiting magnitude.
+    n_frames : int
+        Frames of one calibration.
     seed : int
         The same seed gives the same result, bit for bit, for any number of processes; the first
         replicates of a longer validation are those of a shorter one.
-    workers : int, optional
-        Processes; as many as there are processors by default. With 0, everything happens in this
-        process, where a BLAS with several threads can change the last digits.
     truth : {"fixed", "prior"}
         ``fixed``: the truth is `camera` in every replicate, sampled with the default priors, which
         are nearly flat there. ``prior``: the truth is drawn from the priors.
-    progress : callable, optional
-        Called as ``progress(done, total)``.
     priors : Priors, optional
         Instead of ``Priors.default`` of the data-sheet camera, or, with ``truth="prior"``, instead
         of narrow ones around `camera` (`narrow_priors`).
@@ -124,9 +117,6 @@ def validate(
         As in `sample`; or ``(obs, cal) -> object with log_likelihood(theta (n, p), sigma (n,)) ->
         (n,)``, to validate one's own, which with several workers must be a function at the top
         level of a module.
-    keep : path, optional
-        Folder in which replicates are kept as they are made; a later call goes on from them, with
-        more replicates as well. Not for a likelihood of one's own.
 
     Returns
     -------
@@ -141,13 +131,31 @@ def validate(
         When the field is too narrow for the catalogue to show `min_stars`.
     CalibrationError
         When no replicate gave a result.
+
+    Other Parameters
+    ----------------
+    min_stars : int
+        Least stars in each frame; 10 by default.
+    sigma_px : float
+        Centroid noise per axis, px; 0.05 by default.
+    max_mag : float
+        Limiting magnitude; 6.0 by default.
+    workers : int, optional
+        Processes; as many as there are processors by default. With 0, everything happens in this
+        process, where a BLAS with several threads can change the last digits.
+    progress : callable, optional
+        Called as ``progress(done, total)``.
+    keep : path, optional
+        Folder in which replicates are kept as they are made; a later call goes on from them, with
+        more replicates as well. Not for a likelihood of one's own.
     """
     from starcal_uq.sky.catalogue import load_catalogue
 
+    campaign, run = campaign_of(n_frames, **options)
     nominal = camera.data_sheet()
     if priors is None:
-        priors = narrow_priors(camera, sigma_px) if truth == "prior" else Priors.default(nominal)
-    campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
+        narrow = truth == "prior"
+        priors = narrow_priors(camera, campaign.sigma_px) if narrow else Priors.default(nominal)
     study = Replication(
         camera, nominal, priors, truth, campaign, seed, assumed_sigma_px, likelihood
     )
@@ -160,18 +168,12 @@ def validate(
         if isinstance(likelihood, str)
         else getattr(likelihood, "__name__", repr(likelihood)),
     }
-    sky = load_catalogue(max_mag=max_mag) if stars is None else stars
-    kept = None
-    if keep is not None:
-        if not isinstance(likelihood, str):
-            raise SamplingError(
-                "replicates of a likelihood of your own cannot be kept: leave out `keep`."
-            )
-        identity = [camera, nominal, priors, seed, settings, sky.source]
-        kept = Kept(keep, identity, (TrialOutcome,))
-    return validate_study(
-        study, sky, n_replicates, workers=workers, progress=progress, settings=settings, kept=kept
-    )
+    if run.get("keep") is not None and not isinstance(likelihood, str):
+        raise SamplingError(
+            "replicates of a likelihood of your own cannot be kept: leave out `keep`."
+        )
+    sky = load_catalogue(max_mag=campaign.max_mag) if stars is None else stars
+    return validate_study(study, sky, n_replicates, settings=settings, **run)
 
 
 def validate_study(
@@ -179,18 +181,15 @@ def validate_study(
     stars: StarCatalogue,
     n_replicates: int,
     *,
-    workers: int | None = None,
-    progress: Progress | None = None,
     settings: AnyDict | None = None,
-    kept: Kept | None = None,
+    **run: Unpack[TrialOptions],
 ) -> Validation:
     """Run the replicates of a study, whose settings may be any, and collect them."""
-    outcomes, interrupted = run_replicates(study, stars, n_replicates, workers, progress, kept)
-    good = [o for o in outcomes if not o.failure]
-    failures = tuple(o.failure for o in outcomes if o.failure)
-    if not good:
-        commonest = Counter(failures).most_common(1)[0][0]
-        raise CalibrationError(f"no replicate gave a result; the commonest reason: {commonest}")
+    trial = partial(run_replicate, study, stars)
+    outcomes = Trials(trial, "validate", _CHUNK, (TrialOutcome,)).run(
+        n_replicates, study.seed, **run
+    )
+    good = outcomes.good
     sampling = {name: getattr(study, name) for name in ("n_walkers", "n_steps", "n_burn", "thin")}
     return Validation(
         quantities=study.quantities,
@@ -200,9 +199,9 @@ def validate_study(
         priors=study.priors,
         n_ranked=study.n_ranked,
         **{name: np.array([getattr(o, name) for o in good]) for name in _ARRAYS},
-        failures=failures,
+        failures=outcomes.failures,
         n_requested=n_replicates,
-        interrupted=interrupted,
+        interrupted=outcomes.interrupted,
         provenance=provenance(
             study.seed, {**(settings or {}), "n_replicates": n_replicates, **sampling}, None
         ),
@@ -249,26 +248,3 @@ def _check(study: Replication) -> None:
             f"{', '.join(study.camera.parameter_names)} and sigma: make them with Priors.default "
             "of this camera."
         )
-
-
-_CHUNK = 8
-
-
-def run_replicates(
-    study: Replication,
-    stars: StarCatalogue,
-    n_replicates: int,
-    workers: int | None,
-    progress: Progress | None,
-    kept: Kept | None = None,
-) -> tuple[list[TrialOutcome], bool]:
-    """Run replicates 0 .. n_replicates - 1; as `run_tasks`."""
-    return run_tasks(
-        partial(run_replicate, study, stars),
-        n_replicates,
-        caller="validate",
-        chunk=_CHUNK,
-        workers=workers,
-        progress=progress,
-        kept=kept,
-    )

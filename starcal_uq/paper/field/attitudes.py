@@ -23,9 +23,9 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CalibrationError, DistortionError
 from starcal_uq.core.store import Kept
+from starcal_uq.core.tasks import run_tasks
 from starcal_uq.core.types import FloatArray, IntArray, Progress
 from starcal_uq.identification.search import LEAST_SIGMA_PX
-from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.field.frames import FieldFrames, FieldIdentification, true_pixels
 from starcal_uq.paper.published import PAPER_METHODS
 
@@ -235,8 +235,15 @@ def replicate_field(
     kept: Kept | None = None,
 ) -> FieldReplicates:
     """Every repetition; `FieldReplicates`."""
-    results = run_or_stop(
-        repetition, n_replicates, chunk=_CHUNK, workers=workers, progress=progress, kept=kept
+    results, _ = run_tasks(
+        repetition,
+        n_replicates,
+        caller="field_experiment",
+        chunk=_CHUNK,
+        workers=workers,
+        progress=progress,
+        kept=kept,
+        whole=True,
     )
     empty = np.empty((0, 3))
     return FieldReplicates(

@@ -19,13 +19,13 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.store import Kept
+from starcal_uq.core.tasks import run_tasks
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, PathLike, Progress
 from starcal_uq.identification.proposers import Proposer, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.search import FrameTable, Search, field_geometry
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.extract import extract_centroids
-from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.field.published import MORE_THAN_STARS, FieldReading
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.simulation.rendering import Scene
@@ -44,6 +44,7 @@ _BATCH = 256
 # suffice.
 _CANDIDATES, _MORE_CANDIDATES = 1.9, 8
 _MAX_BATCHES = 400
+_CALLER = "field_experiment"
 _CHUNK = 8
 # A star is wrong if it truly is farther than this from the centroid that was given its name.
 WRONG_PX = 3.0
@@ -116,8 +117,15 @@ def take_frames(
         # A candidate depends on the seed and its own number.
         identity = ["field frames", reading.name, seed, done, stars.source]
         kept = None if keep is None else Kept(keep, identity, (Centroids,))
-        tables = run_or_stop(
-            task, len(some), chunk=_CHUNK, workers=workers, progress=move, kept=kept
+        tables, _ = run_tasks(
+            task,
+            len(some),
+            caller=_CALLER,
+            chunk=_CHUNK,
+            workers=workers,
+            progress=move,
+            kept=kept,
+            whole=True,
         )
         done += len(some)
         for table, rotation, number in zip(tables, some, ranks, strict=True):
@@ -262,4 +270,14 @@ def identify_all(
     wide = CameraTolerance(0.03, 0.0, 0.0)
     proposer = prepare_engine("pyramid", stars, field_geometry(truth), wide, False, None)
     task = _IdentifyTask(frames, truth, stars, jobs, proposer)
-    return run_or_stop(task, len(jobs), chunk=1, workers=workers, progress=progress, kept=kept)
+    found, _ = run_tasks(
+        task,
+        len(jobs),
+        caller=_CALLER,
+        chunk=1,
+        workers=workers,
+        progress=progress,
+        kept=kept,
+        whole=True,
+    )
+    return found
