@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ast
 import re
+import tomllib
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
@@ -32,6 +33,7 @@ from starcal_uq.presentation.words.sentences import templates, told
 from starcal_uq.propagation.coupling import Trade
 
 PACKAGE = Path(status.__file__).parents[1]
+WORDS = PACKAGE / "presentation" / "words"
 # Wings that show findings, or stand above those that do.
 ABOVE = ("presentation", "runs", "paper", "cli")
 MAKERS = ("Check", "judged", "Order", "Finding", "clause")
@@ -86,6 +88,11 @@ def test_every_code_has_a_sentence() -> None:
     }
     assert names - {kind.__name__ for kind in KINDS} <= {"Level", "Status"}
     assert {kind.__name__ for kind in KINDS} <= names
+
+
+def test_no_two_templates_have_one_name() -> None:
+    tables = [tomllib.loads(path.read_text("utf-8")) for path in WORDS.glob("*.toml")]
+    assert sum(len(entries) for table in tables for entries in table.values()) == len(templates())
 
 
 def test_a_code_without_words_is_noticed() -> None:
