@@ -47,6 +47,7 @@ _HEAD = Section(
         "name": Key(str, "text in quotes", required=True, pattern=r"\S"),
         "rotation": ROTATION,
         "run": Key(str, "the run folder of its calibration, beside this file", pattern=r"\S"),
+        "weighed_arcsec": Key(list[float], "three positive numbers, about X, Y and Z of the head"),
     },
     HeadError,
 )
@@ -132,11 +133,15 @@ class HeadArray:
         Rotations that turn vectors of a head into those of the body.
     runs : tuple of str
         Run folders of their calibrations, empty where none is stated.
+    weighed_arcsec : (H, 3) array or None
+        Standard deviations about the axes of each head by which the software aboard weighs it, NaN
+        for one that is weighed by its noise; None where all are.
     """
 
     names: tuple[str, ...]
     R_body_head: FloatArray
     runs: tuple[str, ...] = ()
+    weighed_arcsec: FloatArray | None = None
 
     def __post_init__(self) -> None:
         rotations = np.array(self.R_body_head, dtype=float)
@@ -259,7 +264,8 @@ def load_heads(path: PathLike) -> HeadArray:
 
     Each has ``name``, ``rotation`` (v_body = R v_head: three rows of three numbers, or a quaternion
     with its scalar last) and, for a budget, ``run``: the run folder of its calibration, beside the
-    file. Other tables are those of a budget of the array.
+    file; where the software aboard weighs it by another noise than its own, ``weighed_arcsec`` about
+    X, Y and Z of the head. Other tables are those of a budget of the array.
 
     Raises
     ------
@@ -269,7 +275,7 @@ def load_heads(path: PathLike) -> HeadArray:
     tables = read_toml(path, "heads", HeadError).get("head", [])
     good = isinstance(tables, list) and len(tables) > 0
     require(HeadError, (good, f"{path}: holds no head; write [[head]] above the keys of each."))
-    names, rotations, runs = [], [], []
+    names, rotations, runs, weighed = [], [], [], []
     for number, table in enumerate(tables, start=1):
         where = f"{path}, [[head]] {number}"
         good = isinstance(table, Mapping)
@@ -279,8 +285,13 @@ def load_heads(path: PathLike) -> HeadArray:
         words = "v_body = R v_head"
         rotations.append(stated_rotation(read["rotation"], where, words, HeadError))
         runs.append(str(Path(path).parent / read["run"]) if "run" in read else "")
+        weighed.append(read.get("weighed_arcsec", [np.nan] * 3))
+        good = len(weighed[-1]) == 3 and not min(weighed[-1]) <= 0.0
+        text = f"{where}: key weighed_arcsec is {weighed[-1]}; write three positive numbers."
+        require(HeadError, (good, text))
+    stated = None if np.isnan(weighed).all() else np.array(weighed, dtype=float)
     try:
-        return HeadArray(tuple(names), np.stack(rotations), tuple(runs))
+        return HeadArray(tuple(names), np.stack(rotations), tuple(runs), stated)
     except HeadError as error:
         raise HeadError(f"{path}: {error}") from None
 

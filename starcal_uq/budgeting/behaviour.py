@@ -67,6 +67,24 @@ class Behaviour:
     mean_arcsec: float = 0.0
 
     @property
+    def text(self) -> str:
+        """Kind and time, as rows of a budget state them."""
+        return self.kind + ("" if math.isnan(self.seconds) else f", {self.seconds:.4g} s")
+
+    @classmethod
+    def of_text(cls, text: str) -> Behaviour | None:
+        """The behaviour that such a text states; None for spectra and series, which are not in
+        it.
+        """
+        kind, _, seconds = text.partition(", ")
+        if kind == "constant":
+            return cls("constant")
+        for stated in KEYS:
+            if stated == kind and stated not in ("spectrum", "series"):
+                return cls(stated, float(seconds.removesuffix(" s")))
+        return None
+
+    @property
     def sigma_arcsec(self) -> float:
         """Standard deviation of a spectrum or a series, arcsec; NaN where it is stated apart."""
         if self.kind == "spectrum":

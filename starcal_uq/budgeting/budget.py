@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 
 _CONFIDENCE = 0.997
 # What to know of the rows.
-Remark = Enum("Remark", "REPLACED TWICE NOT_ASSESSED IN_PART")
+Remark = Enum("Remark", "REPLACED TWICE NOT_ASSESSED IN_PART OF_HEADS WEIGHTS")
 # A row of the file that may hold what effects fill rows with.
 _DRIFT = "drift of focal length and distortion"
 _OF_TIME_OR_WARMTH = [OF_EFFECTS[name].name for name in ("temperature", "time", "epoch")]
@@ -134,15 +134,7 @@ def budget(
         if file is None
         else load_budget_file(file)
     )
-    chosen = confidence if confidence is not None else stated.confidence
-    chosen = checked_confidence(
-        _CONFIDENCE if chosen is None else chosen, "the confidence of the budget"
-    )
-    if n_samples < 10_000:
-        raise BudgetError(
-            f"n_samples is {n_samples}, too few for the tails of an error; use at least 10000."
-        )
-    check_memory(f"n_samples={n_samples}", 8.0 * 12 * n_samples)
+    chosen = confidence_of(stated, confidence, n_samples)
     if misfit is not None and attitude.misfit is None:
         from starcal_uq.diagnostics.found import with_misfit
 
@@ -150,7 +142,7 @@ def budget(
     untested = () if attitude.misfit is not None else (UNTESTED,)
     effects, replaced = stated_instead(effect_rows(attitude, post), stated.contributors)
     known = (*alignment_rows(attitude), *effects)
-    filled = _from_file(stated, (*untested, *FROM_FILE), known)
+    filled = from_file(stated, (*untested, *FROM_FILE), known)
     # Effects stand beside the other rows of the calibration.
     ours = {row.name for row in effects} - {entry.name for entry in FROM_FILE}
     beside = tuple(row for row in filled if row.name in ours)
@@ -161,18 +153,7 @@ def budget(
     )
     behaviours = _in_time(rows, stated, post.camera, spectrum)
     rows = tuple(_described(row, behaviours, stated.rate_deg_s) for row in rows)
-    index_totals: list[Total] = []
-    outcomes: dict[Requirement, Outcome] = {}
-    asked = (Index("AKE"), *indices, *stated.indices, *(one.limited for one in stated.requirements))
-    for label, index in {index.label: index for index in asked}.items():
-        seen, at_most = seen_by(index, rows, behaviours)
-        made, samples = totals(
-            *(seen, chosen), of_index=label, at_most=at_most, n_samples=n_samples, seed=seed
-        )
-        index_totals += made
-        limits = [one for one in stated.requirements if one.limited.label == label]
-        judged = judge(limits, seen, samples, stated.frames, at_most)
-        outcomes |= dict(zip(limits, judged, strict=True))
+    combined = combination(rows, stated, behaviours, chosen, n_samples, seed, indices)
     settings: AnyDict = {
         "confidence": chosen,
         "n_samples": n_samples,
@@ -184,20 +165,61 @@ def budget(
     if stated.frames:
         settings["frames"] = {name: rotation.tolist() for name, rotation in stated.frames.items()}
     return Budget(
-        rows=rows,
-        totals=tuple(entry for entry in index_totals if entry.of_index == "AKE"),
-        outcomes=tuple(outcomes[one] for one in stated.requirements),
-        confidence=chosen,
+        **combined,
         title=stated.title or "Attitude error budget",
         notes=(
             f"After alignment: an alignment calibration on {attitude.alignment}.",
             *misfit_notes(attitude),
             *_effect_notes(effects, replaced, stated),
-            *_notes(rows),
+            *row_notes(rows),
         ),
         provenance=provenance(seed, settings, post.provenance.data_sha256),
-        index_totals=tuple(entry for entry in index_totals if entry.of_index != "AKE"),
     )
+
+
+def confidence_of(stated: BudgetFile, confidence: float | None, n_samples: int) -> float:
+    """The confidence of totals, of which so many samples are to say something."""
+    chosen = confidence if confidence is not None else stated.confidence
+    chosen = checked_confidence(
+        _CONFIDENCE if chosen is None else chosen, "the confidence of the budget"
+    )
+    if n_samples < 10_000:
+        raise BudgetError(
+            f"n_samples is {n_samples}, too few for the tails of an error; use at least 10000."
+        )
+    check_memory(f"n_samples={n_samples}", 8.0 * 12 * n_samples)
+    return chosen
+
+
+def combination(
+    rows: tuple[Contributor, ...],
+    stated: BudgetFile,
+    behaviours: Behaviours,
+    confidence: float,
+    n_samples: int,
+    seed: int,
+    indices: Sequence[Index] = (),
+) -> AnyDict:
+    """Totals of rows and indices, and the requirements of a file: fields of a `Budget`."""
+    index_totals: list[Total] = []
+    outcomes: dict[Requirement, Outcome] = {}
+    asked = (Index("AKE"), *indices, *stated.indices, *(one.limited for one in stated.requirements))
+    for label, index in {index.label: index for index in asked}.items():
+        seen, at_most = seen_by(index, rows, behaviours)
+        made, samples = totals(
+            *(seen, confidence), of_index=label, at_most=at_most, n_samples=n_samples, seed=seed
+        )
+        index_totals += made
+        limits = [one for one in stated.requirements if one.limited.label == label]
+        judged = judge(limits, seen, samples, stated.frames, at_most)
+        outcomes |= dict(zip(limits, judged, strict=True))
+    return {
+        "rows": rows,
+        "totals": tuple(entry for entry in index_totals if entry.of_index == "AKE"),
+        "outcomes": tuple(outcomes[one] for one in stated.requirements),
+        "confidence": confidence,
+        "index_totals": tuple(entry for entry in index_totals if entry.of_index != "AKE"),
+    }
 
 
 def _in_time(
@@ -242,11 +264,10 @@ def _described(row: Contributor, behaviours: Behaviours, rate_deg_s: float | Non
         return row
     if rate_deg_s == 0.0 and behaviour.kind == "constant" and row.interpretation == "mixed":
         row = replace(row, ecss_class="bias", interpretation="ensemble")
-    time = "" if math.isnan(behaviour.seconds) else f", {behaviour.seconds:.4g} s"
-    return replace(row, behaviour=behaviour.kind + time)
+    return replace(row, behaviour=behaviour.text)
 
 
-def _from_file(
+def from_file(
     stated: BudgetFile, expected: tuple[Expected, ...], known: tuple[Contributor, ...]
 ) -> tuple[Contributor, ...]:
     """Expected contributors as the file states them, as known without it, or not assessed; then the
@@ -301,7 +322,8 @@ def _effect_notes(
     return tuple(notes)
 
 
-def _notes(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
+def row_notes(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
+    """What rows leave open, and what alignment absorbs in part."""
     part = [row.name for row in rows if row.absorbed_by_alignment == "in part" and row.assessed]
     named = {
         Remark.NOT_ASSESSED: _missing(rows),

@@ -243,8 +243,8 @@ def checked_confidence(value: float, where: str) -> float:
     return value
 
 
-def load_budget_file(path: PathLike) -> BudgetFile:
-    """Read and check a budget file.
+def load_budget_file(path: PathLike, others: Sequence[str] = ()) -> BudgetFile:
+    """Read and check a budget file, in which `others` may stand as well.
 
     Raises
     ------
@@ -256,7 +256,7 @@ def load_budget_file(path: PathLike) -> BudgetFile:
     missing = f"check the path, or write a starter with `{starter.words}`"
     content = read_toml(path, "budget", BudgetError, missing)
     for key in content:
-        if key not in ("budget", "frame", *_LISTS):
+        if key not in ("budget", "frame", *_LISTS, *others):
             raise BudgetError(
                 f"{path}: {key} is not known; write [budget], [frame.NAME], "
                 f"{listed([f'[[{name}]]' for name in _LISTS])} tables only."

@@ -45,7 +45,8 @@ def check_output(out: Path | None, command: str, force: bool) -> None:
 
 
 def budget_command(
-    run: Path,
+    run: Path | None = None,
+    heads: Path | None = None,
     file: Path | None = None,
     out: list[Path] | None = None,
     template: Path | None = None,
@@ -56,7 +57,6 @@ def budget_command(
 ) -> Answer:
     """Attitude error budget in the terms of ECSS; status 1 when a requirement is violated."""
     from starcal_uq.presentation.pages.budgeting import FORMATS
-    from starcal_uq.presentation.pages.write import write_page
 
     if template is not None and file is not None and template.resolve() == file.resolve():
         raise typer.BadParameter(f"--template would write over {file}: name another file.")
@@ -66,6 +66,18 @@ def budget_command(
                 f"{path}: the ending names the format; use one of {', '.join(FORMATS)}."
             )
         ensure_new(path, force)
+    if heads is not None and run is None:
+        if any(one is not None for one in (file, template, temperature_profile)):
+            raise typer.BadParameter(
+                "--heads takes budgets of the heads as they are: give --budget, --template and "
+                "--temperature-profile to the budget of each."
+            )
+        found = sc.budgeting.array_budget(heads, confidence=confidence, seed=seed)
+        return _deliver(found, heads, [], out or [])
+    if run is None or heads is not None:
+        raise typer.BadParameter(
+            "give the run folder RUN, or --heads FILE with those of the heads."
+        )
     opened = sc.Run(run, tell=note)
     if template is not None:
         rows = sc.budget(opened.posterior, opened.observations, opened.attitude, seed=seed).rows
@@ -84,13 +96,21 @@ def budget_command(
         found = opened.error_budget
     else:
         found = opened.budget(**asked, seed=seed, force=force)
-    for path in out or []:
+    return _deliver(found, run, [run / "budget.csv"], out or [])
+
+
+def _deliver(found: Budget, of: Path, written: list[Path], out: list[Path]) -> Answer:
+    """Write a budget of a run or of heads where it is not, and show it."""
+    from starcal_uq.presentation.pages.write import write_page
+
+    for path in out:
         write_page(found, path)
     show_budget(found)
-    files = [run / "budget.csv", *(out or [])]
-    say(f"Budget: {', '.join(map(str, files))}")
+    files = [*written, *out]
+    if files:
+        say(f"Budget: {', '.join(map(str, files))}")
     tell_violations(found)
-    results = {"run": run, "files": files, "template": None, "budget": found}
+    results = {"run": of, "files": files, "template": None, "budget": found}
     return Answer(results, int(bool(found.violations)))
 
 

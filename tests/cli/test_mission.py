@@ -110,6 +110,30 @@ def test_violated_requirement_is_named_and_ends_with_status_1(cli, run, tmp_path
     assert "R-1 impossible" in text
 
 
+def test_budget_of_two_heads(cli, run, tmp_path, small_budgets):
+    """One sensor twice, with boresights at right angles: the turn about either is known well."""
+    (tmp_path / "heads.toml").write_text(
+        '[[head]]\nname = "A"\nrotation = [0, 0, 0, 1]\nrun = "run"\n'
+        '[[head]]\nname = "B"\nrotation = [0, 1, 0, 1]\nrun = "run"\n'
+    )
+    status, _, err = cli("budget", "--heads", "heads.toml")
+    assert (status, "run `starcal-uq budget run`" in err) == (2, True), err
+    cli("budget", "run")
+    status, out, _ = cli("budget", "--heads", "heads.toml", "-o", "array.html", "-o", "array.csv")
+    assert status == 0
+    assert "centroid noise (NEA), B" in out
+    array, alone = (sc.budgeting.Budget.load(tmp_path / n) for n in ("array.csv", "run/budget.csv"))
+    assert array.total("Z").sigma_arcsec < 0.3 * alone.total("Z").sigma_arcsec
+    assert "of the body" in (tmp_path / "array.html").read_text()
+    status, out, _ = cli("budget", "--heads", "heads.toml", "--json")
+    assert json.loads(out)["run"] == "heads.toml"
+    for words in (("budget",), ("budget", "run", "--heads", "heads.toml")):
+        status, _, err = cli(*words)
+        assert (status, "--heads FILE" in err) == (2, True), err
+    status, _, err = cli("budget", "--heads", "heads.toml", "--template", "t.toml")
+    assert (status, "to the budget of each" in err) == (2, True)
+
+
 def test_run_refuses_a_wrong_budget_file_before_any_work(cli, inputs, tmp_path):
     (tmp_path / "wrong.toml").write_text("[[contributor]]\nname = 3\n")
     status, _, err = cli(
