@@ -30,9 +30,10 @@ from starcal_uq.camera.distortion import (
 )
 from starcal_uq.camera.formats import read_pinhole
 from starcal_uq.camera.opencv import from_opencv, to_opencv
+from starcal_uq.camera.spice import fitted_optics, read_kernel
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
-from starcal_uq.core.files import reading, shown
+from starcal_uq.core.files import reading, shown, split_part
 from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
 from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, PathLike, floats
@@ -291,8 +292,11 @@ class Camera(Shown):
 
     @classmethod
     def load(cls, path: PathLike) -> Camera:
-        """Read a camera from a TOML file, or from one of OpenCV, ROS, Kalibr or mrcal by its
+        """Read a camera from a TOML file, or from one of OpenCV, ROS, Kalibr, mrcal or SPICE by its
         ending.
+
+        A SPICE instrument kernel (``.ti``) with several cameras takes the NAIF ID of one of them
+        behind a ``#``: ``"nh_lorri_v201.ti#-98301"``. x is its sample, y its line.
 
         Raises
         ------
@@ -302,6 +306,9 @@ class Camera(Shown):
         """
         if os.fspath(path).endswith((".yaml", ".yml", ".cameramodel")):
             return cls._of_others(path)
+        file, instrument = split_part(path)
+        if file.lower().endswith(".ti"):
+            return cls._of_kernel(file, instrument)
         return cls(
             **_checked(read_section(path, "camera", CameraError), f"{path}, section [camera]")
         )
@@ -324,6 +331,23 @@ class Camera(Shown):
             )
         except CameraError as error:
             raise CameraError(f"{path}: {error}") from None
+
+    @classmethod
+    def _of_kernel(cls, path: str, instrument: int | None) -> Camera:
+        with reading(path, "an instrument kernel of SPICE", "check the file", CameraError):
+            held = read_kernel(Path(path).read_text(encoding="utf-8", errors="replace"), instrument)
+            optics = fitted_optics(held)
+        return cls(
+            held.width_px,
+            held.height_px,
+            held.pixel_um,
+            None,
+            *optics.centre_px,
+            optics.distortion,
+            optics.coefficients,
+            optics.name,
+            optics.focal_px,
+        )
 
     def save(self, path: PathLike, force: bool = False) -> None:
         """Write the camera to a TOML file without loss of digits.

@@ -143,6 +143,12 @@ def _thin_prism(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
     return du + s1 * r2, dv + s2 * r2
 
 
+def _cubic(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
+    powers = [u**p * v**q for p, q in _POWERS]
+    du, dv = (sum(a * b for a, b in zip(half, powers, strict=True)) for half in (k[:7], k[7:]))
+    return du, dv
+
+
 _K1 = Coefficient("k1", "px^-2", 1e-10, "1e-10 px^-2", "radial distortion, cubic term", 3)
 _K2 = Coefficient("k2", "px^-4", 1e-15, "1e-15 px^-4", "radial distortion, quintic term", 5)
 _K3 = Coefficient("k3", "px^-6", 1e-20, "1e-20 px^-6", "radial distortion, seventh-order term", 7)
@@ -152,6 +158,20 @@ _P2 = Coefficient("p2", "px^-1", 1e-7, "1e-7 px^-1", "decentring distortion alon
 
 _S1 = Coefficient("s1", "px^-1", 1e-7, "1e-7 px^-1", "thin prism along x", 2)
 _S2 = Coefficient("s2", "px^-1", 1e-7, "1e-7 px^-1", "thin prism along y", 2)
+# Names as in FITS headers with SIP: a_pq u^p v^q along x, b_pq u^p v^q along y.
+_POWERS = tuple((order - q, q) for order in (2, 3) for q in range(order + 1))
+_CUBIC = tuple(
+    Coefficient(
+        f"{letter}{p}{q}",
+        f"px^-{p + q - 1}",
+        float(scale := {2: "1e-7", 3: "1e-10"}[p + q]),
+        f"{scale} px^-{p + q - 1}",
+        f"term u^{p} v^{q} of the displacement along {axis}",
+        p + q,
+    )
+    for letter, axis in (("a", "x"), ("b", "y"))
+    for p, q in _POWERS
+)
 _AXES = (
     Coefficient("stretch", "1", 1e-6, "1e-6", "scale along y over that along x, less one", 1),
     Coefficient("skew", "1", 1e-6, "1e-6", "shift along x with the offset along y", 1),
@@ -190,6 +210,14 @@ _MODELS = {
             "forward",
             _thin_prism,
             "Weng, Cohen & Herniou 1992, without decentring",
+            compared=False,
+        ),
+        DistortionModel(
+            "cubic",
+            _CUBIC,
+            "forward",
+            _cubic,
+            "Taylor series to third order, as in NAIF's kernel of MESSENGER MDIS",
             compared=False,
         ),
         DistortionModel("f_theta", (), "forward", _none, "equidistant projection", EQUIDISTANT),

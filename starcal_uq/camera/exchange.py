@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, shared_names, with_axes
+from starcal_uq.camera.distortion import Parameter, get_model, shared_names, with_axes
 from starcal_uq.camera.formats import TEXT_FORMATS, Pinhole, write_pinhole
 from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
+from starcal_uq.camera.spice import NO_INSTRUMENT, kernel_text
 from starcal_uq.core.errors import CameraError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, ensure_new
@@ -52,9 +54,16 @@ class Exported:
     note: str
 
 
-def export_camera(camera: Camera, to: str, path: PathLike, *, force: bool = False) -> Exported:
-    """Write a camera for another program, one of `CAMERA_FORMATS`; without `Camera.name` the file
-    gets a neutral one.
+def export_camera(
+    camera: Camera,
+    to: str,
+    path: PathLike,
+    *,
+    force: bool = False,
+    write: Writer | None = None,
+) -> Exported:
+    """Write a camera for another program, one of `CAMERA_FORMATS`, by the format's own writer or
+    another; without `Camera.name` the file gets a neutral one.
 
     CameraError for an unknown format or a camera that folds over within its detector.
     """
@@ -71,8 +80,11 @@ def export_camera(camera: Camera, to: str, path: PathLike, *, force: bool = Fals
             "the distortion folds over within the detector: a camera that does has no counterpart."
         )
     with atomic_path(Path(path)) as temporary:
-        error, note = CAMERA_FORMATS[to].write(camera, temporary)
+        error, note = (write or CAMERA_FORMATS[to].write)(camera, temporary)
     return Exported(Path(path), error, note)
+
+
+Writer = Callable[[Camera, Path], tuple[float, str]]
 
 
 def _grid(camera: Camera, points: int) -> FloatArray:
@@ -275,19 +287,71 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
     return header, worst
 
 
-def _powers(order: int) -> list[tuple[int, int]]:
-    return [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
+def _powers(order: int, least: int = 2) -> list[tuple[int, int]]:
+    return [(p, n - p) for n in range(least, order + 1) for p in range(n, -1, -1)]
 
 
-def _polynomial(at: FloatArray, shift: FloatArray, scale: float) -> tuple[int, FloatArray, float]:
-    """Least order, coefficients (n, 2) and largest error (px) of polynomials for a displacement."""
+def _polynomial(
+    at: FloatArray, shift: FloatArray, scale: float, least: int = 2, close_px: float = _CLOSE_PX
+) -> tuple[int, FloatArray, float]:
+    """Lowest order, coefficients (n, 2) and largest error (px) of polynomials for a displacement,
+    with terms from the order `least` on.
+    """
     for order in range(2, _MOST_ORDERS + 1):
-        terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in _powers(order)], axis=1)
+        terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in _powers(order, least)], axis=1)
         found = floats(np.linalg.lstsq(terms, shift, rcond=None)[0])
         error = scale * float(np.max(np.linalg.norm(terms @ found - shift, axis=1)))
-        if error < _CLOSE_PX:
+        if error < close_px:
             break
     return order, found, error
+
+
+def write_kernel(
+    camera: Camera,
+    path: Path,
+    instrument: int = NO_INSTRUMENT,
+    sigmas: Sequence[tuple[Parameter, float]] = (),
+) -> tuple[float, str]:
+    """Write a text instrument kernel of SPICE: FOCAL_LENGTH, PIXEL_SIZE, PIXEL_SAMPLES,
+    PIXEL_LINES and CCD_CENTER (pixels count from 0), the field of view for GETFOV, and
+    SIP_AP_p_q and SIP_BP_p_q, the polynomials from the ideal to the measured pixel offset.
+
+    `sigmas`, standard deviations in the parameters' units, stand as comments. Returns the largest
+    error, px, and a sentence. CameraError without a pixel pitch.
+    """
+    if camera.focal_mm is None or camera.pixel_um is None:
+        raise CameraError(
+            "a kernel has its focal length in mm: state pixel_um in the camera's file first."
+        )
+    pixels, seen = _grid(camera, _POINTS), _in_front(camera)
+    centre = np.array([camera.x0_px, camera.y0_px])
+    ideal, scale = camera.focal_px * seen[:, :2] / seen[:, 2:], camera.corner_radius_px
+    order, coefficients, error = _polynomial(
+        ideal / scale, (pixels - centre - ideal) / scale, scale, 1, _EXACT_PX / 1e3
+    )
+    corners = unproject(camera, _grid(camera, 2)[[0, 1, 3, 2]])
+    values: dict[str, object] = {
+        "FOCAL_LENGTH": camera.focal_mm,
+        "PIXEL_SIZE": camera.pixel_um,
+        "PIXEL_SAMPLES": camera.width_px,
+        "PIXEL_LINES": camera.height_px,
+        "CCD_CENTER": (camera.x0_px, camera.y0_px),
+        "FOV_FRAME": f"'{re.sub(r'[^A-Z0-9]+', '_', camera.name.upper())[:26] or 'STAR_CAMERA'}'",
+        "FOV_SHAPE": "'POLYGON'",
+        "FOV_CLASS_SPEC": "'CORNERS'",
+        "BORESIGHT": (0.0, 0.0, 1.0),
+        "FOV_BOUNDARY_CORNERS": tuple(corners.ravel().tolist()),
+        "SIP_AP_ORDER": order,
+        "SIP_BP_ORDER": order,
+    }
+    for column, letter in enumerate("AB"):
+        for (p, q), value in zip(_powers(order, 1), coefficients[:, column], strict=True):
+            # Below it no pixel of the detector moves by the thousandth part of rounding.
+            if abs(value) * scale > _EXACT_PX / 1e6:
+                values[f"SIP_{letter}P_{p}_{q}"] = float(value) * scale ** (1 - p - q)
+    known = "".join(f"   {spec.name:8} {sd:12.4g} {spec.unit}\n" for spec, sd in sigmas)
+    path.write_text(kernel_text(instrument, values, known), encoding="ascii")
+    return error, _said(error, f"SPICE instrument kernel of INS{instrument}")
 
 
 def _sip(camera: Camera, path: Path) -> tuple[float, str]:
@@ -320,7 +384,7 @@ class CameraFormat:
     """
 
     ending: str
-    write: Callable[[Camera, Path], tuple[float, str]]
+    write: Writer
 
 
 CAMERA_FORMATS = {
@@ -330,5 +394,6 @@ CAMERA_FORMATS = {
     "tetra3rs": CameraFormat(".bin", _tetra3rs),
     "tetra3": CameraFormat(".json", _tetra3),
     "sip": CameraFormat(".hdr", _sip),
+    "spice": CameraFormat(".ti", write_kernel),
     "asdf": CameraFormat(".asdf", _asdf),
 }

@@ -17,7 +17,7 @@ import typer
 
 from starcal_uq.core import settings
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.files import shown
+from starcal_uq.core.files import shown, split_part
 from starcal_uq.core.settings import KEYS, LIMITS, Limit
 
 if TYPE_CHECKING:
@@ -55,15 +55,16 @@ def _path(value: str | Path) -> Path:
 def read_path(value: str | Path) -> Path:
     """Path of a file or a folder that can be read."""
     path = _path(value)
-    if _mode(path) is None:
+    file = Path(split_part(path)[0])
+    if _mode(file) is None:
         # Files of these names are what `new` writes.
         new = path.stem in get_args(settings.Starter) and path.suffix == ".toml"
         raise _refuse(
             path,
             f"does not exist; check the path{f', or starcal-uq new {path.stem}' if new else ''}",
         )
-    if not os.access(path, os.R_OK):
-        raise _refuse(path, "cannot be read; check its permissions")
+    if not os.access(file, os.R_OK):
+        raise _refuse(file, "cannot be read; check its permissions")
     return path
 
 

@@ -276,13 +276,14 @@ def export_command(
     source: Path,
     to: settings.ExportFormat,
     out: Path | None = None,
+    instrument: int | None = None,
     force: bool = False,
 ) -> Answer:
     """Write the calibrated camera, or what is known of it, for another program; say how near that
     comes.
     """
     with progress_bar("log likelihood") as progress:
-        made = sc.export(source, to, out, force=force, progress=progress)
+        made = sc.export(source, to, out, instrument=instrument, force=force, progress=progress)
     say(made.note)
     say(f"File: {made.path}")
     return Answer({"file": made.path, "to": to, "error_px": made.error_px, "text": made.note})

@@ -461,3 +461,9 @@ def table_ending(path: Path, endings: tuple[str, ...] = ENDINGS) -> str:
 def as_plain(value: Any) -> Any:
     """For json.dumps: numpy values as Python's, anything else in words."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+
+def split_part(path: PathLike) -> tuple[str, int | None]:
+    """Name of a file and the number of a part of it behind a ``#``, as ``kernel.ti#-98301``."""
+    match = re.fullmatch(r"(.+\.\w+)#(-?\d+)", os.fspath(path))
+    return (match[1], int(match[2])) if match else (os.fspath(path), None)

@@ -7,13 +7,17 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
-from starcal_uq.camera.exchange import CAMERA_FORMATS, Exported, export_camera
+from starcal_uq.camera.exchange import CAMERA_FORMATS, Exported, export_camera, write_kernel
+from starcal_uq.camera.spice import NO_INSTRUMENT
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_write_text, ensure_new, write_csv
+from starcal_uq.core.files import atomic_write_text, ensure_new, split_part, write_csv
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.types import AnyDict, PathLike, Progress
@@ -33,6 +37,7 @@ def export(
     to: str,
     path: PathLike | None = None,
     *,
+    instrument: int | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Exported:
@@ -45,11 +50,13 @@ def export(
         is that of a run folder, or of a camera.
     to : str
         One of `FORMATS`. ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``tetra3rs``, ``tetra3``,
-        ``sip`` and ``asdf`` hold the camera; ``covariance`` (JSON) parameters and their covariance,
+        ``sip``, ``spice`` and ``asdf`` hold the camera; ``covariance`` (JSON) parameters and their covariance,
         ``csv`` and ``netcdf`` the draws, ``arviz`` (netCDF) a thousand of them with all of ArviZ's
         groups, ``latex`` and ``markdown`` the table of the parameters.
     path : path, optional
         File to write; by default one in the current folder, named after the run and the format.
+    instrument : int, optional
+        NAIF ID of the camera in a ``spice`` kernel.
     force : bool
         Whether to replace a file.
     progress : callable, optional
@@ -72,15 +79,21 @@ def export(
     if to not in FORMATS:
         raise RunFolderError(f"{to!r} is no format: use one of {', '.join(FORMATS)}.")
     if isinstance(what, str | os.PathLike):
-        what = Run(what) if os.path.isdir(what) or not os.path.exists(what) else Camera.load(what)
+        is_file = os.path.isfile(split_part(what)[0])
+        what = Camera.load(what) if is_file else Run(what)
     name, run = "camera", None
     if isinstance(what, Run):
         name, run, what = what.name, what, what.best
     place = Path(f"{name}-{to}{FORMATS[to]}" if path is None else path)
     if to in CAMERA_FORMATS:
-        return export_camera(
-            what if isinstance(what, Camera) else _camera_of(what), to, place, force=force
-        )
+        camera = what if isinstance(what, Camera) else _camera_of(what)
+        write = None
+        if to == "spice":
+            specs = parameters(camera.distortion)
+            known = () if isinstance(what, Camera) else np.sqrt(np.diag(what.covariance)).tolist()
+            sigmas = tuple(zip(specs, known, strict=False))
+            write = partial(write_kernel, instrument=instrument or NO_INSTRUMENT, sigmas=sigmas)
+        return export_camera(camera, to, place, force=force, write=write)
     if isinstance(what, Camera):
         raise RunFolderError(f"a camera alone has no {to}: name the folder of a run.")
     if to in _OF_DRAWS and not isinstance(what, Posterior):

@@ -38,6 +38,16 @@ CAMERAS = {
     "prism": sc.Camera(
         1024, 768, 14.0, 60.0, 500, 390, "thin_prism", (-3e-8, 1e-15, 2.3e-7, 4.5e-7)
     ),
+    "cubic": sc.Camera(
+        1024,
+        768,
+        14.0,
+        60.0,
+        500,
+        390,
+        "cubic",
+        (3e-7, 1e-7, 0, *[-3e-8] * 4, 2e-7, 0, 1e-7, *[2e-8] * 4),
+    ),
     "skewed": sc.Camera(1024, 768, 14.0, 60.0, 500, 390, "brown+axes", (-3e-8, 1e-15, -0.05, 2e-3)),
 }
 OPENCV_LIKE = ("opencv", "ros", "kalibr", "mrcal")
@@ -184,7 +194,7 @@ def test_what_is_written_is_read_again(camera, to, tmp_path):
     )
     # Terms that the format has are held; others are said to be fitted.
     skewed = camera.axes[1] != 0.0
-    fitted = camera.distortion == "inverse" or (camera.distortion, to) == ("brown3", "kalibr")
+    fitted = camera.distortion in ("inverse", "cubic") or (camera.distortion, to) == ("brown3", "kalibr")
     fitted = fitted or (skewed and to in ("kalibr", "mrcal"))
     fitted = fitted or (camera.distortion == "thin_prism" and to in ("ros", "kalibr"))
     assert ("fitted" in made.note) == fitted

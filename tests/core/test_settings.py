@@ -20,6 +20,7 @@ from starcal_uq.budgeting.file import (
     REQUIREMENT_KEYS,
     load_budget_file,
 )
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.core import settings
 from starcal_uq.core.errors import SettingError, StarcalError
 from starcal_uq.core.settings import LIMITS, Limit, bounded
@@ -187,6 +188,7 @@ def test_cells_at_the_limits_of_an_axis_have_numbers_or_a_reason(name):
     models = {"k3": "brown3", "p1": "brown_tangential", "p2": "brown_tangential"}
     models |= dict.fromkeys(("stretch", "skew"), "brown+axes")
     models |= dict.fromkeys(("s1", "s2"), "thin_prism") | {"k4": "fisheye"}
+    models |= {c.name: "cubic" for c in get_model("cubic").lens}
     content["camera"]["distortion"] = models.get(name, "brown")
     found = sc.study(StudyDefinition.from_dict(content), workers=0)
     assert found.ok.sum() + sum(found.problems.values()) == found.n_cells

@@ -25,6 +25,22 @@ COEFFICIENTS: dict[str, tuple[float, ...]] = {
 USUAL = tuple(COEFFICIENTS)
 COEFFICIENTS |= {
     "thin_prism": (2e-9, -3.5e-15, 2e-7, -3e-7),
+    "cubic": (
+        1e-7,
+        2e-7,
+        -1e-7,
+        2e-9,
+        1e-10,
+        2e-9,
+        3e-10,
+        1e-7,
+        2e-7,
+        -3e-7,
+        1e-10,
+        2e-9,
+        1e-10,
+        2e-9,
+    ),
     "f_theta": (),
     "equidistant": (2e-9, -3.5e-15),
     "fisheye": (2e-9, -3.5e-15, 3e-21, -1e-27),
@@ -32,7 +48,15 @@ COEFFICIENTS |= {
 AXES = (6.4e-4, -3e-4)
 COEFFICIENTS |= {name + "+axes": (*values, *AXES) for name, values in COEFFICIENTS.items()}
 # Every kind of formula, with square pixels or free axes.
-MODELS = (*USUAL, "none+axes", "thin_prism+axes", "inverse+axes", "fisheye", "equidistant+axes")
+MODELS = (
+    *USUAL,
+    "none+axes",
+    "thin_prism+axes",
+    "cubic",
+    "inverse+axes",
+    "fisheye",
+    "equidistant+axes",
+)
 
 
 def camera(model: str = "brown", **changes: object) -> Camera:
