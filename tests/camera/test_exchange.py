@@ -194,7 +194,10 @@ def test_what_is_written_is_read_again(camera, to, tmp_path):
     )
     # Terms that the format has are held; others are said to be fitted.
     skewed = camera.axes[1] != 0.0
-    fitted = camera.distortion in ("inverse", "cubic") or (camera.distortion, to) == ("brown3", "kalibr")
+    fitted = camera.distortion in ("inverse", "cubic") or (camera.distortion, to) == (
+        "brown3",
+        "kalibr",
+    )
     fitted = fitted or (skewed and to in ("kalibr", "mrcal"))
     fitted = fitted or (camera.distortion == "thin_prism" and to in ("ros", "kalibr"))
     assert ("fitted" in made.note) == fitted
