@@ -1,10 +1,10 @@
 from .behaviour import Behaviour as Behaviour
 from .file import BudgetFile as BudgetFile
 from .file import load_budget_file as load_budget_file
-from .file import write_budget_template as write_budget_template
 from .heads import array_budget as array_budget
 from .indices import Index as Index
 from .result import Budget as Budget
 from .rows import Contributor as Contributor
+from .starter import write_budget_template as write_budget_template
 from .whatif import allocation as allocation
 from .whatif import budget_difference as budget_difference

@@ -454,7 +454,7 @@ def interaction_study(
         some = [one for one in found.good if conditions[one.condition] == point.condition]
         if some:
             rows += summary_rows(_head(point, some, seed), some)
-    settings: AnyDict = {"n_replicates": n_replicates, **dataclasses.asdict(campaign)}
+    settings = {"n_replicates": n_replicates, **campaign.settings(None)}
     return InteractionStudy(pd.DataFrame(rows), found.interrupted, provenance(seed, settings, None))
 
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcal_uq.budgeting.file import load_budget_file, template_text, write_budget_template
+from starcal_uq.budgeting.file import load_budget_file
 from starcal_uq.budgeting.rows import FROM_FILE, Contributor, not_assessed
+from starcal_uq.budgeting.starter import template_text, write_budget_template
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
 
