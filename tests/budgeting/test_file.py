@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from starcal_uq.budgeting.file import load_budget_file
-from starcal_uq.budgeting.rows import FROM_FILE, Contributor, not_assessed
-from starcal_uq.budgeting.starter import template_text, write_budget_template
+from starcal_uq.budgeting.rows import FROM_FILE
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.errors import BudgetError, RunFolderError
+from starcal_uq.core.errors import BudgetError
 
 ROW = """
 [[contributor]]
@@ -234,54 +233,6 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         load_budget_file(path)
 
 
-def test_the_template_states_nothing_and_lists_everything(tmp_path: Path) -> None:
-    path = tmp_path / "starter.toml"
-    write_budget_template(path)
-    found = load_budget_file(path)
-    assert not found.contributors and not found.requirements and found.confidence == 0.997
-    text = path.read_text(encoding="utf-8")
-    assert all(f'# name = "{entry.name}"' in text for entry in FROM_FILE)
-    assert max(len(line) for line in text.splitlines()) <= 120
-    with pytest.raises(RunFolderError, match="exists already"):
-        write_budget_template(path)
-    write_budget_template(path, force=True)
-
-
-def test_an_uncommented_template_loads_once_numbers_are_in(tmp_path: Path) -> None:
-    body = template_text().split("# [[requirement]]", 1)[1]
-    lines = ["[[requirement]]"]
-    for line in body.splitlines():
-        bare = line.removeprefix("# ")
-        if line.startswith("# ") and (" = " in f"{bare} " or bare.startswith("[")):
-            bare = bare.replace('provenance = ""', 'provenance = "test"')
-            lines.append(bare + "1.5" if bare.rstrip().endswith("arcsec =") else bare)
-            lines[-1] = lines[-1].replace("arcsec =1.5", "arcsec = 1.5")
-    found = load_budget_file(written(tmp_path, "\n".join(lines)))
-    assert {(row.name, row.axis) for row in found.contributors} == {
-        (entry.name, axis) for entry in FROM_FILE for axis in AXES
-    }
-    assert len(found.requirements) == 1
-    by_name = {row.name: row for row in found.contributors}
-    for entry in FROM_FILE:
-        assert by_name[entry.name].ecss_class == entry.ecss_class
-        assert by_name[entry.name].distribution == entry.distribution
-
-
-def test_the_template_leaves_out_what_is_assessed() -> None:
-    rows = [not_assessed(entry, axis) for entry in FROM_FILE for axis in AXES]
-    catalogue = "star catalogue"
-    rows = [
-        Contributor(row.name, row.ecss_class, row.axis, 0.0, 1.0, source="file")
-        if row.name == catalogue or (row.name == "end-of-life noise" and row.axis != "roll")
-        else row
-        for row in rows
-    ]
-    text = template_text(rows)
-    assert f'name = "{catalogue}"' not in text
-    part = text.split('# name = "end-of-life noise"', 1)[1].split("[[contributor]]")[0]
-    assert '# axis = "Z"' in part and text.count('# name = "end-of-life noise"') == 1
-
-
 def example(root: Path) -> str:
     """The full example of the how-to page."""
     page = (root / "docs" / "how-to" / "budget.md").read_text(encoding="utf-8")
@@ -349,41 +300,3 @@ def test_frames_are_rotations_that_requirements_name(tmp_path: Path) -> None:
         load_budget_file(written(tmp_path, LIMIT + 'frame = "payload"\n'))
     with pytest.raises(BudgetError, match="needs a name"):
         load_budget_file(written(tmp_path, "[frame]\nrotation = 1\n"))
-
-
-def test_an_entry_of_the_starter_to_the_letter() -> None:
-    """All axes, or one by one those that are open."""
-
-    def entry(*axes: str) -> str:
-        words = [
-            "Thermo-elastic distortion: motion of boresight against mounting reference with "
-            "temperature and its "
-            "gradients over",
-            "orbit and season.",
-        ]
-        keys = [
-            *("half_width_arcsec =", 'distribution = "arcsine"', 'ecss_class = "thermo-elastic"'),
-            *(
-                'interpretation = "temporal"',
-                'absorbed_by_alignment = "no"',
-                'conditions = ""',
-                'provenance = ""',
-            ),
-        ]
-        blocks = [
-            ["[[contributor]]", 'name = "thermo-elastic distortion"', f'axis = "{a}"', *keys]
-            for a in axes
-        ]
-        return "#\n".join("".join(f"# {line}\n" for line in block) for block in (words, *blocks))
-
-    rows = [not_assessed(each, axis) for each in FROM_FILE for axis in AXES]
-    text = template_text(rows)
-    assert text == template_text()
-    assert f"\n\n{entry('cross-boresight', 'Z')}\n# Drift of focal length and distortion: " in text
-    assert "\n# sigma_arcsec =\n" in text.split("# Drift of")[1].split("# Chromatic")[0]
-    for known, open_ones in (("roll", "XY"), ("pitch", "YZ"), ("yaw", "XZ")):
-        some = [
-            Contributor(r.name, "other", r.axis, source="file") if r.axis == known else r
-            for r in rows
-        ]
-        assert f"\n\n{entry(*open_ones)}\n" in template_text(some)
