@@ -12,6 +12,7 @@ from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import STYLES, note, print_table, progress_bar, say, tell
 from starcal_uq.cli.options import check_same_sensor, parse_labels
 from starcal_uq.cli.settings import (
+    SIGMA_PX,
     CampaignSettings,
     ChoiceSettings,
     EffectSettings,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from starcal_uq.planning.design import FrameChoice
     from starcal_uq.planning.planned import Plan
     from starcal_uq.planning.ties import PlannedTies
+    from starcal_uq.simulation.noise import Noise
 
 
 def check_output(out: Path | None, command: str, force: bool) -> None:
@@ -221,12 +223,22 @@ def plan_command(
             raise typer.BadParameter(
                 "--choose and --check plan calibrations without effects: leave them out."
             )
+    if campaign.sensor is not None and campaign.sigma is not None:
+        raise typer.BadParameter(
+            "--sensor and --sigma both state the noise: leave one of them out."
+        )
+    if campaign.sensor is not None and check is not None:
+        raise typer.BadParameter(
+            "--check simulates one noise for all stars: leave out --sensor, or --check."
+        )
     sheet, known = sc.Camera.load(camera), None
-    noise: float | NoiseModel = 0.05
+    noise: Noise = SIGMA_PX
     if after is not None:
         known, noise = _known(after, sheet, camera)
         sheet = known.camera
     used = noise if campaign.sigma is None else campaign.sigma
+    if campaign.sensor is not None:
+        used = sc.simulation.Sensor.load(campaign.sensor).noise(sheet)
     # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
     deepest = min(forecast.max_mag + 1.0, KEYS["magnitude"].high)
     deep = sc.load_catalogue(max_mag=deepest, epoch=campaign.epoch)
@@ -263,7 +275,7 @@ def plan_command(
             simulated = sc.planning.check_forecast(
                 sheet,
                 stars,
-                sigma_px=0.05 if campaign.sigma is None else campaign.sigma,
+                sigma_px=SIGMA_PX if campaign.sigma is None else campaign.sigma,
                 n_frames=sizes,
                 n_campaigns=check,
                 progress=progress,

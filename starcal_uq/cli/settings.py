@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from starcal_uq.runs.run import Run
 
 
+# Centroid noise of a small tracker, px per axis, where nothing states another.
+SIGMA_PX = 0.05
 # Settings of an estimation that change the nominal camera.
 _OF_CAMERA = ("start", "pixel_um")
 
@@ -214,7 +216,7 @@ class SimulationSettings:
     """What is simulated."""
 
     n_frames: int = 1000
-    sigma_px: float = 0.05
+    sigma_px: float | None = None
     min_stars: int = 10
     max_stars: int | None = None
     seed: int = 0
@@ -236,7 +238,7 @@ class ValidationSettings:
     n_replicates: int = 1000
     n_frames: int = 50
     min_stars: int = 10
-    sigma_px: float = 0.05
+    sigma_px: float = SIGMA_PX
     max_mag: float = 6.0
     truth: settings.Truth = "fixed"
     workers: int | None = None
@@ -273,6 +275,7 @@ class CampaignSettings:
     """What the campaign will be."""
 
     sigma: float | None = None
+    sensor: Path | None = None
     frames: list[int] | None = None
     after: Path | None = None
     epoch: float = 2026.9

@@ -21,7 +21,7 @@ def new_command(
     near: tuple[float, float] | None = None,
     force: bool = False,
 ) -> Answer:
-    """Write a starter file with comments (camera, site, budget, study), or real data to try
+    """Write a starter file with comments (camera, sensor, site, budget, study), or real data to try
     everything on.
     """
     if template is not None and what != "study":
@@ -42,6 +42,11 @@ def new_command(
         x0, y0 = start.centre_px
         start.replace(name="my camera", x0_px=x0, y0_px=y0).save(path, force=force)
         following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"
+    elif what == "sensor":
+        sc.simulation.Sensor().save(path, force=force)
+        following = (
+            f"put in the numbers of your tracker, then starcal-uq plan CAMERA --sensor {path}"
+        )
     elif what == "site":
         example = sc.sky.Site(
             52.0, 4.4, 10.0, pressure_hpa=1013.0, temperature_c=15.0, relative_humidity=0.5

@@ -34,6 +34,7 @@ from starcal_uq.cli.options import (
     parse_velocity,
 )
 from starcal_uq.cli.settings import (
+    SIGMA_PX,
     EstimationSettings,
     MissionSettings,
     PartitionSettings,
@@ -106,12 +107,15 @@ def simulate_command(
         ensure_new(out, force)
     elif images is not None:
         raise typer.BadParameter("--images belongs to one table: leave out --partition-frames.")
-    if sensor is not None and images is None:
+    if sensor is not None and simulation.sigma_px is not None and images is None:
         raise typer.BadParameter(
-            "--sensor describes the detector of images: give --images DIR as well."
+            "--sensor and --sigma both state the noise: leave one of them out."
         )
     stars, truth = sc.load_catalogue(max_mag=max_mag, epoch=epoch), sc.Camera.load(camera)
-    wanted: AnyDict = vars(simulation)
+    detector = None if sensor is None else sc.simulation.Sensor.load(sensor)
+    wanted: AnyDict = {**vars(simulation)}
+    if simulation.sigma_px is None:
+        wanted["sigma_px"] = SIGMA_PX if detector is None else detector.noise(truth)
     paths: list[Path] = []
     if partitions.partition_frames is not None:
         with progress_bar("files") as progress:
@@ -127,11 +131,13 @@ def simulate_command(
     else:
         obs = sc.simulate(stars, truth, **wanted)
         if images is not None:
-            if sensor is not None:
-                wanted = wanted | {"sensor": sc.simulation.Sensor.load(sensor)}
             with progress_bar("images") as progress:
                 paths = sc.simulation.render_frames(
-                    stars, truth, images, **wanted, force=force, progress=progress
+                    *(stars, truth, images),
+                    **wanted,
+                    sensor=detector,
+                    force=force,
+                    progress=progress,
                 )
             say(f"{len(paths)} images: {images}")
         obs.save(out, force=force)

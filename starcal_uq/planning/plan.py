@@ -44,6 +44,7 @@ from starcal_uq.planning.planned import SWEEP_FRAMES, Need, Plan
 from starcal_uq.planning.ties import PlannedTies
 from starcal_uq.simulation.frames import Tracker
 from starcal_uq.simulation.noise import Noise, noise_of
+from starcal_uq.simulation.sensor import SensorNoise
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -207,6 +208,7 @@ def plan(
         "stars": stars.source,
         "band": stars.band,
         **({} if max_stars is None else {"max_stars": max_stars}),
+        **({"sensor": asdict(sigma_px.sensor)} if isinstance(sigma_px, SensorNoise) else {}),
         "after": None if after is None else type(after).__name__,
         **({} if ties is None else {"ties": asdict(ties)}),
         "distortion_percent": None if bounds is None else list(bounds),

@@ -72,7 +72,8 @@ def render_frames(
         R_cam_icrs at the middle of the exposures, instead of random ones; `n_frames` is then
         ignored.
     rates_rad_s : (3,) or (n, 3) array, optional
-        Angular rate of the camera in its own axes, rad/s, of all frames or of each.
+        Angular rate of the camera in its own axes, rad/s, of all frames or of each; the sensor's
+        by default.
     times_utc : sequence of str, optional
         Middle of each exposure, UTC, ISO 8601; recorded only, the stars are not moved.
     sigma_px, max_stars
@@ -102,7 +103,8 @@ def render_frames(
     tracker = Tracker(camera, sigma_px, min_stars, max_stars)
     rotations, _ = tracker.frames(stars, np.random.default_rng(seed), n_frames, given)
     n = len(rotations)
-    rates = np.zeros(3) if rates_rad_s is None else floats(rates_rad_s)
+    scene = Scene(stars, camera, Sensor() if sensor is None else sensor)
+    rates = scene.rate_rad_s if rates_rad_s is None else floats(rates_rad_s)
     if rates.shape not in ((3,), (n, 3)):
         raise SensorError(
             f"rendering: the rates have shape {rates.shape}; give (3,) or ({n}, 3) in rad/s."
@@ -112,7 +114,6 @@ def render_frames(
         raise SensorError(
             f"rendering: there are {len(times)} times for {n} frames; give one for each."
         )
-    scene = Scene(stars, camera, Sensor() if sensor is None else sensor)
     with alone(out_dir):
         paths = _targets(Path(out_dir), n, force)
         for number, path in enumerate(paths):

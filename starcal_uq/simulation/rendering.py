@@ -38,7 +38,7 @@ class Scene:
     def __init__(self, stars: StarCatalogue, camera: Camera, sensor: Sensor) -> None:
         self.stars = stars
         self.camera = camera
-        self.sensor = sensor
+        self.sensor, self.rate_rad_s = sensor.now, np.radians([0.0, sensor.rate_deg_s, 0.0])
         self.electrons = sensor.electrons(stars.mag)
         # Stars outside whose light still reaches the detector.
         self.sky = Sky(stars, camera, -float(half_width_px(sensor.psf_sigma_px) + 1))
@@ -58,7 +58,7 @@ class Scene:
     ) -> RenderedFrame:
         """One frame; the arguments are those of `render`."""
         centre = floats(rotation)
-        rate = np.zeros(3) if rate_rad_s is None else floats(rate_rad_s)
+        rate = self.rate_rad_s if rate_rad_s is None else floats(rate_rad_s)
         if centre.shape != (3, 3) or not np.allclose(centre @ centre.T, np.eye(3), atol=1e-6):
             raise SensorError(
                 "rendering: the attitude is no rotation; give R_cam_icrs as an orthogonal 3 x 3 "
@@ -153,7 +153,7 @@ class Scene:
         electronics.
         """
         sensor, shape = self.sensor, (self.camera.height_px, self.camera.width_px)
-        uniform = (sensor.background_e_px_s + sensor.dark_e_px_s) * sensor.exposure_s
+        uniform = sensor.uniform_e_px
         hot, level = self.hot
         electrons: np.ndarray[Any, Any]
         if rng is None:
@@ -218,7 +218,7 @@ def render(
     rate_rad_s : (3,) array, optional
         Angular rate of the camera in its own axes (x right, y down, z along the boresight),
         constant over the exposure, rad/s. A positive rate about y turns the boresight towards +x,
-        and the stars move towards -x.
+        and the stars move towards -x. By default the sensor's rate, about y.
     noise : bool
         False: expected values, without shot and read noise.
     quantise : bool

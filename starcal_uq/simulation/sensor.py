@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,15 +15,21 @@ from starcal_uq.core.toml import Key, Section, read_section, write_section
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, IntArray, PathLike, floats
 from starcal_uq.simulation.psf import KINDS, profiles
 
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+
 _HEADER = """\
 # Sensor of a star camera.
 #
 # psf_sigma_px: standard deviation of the Gaussian image of a star, pixels. psf: "gaussian" (integrated over each pixel)
-# or "sampled" (density at the pixel's centre). zero_point_e_s: electrons per second of a star of magnitude 0.
+# or "sampled" (density at the pixel's centre). zero_point_e_s: electrons per second of a star of magnitude 0; or
+# in its place aperture_mm (diameter), transmission and quantum_efficiency (400 to 900 nm, up to 1).
 # exposure_s: seconds. background_e_px_s, dark_e_px_s: electrons per pixel and second. read_noise_e: electrons, RMS.
 # gain_e_per_count: electrons per count. offset_counts: counts without light. bits: 1 to 16. full_well_e: electrons.
 # hot_pixel_fraction: part of all pixels. hot_pixel_e_s: their mean dark current, electrons per second.
 # hot_pixel_seed: which pixels they are.
+# rate_deg_s: rate of turn across the boresight during exposures. age_years: years in orbit, each of which takes the
+# share transmission_loss_per_year of the light and adds dark_growth_e_px_s to the dark current.
 
 """
 
@@ -34,6 +40,9 @@ _SECTION = Section(
         "psf_sigma_px": Key(float, "a number of pixels from 0.1 to 100", ge=0.1, le=100.0),
         "psf": Key.choice(KINDS),
         "zero_point_e_s": Key(float, f"{_E} per second above 0", gt=0.0),
+        "aperture_mm": Key(float, "a number of mm, 0 where it is not stated", ge=0.0),
+        "transmission": Key(float, "a number above 0, at most 1", gt=0.0, le=1.0),
+        "quantum_efficiency": Key(float, "a number above 0, at most 1", gt=0.0, le=1.0),
         "exposure_s": Key(float, "a number of seconds above 0", gt=0.0),
         "background_e_px_s": Key(float, f"{_E} per pixel and second, 0 or more", ge=0.0),
         "dark_e_px_s": Key(float, f"{_E} per pixel and second, 0 or more", ge=0.0),
@@ -45,9 +54,52 @@ _SECTION = Section(
         "hot_pixel_fraction": Key(float, "a number from 0 to 1", ge=0.0, le=1.0),
         "hot_pixel_e_s": Key(float, f"{_E} per second, 0 or more", ge=0.0),
         "hot_pixel_seed": Key(int, "a whole number, 0 or more", ge=0),
+        "rate_deg_s": Key(float, "a number of degrees per second, 0 to 100", ge=0.0, le=100.0),
+        "age_years": Key(float, "a number of years, 0 to 100", ge=0.0, le=100.0),
+        "transmission_loss_per_year": Key(float, "a share from 0 to below 1", ge=0.0, lt=1.0),
+        "dark_growth_e_px_s": Key(float, f"{_E} per pixel, second and year, 0 or more", ge=0.0),
     },
     SensorError,
 )
+
+
+_ZERO_POINT_E_S = 2.6e6
+# Light of a star of G = 0: 3631 Jy of the AB system, of which Vega's system is 0.1137 mag away in G
+# (Riello et al. 2021, A&A 649, A3: zero points 25.6874 and 25.8010), over Planck's constant; photons
+# per second and m^2, for each unit of the logarithm of the wavelength.
+_PHOTONS_S_M2 = 3631e-26 * 10.0 ** (-0.4 * (25.8010 - 25.6874)) / 6.62607015e-34
+_BAND_M = (400e-9, 900e-9)
+_BAND = math.log(_BAND_M[1] / _BAND_M[0])
+# Root mean square of 1 / wavelength over the photons of the band, 1/m.
+_PER_WAVELENGTH = math.sqrt(0.5 * (_BAND_M[0] ** -2 - _BAND_M[1] ** -2) / _BAND)
+# Places of a star along one axis of its pixel, and the step of magnitudes that noise is computed at.
+_PLACES, _MAG_STEP = 4, 0.1
+# Keys that say how a sensor is used, and that are done with once their effects are in the others.
+_OF_USE = (
+    *("aperture_mm", "transmission", "quantum_efficiency", "rate_deg_s", "age_years"),
+    *("transmission_loss_per_year", "dark_growth_e_px_s"),
+)
+
+
+def _zero_point_e_s(table: AnyMapping, where: str) -> float:
+    """Electrons per second of a star of magnitude 0: as stated, or through the aperture."""
+    stated, aperture_mm = table.get("zero_point_e_s", _ZERO_POINT_E_S), table.get("aperture_mm", 0)
+    share = table.get("transmission", 1.0) * table.get("quantum_efficiency", 1.0)
+    if not aperture_mm:
+        if share < 1.0:
+            raise SensorError(
+                f"{where}: transmission and quantum_efficiency need aperture_mm; add it, or state "
+                "zero_point_e_s in their place."
+            )
+        return float(stated)
+    area_m2 = 0.25 * math.pi * (aperture_mm / 1000.0) ** 2
+    found = float(_PHOTONS_S_M2 * _BAND * area_m2 * share)
+    if stated != _ZERO_POINT_E_S and not math.isclose(stated, found, rel_tol=1e-9):
+        raise SensorError(
+            f"{where}: zero_point_e_s is {stated:g}, but aperture_mm, transmission and "
+            f"quantum_efficiency make it {found:.6g}; leave zero_point_e_s or aperture_mm out."
+        )
+    return found
 
 
 @dataclass(frozen=True)
@@ -68,7 +120,12 @@ class Sensor:
         Integrated over each pixel (by differences of the error function), or the density at its
         centre.
     zero_point_e_s : float
-        Electrons per second of a star of magnitude 0, in the catalogue's band.
+        Electrons per second of a star of magnitude 0, in the catalogue's band; where the aperture
+        is stated, what follows from it: 4.00e10 photons per second and m^2 from 400 to 900 nm.
+    aperture_mm : float
+        Diameter of the entrance pupil, mm; 0 where it is not stated.
+    transmission, quantum_efficiency : float
+        Shares of the light that pass the optics, and that become electrons, means over the band.
     exposure_s : float
         Exposure time, s.
     background_e_px_s, dark_e_px_s : float
@@ -90,6 +147,14 @@ class Sensor:
         exponentially.
     hot_pixel_seed : int
         Seed of the places and levels of the hot pixels: they stay the same from frame to frame.
+    rate_deg_s : float
+        Rate of turn across the boresight during exposures, degrees per second.
+    age_years : float
+        Years in orbit.
+    transmission_loss_per_year : float
+        Share of the light that each year takes from what is left.
+    dark_growth_e_px_s : float
+        What each year adds to the dark current, electrons per pixel and second.
 
     Raises
     ------
@@ -99,7 +164,10 @@ class Sensor:
 
     psf_sigma_px: float = 1.0
     psf: str = "gaussian"
-    zero_point_e_s: float = 2.6e6
+    zero_point_e_s: float = _ZERO_POINT_E_S
+    aperture_mm: float = 0.0
+    transmission: float = 1.0
+    quantum_efficiency: float = 1.0
     exposure_s: float = 0.1
     background_e_px_s: float = 80.0
     dark_e_px_s: float = 20.0
@@ -111,6 +179,10 @@ class Sensor:
     hot_pixel_fraction: float = 0.0
     hot_pixel_e_s: float = 5000.0
     hot_pixel_seed: int = 0
+    rate_deg_s: float = 0.0
+    age_years: float = 0.0
+    transmission_loss_per_year: float = 0.0
+    dark_growth_e_px_s: float = 0.0
 
     def __post_init__(self) -> None:
         given = {
@@ -119,6 +191,7 @@ class Sensor:
         }
         for name, value in _SECTION.check(given, "sensor").items():
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "zero_point_e_s", _zero_point_e_s(vars(self), "sensor"))
 
     @classmethod
     def from_psf_radius(
@@ -147,6 +220,22 @@ class Sensor:
         return cls(psf_sigma_px=radius_px / math.sqrt(-2.0 * math.log1p(-fraction)), **values)
 
     @property
+    def now(self) -> Sensor:
+        """A new sensor at rest that sees and measures what this one does at its age."""
+        kept = (1.0 - self.transmission_loss_per_year) ** self.age_years
+        changed: AnyDict = {
+            "zero_point_e_s": self.zero_point_e_s * kept,
+            "dark_e_px_s": self.dark_e_px_s + self.dark_growth_e_px_s * self.age_years,
+        }
+        own = {name: value for name, value in vars(self).items() if name not in _OF_USE}
+        return Sensor(**own | changed)
+
+    @property
+    def uniform_e_px(self) -> float:
+        """Electrons of sky and dark current in every pixel of one exposure."""
+        return (self.background_e_px_s + self.now.dark_e_px_s) * self.exposure_s
+
+    @property
     def max_counts(self) -> int:
         """The largest count of the converter."""
         return int(2**self.bits - 1)
@@ -167,12 +256,11 @@ class Sensor:
         """Variance of a pixel without a star, electrons^2: sky, dark current, read noise and
         quantisation.
         """
-        shot = (self.background_e_px_s + self.dark_e_px_s) * self.exposure_s
-        return shot + self.read_noise_e**2 + self.gain_e_per_count**2 / 12.0
+        return self.uniform_e_px + self.read_noise_e**2 + self.gain_e_per_count**2 / 12.0
 
     def electrons(self, mag: FloatArray | float) -> FloatArray:
         """Electrons of stars of these magnitudes in one exposure."""
-        return np.asarray(self.zero_point_e_s * self.exposure_s * 10.0 ** (-0.4 * floats(mag)))
+        return np.asarray(self.now.zero_point_e_s * self.exposure_s * 10.0 ** (-0.4 * floats(mag)))
 
     def hot_pixels(self, width_px: int, height_px: int) -> tuple[IntArray, FloatArray]:
         """Flat indices (row by row, ascending) and mean extra electrons in one exposure of the hot
@@ -184,41 +272,61 @@ class Sensor:
         level = self.hot_pixel_e_s * self.exposure_s * rng.standard_exponential(len(where))
         return np.sort(where).astype(np.int64), level
 
-    def star_accuracy(self, mag: float) -> tuple[float, float]:
+    def star_accuracy(
+        self, mag: FloatArray | float, smear_px: float = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
         """Signal-to-noise ratio of a star's flux, and the smallest possible centroid noise per axis
         in px.
 
-        Both are Cramér-Rao bounds for a star at rest in an unsaturated stamp, with position and
-        flux unknown and the background known, noise taken as Gaussian with the variance of the mean
-        image; averaged over 4 x 4 places of the star in its pixel.
+        Both are Cramér-Rao bounds in an unsaturated stamp, with position and flux unknown and the
+        background known, noise taken as Gaussian with the variance of the mean image; averaged over
+        4 x 4 places of the star in its pixel. Without sky, dark current and read noise the second
+        is sigma_psf / sqrt(electrons). A star that moves by `smear_px` along x during the exposure
+        has a Gaussian image of the same variance; the noise is the root mean square of both axes.
         """
-        flux = float(self.electrons(mag))
-        step = 1e-4
-        phase = (np.arange(4) - 1.5) / 4.0
-        value, slope = [], []
-        for centre in phase:
-            (_, low), (_, middle), (_, high) = (
-                profiles(np.array([centre + shift]), self.psf_sigma_px, self.psf)
+        flux = self.electrons(mag)
+        along = math.hypot(self.psf_sigma_px, smear_px / math.sqrt(12.0))
+        snr2, variance = np.zeros(flux.shape), np.zeros(flux.shape)
+        for ey, dy in self._profiles(self.psf_sigma_px):
+            for ex, dx in self._profiles(along):
+                shape = np.outer(ey, ex)
+                # Of the flux, and of the position for a flux of one electron.
+                gradient = np.stack([shape, np.outer(ey, dx), np.outer(dy, ex)]).reshape(3, -1)
+                weight = 1.0 / (flux[..., None] * shape.ravel() + self.pixel_variance_e2)
+                covariance = np.linalg.inv((gradient * weight[..., None, :]) @ gradient.T)
+                snr2 += flux**2 / covariance[..., 0, 0] / _PLACES**2
+                both = 0.5 * (covariance[..., 1, 1] + covariance[..., 2, 2])
+                variance += both / flux**2 / _PLACES**2
+        return np.sqrt(snr2), np.sqrt(variance)
+
+    def _profiles(self, sigma_px: float) -> list[tuple[FloatArray, FloatArray]]:
+        """Light along one axis, and its slope, for a star at some places in its pixel."""
+        step, found = 1e-4, []
+        for phase in (np.arange(_PLACES) - 0.5 * (_PLACES - 1)) / _PLACES:
+            low, middle, high = (
+                profiles(np.array([phase + shift]), sigma_px, self.psf)[1][0]
                 for shift in (-step, 0.0, step)
             )
-            value.append(middle[0])
-            slope.append((high[0] - low[0]) / (2.0 * step))
-        snr2, variance = [], []
-        for ey, dy in zip(value, slope, strict=True):
-            for ex, dx in zip(value, slope, strict=True):
-                shape = np.outer(ey, ex)
-                gradient = np.stack(
-                    [shape, flux * np.outer(ey, dx), flux * np.outer(dy, ex)]
-                ).reshape(3, -1)
-                weight = 1.0 / (flux * shape.ravel() + self.pixel_variance_e2)
-                covariance = np.linalg.inv((gradient * weight) @ gradient.T)
-                snr2.append(flux**2 / covariance[0, 0])
-                variance.append(0.5 * (covariance[1, 1] + covariance[2, 2]))
-        return float(np.sqrt(np.mean(snr2))), float(np.sqrt(np.mean(variance)))
+            found.append((middle, (high - low) / (2.0 * step)))
+        return found
+
+    def noise(self, camera: Camera) -> SensorNoise:
+        """Centroid noise by magnitude behind the optics of a camera, as `sigma_px` of `simulate`
+        and `plan`.
+
+        Raises
+        ------
+        SensorError
+            If sky and dark current alone fill the pixels.
+        """
+        return SensorNoise(self, camera.focal_px)
 
     def replace(self, **changes: Any) -> Sensor:
         """A copy with some attributes changed."""
-        return self.from_dict(asdict(self) | changes)
+        table = asdict(self) | changes
+        if table["aperture_mm"] and "zero_point_e_s" not in changes:
+            del table["zero_point_e_s"]
+        return self.from_dict(table)
 
     def to_dict(self) -> AnyDict:
         """The [sensor] table: plain values."""
@@ -245,12 +353,78 @@ class Sensor:
             If the file cannot be read or its content does not fit; the message names file, key and
             remedy.
         """
-        return cls(
-            **_SECTION.check(read_section(path, "sensor", SensorError), f"{path}, section [sensor]")
-        )
+        where = f"{path}, section [sensor]"
+        table = _SECTION.check(read_section(path, "sensor", SensorError), where)
+        _zero_point_e_s(table, where)
+        return cls(**table)
 
     def save(self, path: PathLike, force: bool = False) -> None:
         """Write the sensor to a TOML file without loss of digits; `force` allows to write over
         one.
         """
         write_section(path, "sensor", self.to_dict(), _HEADER, force)
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Centroid noise of a sensor behind optics of some focal length, px per axis, by magnitude.
+
+    The bound of `Sensor.star_accuracy`, smeared by the rate; no star is located better than the
+    brightest one that does not saturate, and, where the aperture is stated, than diffraction allows
+    its photons: lambda / (pi aperture sqrt(electrons)) per axis (Lindegren 1978; Fialho & Mortari
+    2019, Sensors 19, 5355).
+    """
+
+    sensor: Sensor
+    focal_px: float
+
+    def __post_init__(self) -> None:
+        if self._room_e <= 0.0:
+            raise SensorError(
+                f"sensor: background and dark current bring {self.sensor.uniform_e_px:.4g} "
+                "electrons to every pixel, which fills it: shorten exposure_s, or raise "
+                "full_well_e."
+            )
+
+    @property
+    def smear_px(self) -> float:
+        """Motion of a star's image near the boresight during one exposure, px."""
+        turn_rad = math.radians(self.sensor.rate_deg_s) * self.sensor.exposure_s
+        return self.focal_px * turn_rad
+
+    @property
+    def _room_e(self) -> float:
+        """Electrons of starlight that fit into a pixel."""
+        sensor = self.sensor
+        most = (sensor.max_counts - sensor.offset_counts) * sensor.gain_e_per_count
+        return min(sensor.full_well_e, most) - sensor.uniform_e_px
+
+    @property
+    def brightest_mag(self) -> float:
+        """Magnitude at which a star in the centre of a pixel fills it."""
+        sensor = self.sensor
+        along = math.hypot(sensor.psf_sigma_px, self.smear_px / math.sqrt(12.0))
+        peak = 1.0
+        for sigma_px in (along, sensor.psf_sigma_px):
+            peak *= float(profiles(np.zeros(1), sigma_px, sensor.psf)[1].max())
+        return 2.5 * math.log10(float(sensor.electrons(0.0)) * peak / self._room_e)
+
+    def photon_limit_px(self, mag: FloatArray) -> FloatArray:
+        """Least noise per axis that diffraction at the aperture allows; 0 where none is stated."""
+        if not self.sensor.aperture_mm:
+            return np.zeros(np.shape(mag))
+        diameter_m = self.sensor.aperture_mm / 1000.0
+        width_rad = 1.0 / (math.pi * diameter_m * _PER_WAVELENGTH)
+        return self.focal_px * width_rad / np.sqrt(self.sensor.electrons(mag))
+
+    def __call__(self, mag: FloatArray) -> FloatArray:
+        """Noise (n,) of stars with magnitudes (n,)."""
+        used = np.maximum(floats(mag), self.brightest_mag)
+        low, high = np.min(used, initial=np.inf), np.max(used, initial=-np.inf)
+        if not low <= high:
+            return np.zeros(0)
+        # Interpolated: the logarithm bends upwards, so that no value lies below the bound.
+        grid = low + _MAG_STEP * np.arange(int((high - low) / _MAG_STEP) + 2)
+        bound = np.log(self.sensor.star_accuracy(grid, self.smear_px)[1])
+        noise = np.exp(np.interp(used, grid, bound))
+        return np.maximum(noise, self.photon_limit_px(used))

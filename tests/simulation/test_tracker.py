@@ -11,6 +11,7 @@ import starcal_uq as sc
 from starcal_uq.core.errors import SettingError
 from starcal_uq.planning.plan import plan
 from starcal_uq.simulation.frames import Tracker
+from tests.helpers.pinhole import ARCSEC, attitude_variance, directions, on_detector
 
 MAX_STARS = 12
 
@@ -25,16 +26,8 @@ def sheet() -> sc.Camera:
     return sc.Camera(1024, 1024, 10.0, 36.0, 511.5, 511.5, "none", ())
 
 
-def on_detector(rotation: np.ndarray, margin_px: float) -> np.ndarray:
-    """Catalogue numbers of the stars that a pinhole shows, brightest first."""
-    ra, dec = np.radians(sky().ra_deg), np.radians(sky().dec_deg)
-    r = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
-    b = r @ rotation.T
-    x, y = (3600.0 * b[:, axis] / b[:, 2] + 511.5 for axis in (0, 1))
-    low, high = -0.5 + margin_px, 1023.5 - margin_px
-    inside = (b[:, 2] > 0.0) & (x > low) & (x < high) & (y > low) & (y < high)
-    seen = np.flatnonzero(inside)
-    return seen[np.argsort(sky().mag[seen], kind="stable")]
+def stars_at(rotation: np.ndarray) -> np.ndarray:
+    return on_detector(directions(sky().ra_deg, sky().dec_deg), sky().mag, rotation, 6 * 0.05)
 
 
 def test_the_brightest_stars_of_a_frame_are_used() -> None:
@@ -42,7 +35,7 @@ def test_the_brightest_stars_of_a_frame_are_used() -> None:
     rotations, frames = tracker.frames(sky(), np.random.default_rng(1), 40)
     fuller = 0
     for rotation, (index, _) in zip(rotations, frames, strict=True):
-        seen = on_detector(rotation, 6 * 0.05)
+        seen = stars_at(rotation)
         assert set(index) == set(seen[:MAX_STARS])
         fuller += len(seen) > MAX_STARS
         # Control: the faintest ones are others.
@@ -68,22 +61,14 @@ def test_fewer_stars_make_a_plan_worse_as_their_geometry_says() -> None:
     found = plan(sheet(), sky(), max_stars=MAX_STARS, **options)
     assert found.mean_stars <= MAX_STARS < plan(sheet(), sky(), **options).mean_stars
     rotations, _ = Tracker(sheet(), 0.05, 5).frames(sky(), np.random.default_rng(3), 300)
-    ra, dec = np.radians(sky().ra_deg), np.radians(sky().dec_deg)
-    r = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    r = directions(sky().ra_deg, sky().dec_deg)
 
     def nea(most: int) -> np.ndarray:
         variances = []
         for rotation in rotations:
-            b = r[on_detector(rotation, 6 * 0.05)[:most]] @ rotation.T
-            x, y, one = b[:, 0] / b[:, 2], b[:, 1] / b[:, 2], np.ones(len(b))
-            # A small turn moves the image (x, y) of a pinhole by these columns.
-            rows = (
-                np.stack([x * y, -(one + x * x), y], axis=1),
-                np.stack([one + y * y, -x * y, -x], axis=1),
-            )
-            a = 3600.0 * np.concatenate(rows)
-            variances.append(np.diag(np.linalg.inv(a.T @ a / 0.05**2)))
-        return 206264.806 * np.sqrt(np.mean(variances, axis=0))
+            b = r[stars_at(rotation)[:most]] @ rotation.T
+            variances.append(attitude_variance(b, np.full(len(b), 0.05)))
+        return ARCSEC * np.sqrt(np.mean(variances, axis=0))
 
     assert found.nea_arcsec == pytest.approx(nea(MAX_STARS), rel=1e-6)
     # Control: with all stars the plan would be better.
