@@ -406,7 +406,7 @@ WITHOUT_NAMESAKE = {
         "compare frames merge priors report steps/budgeting steps/estimate steps/images "
         "steps/misfit steps/mission steps/pages steps/posterior"
     ),
-    "simulation": "campaign contamination mission pointing psf sensor truth",
+    "simulation": "campaign contamination mission pointing psf truth",
     "sky": "cds gaia names neighbours positions refraction",
     "studies": "axes cells definition geometry result store",
 }

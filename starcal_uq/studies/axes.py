@@ -120,6 +120,9 @@ AXES = {
         _number("noise_per_mag", "growth of the noise per magnitude", "dex", base=0.0),
         _number("noise_mag", "magnitude of the stated noise", "mag", base=6.0),
         _number("noise_floor_px", "noise of bright stars", "px", base=0.0),
+        _number("exposure_s", "exposure time", "s"),
+        _number("rate_deg_s", "rate across the boresight", "deg/s"),
+        _number("age_years", "age of the sensor", "a"),
         _number("direction_mas", "errors of the stars' directions", "mas", base=0.0),
         Axis("prior", "prior", base=FLAT),
         Axis("method", "method", "", choices=METHODS, base="efficient"),
@@ -129,6 +132,9 @@ AXES = {
         _number("nights", "nights", ""),
     )
 }  # fmt: skip
+# Axes that change the sensor of a study, and those that its noise takes the place of.
+SENSOR_AXES = ("exposure_s", "rate_deg_s", "age_years")
+NOISE_AXES = ("sigma_px", "noise_per_mag", "noise_mag", "noise_floor_px")
 # Axes that make another camera.
 CAMERA_AXES = tuple(AXES)[: tuple(AXES).index("max_mag")]
 # Both set the focal length; the coefficients and the size of the distortion both set the

@@ -137,14 +137,14 @@ class FisherCells(Cells):
         settings = cell.settings
         key = geometry_key(camera, settings, self.definition.seed, cell.seed_index, False)
         offset = offset_of(camera, settings)
-        shape, scale = noise_shape(settings)
+        shape, scale = noise_shape(settings, camera.focal_px)
         effects = planned_effects(settings)
         if effects is not None and offset > 0.0:
             raise StudyError(
                 "effects and errors of the stars are not studied together: leave effects or "
                 "direction_mas out."
             )
-        if offset > 0.0 or effects is not None:
+        if isinstance(shape, tuple) and (offset > 0.0 or effects is not None):
             # Two sizes of noise have no common factor, and noise none with effects of frames.
             shape, scale = (settings["sigma_px"], *shape[1:]), 1.0
         whole = (key, settings.get("stars"), shape, offset, effects)

@@ -19,14 +19,24 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
-from starcal_uq.core.errors import CameraError, PriorError, StudyError, check_known
+from starcal_uq.core.errors import CameraError, PriorError, SensorError, StudyError, check_known
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 from starcal_uq.inference.priors import PRIORS
-from starcal_uq.studies.axes import AXES, EFFECT_AXES, EXCLUSIVE, FLAT, base_settings, camera_of
+from starcal_uq.simulation.sensor import Sensor
+from starcal_uq.studies.axes import (
+    AXES,
+    EFFECT_AXES,
+    EXCLUSIVE,
+    FLAT,
+    NOISE_AXES,
+    SENSOR_AXES,
+    base_settings,
+    camera_of,
+)
 
 MODES = ("fisher", "simulate")
 POSTERIORS = ("importance", "ensemble", "none")
@@ -36,7 +46,7 @@ MAX_CELLS = int(KEYS["values"].high)
 # Changes whenever the same settings would give other numbers: results from before are then computed
 # anew.
 VERSION = 1
-_SECTIONS = ("study", "camera", "observation", "sweep", "priors")
+_SECTIONS = ("study", "camera", "sensor", "observation", "sweep", "priors")
 _SPACINGS = ("linear", "log")
 
 _STUDY = Section(
@@ -53,6 +63,7 @@ _STUDY = Section(
             dict[str, float], "a table of errors above zero by parameter, such as {f = 0.05}"
         ),
         "camera": Key(str, "the path of a camera file in quotes"),
+        "sensor": Key(str, "the path of a sensor file in quotes"),
         "epoch": Key.number(KEYS["epoch"], "a Julian year such as 2026.9"),
         "geometries": Key.number(KEYS["geometries"], "a number of frames"),
         "posterior": Key(str, f"one of {', '.join(POSTERIORS)}, in quotes"),
@@ -119,6 +130,8 @@ class StudyDefinition:
         ensemble of emcee.
     draws : int
         Draws of a simulated cell.
+    sensor : Sensor or None
+        What centroid noise follows from, in place of ``sigma_px``.
     """
 
     camera: Camera
@@ -138,6 +151,7 @@ class StudyDefinition:
     geometries: int = 300
     posterior: str = "importance"
     draws: int = 1000
+    sensor: Sensor | None = None
 
     @classmethod
     def load(cls, path: PathLike) -> StudyDefinition:
@@ -174,6 +188,7 @@ class StudyDefinition:
                 raise StudyError(f"{where}: {name} is no section; write [{name}] above its keys.")
         study = _STUDY.check(content.get("study", {}), f"{where}, section [study]")
         camera = _camera(content, study.pop("camera", None), where, folder)
+        sensor = _sensor(content, study.pop("sensor", None), where, folder)
         sweep, latin, latin_n = _swept(dict(content.get("sweep", {})), f"{where}, section [sweep]")
         given = _observation(content.get("observation", {}), f"{where}, section [observation]")
         priors = {
@@ -194,6 +209,7 @@ class StudyDefinition:
             latin=latin,
             latin_n=latin_n,
             priors=priors,
+            sensor=sensor,
             **study,
         )
         made.check(where)
@@ -216,6 +232,8 @@ class StudyDefinition:
             "observation": self.observation,
             "sweep": sweep,
         }
+        if self.sensor is not None:
+            tables["sensor"] = self.sensor.to_dict()
         return tables | ({"priors": self.priors} if self.priors else {})
 
     def check(self, where: str = "study") -> None:
@@ -285,6 +303,15 @@ class StudyDefinition:
                     f"{where}: {one} and {other} set the same thing; leave one of them out."
                 )
         for name in every:
+            if self.sensor is None and name in SENSOR_AXES:
+                raise StudyError(
+                    f"{where}: {name} varies a sensor, and there is none; add a section [sensor], "
+                    f'or sensor = "sensor.toml" in [study].'
+                )
+            if self.sensor is not None and name in NOISE_AXES:
+                raise StudyError(
+                    f"{where}: {name} and the sensor both set the noise; leave one of them out."
+                )
             if name in COEFFICIENTS and name not in self.parameter_names:
                 raise StudyError(
                     f"{where}: {name} is no coefficient of distortion "
@@ -372,7 +399,11 @@ class StudyDefinition:
         for values in product(*self.sweep.values()):
             grid = fixed | dict(zip(self.sweep, values, strict=True))
             for point in self._points:
-                made += [Cell(grid | point, index) for index in self.seeds]
+                settings = grid | point
+                if self.sensor is not None:
+                    own = {name: settings[name] for name in SENSOR_AXES if name in settings}
+                    settings["sensor"] = self.sensor.replace(**own).to_dict()
+                made += [Cell(settings, index) for index in self.seeds]
         return made
 
     def key(self, cell: Cell, stars: str) -> str:
@@ -429,6 +460,23 @@ def _camera(content: AnyMapping, path: str | None, where: str, folder: Path | No
     except CameraError as error:
         raise StudyError(
             str(error) if path is not None else f"{where}, section [camera]: {error}"
+        ) from None
+
+
+def _sensor(
+    content: AnyMapping, path: str | None, where: str, folder: Path | None
+) -> Sensor | None:
+    if "sensor" in content and path is not None:
+        raise StudyError(
+            f"{where}: the sensor is given twice; leave out the section [sensor] or the key sensor."
+        )
+    try:
+        if path is not None:
+            return Sensor.load((folder or Path()) / path)
+        return Sensor.from_dict(content["sensor"]) if "sensor" in content else None
+    except SensorError as error:
+        raise StudyError(
+            str(error) if path is not None else f"{where}, section [sensor]: {error}"
         ) from None
 
 

@@ -29,6 +29,7 @@ from starcal_uq.planning.effects import JointMatrices, PlannedEffects
 from starcal_uq.planning.information import frame_matrices
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Window, brightest
 from starcal_uq.simulation.pointing import pattern_rotations
+from starcal_uq.simulation.sensor import Sensor, SensorNoise
 from starcal_uq.studies.axes import CAMERA_AXES, EFFECT_AXES
 from starcal_uq.studies.definition import Cell
 
@@ -241,13 +242,15 @@ class Geometry:
         )
 
 
-NoiseShape = tuple[float, float, float, float]
+NoiseShape = tuple[float, float, float, float] | SensorNoise
 
 
-def noise_shape(settings: AnyMapping) -> tuple[NoiseShape, float]:
-    """How noise depends on magnitude (size, dex per magnitude, magnitude, floor), and a factor on
-    all of it.
+def noise_shape(settings: AnyMapping, focal_px: float) -> tuple[NoiseShape, float]:
+    """How noise depends on magnitude (size, dex per magnitude, magnitude, floor; or that of a
+    sensor), and a factor on all of it.
     """
+    if "sensor" in settings:
+        return SensorNoise(Sensor.from_dict(settings["sensor"]), focal_px), 1.0
     size, slope = settings["sigma_px"], settings["noise_per_mag"]
     if settings["noise_floor_px"] > 0.0:
         return (size, slope, settings["noise_mag"], settings["noise_floor_px"]), 1.0
@@ -256,6 +259,8 @@ def noise_shape(settings: AnyMapping) -> tuple[NoiseShape, float]:
 
 def star_noise(mag: FloatArray, shape: NoiseShape) -> FloatArray:
     """Noise of stars of these magnitudes (n,), px per axis."""
+    if isinstance(shape, SensorNoise):
+        return shape(mag)
     size, slope, at, floor = shape
     noise: FloatArray = np.hypot(size * 10.0 ** (slope * (mag - at)), floor)
     return noise
@@ -273,11 +278,11 @@ class GeometryKey(NamedTuple):
     seed: tuple[int, ...]
 
 
-def margin_px(settings: AnyMapping) -> float:
+def margin_px(settings: AnyMapping, focal_px: float) -> float:
     """Stars nearer to the edge than this are left out: a power of two, so that many noises share
     their frames.
     """
-    shape, scale = noise_shape(settings)
+    shape, scale = noise_shape(settings, focal_px)
     faintest = scale * float(star_noise(np.array([settings["max_mag"]]), shape)[0])
     return float(max(1.0, 2.0 ** np.ceil(np.log2(EDGE_SIGMAS * faintest))))
 
@@ -296,7 +301,7 @@ def geometry_key(
         camera,
         settings["max_mag"],
         settings["min_stars"],
-        margin_px(settings),
+        margin_px(settings, camera.focal_px),
         settings["pointing"],
         (settings["frames"] if exact else min(settings["frames"], _MOST_FRAMES)) if own else None,
         (seed, seed_index) if own else (seed,),
@@ -316,7 +321,8 @@ def frames_of(cell: Cell) -> tuple[Any, ...]:
     own = settings["pointing"] != "random" or settings["direction_mas"] > 0.0
     frames = (settings["frames"], cell.seed_index) if own else ()
     names = (*CAMERA_AXES, "max_mag", "min_stars", "pointing")
-    return (*(settings.get(name) for name in names), margin_px(settings), *frames)
+    noise = repr(settings["sensor"]) if "sensor" in settings else margin_px(settings, 0.0)
+    return (*(settings.get(name) for name in names), noise, *frames)
 
 
 def weights_of(cell: Cell) -> str:
@@ -325,7 +331,7 @@ def weights_of(cell: Cell) -> str:
     """
     settings = cell.settings
     effects = [settings.get(name) for name in EFFECT_AXES]
-    noise = settings["sigma_px"] if effects[0] else noise_shape(settings)[0]
+    noise = settings["sigma_px"] if effects[0] else noise_shape(settings, 0.0)[0]
     return repr((settings.get("stars"), noise, settings["direction_mas"], effects))
 
 

@@ -73,7 +73,7 @@ class SimulatedCells(Cells):
         geometry = take_frames(key, self.heaven, definition.geometries).brightest(
             settings.get("stars")
         )
-        shape, scale = noise_shape(settings)
+        shape, scale = noise_shape(settings, camera.focal_px)
         noise = scale * star_noise(geometry.mag, shape)
         random, sampling = np.random.SeedSequence(self._seed(cell)).spawn(2)
         rng = np.random.default_rng(random)
@@ -124,7 +124,7 @@ class SimulatedCells(Cells):
         if key.pointing != "random":
             mission = take_frames(mission_key(key), self.heaven, self.definition.geometries)
             mission = mission.brightest(settings.get("stars"))
-            shape, scale = noise_shape(settings)
+            shape, scale = noise_shape(settings, camera.focal_px)
             stated = stated.for_mission(
                 statements(mission, scale * star_noise(mission.mag, shape), offset)
             )
@@ -262,7 +262,9 @@ def observe(
             column[image]
             for column in ra_dec_deg(turned / np.linalg.norm(turned, axis=1, keepdims=True))
         )
-    uneven = settings["noise_per_mag"] > 0.0 or settings["noise_floor_px"] > 0.0
+    uneven = (
+        "sensor" in settings or settings["noise_per_mag"] > 0.0 or settings["noise_floor_px"] > 0.0
+    )
     return Observations(
         frame=frame,
         x_px=xy[:, 0],

@@ -461,3 +461,26 @@ def test_propagate_tells_what_it_found_odd(cli, run, tmp_path):
     status, _, err = cli("propagate", "run", "--rate", 2)
     assert status == 2
     assert "belong to an attitude profile" in err
+
+
+def test_a_plan_takes_its_noise_from_a_sensor(cli, inputs, tmp_path, small_plans):
+    sheet = inputs / "camera.toml"
+    assert cli("new", "sensor", "-o", tmp_path / "sensor.toml")[0] == 0
+    answers = {}
+    for name, options in {
+        "all": (),
+        "brightest": ("--max-stars", "12"),
+        "sensor": ("--max-stars", "12", "--sensor", tmp_path / "sensor.toml"),
+    }.items():
+        status, out, err = cli("plan", sheet, *options, "--json")
+        assert status == 0, err
+        answers[name] = json.loads(out)["plan"]
+    assert answers["brightest"]["mean_stars"] <= 12.0 < answers["all"]["mean_stars"]
+    # The brightest stars of a small tracker are located better than to 0.05 px.
+    assert answers["sensor"]["sigma_px"] < 0.04
+    for options, words in (
+        (("--sigma", "0.1"), "--sensor and --sigma both state the noise"),
+        (("--check", "10"), "leave out --sensor, or --check"),
+    ):
+        status, _, err = cli("plan", sheet, "--sensor", tmp_path / "sensor.toml", *options)
+        assert status == 2 and words in err

@@ -14,6 +14,7 @@ import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError, StudyError
 from starcal_uq.core.manifest import read_manifest
 from starcal_uq.paper import paper_camera
+from starcal_uq.simulation.sensor import Sensor
 from starcal_uq.studies import TEMPLATES, Study, StudyDefinition, cells, write_study_template
 from starcal_uq.studies.axes import camera_of
 from starcal_uq.studies.geometry import Geometry, GeometryKey, Heaven, statements, take_frames
@@ -74,6 +75,39 @@ def test_parameters_of_a_study_have_their_own_units(small: Study, tmp_path: Path
     # A file of before, without that coordinate, is read.
     small.data.drop_vars("parameter_unit").pipe(Study, small.definition).save(tmp_path)
     assert Study.load(tmp_path).table()["unit"].tolist() == table["unit"].tolist()
+
+
+def test_a_sensor_ages_as_its_photons_do() -> None:
+    """With photons alone, ten years that take 3 % of the light each cost the root of 0.97^-10."""
+    quiet = Sensor(
+        background_e_px_s=0.0,
+        dark_e_px_s=0.0,
+        read_noise_e=0.0,
+        gain_e_per_count=0.5,
+        full_well_e=1e9,
+        bits=16,
+        transmission_loss_per_year=0.03,
+    )
+    wanted = definition(sweep={"age_years": (0.0, 10.0)}, sensor=quiet)
+    nea = sc.study(wanted, workers=0).data["nea_arcsec"].squeeze().values
+    places = nea if nea.shape[0] == 2 else nea.T
+    assert places[1] / places[0] == pytest.approx(np.full(3, 0.97**-5.0), rel=0.02)
+    # Control: dark current grows as well, and costs more.
+    darker = definition(
+        sweep={"age_years": (0.0, 10.0)}, sensor=quiet.replace(dark_growth_e_px_s=500.0)
+    )
+    nea = sc.study(darker, workers=0).data["nea_arcsec"].squeeze().values
+    places = nea if nea.shape[0] == 2 else nea.T
+    assert np.all(places[1] / places[0] > 1.1 * 0.97**-5.0)
+
+
+def test_a_sensor_and_its_axes_belong_together() -> None:
+    with pytest.raises(StudyError, match=r"add a section \[sensor\]"):
+        definition(sweep={"age_years": (0.0, 10.0)}).check()
+    with pytest.raises(StudyError, match="sigma_px and the sensor both set the noise"):
+        definition(sensor=Sensor()).check()
+    kept = definition(sweep={"age_years": (0.0, 10.0)}, sensor=Sensor(bits=14)).to_dict()
+    assert StudyDefinition.from_dict(kept).sensor == Sensor(bits=14)
 
 
 def test_sigma_follows_noise_exactly_and_frames_by_the_root(small: Study) -> None:
