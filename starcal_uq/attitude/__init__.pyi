@@ -1,6 +1,8 @@
 from .heads import FusedAttitudes as FusedAttitudes
 from .heads import HeadArray as HeadArray
 from .heads import load_heads as load_heads
+from .mountings import Misalignments as Misalignments
+from .mountings import misalignments as misalignments
 from .profile import AttitudeProfile as AttitudeProfile
 from .profile import load_attitude_profile as load_attitude_profile
 from .relative import RelativeAttitudes as RelativeAttitudes

@@ -173,7 +173,7 @@ class HeadArray:
             Turn about the axes of the body by a unit error about those of a head, and the
             covariance of the sum if those that weigh are right, in their unit.
         """
-        weights, fused = self._weights(covariance)
+        weights, fused = self.weights(covariance)
         return weights @ self.R_body_head, fused
 
     def fuse(self, quaternions: FloatArray, covariance: FloatArray) -> FusedAttitudes:
@@ -191,19 +191,19 @@ class HeadArray:
         HeadError
             For arrays of another shape, and frames without any attitude.
         """
-        q, cov, seen = self._frames(quaternions, covariance)
-        weights, fused = self._weights(cov)
-        reference = _first(self._of_body(q, self.R_body_head), seen)
+        q, cov, seen = self.by_frame(quaternions, covariance)
+        weights, fused = self.weights(cov)
+        reference = first_of_body(q, self.R_body_head, seen)
         for _ in range(_PASSES):
-            apart = self._apart(q, self.R_body_head, reference, seen)
+            apart = apart_from(reference, q, self.R_body_head, seen)
             mean = np.einsum("khij,khj->ki", weights, apart)
             reference = quaternion_multiply(rotation_to_quaternion(exp_rotation(mean)), reference)
-        apart = self._apart(q, self.R_body_head, reference, seen)
+        apart = apart_from(reference, q, self.R_body_head, seen)
         information = np.linalg.inv(fused)[:, None] @ weights
         squares = np.einsum("khi,khij,khj->k", apart, information, apart)
         return FusedAttitudes(reference, fused, seen.sum(axis=1), squares)
 
-    def _frames(
+    def by_frame(
         self, quaternions: FloatArray, covariance: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Quaternions (K, H, 4), covariances (K, H, 3, 3), NaN where there is no attitude, and
@@ -236,27 +236,24 @@ class HeadArray:
         )
         return q, np.where(seen[:, :, None, None], cov, np.nan), seen
 
-    def _weights(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def weights(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Weights of errors about the axes of the body, and the covariance of their mean."""
         turns = self.R_body_head
         return mean_weights(turns @ covariance @ np.swapaxes(turns, -1, -2))
 
-    @staticmethod
-    def _of_body(q: FloatArray, rotations: FloatArray) -> FloatArray:
-        """Attitudes of the body (K, H, 4) as every head has them."""
-        return quaternion_multiply(rotation_to_quaternion(rotations), q)
 
-    def _apart(
-        self, q: FloatArray, rotations: FloatArray, reference: FloatArray, seen: FloatArray
-    ) -> FloatArray:
-        """Left errors (K, H, 3) from a reference, rad; zero where there is no attitude."""
-        found = left_error(self._of_body(q, rotations), reference[:, None])
-        return np.where(seen[:, :, None], found, 0.0)
+def first_of_body(q: FloatArray, rotations: FloatArray, seen: FloatArray) -> FloatArray:
+    """Attitude of the body (K, 4) by the first head that has one."""
+    of_body = quaternion_multiply(rotation_to_quaternion(rotations), q)
+    return np.asarray(of_body[np.arange(len(q)), np.argmax(seen, axis=1)])
 
 
-def _first(attitudes: FloatArray, seen: FloatArray) -> FloatArray:
-    """The attitude (K, 4) of the first head that has one."""
-    return np.asarray(attitudes[np.arange(len(attitudes)), np.argmax(seen, axis=1)])
+def apart_from(
+    reference: FloatArray, q: FloatArray, rotations: FloatArray, seen: FloatArray
+) -> FloatArray:
+    """Left errors (K, H, 3) of the body from a reference, rad; zero where there is no attitude."""
+    of_body = quaternion_multiply(rotation_to_quaternion(rotations), q)
+    return np.where(seen[:, :, None], left_error(of_body, reference[:, None]), 0.0)
 
 
 def load_heads(path: PathLike) -> HeadArray:
