@@ -16,7 +16,7 @@ best of them are then evaluated exactly.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Unpack, get_args
 
 import numpy as np
 
@@ -31,8 +31,7 @@ from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import quantities, spreads
 from starcal_uq.planning.information import FrameSet, look_at, random_frames
 from starcal_uq.planning.plan import HasInformation, start_information
-from starcal_uq.simulation.frames import Tracker
-from starcal_uq.simulation.noise import Noise
+from starcal_uq.simulation.frames import Tracker, TrackerOptions
 from starcal_uq.sky.positions import ra_dec_deg
 
 if TYPE_CHECKING:
@@ -56,14 +55,12 @@ def choose_frames(
     *,
     n_frames: int,
     candidates: FloatArray | int = 3000,
-    sigma_px: Noise = 0.05,
-    min_stars: int = 10,
-    max_stars: int | None = None,
     criterion: str = "A",
     scope: str = "common",
     after: HasInformation | None = None,
     n_geometries: int = 1000,
     seed: int = 0,
+    **options: Unpack[TrackerOptions],
 ) -> FrameChoice:
     """Choose the frames that improve a calibration most.
 
@@ -78,12 +75,8 @@ def choose_frames(
     candidates : (M, 3, 3) array or int
         Attitudes (R_cam_icrs) that could be taken; or how many random ones to choose from. Each is
         taken at most once.
-    sigma_px : float or callable
-        Centroid noise, as for `plan`.
-    min_stars : int
-        Candidates with fewer stars are refused.
-    max_stars : int, optional
-        Stars that the tracker uses of a frame, the brightest ones; all on the detector by default.
+    sigma_px, min_stars, max_stars
+        Noise and stars of a frame, as for `plan`; candidates with fewer stars are refused.
     criterion : {"A", "D"}
         ``A`` for the attitude error of `scope`, ``D`` for the parameters as a whole.
     scope : {"common", "rest", "calibration"}
@@ -102,13 +95,13 @@ def choose_frames(
     CatalogueError
         When the field is too narrow for the catalogue to show `min_stars`.
     """
-    _check(min_stars, criterion, scope)
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    tracker = Tracker.of(camera, **options)
+    _check(tracker.min_stars, criterion, scope)
     mission = random_frames(stars, tracker, n_frames=n_geometries, seed=seed)
     pool = _pool(stars, tracker, candidates, seed)
     if pool.n_frames < n_frames:
         raise PlanningError(
-            f"{pool.n_frames} candidate attitudes show {min_stars} stars, fewer than the "
+            f"{pool.n_frames} candidate attitudes show {tracker.min_stars} stars, fewer than the "
             f"{n_frames} frames asked for: "
             "give more candidates or ask for fewer frames."
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol, Unpack
 
 import numpy as np
 
@@ -42,8 +42,8 @@ from starcal_uq.planning.open_distortion import (
 )
 from starcal_uq.planning.planned import SWEEP_FRAMES, Need, Plan
 from starcal_uq.planning.ties import PlannedTies
-from starcal_uq.simulation.frames import Tracker
-from starcal_uq.simulation.noise import Noise, noise_of
+from starcal_uq.simulation.frames import Tracker, TrackerOptions
+from starcal_uq.simulation.noise import noise_of
 from starcal_uq.simulation.sensor import SensorNoise
 
 if TYPE_CHECKING:
@@ -77,10 +77,7 @@ def plan(
     camera: Camera,
     stars: StarCatalogue,
     *,
-    sigma_px: Noise = 0.05,
     n_frames: Sequence[int] = N_FRAMES,
-    min_stars: int = 10,
-    max_stars: int | None = None,
     max_mag: float | None = None,
     target_arcsec: float | None = None,
     confidence: float = 0.997,
@@ -94,6 +91,7 @@ def plan(
     n_campaigns: int = N_CAMPAIGNS,
     seed: int = 0,
     progress: Progress | None = None,
+    **options: Unpack[TrackerOptions],
 ) -> Plan:
     """Forecast parameter and attitude errors of a calibration, and the frames that it needs.
 
@@ -103,16 +101,8 @@ def plan(
         The sheet; optics and distortion are those that one expects.
     stars : StarCatalogue
         The sky.
-    sigma_px : float, callable or NoiseModel
-        Centroid noise, px per axis; a function from magnitudes (n,) to noise (n,) where it depends
-        on them; the noise model of a calibration where it depends on the place in the field as
-        well.
     n_frames : sequence of int
         Sizes of campaigns to forecast.
-    min_stars : int
-        Frames with fewer stars are not used (at least 3).
-    max_stars : int, optional
-        Stars that the tracker uses of a frame, the brightest ones; all on the detector by default.
     max_mag : float, optional
         The sensor's limit, where `stars` is deeper: the sweep then goes beyond it.
     target_arcsec : float, optional
@@ -156,8 +146,21 @@ def plan(
         For settings that cannot work.
     CatalogueError
         When the field is too narrow for the catalogue to show `min_stars`.
+
+    Other Parameters
+    ----------------
+    sigma_px : float, callable or NoiseModel
+        Centroid noise, px per axis, 0.05 by default; a function from magnitudes (n,) to noise (n,) where it depends
+        on them; the noise model of a calibration where it depends on the place in the field as
+        well.
+    min_stars : int
+        Frames with fewer stars are not used (at least 3; 10 by default).
+    max_stars : int, optional
+        Stars that the tracker uses of a frame, the brightest ones; all on the detector by default.
     """
-    _check(n_frames, min_stars, target_arcsec, n_geometries, n_campaigns)
+    tracker = Tracker.of(camera, **options)
+    sigma_px = tracker.noise
+    _check(n_frames, tracker.min_stars, target_arcsec, n_geometries, n_campaigns)
     effects = PlannedEffects.parsed(effects) if isinstance(effects, str) else effects
     if effects is not None and ties is not None:
         raise PlanningError(
@@ -181,7 +184,7 @@ def plan(
         raise PlanningError(
             f"no star is brighter than max_mag={limit:g}: raise it or use another catalogue."
         )
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    tracker = replace(tracker, camera=camera)
     frames = random_frames(seen, tracker, n_frames=n_geometries, seed=seed, effects=effects)
     # A posterior does not say how many data it rests on; its noise is then as uncertain as the new
     # frames make it.
@@ -207,7 +210,7 @@ def plan(
         "n_campaigns": n_campaigns,
         "stars": stars.source,
         "band": stars.band,
-        **({} if max_stars is None else {"max_stars": max_stars}),
+        **({} if tracker.max_stars is None else {"max_stars": tracker.max_stars}),
         **({"sensor": asdict(sigma_px.sensor)} if isinstance(sigma_px, SensorNoise) else {}),
         "after": None if after is None else type(after).__name__,
         **({} if ties is None else {"ties": asdict(ties)}),
@@ -245,7 +248,7 @@ def plan(
         camera=camera,
         sigma_px=noise,
         max_mag=limit,
-        min_stars=min_stars,
+        min_stars=tracker.min_stars,
         mean_stars=frames.mean_stars,
         sky_fraction=_sky_fraction(seen, tracker, seed),
         forecast=forecast,

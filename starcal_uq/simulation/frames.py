@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -87,6 +87,14 @@ class Campaign:
         return {**given, "stars": "embedded" if stars is None else stars.source}
 
 
+class TrackerOptions(TypedDict, total=False):
+    """Fields of a `Tracker` beside its camera, as keywords; `sigma_px` is its noise."""
+
+    sigma_px: Noise
+    min_stars: int
+    max_stars: int | None
+
+
 @dataclass(frozen=True)
 class Tracker:
     """What takes frames: a camera, its centroid noise, and the stars that it uses.
@@ -119,6 +127,11 @@ class Tracker:
                 f"max_stars is {self.max_stars} and min_stars {self.min_stars}: use at least as "
                 "many stars of a frame as it must have."
             )
+
+    @classmethod
+    def of(cls, camera: Camera, *, sigma_px: Noise = 0.05, **options: Any) -> Tracker:
+        """The tracker of keywords (`TrackerOptions`)."""
+        return cls(camera, sigma_px, **options)
 
     def sky(self, stars: StarCatalogue) -> Sky:
         """The stars of a catalogue on the detector, so far from the edge that noise does not decide
