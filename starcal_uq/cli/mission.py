@@ -18,6 +18,7 @@ from starcal_uq.cli.settings import (
     EffectSettings,
     ForecastSettings,
     TieSettings,
+    TrackerSettings,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
@@ -191,6 +192,7 @@ def plan_command(
     camera: Path,
     forecast: ForecastSettings,
     campaign: CampaignSettings,
+    tracker: TrackerSettings,
     choices: ChoiceSettings,
     rotations: TieSettings,
     expected: EffectSettings,
@@ -223,11 +225,7 @@ def plan_command(
             raise typer.BadParameter(
                 "--choose and --check plan calibrations without effects: leave them out."
             )
-    if campaign.sensor is not None and campaign.sigma is not None:
-        raise typer.BadParameter(
-            "--sensor and --sigma both state the noise: leave one of them out."
-        )
-    if campaign.sensor is not None and check is not None:
+    if tracker.sensor is not None and check is not None:
         raise typer.BadParameter(
             "--check simulates one noise for all stars: leave out --sensor, or --check."
         )
@@ -236,9 +234,7 @@ def plan_command(
     if after is not None:
         known, noise = _known(after, sheet, camera)
         sheet = known.camera
-    used = noise if campaign.sigma is None else campaign.sigma
-    if campaign.sensor is not None:
-        used = sc.simulation.Sensor.load(campaign.sensor).noise(sheet)
+    seen = tracker.options(sheet, campaign.sigma, noise)
     # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
     deepest = min(forecast.max_mag + 1.0, KEYS["magnitude"].high)
     deep = sc.load_catalogue(max_mag=deepest, epoch=campaign.epoch)
@@ -250,12 +246,12 @@ def plan_command(
         found = sc.plan(
             sheet,
             deep,
-            sigma_px=used,
             n_frames=sizes,
             after=known,
             ties=ties,
             effects=planned,
             progress=progress,
+            **seen,
             **vars(forecast),
         )
     choice = simulated = None
@@ -264,10 +260,10 @@ def plan_command(
             sheet,
             stars,
             n_frames=choose,
-            sigma_px=used,
             criterion=choices.criterion,
             scope="calibration" if forecast.scope == "total" else forecast.scope,
             after=known,
+            **seen,
             **common,
         )
     if check is not None:

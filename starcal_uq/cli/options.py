@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
 _VELOCITY = Limit(-1e5, 1e5, whole=False)
+_POSITION = Limit(-1e9, 1e9, whole=False)
 _LONGEST_LABELS, _LONGEST_ADDRESS = 200, 500
 
 
@@ -110,19 +111,30 @@ def parse_columns(pairs: list[str] | None) -> dict[str, str]:
     return found
 
 
-def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
-    """``VX,VY,VZ`` as numbers."""
+def _parse_vector(
+    text: str | None, what: str, unit: str, example: str, limit: Limit
+) -> tuple[float, float, float] | None:
     if text is None:
         return None
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
         raise typer.BadParameter(
-            f"{shown(text)} is not three numbers in km/s, such as 7.5,0.0,0.0."
+            f"{shown(text)} is not three numbers in {unit}, such as {example}."
         ) from None
-    if not _VELOCITY.holds([x, y, z]):
-        raise typer.BadParameter(f"{shown(text)} is no velocity in km/s: {_VELOCITY.wanted()}.")
+    if not limit.holds([x, y, z]):
+        raise typer.BadParameter(f"{shown(text)} is no {what} in {unit}: {limit.wanted()}.")
     return x, y, z
+
+
+def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
+    """``VX,VY,VZ`` as numbers."""
+    return _parse_vector(text, "velocity", "km/s", "7.5,0.0,0.0", _VELOCITY)
+
+
+def parse_position(text: str | None) -> tuple[float, float, float] | None:
+    """``X,Y,Z`` as numbers."""
+    return _parse_vector(text, "position", "km", "6878,0,0", _POSITION)
 
 
 def parse_start(text: str | None) -> dict[str, float]:
@@ -260,6 +272,7 @@ _CHECKS: Mapping[str, Callable[[Any], object]] = {
     "frames": parse_frames,
     "labels": parse_labels,
     "names": check_names,
+    "position": parse_position,
     "planned effects": _known_to("planning.effects:PlannedEffects.parsed"),
     "schema": _check_schema,
     "start": parse_start,

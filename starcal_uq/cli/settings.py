@@ -18,15 +18,18 @@ from starcal_uq.cli.console import quiet
 from starcal_uq.cli.options import (
     declared,
     parse_dof,
+    parse_position,
     parse_start,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.conflicts import refusal, sampled_by_default
+from starcal_uq.core.errors import SensorError
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.runs.run import Run
+    from starcal_uq.simulation.noise import Noise
 
 
 # Centroid noise of a small tracker, px per axis, where nothing states another.
@@ -271,11 +274,41 @@ class ForecastSettings:
 
 
 @dataclass(frozen=True)
+class TrackerSettings:
+    """The tracker, and when and where it looks."""
+
+    sensor: Path | None = None
+    time: str | None = None
+    position_km: str | None = None
+
+    def options(
+        self, camera: Camera, stated_px: float | None, otherwise: Noise = SIGMA_PX
+    ) -> AnyDict:
+        """Keyword arguments of `simulate` and `plan`: noise as stated, of the sensor, or otherwise;
+        and exclusion.
+        """
+        if self.sensor is None:
+            if self.time is not None or self.position_km is not None:
+                raise typer.BadParameter(
+                    "--time and --position-km belong to the exclusion angles of a sensor: add "
+                    "--sensor, or leave them out."
+                )
+            return {"sigma_px": otherwise if stated_px is None else stated_px}
+        sensor = sc.simulation.Sensor.load(self.sensor)
+        position_km = parse_position(self.position_km)
+        try:
+            exclusion = sc.simulation.Exclusion.of(sensor, self.time, position_km)
+            noise = sensor.noise(camera) if stated_px is None else stated_px
+        except SensorError as error:
+            raise typer.BadParameter(f"{self.sensor}: {str(error).partition(': ')[2]}") from None
+        return {"sigma_px": noise, "exclusion": exclusion}
+
+
+@dataclass(frozen=True)
 class CampaignSettings:
     """What the campaign will be."""
 
     sigma: float | None = None
-    sensor: Path | None = None
     frames: list[int] | None = None
     after: Path | None = None
     epoch: float = 2026.9

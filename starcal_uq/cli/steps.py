@@ -34,7 +34,6 @@ from starcal_uq.cli.options import (
     parse_velocity,
 )
 from starcal_uq.cli.settings import (
-    SIGMA_PX,
     EstimationSettings,
     MissionSettings,
     PartitionSettings,
@@ -42,6 +41,7 @@ from starcal_uq.cli.settings import (
     SamplingSettings,
     SimulationSettings,
     SkySettings,
+    TrackerSettings,
     refuse_conflicts,
     settings_of,
     typed_words,
@@ -88,11 +88,11 @@ def simulate_command(
     camera: Path,
     out: Path,
     simulation: SimulationSettings,
+    tracker: TrackerSettings,
     partitions: PartitionSettings,
     max_mag: float = 6.0,
     epoch: float = 2026.9,
     images: Path | None = None,
-    sensor: Path | None = None,
     force: bool = False,
 ) -> Answer:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor
@@ -107,15 +107,8 @@ def simulate_command(
         ensure_new(out, force)
     elif images is not None:
         raise typer.BadParameter("--images belongs to one table: leave out --partition-frames.")
-    if sensor is not None and simulation.sigma_px is not None and images is None:
-        raise typer.BadParameter(
-            "--sensor and --sigma both state the noise: leave one of them out."
-        )
     stars, truth = sc.load_catalogue(max_mag=max_mag, epoch=epoch), sc.Camera.load(camera)
-    detector = None if sensor is None else sc.simulation.Sensor.load(sensor)
-    wanted: AnyDict = {**vars(simulation)}
-    if simulation.sigma_px is None:
-        wanted["sigma_px"] = SIGMA_PX if detector is None else detector.noise(truth)
+    wanted: AnyDict = vars(simulation) | tracker.options(truth, simulation.sigma_px)
     paths: list[Path] = []
     if partitions.partition_frames is not None:
         with progress_bar("files") as progress:
@@ -131,6 +124,8 @@ def simulate_command(
     else:
         obs = sc.simulate(stars, truth, **wanted)
         if images is not None:
+            sensor = tracker.sensor
+            detector = None if sensor is None else sc.simulation.Sensor.load(sensor)
             with progress_bar("images") as progress:
                 paths = sc.simulation.render_frames(
                     *(stars, truth, images),

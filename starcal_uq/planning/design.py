@@ -75,8 +75,8 @@ def choose_frames(
     candidates : (M, 3, 3) array or int
         Attitudes (R_cam_icrs) that could be taken; or how many random ones to choose from. Each is
         taken at most once.
-    sigma_px, min_stars, max_stars
-        Noise and stars of a frame, as for `plan`; candidates with fewer stars are refused.
+    sigma_px, min_stars, max_stars, exclusion
+        Noise, stars of a frame and exclusion, as for `plan`; candidates with fewer stars are refused.
     criterion : {"A", "D"}
         ``A`` for the attitude error of `scope`, ``D`` for the parameters as a whole.
     scope : {"common", "rest", "calibration"}

@@ -157,6 +157,8 @@ def plan(
         Frames with fewer stars are not used (at least 3; 10 by default).
     max_stars : int, optional
         Stars that the tracker uses of a frame, the brightest ones; all on the detector by default.
+    exclusion : Exclusion, optional
+        Cones around Sun, Moon and Earth that the boresight keeps out of.
     """
     tracker = Tracker.of(camera, **options)
     sigma_px = tracker.noise
@@ -211,6 +213,7 @@ def plan(
         "stars": stars.source,
         "band": stars.band,
         **({} if tracker.max_stars is None else {"max_stars": tracker.max_stars}),
+        **({} if tracker.exclusion is None else {"exclusion": asdict(tracker.exclusion)}),
         **({"sensor": asdict(sigma_px.sensor)} if isinstance(sigma_px, SensorNoise) else {}),
         "after": None if after is None else type(after).__name__,
         **({} if ties is None else {"ties": asdict(ties)}),

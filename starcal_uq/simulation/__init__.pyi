@@ -1,5 +1,6 @@
 from .campaign import render_frames as render_frames
 from .contamination import contaminate as contaminate
+from .exclusion import Exclusion as Exclusion
 from .mission import mission_frames as mission_frames
 from .mission import profile_frames as profile_frames
 from .partitions import simulate_partitions as simulate_partitions

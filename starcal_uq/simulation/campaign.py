@@ -15,6 +15,7 @@ from starcal_uq.core.files import ensure_new
 from starcal_uq.core.manifest import alone
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray, PathLike, Progress, floats
+from starcal_uq.simulation.exclusion import Exclusion
 from starcal_uq.simulation.frames import Tracker
 from starcal_uq.simulation.noise import Noise
 from starcal_uq.simulation.rendering import Scene
@@ -42,6 +43,7 @@ def render_frames(
     times_utc: Sequence[str] | None = None,
     sigma_px: Noise = 0.05,
     max_stars: int | None = None,
+    exclusion: Exclusion | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -49,7 +51,7 @@ def render_frames(
     ...
 
     The attitudes are those of `simulate` with the same catalogue, camera, `seed`, `min_stars`,
-    `max_stars` and `sigma_px`.
+    `max_stars`, `exclusion` and `sigma_px`.
 
     Parameters
     ----------
@@ -76,8 +78,8 @@ def render_frames(
         by default.
     times_utc : sequence of str, optional
         Middle of each exposure, UTC, ISO 8601; recorded only, the stars are not moved.
-    sigma_px, max_stars
-        Noise and stars of a frame of the `simulate` to be matched: stars within six times the noise
+    sigma_px, max_stars, exclusion
+        Noise, stars of a frame and exclusion of the `simulate` to be matched: stars within six times the noise
         of the edge do not count for `min_stars`. They add no noise, and leave out no star.
     force : bool
         Whether existing files may be replaced.
@@ -100,7 +102,7 @@ def render_frames(
         For arguments that do not fit together.
     """
     given = None if attitudes is None else floats(attitudes).reshape(-1, 3, 3)
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars, exclusion)
     rotations, _ = tracker.frames(stars, np.random.default_rng(seed), n_frames, given)
     n = len(rotations)
     scene = Scene(stars, camera, Sensor() if sensor is None else sensor)

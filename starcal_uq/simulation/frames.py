@@ -18,6 +18,7 @@ from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.origin import SIMULATED, Origin
 from starcal_uq.observations.table import Observations
+from starcal_uq.simulation.exclusion import Exclusion
 from starcal_uq.simulation.noise import Noise, largest_noise, noise_of, one_noise
 
 if TYPE_CHECKING:
@@ -93,6 +94,7 @@ class TrackerOptions(TypedDict, total=False):
     sigma_px: Noise
     min_stars: int
     max_stars: int | None
+    exclusion: Exclusion | None
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,8 @@ class Tracker:
         Frames with fewer stars are not taken.
     max_stars : int or None
         Stars that are used of a frame, the brightest ones; all of them where it is None.
+    exclusion : Exclusion or None
+        Cones that the boresight keeps out of.
 
     Raises
     ------
@@ -120,6 +124,7 @@ class Tracker:
     noise: Noise = 0.05
     min_stars: int = 10
     max_stars: int | None = None
+    exclusion: Exclusion | None = None
 
     def __post_init__(self) -> None:
         if self.max_stars is not None and self.max_stars < self.min_stars:
@@ -138,7 +143,7 @@ class Tracker:
         which of them are seen.
         """
         margin_px = EDGE_SIGMAS * largest_noise(self.noise, stars.mag, self.camera)
-        return Sky(stars, self.camera, margin_px, self.max_stars)
+        return Sky(stars, self.camera, margin_px, self.max_stars, self.exclusion)
 
     def frames(
         self,
@@ -149,10 +154,12 @@ class Tracker:
     ) -> tuple[FloatArray, list[tuple[IntArray, FloatArray]]]:
         """Attitudes (n, 3, 3), random or given, that show enough stars, and their `Sky.views`.
 
-        CatalogueError when a given attitude shows fewer stars, or random ones nearly always do.
+        CatalogueError when a given attitude shows fewer stars or is excluded, or random ones nearly
+        always are.
         """
         sky = self.sky(stars)
         if attitudes is not None:
+            self._refuse_excluded(attitudes)
             frames = sky.views(attitudes)
             for number, (seen, _) in enumerate(frames):
                 if len(seen) < self.min_stars:
@@ -182,6 +189,16 @@ class Tracker:
                     "raise max_mag (--max-mag), or lower min_stars (--min-stars)."
                 )
         return np.concatenate(chosen)[:n_frames], frames[:n_frames]
+
+    def _refuse_excluded(self, attitudes: FloatArray) -> None:
+        if self.exclusion is None:
+            return
+        for number, body in np.argwhere(self.exclusion.inside(attitudes)):
+            raise CatalogueError(
+                f"the attitude with index {number} looks within "
+                f"{self.exclusion.angles_deg[body]:.4g} degrees of the {self.exclusion.bodies[body]}: "
+                "choose other attitudes, or a smaller exclusion."
+            )
 
     def observe(
         self,
@@ -214,6 +231,7 @@ def simulate(
     min_stars: int = 10,
     sigma_px: Noise = 0.05,
     max_stars: int | None = None,
+    exclusion: Exclusion | None = None,
     seed: int = 0,
     attitudes: FloatArray | None = None,
 ) -> Observations:
@@ -234,6 +252,8 @@ def simulate(
         noise model of a calibration, is stated star by star in the table.
     max_stars : int, optional
         Stars of a frame, the brightest ones; all on the detector by default.
+    exclusion : Exclusion, optional
+        Cones around Sun, Moon and Earth that the boresight keeps out of.
     seed : int
         Repeats bit for bit.
     attitudes : (n_frames, 3, 3) array, optional
@@ -260,7 +280,7 @@ def simulate(
             f"n_frames={n_frames}, min_stars={min_stars}", _BYTES_PER_STAR * n_frames * min_stars
         )
     rng = np.random.default_rng(seed)
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars, exclusion)
     frame, index, xy, sigma = tracker.observe(stars, rng, n_frames, attitudes)
     return Observations(
         frame=frame,
@@ -320,7 +340,7 @@ def brightest(mag: FloatArray, starts: IntArray, n: int) -> IntArray:
 
 class Sky(Window):
     """Finds the stars of a catalogue on the detector (`Window`), the brightest `max_stars` of
-    each frame.
+    each frame. A frame whose boresight is excluded shows none.
     """
 
     def __init__(
@@ -329,8 +349,10 @@ class Sky(Window):
         camera: Camera,
         margin_px: float,
         max_stars: int | None = None,
+        exclusion: Exclusion | None = None,
     ) -> None:
         super().__init__(camera, margin_px)
+        self.exclusion = exclusion
         self.directions, self.mag, self.max_stars = stars.directions_icrs, stars.mag, max_stars
 
     def views(self, rotations: FloatArray) -> list[tuple[IntArray, FloatArray]]:
@@ -340,6 +362,9 @@ class Sky(Window):
         frame, star = self._near(rotations[:, 2])
         b = np.einsum("nij,nj->ni", rotations[frame], self.directions[star])
         xy, inside = self.seen(b)
+        if self.exclusion is not None:
+            free = ~np.any(self.exclusion.inside(rotations), axis=1)
+            inside = inside & free[frame]
         frame, star, xy = frame[inside], star[inside], xy[inside]
         number = np.arange(len(rotations) + 1)
         edges = np.searchsorted(frame, number)

@@ -19,6 +19,7 @@ from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.observations.files import parquet_summary
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
 from starcal_uq.observations.written import write_partition
+from starcal_uq.simulation.exclusion import Exclusion
 from starcal_uq.simulation.frames import Tracker, simulated_meta
 from starcal_uq.simulation.noise import Noise, one_noise
 
@@ -42,6 +43,7 @@ def simulate_partitions(
     min_stars: int = 10,
     sigma_px: Noise = 0.05,
     max_stars: int | None = None,
+    exclusion: Exclusion | None = None,
     seed: int = 0,
     force: bool = False,
     **options: Unpack[ClusterOptions],
@@ -54,7 +56,7 @@ def simulate_partitions(
 
     Parameters
     ----------
-    stars, camera, min_stars, sigma_px, max_stars
+    stars, camera, min_stars, sigma_px, max_stars, exclusion
         As for `simulate`.
     folder : path
         Folder, made if it does not exist.
@@ -102,11 +104,13 @@ def simulate_partitions(
     }
     if max_stars is not None:
         known["max_stars"] = max_stars
+    if exclusion is not None:
+        known["exclusion"] = repr(exclusion)
     if one_noise(sigma_px) is None:
         known["noise"] = repr(sigma_px)
     meta = simulated_meta(camera, sigma_px, seed) | known
     unfinished = folder / UNFINISHED
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    tracker = Tracker(camera, sigma_px, min_stars, max_stars, exclusion)
     make = _Maker(stars, tracker, unfinished, n_frames, partition_frames, seed, meta)
     names = [_NAME.format(number) for number in range(-(-n_frames // partition_frames))]
     with alone(folder):

@@ -30,11 +30,14 @@ _HEADER = """\
 # hot_pixel_seed: which pixels they are.
 # rate_deg_s: rate of turn across the boresight during exposures. age_years: years in orbit, each of which takes the
 # share transmission_loss_per_year of the light and adds dark_growth_e_px_s to the dark current.
+# sun_exclusion_deg, moon_exclusion_deg, earth_exclusion_deg: least angle of the boresight from the centres of Sun and
+# Moon, and from the limb of the Earth; 0 for none.
 
 """
 
 
 _E = "a number of electrons"
+_ANGLE = Key(float, "a number of degrees from 0 to below 180", ge=0.0, lt=180.0)
 _SECTION = Section(
     {
         "psf_sigma_px": Key(float, "a number of pixels from 0.1 to 100", ge=0.1, le=100.0),
@@ -58,6 +61,7 @@ _SECTION = Section(
         "age_years": Key(float, "a number of years, 0 to 100", ge=0.0, le=100.0),
         "transmission_loss_per_year": Key(float, "a share from 0 to below 1", ge=0.0, lt=1.0),
         "dark_growth_e_px_s": Key(float, f"{_E} per pixel, second and year, 0 or more", ge=0.0),
+        **{f"{body}_exclusion_deg": _ANGLE for body in ("sun", "moon", "earth")},
     },
     SensorError,
 )
@@ -78,6 +82,7 @@ _PLACES, _MAG_STEP = 4, 0.1
 _OF_USE = (
     *("aperture_mm", "transmission", "quantum_efficiency", "rate_deg_s", "age_years"),
     *("transmission_loss_per_year", "dark_growth_e_px_s"),
+    *("sun_exclusion_deg", "moon_exclusion_deg", "earth_exclusion_deg"),
 )
 
 
@@ -155,6 +160,9 @@ class Sensor:
         Share of the light that each year takes from what is left.
     dark_growth_e_px_s : float
         What each year adds to the dark current, electrons per pixel and second.
+    sun_exclusion_deg, moon_exclusion_deg, earth_exclusion_deg : float
+        Least angle of the boresight from the centres of Sun and Moon and from the limb of the
+        Earth; 0 for none.
 
     Raises
     ------
@@ -183,6 +191,9 @@ class Sensor:
     age_years: float = 0.0
     transmission_loss_per_year: float = 0.0
     dark_growth_e_px_s: float = 0.0
+    sun_exclusion_deg: float = 0.0
+    moon_exclusion_deg: float = 0.0
+    earth_exclusion_deg: float = 0.0
 
     def __post_init__(self) -> None:
         given = {

@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib.resources import files
 from itertools import product
@@ -19,13 +19,21 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
-from starcal_uq.core.errors import CameraError, PriorError, SensorError, StudyError, check_known
+from starcal_uq.core.errors import (
+    CameraError,
+    CatalogueError,
+    PriorError,
+    SensorError,
+    StudyError,
+    check_known,
+)
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict, AnyMapping, PathLike
 from starcal_uq.inference.priors import PRIORS
+from starcal_uq.simulation.exclusion import Exclusion
 from starcal_uq.simulation.sensor import Sensor
 from starcal_uq.studies.axes import (
     AXES,
@@ -64,6 +72,8 @@ _STUDY = Section(
         ),
         "camera": Key(str, "the path of a camera file in quotes"),
         "sensor": Key(str, "the path of a sensor file in quotes"),
+        "time_utc": Key(str, "a UTC time in quotes, such as 2026-11-26T12:00:00"),
+        "position_km": Key(list[float], "x, y and z of the spacecraft in brackets, km"),
         "epoch": Key.number(KEYS["epoch"], "a Julian year such as 2026.9"),
         "geometries": Key.number(KEYS["geometries"], "a number of frames"),
         "posterior": Key(str, f"one of {', '.join(POSTERIORS)}, in quotes"),
@@ -131,7 +141,11 @@ class StudyDefinition:
     draws : int
         Draws of a simulated cell.
     sensor : Sensor or None
-        What centroid noise follows from, in place of ``sigma_px``.
+        What centroid noise follows from, in place of ``sigma_px``, and exclusion.
+    time_utc : str or None
+        When Sun and Moon are where the sensor excludes them.
+    position_km : list of float or None
+        The spacecraft from the Earth's centre, ICRS axes, km, where the sensor excludes the Earth.
     """
 
     camera: Camera
@@ -152,6 +166,8 @@ class StudyDefinition:
     posterior: str = "importance"
     draws: int = 1000
     sensor: Sensor | None = None
+    time_utc: str | None = None
+    position_km: list[float] | None = None
 
     @classmethod
     def load(cls, path: PathLike) -> StudyDefinition:
@@ -234,6 +250,8 @@ class StudyDefinition:
         }
         if self.sensor is not None:
             tables["sensor"] = self.sensor.to_dict()
+            when = {"time_utc": self.time_utc, "position_km": self.position_km}
+            study |= {name: value for name, value in when.items() if value is not None}
         return tables | ({"priors": self.priors} if self.priors else {})
 
     def check(self, where: str = "study") -> None:
@@ -268,6 +286,10 @@ class StudyDefinition:
             if section != "sweep.latin" or axis.kind != "whole":
                 for value in values:
                     axis.check(value, f"{where}, section [{section}]")
+        try:
+            self.exclusion  # noqa: B018
+        except (SensorError, CatalogueError) as error:
+            raise StudyError(f"{where}: {error}") from None
         every = {**self.observation, **self.sweep, **self.latin}
         self._check_names(every, where)
         for name in self.target_sigma:
@@ -346,6 +368,13 @@ class StudyDefinition:
         used = {name for model in self.models for name in parameter_names(model)}
         return tuple(name for name in PARAMETERS if name in used)
 
+    @cached_property
+    def exclusion(self) -> Exclusion | None:
+        """Cones of the sky that the sensor keeps out of."""
+        if self.sensor is None:
+            return None
+        return Exclusion.of(self.sensor, self.time_utc, self.position_km)
+
     @property
     def n_cells(self) -> int:
         """Number of cells."""
@@ -403,6 +432,8 @@ class StudyDefinition:
                 if self.sensor is not None:
                     own = {name: settings[name] for name in SENSOR_AXES if name in settings}
                     settings["sensor"] = self.sensor.replace(**own).to_dict()
+                if self.exclusion is not None:
+                    settings["exclusion"] = asdict(self.exclusion)
                 made += [Cell(settings, index) for index in self.seeds]
         return made
 

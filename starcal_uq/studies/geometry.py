@@ -27,6 +27,7 @@ from starcal_uq.likelihood.terms import add_by_group
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.effects import JointMatrices, PlannedEffects
 from starcal_uq.planning.information import frame_matrices
+from starcal_uq.simulation.exclusion import Exclusion
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Window, brightest
 from starcal_uq.simulation.pointing import pattern_rotations
 from starcal_uq.simulation.sensor import Sensor, SensorNoise
@@ -135,9 +136,9 @@ class Heaven:
 class _Views(Window):
     """The detector on the sky, for stars that a tree has found."""
 
-    def __init__(self, depth: Depth, camera: Camera, max_mag: float, margin_px: float) -> None:
-        super().__init__(camera, margin_px)
-        self.depth, self.max_mag = depth, max_mag
+    def __init__(self, depth: Depth, key: GeometryKey) -> None:
+        super().__init__(key.camera, key.margin_px)
+        self.depth, self.max_mag, self.exclusion = depth, key.max_mag, key.exclusion
 
     def frames(self, blocks: Sequence[Attitudes]) -> Geometry:
         """Frames of some attitudes, whatever they show."""
@@ -150,6 +151,9 @@ class _Views(Window):
         star = np.concatenate([near.star[k] for near, k in zip(blocks, kept, strict=True)])
         b = np.matmul(rotations[frame], self.depth.directions[star][:, :, None])[:, :, 0]
         xy, inside = self.seen(b)
+        if self.exclusion is not None:
+            free = ~np.any(self.exclusion.inside(rotations), axis=1)
+            inside = inside & free[frame]
         sizes = np.bincount(frame[inside], minlength=len(rotations))
         return Geometry(
             self.camera, self.depth, rotations, _starts(sizes), star[inside], xy[inside]
@@ -276,6 +280,7 @@ class GeometryKey(NamedTuple):
     pointing: str
     n_frames: int | None
     seed: tuple[int, ...]
+    exclusion: Exclusion | None = None
 
 
 def margin_px(settings: AnyMapping, focal_px: float) -> float:
@@ -305,6 +310,7 @@ def geometry_key(
         settings["pointing"],
         (settings["frames"] if exact else min(settings["frames"], _MOST_FRAMES)) if own else None,
         (seed, seed_index) if own else (seed,),
+        Exclusion(**settings["exclusion"]) if "exclusion" in settings else None,
     )
 
 
@@ -341,7 +347,7 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
     StudyError when the catalogue cannot fill them.
     """
     depth = heaven.depth(key.max_mag)
-    window = _Views(depth, key.camera, key.max_mag, key.margin_px)
+    window = _Views(depth, key)
     if key.pointing == "random":
         n = key.n_frames
         if n is None:

@@ -478,9 +478,21 @@ def test_a_plan_takes_its_noise_from_a_sensor(cli, inputs, tmp_path, small_plans
     assert answers["brightest"]["mean_stars"] <= 12.0 < answers["all"]["mean_stars"]
     # The brightest stars of a small tracker are located better than to 0.05 px.
     assert answers["sensor"]["sigma_px"] < 0.04
+    text = (tmp_path / "sensor.toml").read_text()
+    (tmp_path / "baffle.toml").write_text(
+        text.replace("sun_exclusion_deg = 0.0", "sun_exclusion_deg = 60.0")
+    )
     for options, words in (
-        (("--sigma", "0.1"), "--sensor and --sigma both state the noise"),
-        (("--check", "10"), "leave out --sensor, or --check"),
+        (("--sensor", "sensor.toml", "--check", "10"), "leave out --sensor, or --check"),
+        (("--time", "2026-11-26T12:00:00"), "add --sensor, or leave them out"),
+        (("--sensor", "baffle.toml"), "baffle.toml: sun_exclusion_deg is 60, but the time"),
+        (("--sensor", "sensor.toml", "--position-km", "1,2"), "not three numbers in km"),
     ):
-        status, _, err = cli("plan", sheet, "--sensor", tmp_path / "sensor.toml", *options)
-        assert status == 2 and words in err
+        named = [tmp_path / word if word.endswith(".toml") else word for word in options]
+        status, _, err = cli("plan", sheet, *named)
+        assert status == 2 and words in err, err
+    options = ("--sensor", tmp_path / "baffle.toml", "--time", "2026-11-26T12:00:00")
+    status, out, err = cli("plan", sheet, *options, "--json")
+    # The cone of 60 degrees around the Sun is a quarter of the sky.
+    seen = json.loads(out)["plan"]["sky_fraction"] / answers["all"]["sky_fraction"]
+    assert seen == pytest.approx(0.75, abs=0.1), err
