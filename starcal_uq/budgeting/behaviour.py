@@ -38,6 +38,10 @@ KEYS: dict[Kind, str] = {
 _UNEVEN = 0.05
 # Arguments below which the first terms of a series are exact to rounding.
 _SMALL = 1e-3
+# Lags at which autocovariances are compared, correlation times that are tried, lines of a spectrum.
+_LAGS, _TIMES, _LINES = 80, 200, 4096
+# Correlation times up to which they are to agree.
+_WITHIN = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +153,42 @@ class Behaviour:
             for t in (window_s, later_s, window_s + later_s, abs(window_s - later_s))
         )
         return max(2.0 * (one + other) - both - apart, 0.0) / window_s**2
+
+    def gauss_markov(self) -> tuple[float, float, float]:
+        """White share of the variance, correlation time of the first-order Gauss-Markov process that
+        has the rest, s, and the largest difference of their autocovariance from that of a series
+        or a spectrum up to three correlation times, in variances.
+
+        Lags are even in their logarithm. Lines are of a record without its mean, in which a process
+        shows the less of itself the longer it takes.
+        """
+        from scipy.optimize import nnls
+
+        lines = self if self.kind == "series" else self._as_lines()
+        step, n = lines.seconds, round(1.0 / (lines.frequency_hz[0] * lines.seconds))
+        own = 0.5 * n * np.concatenate([[0.0], lines.power])
+        own[-1] *= 2.0 if n % 2 == 0 else 1.0
+        lag = np.arange(n)
+        at = np.unique(np.rint(np.geomspace(1, n // 2, _LAGS)).astype(int)) - 1
+        wanted = np.fft.irfft(own, n) / np.sum(lines.power)
+        found = []
+        for time in np.geomspace(0.5, 0.25 * n, _TIMES):
+            known = np.stack([lag == 0, np.exp(-lag / time)])
+            # Of a record: lags meet round its ends, and its mean is gone.
+            known = ((n - lag) * known + lag * np.roll(known[:, ::-1], 1, axis=1)) / n
+            known -= known.mean(axis=1, keepdims=True)
+            shares, miss = nnls(known[:, at].T, wanted[at])
+            apart = np.abs(shares @ known - wanted)[lag <= _WITHIN * time].max()
+            found.append((miss, shares[0] / shares.sum(), time * step, apart / shares.sum()))
+        _, white, seconds, apart = min(found)
+        return float(white), float(seconds), float(apart)
+
+    def _as_lines(self) -> Behaviour:
+        """A spectrum as lines of a record."""
+        step = 0.5 / float(self.frequency_hz[-1])
+        f = np.arange(1, _LINES + 1) / (2 * _LINES * step)
+        power = np.interp(f, self.frequency_hz, self.power, left=0.0) * f[0]
+        return Behaviour("series", step, f, power)
 
 
 def _passed(frequency: FloatArray, density: FloatArray, window_s: float) -> float:

@@ -18,6 +18,7 @@ import numpy as np
 
 from starcal_uq.budgeting.behaviour import Behaviour
 from starcal_uq.budgeting.file import BudgetFile, Requirement, checked_confidence, load_budget_file
+from starcal_uq.budgeting.filters import filter_states
 from starcal_uq.budgeting.indices import Behaviours, Index, seen_by
 from starcal_uq.budgeting.posterior import (
     alignment_rows,
@@ -219,6 +220,7 @@ def combination(
         "outcomes": tuple(outcomes[one] for one in stated.requirements),
         "confidence": confidence,
         "index_totals": tuple(entry for entry in index_totals if entry.of_index != "AKE"),
+        "filter": filter_states(rows, behaviours),
     }
 
 

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.file import SENSOR, Requirement
+from starcal_uq.budgeting.filters import FilterState
 from starcal_uq.budgeting.rows import AXIS_LABELS, ECSS_CLASSES, KNOWLEDGE, SCOPES, Contributor
 from starcal_uq.budgeting.sampling import Samples, draw
 from starcal_uq.budgeting.totals import Difference, Total, grouped_sigma, read_difference, total
@@ -157,6 +158,8 @@ class Budget(Shown):
     index_totals : tuple of Total
         The same totals of every other error index that was asked for; `totals` are those of the
         absolute knowledge error.
+    filter : tuple of FilterState
+        What the rows are to a gyro-stellar filter; empty where none is known to change in time.
     """
 
     rows: tuple[Contributor, ...]
@@ -167,6 +170,7 @@ class Budget(Shown):
     notes: tuple[str, ...]
     provenance: Provenance
     index_totals: tuple[Total, ...] = ()
+    filter: tuple[FilterState, ...] = ()
 
     @property
     def violations(self) -> tuple[Outcome, ...]:
@@ -290,6 +294,15 @@ class Budget(Shown):
             records.append((name, axis, sigma, any(not row.assessed for row in rows)))
         return pd.DataFrame(records, columns=["ecss_class", "axis", "sigma_arcsec", "at_least"])
 
+    def filter_dataframe(self) -> pd.DataFrame:
+        """One row per state of a filter: the fields of `FilterState`, and ``density``."""
+        import pandas as pd
+
+        names = [f.name for f in fields(FilterState)]
+        names.insert(names.index("misfit"), "density")
+        states = [[getattr(state, name) for name in names] for state in self.filter]
+        return pd.DataFrame(states, columns=names)
+
     def requirements_dataframe(self) -> pd.DataFrame:
         """One row per requirement: its fields, the bounds, ``least_arcsec``, ``margin_arcsec`` and
         ``verdict``.
@@ -327,6 +340,7 @@ class Budget(Shown):
             "classes": plain(self.classes_dataframe()),
             "totals": plain(self.totals_dataframe()),
             "requirements": plain(self.requirements_dataframe()),
+            "filter": plain(self.filter_dataframe()),
             "violations": [outcome.requirement.name for outcome in self.violations],
             "not_assessed": list(self.not_assessed),
             "notes": list(self.notes),
@@ -354,6 +368,7 @@ class Budget(Shown):
         ]
         records += [{"record": "total", **_plain(entry)} for entry in self.totals]
         records += [{"record": "index total", **_plain(entry)} for entry in self.index_totals]
+        records += [{"record": "filter state", **_plain(state)} for state in self.filter]
         records += [
             {
                 "record": "requirement",
@@ -430,6 +445,7 @@ class Budget(Shown):
                 notes=tuple(settings["notes"]),
                 provenance=Provenance(settings["provenance"]),
                 index_totals=tuple(_made(Total, one) for one in by_kind.get("index total", [])),
+                filter=tuple(_made(FilterState, one) for one in by_kind.get("filter state", [])),
             )
 
 
@@ -512,12 +528,13 @@ _COLUMNS = tuple(
             "difference",
             *_DERIVED,
             "value",
+            *(f.name for f in fields(FilterState)),
         ]
     )
 )
 
 
-def _plain(entry: Contributor | Total | Requirement) -> dict[str, str]:
+def _plain(entry: Contributor | Total | Requirement | FilterState) -> dict[str, str]:
     names = [f.name for f in fields(entry)]
     names += ["explanation"] if isinstance(entry, Total) else []
     return {name: _text(getattr(entry, name)) for name in names}

@@ -122,6 +122,7 @@ def show_budget(found: Budget) -> None:
     from starcal_uq.presentation.words.budgeting import (
         contributors_table,
         explanations,
+        filter_table,
         indices_table,
         totals_table,
     )
@@ -130,6 +131,8 @@ def show_budget(found: Budget) -> None:
     print_table(totals_table(found))
     if found.index_totals:
         print_table(indices_table(found))
+    if found.filter:
+        print_table(filter_table(found))
     for sentence in (*explanations(found), *found.notes):
         say(sentence)
     for outcome in found.outcomes:

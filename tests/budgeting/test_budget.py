@@ -1076,7 +1076,8 @@ def test_json_is_all_that_the_tables_hold(stated: Path) -> None:
     for key in ("title", "confidence", "provenance"):
         assert plain[key] == getattr(found, key)
     assert plain["notes"] == list(found.notes) and plain["not_assessed"] == list(found.not_assessed)
-    assert len(plain) == 10
+    assert plain["filter"] == [] and found.filter == ()
+    assert len(plain) == 11
 
 
 def test_names_of_axes_and_limits_of_this_confidence(tmp_path: Path) -> None:

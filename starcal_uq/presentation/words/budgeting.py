@@ -45,6 +45,7 @@ def tables(budget: Budget) -> AnyDict:
         "classes": class_rows(budget),
         "totals": total_rows(budget),
         "indices": index_rows(budget),
+        "filter": filter_table(budget).html() if budget.filter else "",
         "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
         "requirements": [_requirement_row(outcome) for outcome in budget.outcomes],
         "headline": told("budget", budget),
@@ -328,3 +329,10 @@ def indices_table(budget: Budget) -> TextTable:
     if taken:
         title += f"; at most, as their behaviour in time is not stated: {join_words([*taken])}"
     return TextTable(heads, rows, title, "lllll")
+
+
+def filter_table(budget: Budget) -> TextTable:
+    """One row per state of a gyro-stellar filter."""
+    title = "For a filter, after alignment, 1 sigma"
+    formats = {"axis": AXIS_LABELS.__getitem__, "contributors": join_words}
+    return TextTable.of(budget.filter_dataframe(), title, formats=formats)
