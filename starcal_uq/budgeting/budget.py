@@ -175,6 +175,13 @@ def budget(
             *row_notes(rows),
         ),
         provenance=provenance(seed, settings, post.provenance.data_sha256),
+        document=stated.document,
+        configuration={
+            "camera": post.calibrated_camera.to_dict(),
+            "effects": [] if post.effects is None else list(post.effects.names),
+            "n_frames": obs.n_frames,
+            "n_stars": obs.n_stars,
+        },
     )
 
 

@@ -70,6 +70,10 @@ BUDGET_KEYS = {
     "frame_seconds": _SECONDS,
     "rate_deg_s": _RATE,
 }
+# Title block of the budget to sign.
+DOCUMENT_KEYS = dict.fromkeys(
+    ("project", "number", "issue", "prepared", "checked", "approved"), _TEXT
+)
 _BEHAVIOUR_KEYS = {
     key: _SECONDS if key.endswith("_seconds") else _TEXT for key in TIME_KEYS.values()
 }
@@ -117,9 +121,12 @@ REQUIREMENT_KEYS = {
 }
 SENSOR = "sensor"
 _FRAME = Section({"rotation": ROTATION}, BudgetError)
-_HEAD, _CONTRIBUTOR, _REQUIREMENT, _BEHAVIOUR, _INDEX = (
+_HEAD, _DOCUMENT, _CONTRIBUTOR, _REQUIREMENT, _BEHAVIOUR, _INDEX = (
     Section(keys, BudgetError)
-    for keys in (BUDGET_KEYS, CONTRIBUTOR_KEYS, REQUIREMENT_KEYS, BEHAVIOUR_KEYS, INDEX_KEYS)
+    for keys in (
+        *(BUDGET_KEYS, DOCUMENT_KEYS, CONTRIBUTOR_KEYS),
+        *(REQUIREMENT_KEYS, BEHAVIOUR_KEYS, INDEX_KEYS),
+    )
 )
 _LISTS = ("contributor", "behaviour", "index", "requirement")
 # Distributions of errors that behave so in time, unless the file states another.
@@ -198,6 +205,8 @@ class BudgetFile:
         Behaviour in time by name and axis of a contributor.
     frame_seconds, rate_deg_s : float or None
         Time between frames, s; angular rate of the sensor, deg/s. None where not stated.
+    document : dict of str
+        Title block of the budget to sign: project, number, issue, prepared, checked, approved.
     """
 
     contributors: tuple[Contributor, ...] = field(default=())
@@ -210,6 +219,7 @@ class BudgetFile:
     behaviours: Behaviours = field(default_factory=dict)
     frame_seconds: float | None = None
     rate_deg_s: float | None = None
+    document: Mapping[str, str] = field(default_factory=dict)
 
 
 def _read(data: Any, where: str, section: Section) -> AnyDict:
@@ -255,9 +265,9 @@ def load_budget_file(path: PathLike, others: Sequence[str] = ()) -> BudgetFile:
     missing = f"check the path, or write a starter with `{starter.words}`"
     content = read_toml(path, "budget", BudgetError, missing)
     for key in content:
-        if key not in ("budget", "frame", *_LISTS, *others):
+        if key not in ("budget", "document", "frame", *_LISTS, *others):
             raise BudgetError(
-                f"{path}: {key} is not known; write [budget], [frame.NAME], "
+                f"{path}: {key} is not known; write [budget], [document], [frame.NAME], "
                 f"{listed([f'[[{name}]]' for name in _LISTS])} tables only."
             )
     frames = _frames(content.get("frame", {}), path)
@@ -290,6 +300,7 @@ def load_budget_file(path: PathLike, others: Sequence[str] = ()) -> BudgetFile:
         frames=frames,
         indices=indices,
         behaviours=behaviours,
+        document=_read(content.get("document", {}), f"{path}, [document]", _DOCUMENT),
         **head,
     )
 

@@ -130,6 +130,8 @@ def array_budget(
             *row_notes(rows),
         ),
         provenance=provenance(seed, settings, None),
+        document=stated.document,
+        configuration={"heads": list(heads.names)},
     )
 
 

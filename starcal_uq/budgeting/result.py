@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -28,7 +28,7 @@ from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Advice, Check, Code, Level, Order
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, PathLike
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -160,6 +160,10 @@ class Budget(Shown):
         absolute knowledge error.
     filter : tuple of FilterState
         What the rows are to a gyro-stellar filter; empty where none is known to change in time.
+    document : dict of str
+        Title block of the budget to sign, from the user's file.
+    configuration : dict
+        Camera and data of the calibration: plain values by name.
     """
 
     rows: tuple[Contributor, ...]
@@ -171,6 +175,8 @@ class Budget(Shown):
     provenance: Provenance
     index_totals: tuple[Total, ...] = ()
     filter: tuple[FilterState, ...] = ()
+    document: Mapping[str, str] = field(default_factory=dict)
+    configuration: AnyMapping = field(default_factory=dict)
 
     @property
     def violations(self) -> tuple[Outcome, ...]:
@@ -384,6 +390,8 @@ class Budget(Shown):
             "title": self.title,
             "notes": list(self.notes),
             "provenance": self.provenance,
+            "document": dict(self.document),
+            "configuration": dict(self.configuration),
         }
         records += [
             {"record": "setting", "name": key, "value": json.dumps(value)}
@@ -446,6 +454,8 @@ class Budget(Shown):
                 provenance=Provenance(settings["provenance"]),
                 index_totals=tuple(_made(Total, one) for one in by_kind.get("index total", [])),
                 filter=tuple(_made(FilterState, one) for one in by_kind.get("filter state", [])),
+                document=settings.get("document", {}),
+                configuration=settings.get("configuration", {}),
             )
 
 

@@ -49,6 +49,14 @@ _HEADER = f"""\
 title = "Star sensor: attitude error budget"
 confidence = 0.997
 
+# [document]                           # title block of the budget to sign: -o budget.pdf
+# project = "..."
+# number = "..."
+# issue = "1"
+# prepared = "..."                     # names, with room for signatures
+# checked = "..."
+# approved = "..."
+
 # [[requirement]]
 # name = "R-1 attitude knowledge across the boresight"
 # axis = "cross-boresight"             # X, Y, Z, or cross-boresight: the angle of both axes together

@@ -52,6 +52,7 @@ def budget_command(
     heads: Path | None = None,
     file: Path | None = None,
     out: list[Path] | None = None,
+    format: settings.BudgetFormat | None = None,
     template: Path | None = None,
     confidence: float | None = None,
     temperature_profile: Path | None = None,
@@ -63,6 +64,10 @@ def budget_command(
 
     if template is not None and file is not None and template.resolve() == file.resolve():
         raise typer.BadParameter(f"--template would write over {file}: name another file.")
+    if format is not None:
+        if run is None:
+            raise typer.BadParameter("--format writes into RUN: name the file with -o.")
+        out = [*(out or []), run / f"budget.{format}"]
     for path in out or []:
         if path.suffix.lower() not in FORMATS:
             raise typer.BadParameter(

@@ -93,6 +93,7 @@ FieldReading = Literal["window", "full"]
 Starter = Literal["camera", "sensor", "site", "budget", "study", "example"]
 ExampleName = Literal["esa"]
 ReportFormat = Literal["html", "pdf"]
+BudgetFormat = Literal["xlsx", "tex", "html", "pdf"]
 ExportFormat = Literal[
     "opencv",
     "ros",

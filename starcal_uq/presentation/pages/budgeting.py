@@ -1,21 +1,23 @@
-"""The budget for people: Excel, LaTeX and HTML."""
+"""The budget for people: Excel, LaTeX, HTML, and PDF to sign."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.result import Budget
 from starcal_uq.budgeting.rows import confidence_text
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.extras import extra
-from starcal_uq.core.files import atomic_path, atomic_write_text, cell_text
+from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, cell_text
 from starcal_uq.core.status import Level
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page, template_environment
+from starcal_uq.presentation.pages.printing import pdf_bytes
 from starcal_uq.presentation.tables import tex
 from starcal_uq.presentation.words.budgeting import NOT_RESOLVED, tables
 from starcal_uq.presentation.words.sentences import told
@@ -76,6 +78,47 @@ def write_html(budget: Budget, path: PathLike) -> None:
         data_sha256=budget.provenance.data_sha256 or "",
     )
     atomic_write_text(path, text)
+
+
+def write_pdf(budget: Budget, path: PathLike) -> None:
+    """The budget to sign; MissingExtraError without a browser or WeasyPrint."""
+    with TemporaryDirectory() as folder:
+        sheet = Path(folder, "budget.html")
+        sheet.write_text(sheet_html(budget), encoding="utf-8")
+        content = pdf_bytes(sheet)
+    atomic_write_bytes(path, content)
+
+
+def sheet_html(budget: Budget) -> str:
+    """The page that is printed to be signed, A4: title block, requirements (violated ones first),
+    configuration, rows by class, totals, assumptions and signatures.
+    """
+    known = tables(budget)
+    document, made = budget.document, budget.provenance
+    by_class: dict[str, list[AnyDict]] = {}
+    for row in known["rows"]:
+        by_class.setdefault(row["ecss_class"], []).append(row)
+    sigma = {row["name"]: row["sigma"] for row in known["classes"]}
+    # Violated, open, met.
+    ranked = sorted(known["requirements"], key=lambda row: -Level(row["level"]).rank)
+    return page(
+        "budget_sheet.html.j2",
+        made,
+        budget=known,
+        document=document,
+        configuration=budget.configuration,
+        requirements=ranked,
+        classes=[
+            (name, by_class[name])
+            for name in dict.fromkeys((*sigma, *by_class))
+            if name in by_class
+        ],
+        sigma=sigma,
+        foot=", ".join(filter(None, (document.get("number"), document.get("issue"), budget.title))),
+        seed=made.seed,
+        file=made.settings.get("file", ""),
+        data_sha256=made.data_sha256 or "",
+    )
 
 
 def write_xlsx(budget: Budget, path: PathLike) -> None:
@@ -201,6 +244,7 @@ _WRITERS: dict[str, Callable[[Budget, PathLike], None]] = {
     ".xlsx": write_xlsx,
     ".tex": write_tex,
     ".html": write_html,
+    ".pdf": write_pdf,
 }
 FORMATS = tuple(_WRITERS)
 

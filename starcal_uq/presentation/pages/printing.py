@@ -81,6 +81,7 @@ def _printed(browser: str, page: Path) -> tuple[bytes, str]:
             "--host-resolver-rules=MAP * ~NOTFOUND",
             f"--user-data-dir={folder}",
             "--no-pdf-header-footer",
+            "--generate-pdf-document-outline",
         ]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
             # Root, as in a container, has no other way.

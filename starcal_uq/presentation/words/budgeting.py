@@ -237,6 +237,8 @@ def _requirement_row(outcome: Outcome) -> Row:
         "limit": significant(asked.limit_arcsec, 3),
         "rule": bound(outcome.total.rule_arcsec, outcome.total.at_least),
         "sampled": _sampled(outcome.total),
+        "bound": bound(outcome.bound_arcsec, outcome.total.at_least),
+        "index": outcome.total.of_index,
         "least": bound(outcome.least_arcsec, outcome.total.at_least),
         "margin": _known(outcome.margin_arcsec),
         "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),

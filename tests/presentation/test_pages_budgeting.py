@@ -1,0 +1,106 @@
+"""The budget to sign, as an installed browser prints it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.budgeting.budget import combination, from_file
+from starcal_uq.budgeting.file import load_budget_file
+from starcal_uq.budgeting.result import Budget
+from starcal_uq.core.provenance import provenance
+from starcal_uq.presentation.pages import budgeting, printing
+
+FILE = """
+[budget]
+title = "Budget of a <tracker>"
+[document]
+number = "TN-014"
+issue = "2"
+prepared = "A. Analyst"
+[[contributor]]
+name = "alignment residual"
+ecss_class = "bias"
+axis = "all"
+sigma_arcsec = 1.0
+interpretation = "ensemble"
+absorbed_by_alignment = "no"
+provenance = "report"
+[[requirement]]
+name = "R-met"
+axis = "X"
+limit_arcsec = 9.0
+[[requirement]]
+name = "R-violated"
+axis = "Y"
+limit_arcsec = 2.0
+"""
+
+
+@pytest.fixture
+def found(tmp_path):
+    path = tmp_path / "budget.toml"
+    path.write_text(FILE)
+    stated = load_budget_file(path)
+    rows = from_file(stated, (), ())
+    return Budget(
+        **combination(rows, stated, {}, 0.997, 20_000, 1),
+        title=stated.title,
+        notes=("A note to read.",),
+        provenance=provenance(1, {"file": "budget.toml"}, None),
+        document=stated.document,
+        configuration={
+            "camera": sc.paper.paper_camera().to_dict(),
+            "effects": [],
+            "n_frames": 60,
+            "n_stars": 999,
+        },
+    )
+
+
+def test_the_sheet_ranks_requirements_and_keeps_what_the_title_block_states(found, tmp_path):
+    found.save(tmp_path / "b.csv")
+    again = Budget.load(tmp_path / "b.csv")
+    assert (again.document, again.configuration) == (found.document, found.configuration)
+    assert again.document == {"number": "TN-014", "issue": "2", "prepared": "A. Analyst"}
+    text = budgeting.sheet_html(again)
+    assert text.index("R-violated") < text.index("R-met</b>")
+    assert "Budget of a &lt;tracker&gt;" in text and "<tracker>" not in text
+    marks = re.findall(r'class="mark (\w+)">(\w+)<', text)
+    assert marks == [("fail", "violated"), ("pass", "met")]
+    for shown in ("999 stars in 60 frames", "A. Analyst", "A note to read.", "TN-014, 2, Budget"):
+        assert shown in text
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="takes an installed browser")
+def test_the_sheet_is_printed_with_numbers_bookmarks_and_text(found, tmp_path):
+    path = sc.report(found, tmp_path / "sheet.pdf")
+    content = path.read_bytes()
+    assert content.startswith(b"%PDF")
+    assert b"/Outlines" in content
+    pages = len(re.findall(rb"/Type\s*/Page\b(?!s)", content))
+    assert 1 <= pages <= 3
+    if shutil.which("pdftotext"):
+        shown = ["pdftotext", "-layout", str(path), "-"]
+        text = subprocess.run(shown, capture_output=True, text=True, check=True).stdout
+        assert "R-violated" in text and f"Page 1 of {pages}" in text
+
+
+def test_a_key_of_the_title_block_that_is_unknown_is_refused(tmp_path):
+    path = tmp_path / "budget.toml"
+    path.write_text(FILE.replace('issue = "2"', 'isue = "2"'))
+    with pytest.raises(sc.errors.BudgetError, match=r"\[document\].*isue.*issue"):
+        load_budget_file(path)
+
+
+def test_without_a_browser_nothing_is_written(found, monkeypatch, tmp_path):
+    monkeypatch.setattr(printing, "browsers", lambda: iter(()))
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
+    with pytest.raises(sc.errors.MissingExtraError, match="a PDF takes a browser"):
+        sc.report(found, tmp_path / "sheet.pdf")
+    assert not (tmp_path / "sheet.pdf").exists()
