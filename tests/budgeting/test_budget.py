@@ -126,9 +126,12 @@ POST = SimpleNamespace(
     mean=np.array([500.0, 530.0, 5850.0, 2e-10, -3.5e-15]),
     provenance=Provenance(data_sha256="0123456789abcdef"),
     camera=SimpleNamespace(distortion="brown", fov_deg=(16.0, 12.0), focal_px=5850.0),
+    calibrated_camera=SimpleNamespace(to_dict=lambda: {"name": "fake"}),
     effects=None,
 )
-OBS = SimpleNamespace(x_px=np.array([100.0, 900.0]), y_px=np.array([530.0, 530.0]))
+OBS = SimpleNamespace(
+    n_frames=1, n_stars=2, x_px=np.array([100.0, 900.0]), y_px=np.array([530.0, 530.0])
+)
 
 
 def made(file: Any = None, **changes: Any) -> Budget:
@@ -1126,6 +1129,6 @@ def test_names_of_axes_and_limits_of_this_confidence(tmp_path: Path) -> None:
         == ["contributor"] * len(found.rows)
         + ["total"] * 24
         + ["requirement"] * 5
-        + ["setting"] * 4
+        + ["setting"] * 6
     )
     assert "\r" not in "".join(text)
