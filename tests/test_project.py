@@ -398,7 +398,7 @@ WITHOUT_NAMESAKE = {
     "pipeline": "cameras displacement images refine",
     "planning": "check costs effects forecast information open_distortion",
     "presentation": (
-        "html pages/budgeting pages/comparison pages/gallery pages/notebook pages/planning "
+        "html pages/comparison pages/gallery pages/notebook pages/planning "
         "pages/printing pages/studies pages/write tables"
     ),
     "propagation": "attitude_error geometry onboard_error sampled",
