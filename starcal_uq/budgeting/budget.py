@@ -41,6 +41,7 @@ from starcal_uq.budgeting.rows import (
 )
 from starcal_uq.budgeting.sampling import N_SAMPLES
 from starcal_uq.budgeting.totals import Total, totals
+from starcal_uq.budgeting.tracker import sensor_rows
 from starcal_uq.core.constants import AXES, INTERACTION
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.findings import clause
@@ -142,7 +143,7 @@ def budget(
         attitude = with_misfit(attitude, misfit, post, obs)
     untested = () if attitude.misfit is not None else (UNTESTED,)
     effects, replaced = stated_instead(effect_rows(attitude, post), stated.contributors)
-    known = (*alignment_rows(attitude), *effects)
+    known = (*alignment_rows(attitude), *effects, *_of_sensor(stated, attitude, post, obs))
     filled = from_file(stated, (*untested, *FROM_FILE), known)
     # Effects stand beside the other rows of the calibration.
     ours = {row.name for row in effects} - {entry.name for entry in FROM_FILE}
@@ -183,6 +184,19 @@ def budget(
             "n_stars": obs.n_stars,
         },
     )
+
+
+def _of_sensor(
+    stated: BudgetFile, attitude: AttitudeError, post: Posterior, obs: Observations
+) -> tuple[Contributor, ...]:
+    """Rows of the sensor of a file, at the rate that the file states or its own."""
+    sensor = stated.sensor
+    if sensor is None:
+        return ()
+    if stated.rate_deg_s is not None:
+        sensor = sensor.replace(rate_deg_s=stated.rate_deg_s)
+    frames = obs if attitude.seen is None else attitude.seen
+    return sensor_rows(sensor, post.calibrated_camera, frames, stated.sensor_path)
 
 
 def confidence_of(stated: BudgetFile, confidence: float | None, n_samples: int) -> float:

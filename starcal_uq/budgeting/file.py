@@ -31,12 +31,13 @@ from starcal_uq.budgeting.rows import (
 )
 from starcal_uq.budgeting.shapes import HALF_WIDTHS, RAYLEIGH_MEAN
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
-from starcal_uq.core.errors import BudgetError
+from starcal_uq.core.errors import BudgetError, SensorError
 from starcal_uq.core.files import listed
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_toml
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, PathLike
+from starcal_uq.simulation.sensor import Sensor
 
 # As people write them: X and Y are across the boresight, Z is along it.
 _AXIS_NAMES = {
@@ -69,6 +70,7 @@ BUDGET_KEYS = {
     "confidence": _CONFIDENCE,
     "frame_seconds": _SECONDS,
     "rate_deg_s": _RATE,
+    "sensor": _TEXT,
 }
 # Title block of the budget to sign.
 DOCUMENT_KEYS = dict.fromkeys(
@@ -207,6 +209,10 @@ class BudgetFile:
         Time between frames, s; angular rate of the sensor, deg/s. None where not stated.
     document : dict of str
         Title block of the budget to sign: project, number, issue, prepared, checked, approved.
+    sensor : Sensor or None
+        The sensor, whose rate and age fill rows.
+    sensor_path : str
+        Path that it was read from.
     """
 
     contributors: tuple[Contributor, ...] = field(default=())
@@ -220,6 +226,8 @@ class BudgetFile:
     frame_seconds: float | None = None
     rate_deg_s: float | None = None
     document: Mapping[str, str] = field(default_factory=dict)
+    sensor: Sensor | None = None
+    sensor_path: str = ""
 
 
 def _read(data: Any, where: str, section: Section) -> AnyDict:
@@ -272,6 +280,12 @@ def load_budget_file(path: PathLike, others: Sequence[str] = ()) -> BudgetFile:
             )
     frames = _frames(content.get("frame", {}), path)
     head = _read(content.get("budget", {}), f"{path}, [budget]", _HEAD)
+    if "sensor" in head:
+        head["sensor_path"] = str(Path(path).parent / head["sensor"])
+        try:
+            head["sensor"] = Sensor.load(head["sensor_path"])
+        except SensorError as error:
+            raise BudgetError(f"{path}, [budget], key sensor: {error}") from None
     rows: list[Contributor] = []
     behaviours: dict[tuple[str, str], Behaviour] = {}
     for table, where in _tables(content, "contributor", path):

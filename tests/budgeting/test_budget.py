@@ -339,7 +339,7 @@ TABLES = {
 # What needs a file or another table is tested with the indices.
 ELSEWHERE = {
     ("[[behaviour]]", "name"),
-    *((head, key) for head in TABLES for key in ("psd", "series")),
+    *((head, key) for head in TABLES for key in ("psd", "series", "sensor")),
     *(("[[requirement]]", key) for key in ("index", "window_seconds", "stability_seconds")),
 }
 

@@ -12,6 +12,7 @@ from starcal_uq.core.records import write_json
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import PathLike
+from starcal_uq.runs.steps.misfit import seen_by
 from starcal_uq.runs.stored import StoredRun, writing
 
 if TYPE_CHECKING:
@@ -58,6 +59,8 @@ def budget(
 
     stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
     posterior, attitude = run.posterior, run.attitude
+    if stated is not None and stated.sensor is not None and attitude.seen is None:
+        attitude = replace(attitude, seen=seen_by(run))
     made = budget(
         posterior,
         run.observations,

@@ -64,10 +64,14 @@ def with_misfit(run: StoredRun, error: AttitudeError) -> AttitudeError:
     from starcal_uq.diagnostics import found
 
     if error.seen is None:
-        mission = _frames_of(run.folder.mission) if run.has("mission") else run.observations
         aligned = _frames_of(run.folder.alignment) if run.has("alignment") else None
-        error = replace(error, seen=mission, aligned=aligned)
+        error = replace(error, seen=seen_by(run), aligned=aligned)
     return found.with_misfit(error, diagnosis, run.posterior, run.observations)
+
+
+def seen_by(run: StoredRun) -> Observations:
+    """Frames that the attitude errors of a run are of."""
+    return _frames_of(run.folder.mission) if run.has("mission") else run.observations
 
 
 def _frames_of(path: Path) -> Observations:
