@@ -80,6 +80,10 @@ def array_budget(
         If a run folder holds no budget.
     """
     heads, stated = load_heads(file), load_budget_file(file, ("head",))
+    if stated.sensor is not None:
+        raise BudgetError(
+            f"{file}, [budget]: key sensor belongs to the budget of one head; move it there."
+        )
     if budgets is None:
         for name, run in zip(heads.names, heads.runs, strict=True):
             if not run:
