@@ -33,6 +33,9 @@ from starcal_uq.core.types import FloatArray, IntArray, PathLike
 from starcal_uq.maths.linear import mean_weights
 
 if TYPE_CHECKING:
+    import pandas as pd
+
+if TYPE_CHECKING:
     pass
 
 # Rows of a matrix that people round to six digits.
@@ -202,6 +205,30 @@ class HeadArray:
         information = np.linalg.inv(fused)[:, None] @ weights
         squares = np.einsum("khi,khij,khj->k", apart, information, apart)
         return FusedAttitudes(reference, fused, seen.sum(axis=1), squares)
+
+    def geometry(self, covariance: FloatArray) -> pd.DataFrame:
+        """Errors about the axes of the body, 1 sigma, for each head alone, all, and all but one.
+
+        Parameters
+        ----------
+        covariance : (3, 3) or (H, 3, 3) array
+            Covariance of a head about its axes, rad^2, such as ``Plan.attitude_noise``.
+
+        Returns
+        -------
+        DataFrame
+            ``heads``, ``x_arcsec``, ``y_arcsec``, ``z_arcsec``.
+        """
+        import pandas as pd
+
+        alone = np.eye(len(self.names), dtype=bool)
+        sets = dict.fromkeys(tuple(kept) for kept in (*alone, *~alone, alone.any(axis=0)))
+        rows = []
+        for kept in sorted(filter(any, sets), key=sum):
+            _, fused = self.gains(np.where(np.array(kept)[:, None, None], covariance, np.nan))
+            names = " + ".join(name for name, one in zip(self.names, kept, strict=True) if one)
+            rows.append((names, *(ARCSEC * np.sqrt(np.diag(fused)))))
+        return pd.DataFrame(rows, columns=["heads", "x_arcsec", "y_arcsec", "z_arcsec"])
 
     def by_frame(
         self, quaternions: FloatArray, covariance: FloatArray

@@ -211,9 +211,11 @@ def plan_command(
     from starcal_uq.planning.effects import PlannedEffects
     from starcal_uq.planning.forecast import N_FRAMES
     from starcal_uq.presentation.pages.write import write_page
+    from starcal_uq.presentation.tables import TextTable
 
     check_output(out, "plan", force)
     after, choose, check = campaign.after, choices.choose, choices.check
+    heads = None if choices.heads is None else sc.attitude.load_heads(choices.heads)
     if after is not None and check is not None:
         raise typer.BadParameter(
             "--check simulates campaigns from nothing: leave it out with --after."
@@ -287,9 +289,14 @@ def plan_command(
             )
     page = None if out is None else write_page(found, out, choice=choice, check=simulated)
     notes = _show_plan(found, choice, simulated)
+    geometry = None if heads is None else heads.geometry(found.attitude_noise)
+    if geometry is not None:
+        title = "Centroid noise of one frame about X, Y and Z of the body, 1 sigma"
+        print_table(TextTable.of(geometry, title))
     if page is not None:
         say(f"Page: {page.resolve()}")
     results = {"page": page, "plan": found, "choice": choice, "check": simulated, "notes": notes}
+    results["heads"] = geometry
     return Answer(results, int(forecast.target_arcsec is not None and found.frames_needed is None))
 
 

@@ -339,6 +339,7 @@ class ChoiceSettings:
     choose: int | None = None
     criterion: settings.Criterion = "A"
     check: int | None = None
+    heads: Path | None = None
 
 
 def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> None:

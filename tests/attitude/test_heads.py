@@ -115,6 +115,22 @@ def test_heads_that_see_nothing_have_no_weight(pair):
         pair.fuse(q, COVARIANCES[:, None])
 
 
+def test_geometry_is_that_of_each_axis(pair):
+    """Heads at right angles: the turn about a boresight is that of the other head."""
+    across, about = 1.0, 12.0
+    noise = np.diag(np.array([across, across, about]) / ARCSEC) ** 2
+    table = pair.geometry(noise)
+    both = (across**-2.0 + about**-2.0) ** -0.5
+    assert table["heads"].tolist() == ["A", "B", "A + B"]
+    found = table.set_index("heads")[["x_arcsec", "y_arcsec", "z_arcsec"]]
+    np.testing.assert_allclose(found.loc["A"], [across, across, about])
+    np.testing.assert_allclose(found.loc["B"], [about, across, across])
+    np.testing.assert_allclose(found.loc["A + B"], [both, across / np.sqrt(2.0), both])
+    three = sc.attitude.HeadArray(("A", "B", "C"), MOUNTINGS[[0, 1, 0]]).geometry(noise)
+    assert len(three) == 7
+    assert three["heads"].iloc[-1] == "A + B + C"
+
+
 def test_far_attitudes_meet_in_the_middle():
     """Two equal heads, three degrees apart: the mean is the middle of the turn between them."""
     turn = Rotation.from_rotvec(np.radians([[1.0, 2.0, -2.0]]))

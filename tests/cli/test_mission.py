@@ -323,6 +323,24 @@ def test_plan_before_any_data(cli, run, tmp_path, small_plans):
     assert status == 1
 
 
+def test_plan_of_two_heads(cli, tmp_path, small_plans):
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
+    (tmp_path / "heads.toml").write_text(
+        '[[head]]\nname = "A"\nrotation = [0, 0, 0, 1]\n'
+        '[[head]]\nname = "B"\nrotation = [0, 1, 0, 1]\n'
+    )
+    words = ("plan", "camera.toml", "--frames", 30, "--heads", "heads.toml")
+    status, out, err = cli(*words, "--json")
+    assert status == 0, err
+    found = {row["heads"]: row for row in json.loads(out)["heads"]}
+    assert found["A + B"]["z_arcsec"] < 0.2 * found["A"]["z_arcsec"]
+    assert found["A"]["z_arcsec"] == pytest.approx(found["B"]["x_arcsec"], rel=1e-6)
+    assert "A + B" in cli(*words)[1]
+    (tmp_path / "heads.toml").write_text("")
+    status, _, err = cli(*words)
+    assert (status, "holds no head" in err) == (2, True)
+
+
 def test_plan_states_what_effects_cost(cli, run, tmp_path, small_plans):
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     words = ("plan", "camera.toml", "--frames", 100, "--distortion-percent", 0, 0, "--effects")
