@@ -39,6 +39,7 @@ from .planning.plan import plan as plan
 from .propagation.coupling import coupling as coupling
 from .propagation.propagate import propagate as propagate
 from .runs.exchange import export as export
+from .runs.exchange import uncertain_values as uncertain_values
 from .runs.report import report as report
 from .runs.run import Run as Run
 from .simulation.frames import simulate as simulate

@@ -1,6 +1,7 @@
 from .compare import compare_runs as compare_runs
 from .compare import compare_split as compare_split
 from .exchange import export as export
+from .exchange import uncertain_values as uncertain_values
 from .folder import RunFolder as RunFolder
 from .merge import join_observations as join_observations
 from .merge import merge_runs as merge_runs

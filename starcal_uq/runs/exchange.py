@@ -4,11 +4,14 @@ tables for a text.
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
@@ -17,6 +20,7 @@ from starcal_uq.camera.distortion import parameters
 from starcal_uq.camera.exchange import CAMERA_FORMATS, Exported, export_camera, write_kernel
 from starcal_uq.camera.spice import NO_INSTRUMENT
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_text, ensure_new, split_part, write_csv
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.remedy import RUN, Remedy
@@ -108,6 +112,47 @@ def export(
         groups = write_arviz(what, run.observations, place, progress=progress)
         return Exported(place, 0.0, f"{join_words(groups)}, for `az.from_netcdf`.")
     return Exported(place, 0.0, _RESULTS[to](what, place))
+
+
+def uncertain_values(
+    what: PathLike | Run | Calibration | Posterior,
+    library: Literal["uncertainties", "gtc"] = "uncertainties",
+) -> dict[str, Any]:
+    """Parameters as correlated uncertain numbers of another library, for error propagation there.
+
+    Parameters
+    ----------
+    what : path, Run, Calibration or Posterior
+        A run, or its folder, gives its posterior, or its estimate where there is no posterior.
+    library : str
+        ``uncertainties`` (``UFloat``) or ``gtc`` (``UncertainReal`` of GTC).
+
+    Returns
+    -------
+    dict
+        Number by name of the parameter, px units: mean, standard deviation and correlations.
+
+    Raises
+    ------
+    MissingExtraError
+        If the library is not installed.
+    """
+    opened = Run(what) if isinstance(what, str | os.PathLike) else what
+    best = opened.best if isinstance(opened, Run) else opened
+    camera, covariance = _camera_of(best), best.covariance
+    names, mean = camera.parameter_names, camera.theta.tolist()
+    with extra("uncertain", "uncertain numbers"):
+        if library == "uncertainties":
+            from uncertainties import correlated_values
+
+            return dict(zip(names, correlated_values(mean, covariance), strict=True))
+        import GTC
+
+    sigma = np.sqrt(np.diag(covariance))
+    found = GTC.multiple_ureal(mean, sigma.tolist(), math.inf, label_seq=names)
+    for (i, one), (j, other) in itertools.combinations(enumerate(found), 2):
+        GTC.set_correlation(float(covariance[i, j] / (sigma[i] * sigma[j])), one, other)
+    return dict(zip(names, found, strict=True))
 
 
 def _camera_of(best: Calibration | Posterior) -> Camera:

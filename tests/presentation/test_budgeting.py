@@ -41,11 +41,32 @@ axis = "Y"
 limit_arcsec = 2.0
 """
 
+GROUPS = """
+[[contributor]]
+name = "thermal, one"
+ecss_class = "thermo-elastic"
+axis = "cross-boresight"
+sigma_arcsec = 0.7
+mean_arcsec = -0.3
+interpretation = "temporal"
+absorbed_by_alignment = "yes"
+correlation_group = "=thermal"
+provenance = "report"
+[[contributor]]
+name = "=thermal, two"
+ecss_class = "thermo-elastic"
+axis = "all"
+sigma_arcsec = 0.4
+interpretation = "temporal"
+absorbed_by_alignment = "no"
+correlation_group = "-=thermal"
+provenance = "report"
+"""
 
-@pytest.fixture
-def found(tmp_path):
+
+def made_of(text, tmp_path):
     path = tmp_path / "budget.toml"
-    path.write_text(FILE)
+    path.write_text(text)
     stated = load_budget_file(path)
     rows = from_file(stated, (), ())
     return Budget(
@@ -61,6 +82,11 @@ def found(tmp_path):
             "n_stars": 999,
         },
     )
+
+
+@pytest.fixture
+def found(tmp_path):
+    return made_of(FILE, tmp_path)
 
 
 def test_the_sheet_ranks_requirements_and_keeps_what_the_title_block_states(found, tmp_path):
@@ -104,3 +130,44 @@ def test_without_a_browser_nothing_is_written(found, monkeypatch, tmp_path):
     with pytest.raises(sc.errors.MissingExtraError, match="a PDF takes a browser"):
         sc.report(found, tmp_path / "sheet.pdf")
     assert not (tmp_path / "sheet.pdf").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.extra("excel")
+@pytest.mark.skipif(shutil.which("soffice") is None, reason="takes LibreOffice")
+def test_a_spreadsheet_recalculates_the_rule_from_the_contributors(tmp_path):
+    """As written, and after a sigma was changed in the workbook, without any code of ours."""
+    import openpyxl
+
+    text = FILE + GROUPS
+    written = sc.report(made_of(text, tmp_path), tmp_path / "b.xlsx")
+    for sigma in (1.0, 2.5):
+        book = openpyxl.load_workbook(written)
+        rows = book["Contributors"]
+        heads = [cell.value for cell in rows[1]]
+        for row in rows.iter_rows(min_row=2):
+            if row[0].value == "alignment residual":
+                row[heads.index("Sigma [arcsec]")].value = sigma
+        book.save(tmp_path / "changed.xlsx")
+        recalculated = ["soffice", "--headless", "--convert-to", "ods", "--outdir", str(tmp_path)]
+        subprocess.run(
+            [*recalculated, str(tmp_path / "changed.xlsx")], check=True, capture_output=True
+        )
+        recalculated[3] = "xlsx:Calc MS Excel 2007 XML"
+        (tmp_path / "changed.xlsx").unlink()
+        subprocess.run(
+            [*recalculated, str(tmp_path / "changed.ods")], check=True, capture_output=True
+        )
+        live = openpyxl.load_workbook(tmp_path / "changed.xlsx", data_only=True)["Live totals"]
+        expected = made_of(text.replace("sigma_arcsec = 1.0", f"sigma_arcsec = {sigma}"), tmp_path)
+        for row in live.iter_rows(min_row=2, max_row=7, values_only=True):
+            scope, axis, mean, spread, factor, rule = row[:6]
+            total = expected.total(axis, scope)
+            shown = (mean, spread, factor, rule)
+            assert shown == pytest.approx(
+                (total.mean_arcsec, total.sigma_arcsec, total.factor, total.rule_arcsec), rel=1e-9
+            )
+    # Rows that err together matter: in squares alone the sum is another.
+    alone = (1.0**2 + 0.7**2 + 0.4**2) ** 0.5
+    before = made_of(text, tmp_path).total("X", "before alignment").sigma_arcsec
+    assert abs(before - (1.0**2 + (0.7 - 0.4) ** 2) ** 0.5) < 1e-12 < 0.1 < alone - before

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import sys
 import warnings
 from typing import get_args
 
@@ -91,3 +92,30 @@ def test_a_calibration_alone_and_a_camera_alone(run, tmp_path, monkeypatch):
 
 def test_the_command_line_has_every_format():
     assert tuple(FORMATS) == get_args(ExportFormat)
+
+
+@pytest.mark.parametrize("library", ["uncertainties", "gtc"])
+def test_parameters_are_correlated_numbers_of_other_libraries(run, library):
+    """Derivatives and correlations count."""
+    pytest.importorskip({"gtc": "GTC"}.get(library, library))
+    values = sc.uncertain_values(run.path, library)
+    assert list(values) == list(run.posterior.camera_names)
+    mean, covariance = run.posterior.mean, run.posterior.covariance
+    made = values["f"] * values["k1"] ** 2 + values["x0"]
+    gradient = np.zeros(len(mean))
+    gradient[[0, 2, 3]] = 1.0, mean[3] ** 2, 2.0 * mean[2] * mean[3]
+    expected = np.sqrt(gradient @ covariance @ gradient)
+    shown = (made.x, made.u) if library == "gtc" else (made.nominal_value, made.std_dev)
+    assert shown == pytest.approx((mean[2] * mean[3] ** 2 + mean[0], expected), rel=1e-9)
+    # Their correlation counts: of two numbers without it the sum would have sqrt(2).
+    sd = np.sqrt(np.diag(covariance))
+    both = values["f"] / sd[2] + values["k1"] / sd[3]
+    found = both.u if library == "gtc" else both.std_dev
+    rho = covariance[2, 3] / (sd[2] * sd[3])
+    assert found == pytest.approx(np.sqrt(2.0 + 2.0 * rho), rel=1e-9) and abs(rho) > 0.1
+
+
+def test_uncertain_numbers_name_the_extra(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "GTC", None)
+    with pytest.raises(sc.errors.MissingExtraError, match=r"starcal-uq\[uncertain\]"):
+        sc.uncertain_values(run, "gtc")

@@ -8,7 +8,8 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.result import Budget
-from starcal_uq.budgeting.rows import confidence_text
+from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, confidence_text
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, cell_text
@@ -122,8 +123,8 @@ def sheet_html(budget: Budget) -> str:
 
 
 def write_xlsx(budget: Budget, path: PathLike) -> None:
-    """A workbook with the sheets Contributors, Totals, Requirements (if any) and Notes; numbers are
-    numbers.
+    """A workbook with the sheets Contributors, Totals, Live totals, Requirements (if any) and Notes;
+    numbers are numbers. The rule of the live totals is formulas over the contributors.
     """
     with extra("excel", "Excel workbooks", "write .csv or .html"):
         from openpyxl import Workbook
@@ -136,6 +137,7 @@ def write_xlsx(budget: Budget, path: PathLike) -> None:
     _sheet(book, "Contributors", contributors, [_AMBER if mark else "" for mark in marks])
     totals = _totals(budget)
     _sheet(book, "Totals", totals, [_AMBER if mark else "" for mark in totals["at_least"]])
+    _live_totals(book, budget, list(contributors))
     if budget.outcomes:
         requirements = budget.requirements_dataframe()
         requirements["in_words"] = [told("outcome", outcome) for outcome in budget.outcomes]
@@ -169,6 +171,61 @@ def _totals(budget: Budget) -> pd.DataFrame:
     for name in names:
         table[name] = table[name].where(table[name].notna(), words)
     return table
+
+
+def _live_totals(book: Workbook, budget: Budget, columns: Sequence[str]) -> None:
+    """A sheet that repeats the rule for each axis in the mixed interpretation: what is changed on
+    the sheet Contributors changes it.
+    """
+    import pandas as pd
+    from openpyxl.utils import get_column_letter
+
+    letters = {name: get_column_letter(n) for n, name in enumerate(columns, start=1)}
+    first = len(SCOPES) * len(AXES) + 4
+    last = first + len(budget.rows) - 1
+    totals: list[tuple[str, ...]] = []
+    rows: list[tuple[str | int, ...]] = []
+    for scope, flag in zip(SCOPES, "FG", strict=True):
+        for axis in AXES:
+            at = len(totals) + 2
+            axes, counts, means, sigmas, together = (
+                f"${c}${first}:${c}${last}" for c in ("B", flag, "C", "E", chr(ord(flag) + 2))
+            )
+            where = f'({axes}="{AXIS_LABELS[axis]}")*{counts}'
+            totals.append(
+                (
+                    *(scope, AXIS_LABELS[axis]),
+                    f"=SUMPRODUCT({where},{means})",
+                    f"=SQRT(SUMPRODUCT({where},{sigmas},{together}))",
+                    f"=NORMSINV((1+{budget.confidence!r})/2)",
+                    f"=ABS(C{at})+E{at}*D{at}",
+                )
+            )
+    for number, row in enumerate(budget.rows):
+        group, sign = row.group
+        at, source = first + number, f"Contributors!{{}}{number + 2}"
+        key = _cell(f"group: {group}" if group else row.name)
+        of_axis = f"B${first}:B${last},B{at},D${first}:D${last},D{at}"
+        rows.append(
+            (
+                *(_cell(row.name), AXIS_LABELS[row.axis]),
+                *(f"=N({source.format(letters['mean_arcsec'])})", key),
+                f"={sign:+.0f}*N({source.format(letters['sigma_arcsec'])})",
+                *(int(row.counts(scope) and row.applies) for scope in SCOPES),
+                *(f"=SUMIFS(E${first}:E${last},{of_axis},{c}${first}:{c}${last},1)" for c in "FG"),
+            )
+        )
+    heads = ("scope", "axis", "mean_arcsec", "sigma_arcsec", "factor", "rule_arcsec")
+    _sheet(book, "Live totals", pd.DataFrame(totals, columns=heads), [""] * len(totals))
+    sheet = book["Live totals"]
+    for number, formulas in enumerate(totals, start=2):
+        for cell, formula in zip(sheet[number], formulas, strict=True):
+            cell.value, cell.number_format = formula, "0.0000"
+    sheet.append([])
+    sums = (f"signed sigma of all that err together, {scope}" for scope in SCOPES)
+    sheet.append(["contributor", "axis", "mean", "errs with", "signed sigma", *SCOPES, *sums])
+    for cells in rows:
+        sheet.append(cells)
 
 
 def _head(name: str) -> str:
