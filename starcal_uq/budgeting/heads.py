@@ -11,7 +11,7 @@ smaller with many heads: it stands in the file of the heads, as in that of a bud
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -32,11 +32,13 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray, PathLike
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
 _LETTERS = dict(zip(AXES, "XYZ", strict=True))
 # A row is turned with its covariance where its axes are alike in these.
 _ALIKE = ("ecss_class", "interpretation", "absorbed_by_alignment", "part", "behaviour")
+# Figures that are turned alike.
+_SIGMAS = ("sigma_arcsec", "if_model_holds_arcsec", "with_misfit_found_arcsec")
 # Less of an error than this is rounding.
 _NOTHING = 1e-9
 # Noise above the least by more than this is worth a note.
@@ -113,17 +115,13 @@ def array_budget(
         )
     gains, _ = heads.gains(weighed)
     turned = _Turned(heads, gains, stated)
-    common = {row.name for row in stated.contributors}
+    shared = {row.name for row in stated.contributors}
     for name in dict.fromkeys(row.name for budget in budgets for row in budget.rows):
-        if name not in common:
+        if name not in shared:
             turned.add(name, [by_contributor(budget.rows).get(name, {}) for budget in budgets])
-    rows = (*turned.rows, *from_file(stated, (), ()))
-    rows = tuple(
-        replace(row, behaviour=turned.behaviours[row.name, row.axis].text)
-        if (row.name, row.axis) in turned.behaviours
-        else row
-        for row in rows
-    )
+    for common in from_file(stated, (), ()):
+        turned.keep(common.name, [common])
+    rows = tuple(turned.rows)
     settings = {"file": str(file), "heads": list(heads.names), "n_samples": n_samples}
     return Budget(
         **combination(rows, stated, turned.behaviours, chosen, n_samples, seed),
@@ -171,9 +169,6 @@ class _Turned:
     rows: list[Contributor] = field(default_factory=list)
     behaviours: dict[tuple[str, str], Behaviour] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        self.behaviours.update(self.stated.behaviours)
-
     def add(self, name: str, by_head: Sequence[Mapping[str, Contributor]]) -> None:
         """One contributor of all heads."""
         every = [row for axes in by_head for row in axes.values()]
@@ -185,15 +180,15 @@ class _Turned:
             rows = list(axes.values())
             called = f"{name}, {head}"
             if rows and _gaussian(rows):
-                self._keep(name, _together(rows, called, gain))
+                self.keep(name, _together(rows, called, gain))
                 continue
             for row in rows:
                 column = gain[:, AXES.index(row.axis)]
                 own = f"{called} about {_LETTERS[row.axis]}"
-                self._keep(name, _alone(row, own, head, column))
+                self.keep(name, _alone(row, own, head, column))
 
-    def _keep(self, name: str, rows: Sequence[Contributor]) -> None:
-        self.rows.extend(rows)
+    def keep(self, name: str, rows: Sequence[Contributor]) -> None:
+        """Rows of a contributor, which behave as the file states, or as their heads do."""
         for row in rows:
             behaviour = self.stated.behaviours.get((name, row.axis))
             if behaviour is None and name == NEA and self.stated.frame_seconds is not None:
@@ -201,6 +196,8 @@ class _Turned:
             behaviour = behaviour or Behaviour.of_text(row.behaviour)
             if behaviour is not None:
                 self.behaviours[row.name, row.axis] = behaviour
+                row = replace(row, behaviour=behaviour.text)
+            self.rows.append(row)
 
 
 def _gaussian(rows: Sequence[Contributor]) -> bool:
@@ -218,25 +215,26 @@ def _together(rows: Sequence[Contributor], name: str, gain: FloatArray) -> list[
     for row in rows:
         mean[AXES.index(row.axis)] = row.mean_arcsec
     mean = gain @ mean
-    sigma, correlation = _sigmas(rows, gain, "sigma_arcsec")
-    held, _ = _sigmas(rows, gain, "if_model_holds_arcsec")
-    found, _ = _sigmas(rows, gain, "with_misfit_found_arcsec")
-    exists = any(row.applies for row in rows)
+    figures = [_sigmas(rows, gain, key) for key in _SIGMAS]
+    sigma, correlation = figures[0]
     return [
         replace(
             rows[0],
             name=name,
             axis=axis,
             mean_arcsec=float(mean[i]),
-            sigma_arcsec=float(sigma[i]),
             axis_correlation=tuple(map(float, correlation[i])) if sigma.any() else (),
             tail_997=max(row.tail_997 for row in rows),
-            if_model_holds_arcsec=float(held[i]),
-            with_misfit_found_arcsec=float(found[i]),
-            applies=exists,
+            applies=any(row.applies for row in rows),
+            **own,
         )
         for i, axis in enumerate(AXES)
+        for own in [_figures(float(found[i]) for found, _ in figures)]
     ]
+
+
+def _figures(sigmas: Iterable[float]) -> AnyDict:
+    return dict(zip(_SIGMAS, sigmas, strict=True))
 
 
 def _sigmas(
@@ -260,21 +258,14 @@ def _alone(row: Contributor, name: str, head: str, column: FloatArray) -> list[C
     """An error about one axis of a head, which turns the body about a fixed axis."""
     made = []
     group, sign = row.group
+    together = f"{group}, {head}" if group else name
     for axis, turn in zip(AXES, column, strict=True):
-        moved = replace(row, name=name, axis=axis, axis_correlation=())
+        figures = _figures(float(abs(turn) * getattr(row, key)) for key in _SIGMAS)
+        figures["mean_arcsec"] = float(turn * row.mean_arcsec)
+        source, signed = row.source, together if sign * turn > 0.0 else f"-{together}"
         if abs(turn) < _NOTHING:
             # It is known to be nothing about this axis.
-            made.append(replace(moved, mean_arcsec=0.0, sigma_arcsec=0.0, source="file"))
-            continue
-        together = f"{group}, {head}" if group else name
-        made.append(
-            replace(
-                moved,
-                mean_arcsec=float(turn * row.mean_arcsec),
-                sigma_arcsec=float(abs(turn) * row.sigma_arcsec),
-                if_model_holds_arcsec=float(abs(turn) * row.if_model_holds_arcsec),
-                with_misfit_found_arcsec=float(abs(turn) * row.with_misfit_found_arcsec),
-                correlation_group=together if sign * turn > 0.0 else f"-{together}",
-            )
-        )
+            figures, source, signed = dict.fromkeys(figures, 0.0), "file", ""
+        moved = replace(row, name=name, axis=axis, axis_correlation=(), source=source)
+        made.append(replace(moved, correlation_group=signed, **figures))
     return made

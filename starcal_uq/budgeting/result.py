@@ -256,18 +256,7 @@ class Budget(Shown):
         """One row per contributor and axis: the fields of `Contributor`, ``assessed`` and
         ``combination``.
         """
-        import pandas as pd
-
-        names = [f.name for f in fields(Contributor)]
-        rows = [
-            {
-                **{name: getattr(row, name) for name in names},
-                "assessed": row.assessed,
-                "combination": row.combination,
-            }
-            for row in self.rows
-        ]
-        return pd.DataFrame(rows)
+        return _table(self.rows, Contributor)
 
     def totals_dataframe(self) -> pd.DataFrame:
         """One row per total: the fields of `Total`, and ``at_least``."""
@@ -302,12 +291,7 @@ class Budget(Shown):
 
     def filter_dataframe(self) -> pd.DataFrame:
         """One row per state of a filter: the fields of `FilterState`, and ``density``."""
-        import pandas as pd
-
-        names = [f.name for f in fields(FilterState)]
-        names.insert(names.index("misfit"), "density")
-        states = [[getattr(state, name) for name in names] for state in self.filter]
-        return pd.DataFrame(states, columns=names)
+        return _table(self.filter, FilterState)
 
     def requirements_dataframe(self) -> pd.DataFrame:
         """One row per requirement: its fields, the bounds, ``least_arcsec``, ``margin_arcsec`` and
@@ -457,6 +441,15 @@ class Budget(Shown):
                 document=settings.get("document", {}),
                 configuration=settings.get("configuration", {}),
             )
+
+
+def _table(records: Sequence[Any], kind: Any) -> pd.DataFrame:
+    """Records of a kind, a row each: their fields, and what is documented beside them."""
+    import pandas as pd
+
+    names = [*(f.name for f in fields(kind)), *kind.DOCUMENTED]
+    rows = [[getattr(record, name) for name in names] for record in records]
+    return pd.DataFrame(rows, columns=names)
 
 
 def _unknown(value: Any) -> bool:

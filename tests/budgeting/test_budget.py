@@ -1122,6 +1122,7 @@ def test_names_of_axes_and_limits_of_this_confidence(tmp_path: Path) -> None:
     names.remove("difference")
     names += ["explanation", "difference"]
     columns = ["record", *dict.fromkeys(names), "combination", "margin_arcsec", "verdict", "value"]
+    columns += ["kind", "seconds", "misfit", "contributors"]
     assert text[0] == ",".join(columns)
     kinds = [line.split(",")[0] for line in text[1:]]
     assert (

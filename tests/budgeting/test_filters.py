@@ -39,7 +39,7 @@ class Draws:
         self.mean, self.covariance = THETA, np.diag(SIGMA**2)
         self.sigma_name, self.star_error_px, self.effects = "sigma", 0.0, None
         self.provenance = Provenance()
-        self.camera = sc.Camera(
+        self.camera = self.calibrated_camera = sc.Camera(
             width_px=SIZE, height_px=SIZE, pixel_um=10.0, focal_mm=58.0, x0_px=511.5, y0_px=511.5,
             distortion="brown", coefficients=(1.0e-10, 0.0),
         )  # fmt: skip
