@@ -17,7 +17,7 @@ from starcal_uq.core.records import read_arrays
 from starcal_uq.core.settings import Moves
 from starcal_uq.core.tasks import interrupt_between_steps
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Progress
-from starcal_uq.inference.target import Density, student_t_log_density
+from starcal_uq.inference.target import Density, Target, student_t_log_density
 
 # Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is
 # out of reach.
@@ -123,6 +123,17 @@ def run_ensembles(
                 store.add(index, first, last, sampler, state)
             store.next_ensemble()
     return store.chains
+
+
+def ensemble_draws(
+    target: Target,
+    seed: np.random.SeedSequence,
+    settings: EnsembleSettings,
+    moves: list[tuple[Any, float]] | None = None,
+) -> FloatArray:
+    """Draws (n, p+1) of one ensemble, step after step; `moves` as of `run_ensembles`."""
+    chains = run_ensembles(target.log_density, target.dim, [seed], settings, moves=moves)
+    return target.natural(chains.u[0].reshape(-1, target.dim))
 
 
 def autocorrelation(values: FloatArray) -> FloatArray:

@@ -24,7 +24,14 @@ from starcal_uq.core.remedy import calibrated
 from starcal_uq.core.settings import Evaluation, LikelihoodName
 from starcal_uq.core.status import Check, Code, Level, Note
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
+from starcal_uq.inference.target import (
+    Extra,
+    Likelihood,
+    LogLikelihood,
+    Target,
+    laplace_approximation,
+    start_target,
+)
 from starcal_uq.likelihood.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -32,6 +39,7 @@ from starcal_uq.observations.frames import StarFrames
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.exact import FrameSample
+    from starcal_uq.inference.priors import Priors
     from starcal_uq.observations.table import Observations
 
 LIKELIHOODS = get_args(LikelihoodName)
@@ -127,6 +135,37 @@ def find_source(
         remedies=calibrated(),
     )
     return replace(source, checks=(check,))
+
+
+def quick_target(
+    likelihood: str | Likelihood,
+    obs: Observations,
+    cal: Calibration,
+    priors: Priors,
+    sigma: float | None = None,
+) -> tuple[Target, bool]:
+    """Target of one of many simulated tables, centred at its mode, and whether it is fast; `sigma`
+    is a noise that is given.
+    """
+    with warnings.catch_warnings():
+        # That pairs are not independent is what a simulation of them shows.
+        warnings.simplefilter("ignore", NaivePairsWarning)
+        source = find_source(likelihood, obs, cal, None)
+    evaluate = source.exact if source.fast is None else source.fast
+    if evaluate is None:
+        raise SamplingError(f"the likelihood {source.name!r} cannot be evaluated: give another.")
+    noise = source.sigma if sigma is None else sigma
+    start = start_target(
+        evaluate,
+        priors,
+        source.theta,
+        source.information * (source.sigma / noise) ** 2,
+        noise,
+        source.dof,
+        sigma is not None,
+        source.extra,
+    )
+    return laplace_approximation(start)[0], source.fast is not None
 
 
 def _widened(source: Source, factors: FloatArray) -> Source:

@@ -225,6 +225,19 @@ def student_t_log_density(u: FloatArray, df: float) -> FloatArray:
     return np.asarray(-0.5 * (df + u.shape[1]) * np.log1p(np.sum(u * u, axis=1) / df))
 
 
+def importance_draws(
+    target: Target, n: int, df: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, float]:
+    """Draws (n, p+1) of a multivariate t around the mode, their Pareto-smoothed weights (n,), and
+    the weights' shape; arguments as of `importance_check`.
+    """
+    from starcal_uq.inference.arviz import psis
+
+    u = rng.standard_normal((n, target.dim)) / np.sqrt(rng.chisquare(df, (n, 1)) / df)
+    log_weights, khat = psis(target.log_density(u) - student_t_log_density(u, df))
+    return target.natural(u), np.exp(log_weights), float(khat)
+
+
 @dataclass(frozen=True)
 class ImportanceCheck:
     """Moments of the posterior by importance sampling."""
@@ -245,17 +258,10 @@ def importance_check(
     `target` is one that `laplace_approximation` has centred and whitened; `df` are the proposal's
     degrees of freedom.
     """
-    from starcal_uq.inference.arviz import psis
-
-    u = rng.standard_normal((n, target.dim)) / np.sqrt(rng.chisquare(df, (n, 1)) / df)
-    log_weights, khat = psis(target.log_density(u) - student_t_log_density(u, df))
-    weights = np.exp(log_weights)
-    natural = target.natural(u)
+    natural, weights, khat = importance_draws(target, n, df, rng)
     # Moments about a point among the draws: 5000 px with a sd of 0.03 px would lose digits in a raw
     # second moment.
     origin = target.natural(np.zeros((1, target.dim)))[0]
     shift = weights @ (natural - origin)
     variance = weights @ (natural - origin - shift) ** 2
-    return ImportanceCheck(
-        float(khat), origin + shift, np.sqrt(variance), float(1.0 / np.sum(weights**2))
-    )
+    return ImportanceCheck(khat, origin + shift, np.sqrt(variance), float(1.0 / np.sum(weights**2)))

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,18 +14,12 @@ import numpy as np
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import AnyMapping, FloatArray
-from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, run_ensembles
-from starcal_uq.inference.named import NaivePairsWarning, find_source
+from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, ensemble_draws
+from starcal_uq.inference.named import quick_target
 from starcal_uq.inference.priors import GaussianPriors, Priors
 from starcal_uq.inference.surrogate import fit_polynomial
-from starcal_uq.inference.target import (
-    Target,
-    laplace_approximation,
-    start_target,
-    student_t_log_density,
-)
+from starcal_uq.inference.target import importance_draws
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, scaled_inverse
 from starcal_uq.observations.origin import SIMULATED, Origin
@@ -171,26 +164,9 @@ class SimulatedCells(Cells):
         seed: np.random.SeedSequence,
     ) -> Numbers:
         """Moments of the posterior, and whether its intervals hold the truth."""
-        with warnings.catch_warnings():
-            # That pairs are not independent is what a study of them shows.
-            warnings.simplefilter("ignore", NaivePairsWarning)
-            source = find_source(likelihood, obs, cal, None)
-        evaluate = source.exact if source.fast is None else source.fast
-        if evaluate is None:
-            raise SamplingError(f"the likelihood {likelihood!r} cannot be evaluated: use another.")
-        start = start_target(
-            evaluate,
-            priors,
-            source.theta,
-            source.information,
-            source.sigma,
-            source.dof,
-            False,
-            source.extra,
-        )
-        target, _ = laplace_approximation(start)
+        target, fast = quick_target(likelihood, obs, cal, priors)
         design, draws = seed.spawn(2)
-        if source.fast is None:
+        if not fast:
             polynomial = fit_polynomial(target, _CUBIC, np.random.default_rng(design))
             target = (
                 target
@@ -199,17 +175,13 @@ class SimulatedCells(Cells):
             )
         if self.definition.posterior == "ensemble":
             steps = max(20, -(-self.definition.draws // _WALKERS))
-            chains = run_ensembles(
-                target.log_density,
-                target.dim,
-                [draws],
-                EnsembleSettings(_WALKERS, steps, _BURN, "mixture"),
+            natural = ensemble_draws(
+                target, draws, EnsembleSettings(_WALKERS, steps, _BURN, "mixture")
             )
-            natural = target.natural(chains.u[0].reshape(-1, target.dim))
             weights, khat = np.full(len(natural), 1.0 / len(natural)), np.nan
         else:
             natural, weights, khat = importance_draws(
-                target, self.definition.draws, np.random.default_rng(draws)
+                target, self.definition.draws, PROPOSAL_DF, np.random.default_rng(draws)
             )
         truth = truth_of(camera, cal)
         shift = natural[:, : len(truth)] - truth
@@ -318,18 +290,3 @@ def embedded(name: str, value: Any, own: tuple[str, ...], names: tuple[str, ...]
     wide = np.full((len(names), *((len(names),) if square else value.shape[1:])), np.nan)
     wide[np.ix_(place, place) if square else place] = value
     return wide
-
-
-def importance_draws(
-    target: Target, n: int, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, float]:
-    """Draws (n, d) of a multivariate t around the mode, their smoothed weights (n,), and the
-    weights' Pareto shape.
-    """
-    from starcal_uq.inference.arviz import psis
-
-    u = rng.standard_normal((n, target.dim)) / np.sqrt(
-        rng.chisquare(PROPOSAL_DF, (n, 1)) / PROPOSAL_DF
-    )
-    log_weights, khat = psis(target.log_density(u) - student_t_log_density(u, PROPOSAL_DF))
-    return target.natural(u), np.exp(log_weights), float(khat)

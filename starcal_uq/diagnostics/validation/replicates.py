@@ -8,7 +8,6 @@ replicates do not.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,17 +18,12 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.constants import ARCSEC, AXES
-from starcal_uq.core.errors import PriorError, SamplingError
+from starcal_uq.core.errors import PriorError
 from starcal_uq.core.settings import Truth
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
-from starcal_uq.inference.ensemble import EnsembleSettings, run_ensembles
-from starcal_uq.inference.named import NaivePairsWarning, find_source
-from starcal_uq.inference.target import (
-    Likelihood,
-    LogLikelihood,
-    laplace_approximation,
-    start_target,
-)
+from starcal_uq.inference.ensemble import EnsembleSettings, ensemble_draws
+from starcal_uq.inference.named import quick_target
+from starcal_uq.inference.target import Likelihood, LogLikelihood
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import symmetric_inverse
 from starcal_uq.simulation.frames import Campaign
@@ -168,35 +162,11 @@ def _sample(
 ) -> tuple[FloatArray, LogLikelihood]:
     """Draws (n_steps, n_walkers, p+1) and the likelihood that they are of."""
     made = study.likelihood if isinstance(study.likelihood, str) else study.likelihood(obs, cal)
-    with warnings.catch_warnings():
-        # That pairs are not independent is what a validation of them shows.
-        warnings.simplefilter("ignore", NaivePairsWarning)
-        source = find_source(made, obs, cal, None)
-    log_likelihood = source.exact if source.fast is None else source.fast
-    if log_likelihood is None:
-        raise SamplingError(f"the likelihood {source.name!r} cannot be evaluated: give another.")
-    given = study.assumed_sigma_px
-    sigma = source.sigma if given is None else given
-    information = source.information * (source.sigma / sigma) ** 2
-    start = start_target(
-        log_likelihood,
-        study.priors,
-        source.theta,
-        information,
-        sigma,
-        source.dof,
-        given is not None,
-    )
-    target, _ = laplace_approximation(start)
-    chains = run_ensembles(
-        target.log_density,
-        target.dim,
-        [seed],
-        EnsembleSettings(study.n_walkers, study.n_steps, study.n_burn, "mixture"),
-        moves=None if study.moves is None else study.moves(),
-    )
-    draws = target.natural(chains.u[0].reshape(-1, target.dim))
-    return draws.reshape(study.n_steps, study.n_walkers, -1), log_likelihood
+    target, _ = quick_target(made, obs, cal, study.priors, study.assumed_sigma_px)
+    settings = EnsembleSettings(study.n_walkers, study.n_steps, study.n_burn, "mixture")
+    moves = None if study.moves is None else study.moves()
+    draws = ensemble_draws(target, seed, settings, moves)
+    return draws.reshape(study.n_steps, study.n_walkers, -1), target.log_likelihood
 
 
 def _compare(
