@@ -156,11 +156,18 @@ class Camera(Shown):
         return (self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0
 
     @property
+    def corner_px(self) -> tuple[float, float]:
+        """The farthest corner of the detector, from the principal point, pixels."""
+        x, y = (
+            max(-0.5 - at, size - 0.5 - at, key=abs)
+            for size, at in ((self.width_px, self.x0_px), (self.height_px, self.y0_px))
+        )
+        return x, y
+
+    @property
     def corner_radius_px(self) -> float:
         """Distance of the principal point from the farthest corner of the detector, pixels."""
-        dx = max(abs(-0.5 - self.x0_px), abs(self.width_px - 0.5 - self.x0_px))
-        dy = max(abs(-0.5 - self.y0_px), abs(self.height_px - 0.5 - self.y0_px))
-        return math.hypot(dx, dy)
+        return math.hypot(*self.corner_px)
 
     @property
     def half_diagonal_px(self) -> float:

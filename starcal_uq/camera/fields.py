@@ -4,10 +4,13 @@ displacements best.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -26,6 +29,20 @@ def detector_axes(camera: Camera, n: int) -> tuple[FloatArray, FloatArray]:
 def grid_points(x: FloatArray, y: FloatArray) -> FloatArray:
     """Points (ny * nx, 2) of a grid; x runs fastest."""
     return np.column_stack([grid.ravel() for grid in np.meshgrid(x, y)])
+
+
+def detector_corners(camera: Camera) -> FloatArray:
+    """Corners (4, 2) of the detector, px."""
+    return grid_points(*detector_axes(camera, 2))
+
+
+def corner_displacement_px(camera: Camera, coefficients: Sequence[Any]) -> Any:
+    """Displacement of the farthest corner away from the principal point, px, by coefficients that
+    are numbers or (n,).
+    """
+    u, v = camera.corner_px
+    du, dv = get_model(camera.distortion).displacement(u, v, coefficients)
+    return (du * u + dv * v) / math.hypot(u, v)
 
 
 def area_weights(n: int) -> FloatArray:

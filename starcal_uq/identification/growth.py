@@ -18,6 +18,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.fields import detector_corners
 from starcal_uq.camera.projection import before_fold, forward_kernel, unproject_theta
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.identification.match import Match, log10_choices, noise_variance
@@ -127,10 +128,7 @@ def grow(
     fit = _fitted(fit, xy[centroid], sigma[centroid], r, prior)
     grown = camera.replace(distortion=_MODEL).with_theta(fit.theta)
     # No lens shows the detector's corners more than once.
-    corners = np.array(
-        [[x, y] for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)]
-    )
-    if not np.isfinite(unproject_theta(_MODEL, fit.theta, corners)).all():
+    if not np.isfinite(unproject_theta(_MODEL, fit.theta, detector_corners(camera))).all():
         return None
     typical = fit.noise * float(median_of(sigma))
     expected = _log10_false(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.fields import corner_displacement_px
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.inference import arviz as arviz_compat
@@ -28,26 +29,12 @@ def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
     if post.camera.pixel_um is not None:
         values["focal length", "mm"] = draws[:, 2] * post.camera.pixel_um / 1000.0
     if model.lens:
-        values["distortion at the corner", "px"] = corner_displacement_px(post)
+        values["distortion at the corner", "px"] = floats(
+            corner_displacement_px(post.camera, list(draws[:, 3:].T))
+        )
     for i, axis in enumerate(AXES):
         values[f"common rotation, {axis}", "arcsec"] = rotation[:, i]
     return tuple(_diagnosed(post, name, unit, v) for (name, unit), v in values.items())
-
-
-def corner_displacement_px(post: Posterior) -> FloatArray:
-    """Displacement (n,) of a star in the farthest corner by the distortion of each draw, along the
-    radius, px.
-    """
-    camera = post.camera
-    corners = np.array(
-        [(x, y) for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)]
-    )
-    offsets = corners - camera.theta[:2]
-    far = offsets[int(np.argmax(np.hypot(*offsets.T)))]
-    du, dv = get_model(camera.distortion).displacement(
-        far[0], far[1], list(post.theta_draws[:, 3:].T)
-    )
-    return floats((du * far[0] + dv * far[1]) / np.hypot(*far))
 
 
 def _diagnosed(post: Posterior, name: str, unit: str, values: FloatArray) -> Derived:

@@ -19,6 +19,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.fields import detector_corners
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import DistortionError, ImageError
@@ -456,10 +457,7 @@ class Frames(Shown):
         stars = None if rotation is None else self._catalogue
         if stars is None or rotation is None:
             return none
-        right, low = self.camera.width_px - 0.5, self.camera.height_px - 0.5
-        corners = unproject(
-            self.camera, np.array([[-0.5, -0.5], [right, -0.5], [-0.5, low], [right, low]])
-        )
+        corners = unproject(self.camera, detector_corners(self.camera))
         # Half a degree wider, for what the sky displaces.
         reach = np.cos(min(np.arccos(corners[:, 2].min()) + 0.01, 0.5 * np.pi))
         inside = np.flatnonzero(stars.directions_icrs @ rotation[2] > reach)

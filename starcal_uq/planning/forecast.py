@@ -31,7 +31,6 @@ from starcal_uq.planning.ties import PlannedTies, tied_campaigns
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.camera.camera import Camera
     from starcal_uq.planning.information import FrameSet
 
 # Parts of the attitude error that a target can be set for: what is in the error of one attitude.
@@ -138,24 +137,15 @@ def _quantity(name: str, rows: FloatArray) -> Quantity:
     return Quantity(name, rows.T @ rows)
 
 
-def edges(camera: Camera) -> FloatArray:
-    """Where the detector begins and ends along x and along y, (2, 2) px."""
-    return np.array([[-0.5, camera.width_px - 0.5], [-0.5, camera.height_px - 0.5]])
-
-
 def _corner_displacement(mission: FrameSet) -> FloatArray:
     """Displacement (2, p) px by the distortion at the corner that is farthest from the principal
     point.
     """
     camera = mission.camera
     model = get_model(camera.distortion)
-    u, v = (
-        side[np.argmax(np.abs(side - point))] - point
-        for side, point in zip(edges(camera), camera.theta[:2], strict=True)
-    )
     columns = np.zeros((2, mission.information.shape[1]))
     for j, one in enumerate(np.eye(len(model.lens)).tolist()):
-        columns[:, 3 + j] = model.displacement(u, v, one)
+        columns[:, 3 + j] = model.displacement(*camera.corner_px, one)
     return columns
 
 

@@ -16,17 +16,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, undistorted
+from starcal_uq.camera.fields import detector_corners
 from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import DistortionError, PlanningError
 from starcal_uq.core.types import FloatArray
-from starcal_uq.planning.forecast import SCOPES, Forecaster, Outlook, edges
+from starcal_uq.planning.forecast import SCOPES, Forecaster, Outlook
 from starcal_uq.planning.information import FrameSet, random_frames
 from starcal_uq.simulation.frames import Tracker
 from starcal_uq.sky.catalogue import StarCatalogue
@@ -132,7 +132,7 @@ def _unfolded(camera: Camera, percent: float) -> float:
     """As much of a displacement of the corner as one coefficient can give without a fold on the
     detector, per cent.
     """
-    corners = np.array(list(product(*edges(camera))))
+    corners = detector_corners(camera)
     for share in np.linspace(1.0, 0.02, 50):
         try:
             unproject(with_distortion(camera, percent * share / _NEAR_FOLD), corners)

@@ -165,7 +165,7 @@ def distortion_curve(
     chosen = _AZIMUTHS_DEG if azimuths_deg is None else tuple(azimuths_deg)
     azimuth = np.array(chosen if decentred else (0.0,), dtype=np.float64)
     camera = post.calibrated_camera
-    radius = np.linspace(0.0, _farthest(camera.width_px, camera.height_px, post.mean), n)
+    radius = np.linspace(0.0, camera.corner_radius_px, n)
     outward = np.column_stack([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))])
     offsets = (radius[None, :, None] * outward[:, None]).reshape(-1, 2)
     unproject(camera, _on_detector(model, offsets, post.mean) + post.mean[:2])
@@ -206,13 +206,6 @@ def distortion_curve(
         if obs is None
         else float(np.hypot(*(obs.xy - post.mean[:2]).T).max()),
     )
-
-
-def _farthest(width: int, height: int, theta: FloatArray) -> float:
-    """Distance of the farthest corner from the principal point."""
-    x = max(theta[0] + 0.5, width - 0.5 - theta[0])
-    y = max(theta[1] + 0.5, height - 0.5 - theta[1])
-    return float(np.hypot(x, y))
 
 
 def _on_detector(model: DistortionModel, offsets: FloatArray, theta: FloatArray) -> FloatArray:

@@ -10,6 +10,7 @@ from typing import Any
 from starcal_uq.calibration.calibrate import METHODS
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, get_model, model_names
+from starcal_uq.camera.fields import corner_displacement_px
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.files import shown
@@ -224,7 +225,8 @@ def _with_displacement(camera: Camera, wanted_px: float) -> Camera:
     if not any(given):
         given = (1.0, *given[1:])
     terms = [
-        _outwards(camera, [k * (i == j) for j in range(len(given))]) for i, k in enumerate(given)
+        corner_displacement_px(camera, [k * (i == j) for j in range(len(given))])
+        for i, k in enumerate(given)
     ]
     total = sum(terms)
     if abs(total) <= _CANCELLED * sum(map(abs, terms)):
@@ -235,14 +237,3 @@ def _with_displacement(camera: Camera, wanted_px: float) -> Camera:
         )
     sign = 1.0 if model.direction == "forward" else -1.0
     return camera.replace(coefficients=(*(sign * wanted_px / total * k for k in given), *axes))
-
-
-def _outwards(camera: Camera, coefficients: list[float]) -> float:
-    """Displacement of the farthest corner away from the principal point, px."""
-    ends = (-0.5, camera.width_px - 0.5), (-0.5, camera.height_px - 0.5)
-    u, v = (
-        max((end - c for end in side), key=abs)
-        for side, c in zip(ends, (camera.x0_px, camera.y0_px), strict=True)
-    )
-    du, dv = get_model(camera.distortion).displacement(u, v, coefficients)
-    return float((u * du + v * dv) / math.hypot(u, v))
