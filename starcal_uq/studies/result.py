@@ -5,6 +5,7 @@ it.
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -41,85 +42,11 @@ _PARAMETER, _OTHER, _AXIS, _FACTOR, _SIMPLER = (
 
 # In place of a unit: each parameter has its own.
 OWN_UNIT = "unit of the parameter"
+_DECLARED = tomllib.loads(Path(__file__).with_name("variables.toml").read_text("utf-8"))
 # Dimensions beyond `cell`, unit, and words of every variable.
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "n_frames": ((), "", "frames of a campaign"),
-    "mean_stars": ((), "", "stars used in a frame on average"),
-    "field_deg": ((), "deg", "full width of the field"),
-    "truth": ((_PARAMETER,), OWN_UNIT, "parameters of the cell's camera"),
-    "sigma": ((_PARAMETER,), OWN_UNIT, "standard deviation, all other parameters unknown"),
-    "sigma_data": ((_PARAMETER,), OWN_UNIT, "standard deviation without the prior"),
-    "sigma_conditional": (
-        (_PARAMETER,),
-        OWN_UNIT,
-        "standard deviation, all other parameters known",
-    ),
-    "variance_inflation": (
-        (_PARAMETER,),
-        "",
-        "square of marginal over conditional standard deviation",
-    ),
-    "correlation": ((_PARAMETER, _OTHER), "", "correlation of two parameters"),
-    "condition_number": ((), "", "condition number of the information with unit diagonal"),
-    "weak_direction": (
-        (_PARAMETER,),
-        "",
-        "least determined direction, in units of the parameters' own sigmas",
-    ),
-    "slope_x0": ((), "px/K", "standard deviation of the slope of x0 with the temperature"),
-    "slope_y0": ((), "px/K", "standard deviation of the slope of y0 with the temperature"),
-    "slope_f": ((), "px/K", "standard deviation of the slope of f with the temperature"),
-    "weak_variance": ((), "", "variance along it, 1 for uncoupled parameters"),
-    "attitude_correlation": ((_PARAMETER, _AXIS), "", "correlation with the common rotation"),
-    "common_rotation_arcsec": ((_AXIS,), "arcsec", "rotation common to all frames, 1 sigma"),
-    "frame_error_arcsec": (
-        (_AXIS,),
-        "arcsec",
-        "frame-dependent attitude error by the calibration, 1 sigma",
-    ),
-    "nea_arcsec": ((_AXIS,), "arcsec", "noise-equivalent angle of one frame, 1 sigma"),
-    "model_bias_arcsec": (
-        (_SIMPLER,),
-        "arcsec",
-        "error of directions over the field, per axis, if it were fitted",
-    ),
-    "model_bias_attitude_arcsec": (
-        (_SIMPLER, _AXIS),
-        "arcsec",
-        "frame-dependent attitude error if it were fitted",
-    ),
-    "model_bias_sigma": (
-        (_SIMPLER, _PARAMETER),
-        "",
-        "shift of a parameter in its own sigmas if it were fitted",
-    ),
-    "error_curve_arcsec": (
-        (_FACTOR,),
-        "arcsec",
-        "frame-dependent error across the boresight per axis, 1 sigma",
-    ),
-    "sigma_curve": (
-        (_PARAMETER, _FACTOR),
-        OWN_UNIT,
-        "standard deviation with other numbers of frames",
-    ),
-    "estimate": ((_PARAMETER,), OWN_UNIT, "estimate from simulated frames"),
-    "sigma_predicted": (
-        (_PARAMETER,),
-        OWN_UNIT,
-        "standard deviation by the information of the same frames",
-    ),
-    "z": ((_PARAMETER,), "", "estimate minus truth in sigmas"),
-    "covered_95": ((_PARAMETER,), "", "1 where the 95 % interval holds the truth, 0 where not"),
-    "posterior_sigma": ((_PARAMETER,), OWN_UNIT, "standard deviation of the posterior"),
-    "posterior_correlation": ((_PARAMETER, _OTHER), "", "correlation in the posterior"),
-    "noise_estimate": ((), "px", "estimated centroid noise, or factor on the stated one"),
-    "khat": (
-        (),
-        "",
-        "Pareto shape of the importance weights; above 0.7 they are not to be trusted",
-    ),
-    "seconds": ((), "s", "processor time of the cell"),
+    name: (tuple(told.get("dims", ())), told.get("unit", ""), told["words"])
+    for name, told in _DECLARED.items()
 }
 TEXTS = ("weak_words",)
 
