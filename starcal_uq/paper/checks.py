@@ -10,7 +10,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import fixed, significant
 from starcal_uq.core.types import FloatArray
-from starcal_uq.paper.errors import MAXIMUM, REPROJECTION, ErrorReading, point_errors, rms_px
+from starcal_uq.paper.errors import ERROR_READINGS, error_size, point_errors
 from starcal_uq.paper.published import (
     CLAIMED_RATIO,
     CLAIMED_Y0_ERROR_PX,
@@ -75,20 +75,13 @@ def paper_checks(
     )
 
 
-def _values(
-    readings: tuple[ErrorReading, ...],
-    truth: Camera,
-    camera: Camera,
-    xy_px: FloatArray,
-    largest: bool,
-) -> dict[str, float]:
+def _values(quantity: str, truth: Camera, camera: Camera, xy_px: FloatArray) -> dict[str, float]:
     """Each reading without noise, by its words; the main one first."""
-    found = {}
-    for reading in readings:
-        if not reading.noisy:
-            errors, weight = point_errors(reading, truth, camera, xy_px)
-            found[reading.words] = errors.max_px if largest else rms_px(reading, errors, weight)
-    return found
+    return {
+        reading.words: error_size(quantity, reading, *point_errors(reading, truth, camera, xy_px))
+        for reading in ERROR_READINGS[quantity]
+        if not reading.noisy
+    }
 
 
 def _compare(number: Printed, statement: str, values: dict[str, float]) -> PaperCheck:
@@ -103,27 +96,25 @@ def _compare(number: Printed, statement: str, values: dict[str, float]) -> Paper
 
 
 def _reprojection(truth: Camera, xy_px: FloatArray, method: str) -> PaperCheck:
-    values = _values(REPROJECTION, truth, printed_camera(truth, method), xy_px, largest=False)
+    number = printed(method, "reprojection_px")
+    values = _values(number.quantity, truth, printed_camera(truth, method), xy_px)
     row = PAPER_METHODS.index(method) + 1
-    return _compare(
-        printed(method, "reprojection_px"), f"Reprojection error of row {row}, px", values
-    )
+    return _compare(number, f"Reprojection error of row {row}, px", values)
 
 
 def _largest(truth: Camera, xy_px: FloatArray, method: str) -> PaperCheck:
+    number = printed(method, "max_residual_px")
     places = ("Table 2",) if method == LEAST_SQUARES else ("Table 2", "section 3.3")
     values: dict[str, float] = {}
     for place in places:
         camera = printed_camera(truth, method, place)
-        some = _values(MAXIMUM, truth, camera, xy_px, largest=True)
+        some = _values(number.quantity, truth, camera, xy_px)
         values |= {
             words if len(places) == 1 else f"{words}, k of {place}": value
             for words, value in some.items()
         }
     figure = 4 + PAPER_METHODS.index(method)
-    return _compare(
-        printed(method, "max_residual_px"), f"Largest residual of Fig. {figure}, px", values
-    )
+    return _compare(number, f"Largest residual of Fig. {figure}, px", values)
 
 
 def _twice(first: Printed, second: Printed, sigma: float) -> str:

@@ -13,8 +13,10 @@ Two measures, both of which need a truth and therefore a simulation:
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -209,63 +211,11 @@ class ErrorReading(NamedTuple):
     whole_field: bool = False
 
 
-# Table 2, last column. The first is the main reading.
-REPROJECTION = (
-    ErrorReading("eq16", "eq. 16 without noise", True),
-    ErrorReading(
-        "eq16 r measured", "eq. 16, r of the measured point", True, undistortion="eq14_measured"
-    ),
-    ErrorReading(
-        "eq16 crossed",
-        "eq. 16, coefficients put into the other equation",
-        True,
-        undistortion="crossed",
-    ),
-    ErrorReading("eq16 noisy", "eq. 16 with centroid noise", True, noisy=True),
-    ErrorReading("eq16 per axis", "eq. 16 per coordinate", False, per_axis=True),
-    ErrorReading("eq16 own f", "eq. 16, ideal points with the estimated f", False, optics="focal"),
-    ErrorReading(
-        "eq16 own optics",
-        "eq. 16, ideal points with all estimated optics",
-        False,
-        optics="estimate",
-    ),
-    ErrorReading("map", "best rotation removed", False, rotated=True),
-    ErrorReading(
-        "map per axis", "best rotation removed, per coordinate", False, rotated=True, per_axis=True
-    ),
-)
-# Figs. 4 to 6: the largest. The text allows all of them.
-MAXIMUM = (
-    ErrorReading("eq16 field", "eq. 16 over the detector", True, whole_field=True),
-    ErrorReading("eq16 stars", "eq. 16 at the stars", True),
-    ErrorReading("eq16 noisy", "eq. 16 at the stars, with noise", True, noisy=True),
-    ErrorReading(
-        "eq16 crossed",
-        "eq. 16, coefficients put into the other equation",
-        True,
-        "crossed",
-        whole_field=True,
-    ),
-    ErrorReading(
-        "eq16 own f",
-        "eq. 16, ideal points with the estimated f",
-        True,
-        optics="focal",
-        whole_field=True,
-    ),
-    ErrorReading(
-        "eq16 own optics", "eq. 16, all estimated optics", True, optics="estimate", whole_field=True
-    ),
-    ErrorReading(
-        "map field",
-        "best rotation removed, over the detector",
-        True,
-        rotated=True,
-        whole_field=True,
-    ),
-    ErrorReading("map stars", "best rotation removed, at the stars", True, rotated=True),
-)
+_DECLARED = tomllib.loads(Path(__file__).with_name("error_readings.toml").read_text("utf-8"))
+# Readings of the error sizes that are printed, by their quantities; the main one of each first.
+ERROR_READINGS = {
+    quantity: tuple(ErrorReading(**row) for row in rows) for quantity, rows in _DECLARED.items()
+}
 
 
 def point_errors(
@@ -306,7 +256,7 @@ def error_sizes(
     left out.
     """
     found: dict[tuple[object, ...], tuple[PointErrors, FloatArray] | None] = {}
-    for quantity, readings in (("reprojection_px", REPROJECTION), ("max_residual_px", MAXIMUM)):
+    for quantity, readings in ERROR_READINGS.items():
         for reading in readings:
             # Several readings look at the same points.
             key = (
@@ -323,13 +273,14 @@ def error_sizes(
                     found[key] = None
             errors = found[key]
             if errors is not None:
-                value = (
-                    rms_px(reading, *errors) if quantity == "reprojection_px" else errors[0].max_px
-                )
-                yield quantity, reading, value
+                yield quantity, reading, error_size(quantity, reading, *errors)
 
 
-def rms_px(reading: ErrorReading, errors: PointErrors, weight: FloatArray) -> float:
-    """Root mean square of the errors of a reading, px, from what `point_errors` gives."""
+def error_size(
+    quantity: str, reading: ErrorReading, errors: PointErrors, weight: FloatArray
+) -> float:
+    """Largest length, or root mean square, of what `point_errors` gives for a reading, px."""
+    if quantity == "max_residual_px":
+        return errors.max_px
     square = float(np.sum(weight * np.sum(errors.error_px**2, axis=1)))
     return float(np.sqrt(0.5 * square if reading.per_axis else square))

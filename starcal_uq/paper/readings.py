@@ -27,7 +27,7 @@ from starcal_uq.estimation.stages import Search, distortion_stage, joint_stage, 
 from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
-from starcal_uq.paper.errors import MAXIMUM, REPROJECTION, error_sizes, undistorted
+from starcal_uq.paper.errors import ERROR_READINGS, error_sizes, undistorted
 from starcal_uq.paper.published import (
     LEAST_SQUARES,
     MAX_MAG,
@@ -72,9 +72,7 @@ class Readings:
         """Words, faithfulness and draws of every reading that gives this number's quantity, the
         main one first.
         """
-        sizes = {"reprojection_px": REPROJECTION, "max_residual_px": MAXIMUM}.get(
-            number.quantity, ()
-        )
+        sizes = ERROR_READINGS.get(number.quantity, ())
         errors = {one.key: (one.words, one.faithful) for one in sizes} or {"": ("", True)}
         for reading in READINGS:
             for error, (words, allowed) in errors.items():

@@ -23,7 +23,7 @@ from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.checks import PaperCheck
-from starcal_uq.paper.errors import REPROJECTION, PointErrors, map_error, reprojection_error_px
+from starcal_uq.paper.errors import ERROR_READINGS, PointErrors, map_error, reprojection_error_px
 from starcal_uq.paper.judgement import Judged, Outcome, trial
 from starcal_uq.paper.published import (
     MAX_MAG,
@@ -334,7 +334,7 @@ class Reproduction(Shown):
                 }
                 good = np.isfinite(over_seeds[:, i])
                 columns[QUANTITIES[parameter]] = over_seeds[good, i] * unit, numbers
-            main = REPROJECTION[0].key
+            main = ERROR_READINGS["reprojection_px"][0].key
             draws = self.readings.of(AS_PRINTED, method.method, "reprojection_px", main)
             size = reprojection_error_px(run.truth, cal.camera, run.observations.xy).rms_px
             found = draws if in_paper else draws[:0]

@@ -20,9 +20,8 @@ from starcal_uq.paper import reproduction as command
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.checks import NO, WITHIN_NOISE, paper_checks, printed_camera
 from starcal_uq.paper.errors import (
-    MAXIMUM,
+    ERROR_READINGS,
     OPTICS,
-    REPROJECTION,
     UNDISTORTIONS,
     aligned,
     detector_grid,
@@ -243,10 +242,10 @@ def test_every_error_reading_is_computed() -> None:
         truth = paper_camera(convention)
         estimate = truth.replace(focal_mm=70.226, coefficients=(2.2e-10, -3.5e-15))
         found = list(error_sizes(truth, estimate, points(), noise))
-        assert [r.key for q, r, _ in found if q == "reprojection_px"] == [
-            r.key for r in REPROJECTION
+        assert [(q, r.key) for q, r, _ in found] == [
+            (quantity, r.key) for quantity, readings in ERROR_READINGS.items() for r in readings
         ]
-        assert [r.key for q, r, _ in found if q == "max_residual_px"] == [r.key for r in MAXIMUM]
+        assert list(map(len, ERROR_READINGS.values())) == [9, 8]
         values = {(q, r.key): value for q, r, value in found}
         assert values["reprojection_px", "eq16 per axis"] == pytest.approx(
             values["reprojection_px", "eq16"] / 2**0.5

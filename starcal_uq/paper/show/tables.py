@@ -22,7 +22,7 @@ from starcal_uq.core.formatting import (
 )
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.paper.checks import NO
-from starcal_uq.paper.errors import MAXIMUM, REPROJECTION
+from starcal_uq.paper.errors import ERROR_READINGS
 from starcal_uq.paper.interaction import AXES, HANDLING, OPTICS
 from starcal_uq.paper.judgement import Judged, Outcome, Trial, trial
 from starcal_uq.paper.published import LEAST_SQUARES, PAPER_METHODS, PROPOSED, SAMAAN, printed
@@ -220,7 +220,7 @@ def error_readings(found: Reproduction, quantity: str) -> TextTable:
     three?
     """
     rows, marks = [], []
-    for reading in REPROJECTION if quantity == "reprojection_px" else MAXIMUM:
+    for reading in ERROR_READINGS[quantity]:
         cells, fits = (
             [reading.words if reading.faithful else f"{reading.words} (against the text)"],
             [],
