@@ -101,23 +101,26 @@ class FieldExperiment(Shown):
             return row | {"ours": rate, "low": low, "high": high, "agrees": agrees}
         if method not in self.errors:
             return row | {"agrees": NEITHER}
-        axis, errors = AXES.index(quantity), self.errors[method]
-        for name, part in (("ours", "rms"), ("aligned", "aligned")):
-            low3, high3 = self.replicates.interval(method, part)
-            prefix = "" if part == "rms" else "aligned_"
-            row[name] = float(getattr(errors, part)[axis])
-            row[f"{prefix}low"], row[f"{prefix}high"] = float(low3[axis]), float(high3[axis])
-        for part in ("common", "rest", "noise"):
-            row[part] = float(getattr(errors, part)[axis])
-        stands = row["low"] <= number.value <= row["high"]
-        aligned = row["aligned_low"] <= number.value <= row["aligned_high"]
-        return row | {
-            "agrees": (BOTH if aligned else AS_IT_STANDS)
-            if stands
-            else ALIGNED
-            if aligned
-            else NEITHER
-        }
+        parts = self._parts(method, AXES.index(quantity))
+        for end in ("", "_low", "_high"):
+            row[end.removeprefix("_") or "ours"] = parts[f"rms{end}"]
+        names = ("aligned", "aligned_low", "aligned_high", "common", "rest", "noise")
+        row |= {name: parts[name] for name in names}
+        stands, aligned = (
+            parts[f"{part}_low"] <= number.value <= parts[f"{part}_high"]
+            for part in ("rms", "aligned")
+        )
+        either = ALIGNED if aligned else NEITHER
+        return row | {"agrees": (BOTH if aligned else AS_IT_STANDS) if stands else either}
+
+    def _parts(self, camera: str, axis: int) -> AnyDict:
+        """Parts of the errors about an axis, arcsec, with their ranges over repetitions."""
+        found: AnyDict = {}
+        for part in PARTS:
+            low, high = self.replicates.interval(camera, part)
+            found[part] = float(getattr(self.errors[camera], part)[axis])
+            found[f"{part}_low"], found[f"{part}_high"] = float(low[axis]), float(high[axis])
+        return found
 
     def rates(self) -> pd.DataFrame:
         """Identification against tolerance: camera, tolerance_px, n_frames, correct, wrong, rate,
@@ -142,11 +145,7 @@ class FieldExperiment(Shown):
             for index, axis in enumerate(AXES):
                 row: AnyDict = {"camera": camera, "axis": axis.removesuffix("_arcsec")}
                 row["sum_of_squares"] = float(errors.sum_of_squares[index])
-                for part in PARTS:
-                    low, high = self.replicates.interval(camera, part)
-                    row[part] = float(getattr(errors, part)[index])
-                    row[f"{part}_low"], row[f"{part}_high"] = float(low[index]), float(high[index])
-                rows.append(row)
+                rows.append(row | self._parts(camera, index))
         return pd.DataFrame(rows)
 
     def sources(self) -> pd.DataFrame:

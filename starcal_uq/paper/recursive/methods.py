@@ -5,6 +5,7 @@ and Griffith's.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -80,12 +81,16 @@ def least_squares(
 
 
 def recursive(
+    method: str,
     obs: Observations | Iterable[Observations],
     camera: Camera,
-    method: str,
     options: RecursionOptions | None,
+    solver: str,
+    max_iterations: int,
+    /,
 ) -> Calibration:
-    """Samaan's or Griffith's method on a table, or on a stream of frames.
+    """Samaan's or Griffith's method, neither of which has a solver, on a table or a stream of
+    frames.
 
     From a table the distortion of ``samaan`` is found in a second pass at the final optics, and the
     result has residuals and attitudes. From a stream it has none; the second pass takes place where
@@ -122,28 +127,7 @@ def recursive(
     )
 
 
-def samaan(
-    obs: Observations | Iterable[Observations],
-    camera: Camera,
-    options: RecursionOptions | None,
-    solver: str,
-    max_iterations: int,
-    /,
-) -> Calibration:
-    """`recursive` by Samaan's method, which has no solver."""
-    return recursive(obs, camera, "samaan", options)
-
-
-def griffith(
-    obs: Observations | Iterable[Observations],
-    camera: Camera,
-    options: RecursionOptions | None,
-    solver: str,
-    max_iterations: int,
-    /,
-) -> Calibration:
-    """`recursive` by Griffith's method, which has no solver."""
-    return recursive(obs, camera, "griffith", options)
+samaan, griffith = partial(recursive, "samaan"), partial(recursive, "griffith")
 
 
 def _from_stream(filtering: RecursiveCalibration, source: Iterable[Observations]) -> Calibration:
