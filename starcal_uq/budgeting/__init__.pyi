@@ -5,6 +5,8 @@ from .heads import array_budget as array_budget
 from .indices import Index as Index
 from .result import Budget as Budget
 from .rows import Contributor as Contributor
+from .sensitivity import BudgetSensitivities as BudgetSensitivities
+from .sensitivity import sensitivities as sensitivities
 from .starter import write_budget_template as write_budget_template
 from .whatif import allocation as allocation
 from .whatif import budget_difference as budget_difference

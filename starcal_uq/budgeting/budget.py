@@ -153,7 +153,7 @@ def budget(
         *beside,
         *(row for row in filled if row.name not in ours),
     )
-    behaviours = _in_time(rows, stated, post.camera, spectrum)
+    behaviours = in_time(rows, stated, post.camera, spectrum)
     rows = tuple(_described(row, behaviours, stated.rate_deg_s) for row in rows)
     combined = combination(rows, stated, behaviours, chosen, n_samples, seed, indices)
     settings: AnyDict = {
@@ -245,7 +245,7 @@ def combination(
     }
 
 
-def _in_time(
+def in_time(
     rows: Sequence[Contributor],
     stated: BudgetFile,
     camera: Camera,

@@ -62,6 +62,12 @@ class Index:
             if not (wanted or math.isnan(value)):
                 raise BudgetError(f"the index {self.kind} takes no {name}; leave it out.")
 
+    @classmethod
+    def of(cls, label: str) -> Index:
+        """The index with a `label`."""
+        kind, *times = label.replace(" s", "").replace("/", " ").split()
+        return cls(kind, *map(float, times))
+
     @property
     def windowed(self) -> bool:
         """True for all but absolute errors."""
