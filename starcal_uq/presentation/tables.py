@@ -47,6 +47,11 @@ class TextTable:
                 "entries"
             )
 
+    @property
+    def records(self) -> list[dict[str, str]]:
+        """The cells of each row by their heads."""
+        return [dict(zip(self.heads, row, strict=True)) for row in self.rows]
+
     @classmethod
     def of(
         cls,

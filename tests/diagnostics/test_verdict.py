@@ -27,7 +27,7 @@ from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.diagnostics.verdict.observed import OUTLIER_P, PATTERN_P, aberration_size
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.likelihood.fitted_effects import Effects
-from starcal_uq.presentation.report.tables import mean_to_mcse
+from starcal_uq.presentation.words.numbers import mean_to_mcse
 from starcal_uq.presentation.words.sentences import say, told
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.onboard import Extended

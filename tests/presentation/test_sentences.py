@@ -92,7 +92,8 @@ def test_every_code_has_a_sentence() -> None:
 
 def test_no_two_templates_have_one_name() -> None:
     tables = [tomllib.loads(path.read_text("utf-8")) for path in WORDS.glob("*.toml")]
-    assert sum(len(entries) for table in tables for entries in table.values()) == len(templates())
+    own = [name for name in templates() if not name.startswith("Heads.")]
+    assert sum(len(entries) for table in tables for entries in table.values()) == len(own)
 
 
 def test_a_code_without_words_is_noticed() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_csv
-from starcal_uq.core.formatting import fixed, p_words, plus_minus, pretty_unit, significant
+from starcal_uq.core.formatting import p_words
 from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.types import PathLike
@@ -17,6 +17,7 @@ from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.sentences import table
 
 # Class and badge of the page.
 _VERDICTS = {
@@ -63,35 +64,14 @@ def render_comparison(comparison: CameraComparison, image: bytes) -> str:
 def _parameter_table(found: CameraComparison) -> TextTable:
     specs = {p.name: p for model in found.models for p in parameters(model)}
     estimates = (found.theta_a, found.theta_b, found.sd_a, found.sd_b, found.sd_difference)
-    rows = []
-    for i, name in enumerate(found.parameter_names):
-        spec = specs[name]
-        a, b, sd_a, sd_b, sd = (values[i] / spec.scale for values in estimates)
-        known = np.isfinite(sd) and sd > 0.0
-        rows.append(
-            (
-                name,
-                plus_minus(a, sd_a),
-                plus_minus(b, sd_b),
-                plus_minus(b - a, sd) if known else significant(b - a),
-                fixed((b - a) / sd, 1) if known else "",
-                pretty_unit(spec.scaled_unit),
-            )
-        )
-    return TextTable(
-        ("", *found.labels, "Difference", "In sigma", "Unit"), tuple(rows), align="lrrrrl"
-    )
+    shown = [specs[name] for name in found.parameter_names]
+    scale = np.array([spec.scale for spec in shown])
+    names = ("a", "b", "sd_a", "sd_b", "sd")
+    scaled = {name: values / scale for name, values in zip(names, estimates, strict=True)}
+    return table("compared", {"labels": found.labels}, spec=shown, **scaled)
 
 
 def _source_table(found: CameraComparison) -> TextTable:
     """Where both results come from."""
-    rows = []
-    for label, key in zip(found.labels, "ab", strict=True):
-        provenance = Provenance(found.provenance.get(key, {}))
-        settings = provenance.settings
-        how = ", ".join(
-            f"{name} {settings[name]}" for name in ("method", "likelihood") if name in settings
-        )
-        created = provenance.created_utc.replace("T", " ").replace("Z", " UTC")
-        rows.append((label, created, how, provenance.data_sha256 or ""))
-    return TextTable(("Calibration", "Made", "How", "Data (SHA-256)"), tuple(rows), align="llll")
+    sources = [Provenance(found.provenance.get(key, {})) for key in "ab"]
+    return table("sources", label=found.labels, it=sources)

@@ -15,7 +15,8 @@ from starcal_uq.core.status import Level, Note, Question, worst
 from starcal_uq.presentation.html import WIDTH, template_environment, wrapped
 from starcal_uq.presentation.report.tables import parameter_rows
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.numbers import axis_label, bound, two_figures
+from starcal_uq.presentation.words.numbers import two_figures
+from starcal_uq.presentation.words.sentences import table
 from starcal_uq.propagation.attitude_error import (
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
@@ -91,41 +92,10 @@ def attitude_summary(error: AttitudeError) -> TextTable:
 def budget_summary(budget: Budget) -> TextTable:
     """Each requirement against what is reached; without any, the totals after alignment."""
     if budget.outcomes:
-        asked = tuple(
-            (
-                o.requirement.name,
-                (
-                    f"{axis_label(o.requirement)}, {o.requirement.scope}, "
-                    f"{confidence_text(o.requirement.confidence)}"
-                ),
-                significant(o.requirement.limit_arcsec, 3),
-                bound(o.bound_arcsec, o.total.at_least),
-                o.verdict,
-            )
-            for o in budget.outcomes
-        )
-        marks = tuple(o.level.value for o in budget.outcomes)
-        return TextTable(
-            ("Requirement", "Of", "Limit [arcsec]", "Reached [arcsec]", "Outcome"),
-            asked,
-            "",
-            "llrrl",
-            marks,
-        )
+        return table("requirements", it=budget.outcomes)
     totals = [budget.total(axis, AFTER) for axis in (CROSS_BORESIGHT, "roll")]
-    rows = tuple(
-        (
-            f"{AXIS_LABELS[t.axis]}, {AFTER}",
-            *(bound(v, t.at_least) for v in (t.rule_arcsec, t.sampled_arcsec)),
-        )
-        for t in totals
-    )
-    heads = (
-        f"Total at {confidence_text(budget.confidence)}",
-        "By the rule [arcsec]",
-        "By sampling [arcsec]",
-    )
-    return TextTable(heads, rows, "No requirement was given.")
+    given = {"confidence": budget.confidence, "labels": AXIS_LABELS}
+    return table("after_alignment", given, it=totals)
 
 
 def terminal_summary(results: Results) -> list[str]:

@@ -22,12 +22,13 @@ from starcal_uq.core.formatting import (
     significant,
     with_sigma,
 )
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict.estimate import truth_z
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.presentation.figures.scales import symbol as written
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable, with_units
+from starcal_uq.presentation.words.sentences import table
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
@@ -62,45 +63,15 @@ def parameter_rows(results: Results) -> list[Row]:
     if truth is not None:
         true[:-1], z[:-1] = truth.theta, truth_z(cal, truth, post)
     numbers = np.stack([mean, sd, low, high, prior, prior_sd, start, true], axis=1)
-    rows = []
-    for parameter, one, z_value in zip(all_parameters(results), numbers, z, strict=True):
-        scaled = one / parameter.scale
-        rows.append(_parameter_row(parameter, parameter.scaled_unit, scaled, z_value))
-        if parameter.name == "f" and cal.camera.pixel_um is not None:
-            millimetres = one / (1000.0 / cal.camera.pixel_um)
-            rows.append(_parameter_row(parameter, "mm", millimetres, z_value))
-            rows[-1]["description"] = "the same in millimetres"
-    return rows
-
-
-def _parameter_row(parameter: Parameter, unit: str, numbers: FloatArray, z: float) -> Row:
-    """From mean, sd, interval, the prior's mean and sd, start and truth in the unit; NaN where
-    there is none.
-    """
-    mean, sd, low, high, prior, prior_sd, start, true = numbers.tolist()
-    row = {
-        "name": parameter.name,
-        "symbol": symbol(parameter.name),
-        "description": parameter.description,
-        "unit": pretty_unit(unit),
-        "estimate": significant(mean, 4),
-        "sigma": "given",
-        "interval": "",
-        "prior": "",
-        "start": "" if np.isnan(start) else with_sigma(start, sd * 10.0),
-        "truth": "" if np.isnan(true) else with_sigma(true, sd / 10.0).rstrip("0").rstrip("."),
-        "z": "" if not np.isfinite(z) else ("+" if z > 0 else "") + fixed(z, 1),
-    }
-    # A noise that was given has no spread: show it, and leave the rest empty.
-    if sd > 0.0:
-        decimals = decimals_for(sd)
-        row["estimate"], row["sigma"] = fixed(mean, decimals), significant(sd)
-        row["interval"] = f"{fixed(low, decimals)} … {fixed(high, decimals)}"
-        if parameter.name.startswith("sigma"):
-            row["prior"] = "" if np.isnan(prior) else "log-normal, below"
-        elif np.isfinite(prior):
-            row["prior"] = plus_minus(prior, prior_sd)
-    return row
+    found = []
+    for spec, one, z_value in zip(all_parameters(results), numbers, z, strict=True):
+        found.append((spec, spec.scaled_unit, z_value, *(one / spec.scale)))
+        if spec.name == "f" and cal.camera.pixel_um is not None:
+            found.append((spec, "mm", z_value, *(one / (1000.0 / cal.camera.pixel_um))))
+    names = ("spec", "unit", "z", "mean", "sd", "low", "high", "prior", "prior_sd", "start")
+    columns = dict(zip((*names, "known"), zip(*found, strict=True), strict=True))
+    rows = table("parameters", **columns).records
+    return [{**row, "symbol": symbol(row["name"])} for row in rows]
 
 
 _ATTITUDE_NOTES = (
@@ -116,10 +87,10 @@ def attitude_rows(error: AttitudeError) -> list[Row]:
     """Contributions to the attitude error by both their figures: 1 sigma, 95 % and 99.7 % for each
     axis, arcsec.
     """
-    table = error.to_dataframe()
+    every = error.to_dataframe()
     rows = []
     for (contributor, group), note in zip(
-        table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True
+        every.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True
     ):
         text = str(contributor)
         shown = _small if text == INTERACTION else significant
@@ -183,46 +154,20 @@ def weak_directions(coupling: Coupling) -> list[Row]:
 
 def diagnostics_table(post: Posterior) -> TextTable:
     """Convergence of every sampled parameter."""
-    d = post.diagnostics
-    rows = []
-    for i in post.sampled:
-        parameter = post.parameters[i]
-        mcse = d.mcse[i] / parameter.scale
-        rows.append(
-            (
-                parameter.name,
-                fixed(d.rhat[i], 4),
-                count(int(d.ess_bulk[i])),
-                count(int(d.ess_tail[i])),
-                mean_to_mcse(post.draws[:, i].mean() / parameter.scale, mcse),
-                _with_unit(significant(mcse), parameter),
-                percent(d.mcse[i] / post.sd[i]),
-                fixed(d.autocorrelation[i], 1),
-            )
-        )
-    heads = (
-        "",
-        "R-hat",
-        "ESS, bulk",
-        "ESS, tail",
-        "Mean, to the digits of its MCSE",
-        "MCSE of the mean",
-        "MCSE / σ",
+    d, sampled = post.diagnostics, list(post.sampled)
+    specs = [post.parameters[i] for i in sampled]
+    scale = np.array([spec.scale for spec in specs])
+    return table(
+        "diagnostics",
+        it=specs,
+        rhat=d.rhat[sampled],
+        bulk=d.ess_bulk[sampled],
+        tail=d.ess_tail[sampled],
+        mean=post.draws.mean(axis=0)[sampled] / scale,
+        mcse=d.mcse[sampled] / scale,
+        share=(d.mcse / post.sd)[sampled],
+        autocorrelation=d.autocorrelation[sampled],
     )
-    return TextTable((*heads, "Autocorrelation [steps]"), tuple(rows))
-
-
-def mean_to_mcse(mean: float, mcse: float) -> str:
-    """A mean with the digits that its Monte Carlo error leaves: the last one is larger than the
-    error.
-    """
-    decimals = 0 if not mcse > 0.0 else max(0, int(np.floor(-np.log10(mcse))))
-    return fixed(mean, decimals)
-
-
-def _with_unit(number: str, parameter: Parameter) -> str:
-    unit = pretty_unit(parameter.scaled_unit)
-    return f"{number} × {unit}" if parameter.scale != 1.0 else f"{number} {unit}".strip()
 
 
 def methods_table(results: Results) -> TextTable | None:
@@ -230,21 +175,19 @@ def methods_table(results: Results) -> TextTable | None:
     cal, post = results.calibration, results.posterior
     if post is None:
         return None
-    d = post.diagnostics
-    means = np.append(cal.theta, cal.sigma), d.laplace_mean, d.psis_mean, post.draws.mean(axis=0)
-    spreads = np.append(cal.sigmas, cal.sigma_std), d.laplace_sd, d.psis_sd, post.sd
-    rows = []
-    for i in post.sampled:
-        parameter = post.parameters[i]
-        # One digit more than elsewhere: the table is there to show small differences.
-        decimals = decimals_for(post.sd[i] / parameter.scale, 3)
-        cells = [
-            " ± ".join(fixed(values[i] / parameter.scale, decimals) for values in pair)
-            for pair in zip(means, spreads, strict=True)
-        ]
-        rows.append((parameter.name, *cells, pretty_unit(parameter.scaled_unit)))
-    heads = ("Calibration (no prior)", "Laplace approximation", "Importance sampling (PSIS)")
-    return TextTable(("", *heads, "emcee", "Unit"), tuple(rows), align="lrrrrl")
+    d, sampled = post.diagnostics, list(post.sampled)
+    specs = [post.parameters[i] for i in sampled]
+    scale = np.array([spec.scale for spec in specs])
+    both = {
+        "calibration": (np.append(cal.theta, cal.sigma), np.append(cal.sigmas, cal.sigma_std)),
+        "laplace": (d.laplace_mean, d.laplace_sd),
+        "psis": (d.psis_mean, d.psis_sd),
+        "emcee": (post.draws.mean(axis=0), post.sd),
+    }
+    pairs = {name: np.array([v[sampled] / scale for v in pair]).T for name, pair in both.items()}
+    # One digit more than elsewhere: the table is there to show small differences.
+    decimals = [decimals_for(sd, 3) for sd in pairs["emcee"][:, 1]]
+    return table("methods", it=specs, n=decimals, **pairs)
 
 
 def stage_table(results: Results) -> TextTable:
@@ -269,23 +212,16 @@ def stage_table(results: Results) -> TextTable:
 def pair_table(cal: Calibration) -> TextTable:
     """The paper's estimator beside the efficient one: its sigma and the price in precision."""
     specs = parameters(cal.camera.distortion)
-    pair_sigmas = np.sqrt(np.diag(cal.pair_covariance))
-    rows = tuple(
-        (
-            p.name,
-            plus_minus(cal.pair_theta[i] / p.scale, pair_sigmas[i] / p.scale),
-            plus_minus(cal.theta[i] / p.scale, cal.sigmas[i] / p.scale),
-            fixed((pair_sigmas[i] / cal.sigmas[i]) ** 2, 2),
-        )
-        for i, p in enumerate(specs)
+    scale = np.array([spec.scale for spec in specs])
+    rows = table(
+        "pairs",
+        it=specs,
+        theta=cal.pair_theta / scale,
+        sigma=np.sqrt(np.diag(cal.pair_covariance)) / scale,
+        best=cal.theta / scale,
+        least=cal.sigmas / scale,
     )
-    heads = (
-        "",
-        "Interstar angles (stage 3)",
-        "Marginal likelihood (stage 4)",
-        "Ratio of variances",
-    )
-    return with_units(TextTable(heads, rows), specs)
+    return with_units(rows, specs)
 
 
 def noise_table(cal: Calibration) -> TextTable | None:
@@ -360,12 +296,4 @@ def _round_table(record: ImageRecord, cal: Calibration) -> TextTable | None:
 
 def derived_table(post: Posterior) -> TextTable:
     """Convergence of what follows from the parameters."""
-    rows = []
-    for d in post.diagnostics.derived or derived_quantities(post):
-        mean = "0" if d.name.startswith("common") else fixed(d.mean, decimals_for(d.sd))
-        share = percent(d.mcse / d.sd if d.sd > 0.0 else 0.0)
-        ess = (count(int(d.ess_bulk)), count(int(d.ess_tail)))
-        name = d.name[0].upper() + d.name[1:]
-        rows.append((name, f"{mean} ± {significant(d.sd)}", d.unit, fixed(d.rhat, 4), *ess, share))
-    heads = ("", "Mean ± σ", "Unit", "R-hat", "ESS, bulk", "ESS, tail", "MCSE / σ")
-    return TextTable(heads, tuple(rows), align="lrlrrrr")
+    return table("derived", it=post.diagnostics.derived or derived_quantities(post))

@@ -5,11 +5,11 @@ differ.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
+from starcal_uq.budgeting.result import Budget, by_contributor
 from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
 from starcal_uq.budgeting.totals import Total
@@ -18,8 +18,8 @@ from starcal_uq.core.findings import Finding
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, significant
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.numbers import axis_label, bound
-from starcal_uq.presentation.words.sentences import told
+from starcal_uq.presentation.words.numbers import bound
+from starcal_uq.presentation.words.sentences import table, told
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 Row = AnyDict
@@ -28,6 +28,13 @@ NOT_RESOLVED = "not resolved"
 _GAUSSIAN_TAIL = 2.98
 _MIXED, *_OTHERS = ("mixed", "ensemble", "temporal")
 
+# What may differ between the axes of a contributor, by the fields of its rows.
+_LISTED = {
+    **{name: name for name in ("ecss_class", "interpretation", "combination", "behaviour")},
+    "absorbed": "absorbed_by_alignment",
+    "group": "correlation_group",
+    "conditions": "conditions",
+}
 _MEANING = {
     "mixed": "a sensor and a moment at random",
     "ensemble": "a sensor at random, at its worst moment",
@@ -37,6 +44,7 @@ _MEANING = {
 
 def tables(budget: Budget) -> AnyDict:
     """All rows and sentences."""
+    sampled = [_sampled(outcome.total) for outcome in budget.outcomes]
     return {
         "title": budget.title,
         "confidence": confidence_text(budget.confidence),
@@ -47,7 +55,7 @@ def tables(budget: Budget) -> AnyDict:
         "indices": index_rows(budget),
         "filter": filter_table(budget).html() if budget.filter else "",
         "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
-        "requirements": [_requirement_row(outcome) for outcome in budget.outcomes],
+        "requirements": table("outcomes", it=budget.outcomes, sampled=sampled).records,
         "headline": told("budget", budget),
         "not_drawn": len(budget.outcomes) - len(budget.comparable),
         "violated": bool(budget.violations),
@@ -74,13 +82,10 @@ def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
     every = stated or [first]
 
     figures = _figures(axes)
-
-    def listed(values: list[str]) -> str:
-        return " / ".join(dict.fromkeys(value for value in values if value))
-
+    listed = {key: _several(every, field) for key, field in _LISTED.items()}
     return {
         "name": name,
-        "ecss_class": listed([row.ecss_class for row in every]),
+        **listed,
         "sigma": [_sigma(axes.get(axis)) for axis in AXES],
         "figures": figures,
         "figures_text": "; ".join(f"{name}: {_listed(values)}" for name, values in figures),
@@ -90,17 +95,16 @@ def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
             dict.fromkeys(row.distribution if row.applies else "does not apply" for row in stated)
         ),
         "tail": _tails(stated),
-        "interpretation": listed([row.interpretation for row in every]),
-        "absorbed": listed([row.absorbed_by_alignment for row in every]),
-        "combination": listed([row.combination for row in every]),
-        "behaviour": listed([row.behaviour for row in every]),
-        "group": listed([row.correlation_group for row in every]),
-        "conditions": listed([row.conditions for row in every]),
-        "provenance": listed([row.provenance for row in stated]),
-        "source": listed([row.source for row in axes.values()]),
+        "provenance": _several(stated, "provenance"),
+        "source": _several(axes.values(), "source"),
         "inflated": any(row.inflated for row in stated),
         "assessed": bool(stated),
     }
+
+
+def _several(rows: Iterable[Contributor], field: str) -> str:
+    """What rows have in a field, each once."""
+    return " / ".join(dict.fromkeys(filter(None, (getattr(row, field) for row in rows))))
 
 
 def _sigma(row: Contributor | None) -> str:
@@ -224,28 +228,6 @@ def _sampled(total: Total) -> str:
 
 def _pair(total: Total) -> dict[str, str]:
     return {"rule": bound(total.rule_arcsec, total.at_least), "sampled": _sampled(total)}
-
-
-def _requirement_row(outcome: Outcome) -> Row:
-    asked = outcome.requirement
-    return {
-        "name": asked.name,
-        "axis": axis_label(asked),
-        "scope": asked.scope,
-        "interpretation": asked.interpretation,
-        "confidence": confidence_text(asked.confidence),
-        "limit": significant(asked.limit_arcsec, 3),
-        "rule": bound(outcome.total.rule_arcsec, outcome.total.at_least),
-        "sampled": _sampled(outcome.total),
-        "bound": bound(outcome.bound_arcsec, outcome.total.at_least),
-        "index": outcome.total.of_index,
-        "least": bound(outcome.least_arcsec, outcome.total.at_least),
-        "margin": _known(outcome.margin_arcsec),
-        "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),
-        "verdict": outcome.verdict,
-        "level": outcome.level.value,
-        "sentence": told("outcome", outcome),
-    }
 
 
 def explanations(budget: Budget) -> list[str]:

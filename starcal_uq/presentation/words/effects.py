@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
+from itertools import chain
+from typing import Any
 
-from starcal_uq.core.formatting import decimals_for, fixed, significant
-from starcal_uq.likelihood.fitted_effects import Effects, FittedEffect
+from starcal_uq.likelihood.fitted_effects import Effects
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.sentences import table
 
 # What every effect is, in one sentence.
 MEANINGS = {
@@ -32,40 +34,11 @@ def effects_table(effects: Effects, *, path: bool = False) -> TextTable | None:
     """
     if not effects.names:
         return None
-    rows = (
-        *map(_weighing_row, effects.weighing),
-        *map(_row, (*effects.of_camera, *effects.fitted)),
-    )
-    if path:
-        rows += tuple(
-            (name, "", "", "", fixed(gain, 1), "not taken up") for name, gain in effects.refused
-        )
-    heads = ("effect", "scale", "95 % interval", "shift rms", "gain [nat]", "moved most")
-    title = "Effects beyond the camera [px; scale: 1 sigma at the corner]"
-    return TextTable(heads, rows, title, "lrrrrl")
-
-
-def _weighing_row(effect: FittedEffect) -> tuple[str, ...]:
-    """Of noise, how far it varies from star to star; of tails, their degrees of freedom."""
-    scale = significant(effect.scale_px if effect.dof is None else effect.dof)
-    scale += "" if effect.dof is None else " dof"
-    moved = f"{effect.moved_name} by {significant(effect.moved_sigma)} sigma"
-    return effect.name, scale, "", "", fixed(effect.gain_nat, 1), moved if effect.moved_name else ""
-
-
-def _row(effect: FittedEffect) -> tuple[str, ...]:
-    scale, interval = "known", ""
-    if math.isnan(effect.scale_px):
-        scale = "in the camera"
-    elif effect.low_px != effect.high_px:
-        decimals = decimals_for(effect.low_px)
-        scale = fixed(effect.scale_px, decimals)
-        interval = f"{fixed(effect.low_px, decimals)} – {fixed(effect.high_px, decimals)}"
-    return (
-        effect.name,
-        scale,
-        interval,
-        significant(effect.size_px),
-        fixed(effect.gain_nat, 1),
-        f"{effect.moved_name} by {significant(effect.moved_sigma)} sigma",
-    )
+    refused = [{"name": name, "gain_nat": gain} for name, gain in effects.refused if path]
+    groups: dict[str, Sequence[Any]] = {
+        "weighs": effects.weighing,
+        "shifts": (*effects.of_camera, *effects.fitted),
+        "refused": refused,
+    }
+    kinds = [kind for kind, group in groups.items() for _ in group]
+    return table("effects", it=[*chain(*groups.values())], kind=kinds)

@@ -16,7 +16,7 @@ from starcal_uq.estimation.merging import Consistency
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.effects import effects_table
-from starcal_uq.presentation.words.sentences import told
+from starcal_uq.presentation.words.sentences import table, told
 
 _SHOWN_ROWS = 30
 
@@ -37,26 +37,24 @@ def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTabl
     """
     if truth is not None and truth.parameter_names != cal.parameter_names:
         truth = None
-    known = () if truth is None else ("truth", "z")
-    rows = []
     specs = parameters(cal.camera.distortion)
-    for index, (spec, value, sigma) in enumerate(zip(specs, cal.theta, cal.sigmas, strict=True)):
-        decimals = decimals_for(sigma / spec.scale)
-        cells = [
-            fixed(number / spec.scale, decimals)
-            for number in (cal.nominal.theta[index], value, sigma)
-        ]
-        if truth is not None:
-            true = truth.theta[index]
-            cells += [fixed(true / spec.scale, decimals), fixed((value - true) / sigma, 2)]
-        rows.append((spec.name, *cells, pretty_unit(spec.scaled_unit)))
-    decimals = decimals_for(cal.sigma_std)
+    scale = np.array([*(spec.scale for spec in specs), 1.0])
+    sd = np.append(cal.sigmas, cal.sigma_std) / scale
+    true = np.full(len(specs), np.nan) if truth is None else truth.theta
     unit = "px per axis" if cal.sigma_name == "sigma" else f"times the {noise_kind(cal)} noise"
-    noise = (fixed(cal.sigma, decimals), fixed(cal.sigma_std, decimals))
-    rows.append((cal.sigma_name, "", *noise, *("" for _ in known), unit))
-    heads = ("parameter", "start", "estimate", "sigma", *known, "unit")
-    title = f"Calibration: {cal.n_stars} stars in {cal.n_frames} frames"
-    return TextTable(heads, tuple(rows), title, "l" + "r" * (len(heads) - 2) + "l")
+    return table(
+        "calibration",
+        {"it": cal},
+        ("truth", "z") if truth is None else (),
+        name=[*(spec.name for spec in specs), cal.sigma_name],
+        start=np.append(cal.nominal.theta, np.nan) / scale,
+        value=np.append(cal.theta, cal.sigma) / scale,
+        sd=sd,
+        n=[decimals_for(value) for value in sd],
+        known=np.append(true, np.nan) / scale,
+        z=np.append((cal.theta - true) / cal.sigmas, np.nan),
+        unit=[*(pretty_unit(spec.scaled_unit) for spec in specs), unit],
+    )
 
 
 def screening_text(screening: Screening) -> str:

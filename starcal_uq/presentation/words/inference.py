@@ -4,30 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from starcal_uq.core.formatting import decimals_for, fixed, pretty_unit
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.sentences import table
 
 
 def posterior_table(post: Posterior) -> TextTable:
     """Mean, spread, interval and convergence of every parameter."""
-    diagnostics, rows = post.diagnostics, []
-    for index, parameter in enumerate(post.parameters):
-        column = post.draws[:, index] / parameter.scale
-        mean, sd = float(np.mean(column)), float(np.std(column))
-        decimals = decimals_for(sd)
-        rows.append(
-            (
-                parameter.name,
-                *(
-                    fixed(number, decimals)
-                    for number in (mean, sd, *np.quantile(column, [0.025, 0.975]))
-                ),
-                fixed(diagnostics.rhat[index], 4),
-                f"{diagnostics.ess_bulk[index]:.0f}",
-                f"{diagnostics.ess_tail[index]:.0f}",
-                pretty_unit(parameter.scaled_unit),
-            )
-        )
-    heads = ("parameter", "mean", "sd", "2.5 %", "97.5 %", "R-hat", "ESS bulk", "ESS tail", "unit")
-    return TextTable(heads, tuple(rows), f"Posterior: {len(post.draws)} draws", "lrrrrrrrl")
+    scale = np.array([parameter.scale for parameter in post.parameters])
+    draws = post.draws / scale
+    low, high = np.quantile(draws, (0.025, 0.975), axis=0)
+    return table(
+        "posterior",
+        {"n": len(draws)},
+        it=post.parameters,
+        mean=draws.mean(axis=0),
+        sd=draws.std(axis=0),
+        low=low,
+        high=high,
+        rhat=post.diagnostics.rhat,
+        bulk=post.diagnostics.ess_bulk,
+        tail=post.diagnostics.ess_tail,
+    )

@@ -127,3 +127,22 @@ def span(found: DistortionRange) -> str:
     """The range of the displacement of the corner."""
     low, high = (f"{significant(p)} %" for p in (found.percent[0], found.percent[-1]))
     return f"{low} to {high}".replace("-", MINUS)
+
+
+def mean_to_mcse(mean: float, mcse: float) -> str:
+    """A mean with the digits that its Monte Carlo error leaves: the last one is larger than the
+    error.
+    """
+    decimals = 0 if not mcse > 0.0 else max(0, int(np.floor(-np.log10(mcse))))
+    return fixed(mean, decimals)
+
+
+def pair(values: Sequence[float], decimals: int) -> str:
+    """A number and its sigma with so many decimals."""
+    return " ± ".join(fixed(value, decimals) for value in values)
+
+
+def across_and_about(angles: Sequence[float]) -> str:
+    """Angles about the three axes: across the boresight, and about it."""
+    pitch, yaw, roll = angles
+    return f"{significant(np.hypot(pitch, yaw))} / {significant(abs(roll))}"

@@ -12,11 +12,10 @@ from starcal_uq.camera.distortion import Parameter
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.formatting import (
     fixed,
-    pretty_unit,
     significant,
 )
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.sentences import told
+from starcal_uq.presentation.words.sentences import table, told
 from starcal_uq.propagation.attitude_error import (
     IF_MODEL_HOLDS,
     WITH_MISFIT_FOUND,
@@ -119,33 +118,19 @@ def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextT
     """What not knowing the others costs every parameter; sigmas in the units of `specs`, or in px
     units.
     """
-    scales = (
-        np.array([spec.scale for spec in specs])
-        if specs
-        else np.ones(len(coupling.parameter_names))
-    )
-    columns = {
-        "σ": coupling.sigma_marginal / scales,
-        "σ, others known": coupling.sigma_conditional / scales,
-        "ratio": coupling.sigma_marginal / coupling.sigma_conditional,
-        "variance inflation": coupling.variance_inflation,
-        "Cramér–Rao bound": coupling.crlb_sigma / scales,
-    }
-    texts = {head: [significant(v) for v in column] for head, column in columns.items()}
-    if coupling.contraction is not None:
-        # The factor by which the data shrank the prior's sigma: a contraction of 1 - 1e-6 would
-        # print as 1.
-        shrunk = np.sqrt(np.maximum(1.0 - coupling.contraction, 1e-30))
-        texts["prior σ / σ"] = [f"{significant(1.0 / v)} ×" for v in shrunk]
-    texts["unit"] = [
-        pretty_unit(unit) for unit in ([s.scaled_unit for s in specs] or coupling.units)
-    ]
-    rows = tuple(zip(coupling.parameter_names, *texts.values(), strict=True))
-    return TextTable(
-        ("", *texts),
-        rows,
-        "Coupling: what not knowing the others costs",
-        "l" + "r" * (len(texts) - 1) + "l",
+    scales = np.array([spec.scale for spec in specs] or np.ones(len(coupling.parameter_names)))
+    contraction = coupling.contraction
+    return table(
+        "coupling",
+        None,
+        ("prior σ / σ",) if contraction is None else (),
+        name=coupling.parameter_names,
+        marginal=coupling.sigma_marginal / scales,
+        conditional=coupling.sigma_conditional / scales,
+        inflation=coupling.variance_inflation,
+        bound=coupling.crlb_sigma / scales,
+        contraction=np.zeros(len(scales)) if contraction is None else contraction,
+        unit=[spec.scaled_unit for spec in specs] or coupling.units,
     )
 
 
@@ -168,24 +153,13 @@ def field_table(field: FieldMap) -> TextTable:
         ("absolute", field.sigma_absolute_arcsec, field.worst_absolute_arcsec),
         ("best rotation removed", field.sigma_compensated_arcsec, field.worst_compensated_arcsec),
     )
-    rows = tuple(
-        (
-            name,
-            *(
-                significant(v)
-                for v in (np.min(sigma), np.median(sigma), np.max(sigma), np.max(worst))
-            ),
-        )
-        for name, sigma, worst in maps
-    )
-    return TextTable(
-        ("", "least", "median", "largest", "worst direction"), rows, "1 sigma per axis, arcsec"
-    )
+    found = [(np.min(s), np.median(s), np.max(s), np.max(worst)) for _, s, worst in maps]
+    return table("field", name=[name for name, *_ in maps], numbers=found)
 
 
 def spectrum_table(spectrum: ErrorSpectrum) -> TextTable:
     """One row per axis."""
-    table = pd.DataFrame(
+    rows = pd.DataFrame(
         {
             "axis": AXES,
             "frame-dependent part [arcsec]": spectrum.rest_arcsec,
@@ -194,4 +168,4 @@ def spectrum_table(spectrum: ErrorSpectrum) -> TextTable:
             "exceeds averaged noise after [s]": spectrum.dominates_after_s,
         }
     )
-    return TextTable.of(table, missing="not known")
+    return TextTable.of(rows, missing="not known")

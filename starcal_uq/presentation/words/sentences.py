@@ -11,9 +11,10 @@ import re
 import shlex
 import tomllib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from functools import cache
 from importlib.resources import files
+from itertools import compress
 from typing import Any
 
 import jinja2
@@ -29,6 +30,7 @@ from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import RUN, Remedy
 from starcal_uq.core.status import Check, Level
 from starcal_uq.core.times import TIMES_IN_NAMES
+from starcal_uq.core.types import AnyMapping
 from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, model_facts, star_facts
@@ -36,6 +38,7 @@ from starcal_uq.estimation.merging import ALPHA
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.planning.open_distortion import AFTER_FRAMES
+from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import numbers
 from starcal_uq.propagation.onboard_error import with_cross
 
@@ -50,11 +53,16 @@ SCOPE_NAMES = {
 _NUMBERS = (
     *("capital", "two_figures", "with_error", "change", "numbers", "digits", "percents", "least"),
     *("bound", "axis_label", "frames", "need_words", "range_words", "corner", "span"),
+    *("across_and_about", "mean_to_mcse", "pair"),
 )
 _FORMATTING = (
     *("count", "fixed", "join_words", "p_words", "percent", "plural", "plus_minus", "significant"),
-    "superscript",
+    *("decimals_for", "p_value", "pretty_unit", "superscript", "with_sigma"),
 )
+
+
+# What an entry for a table has beside the cells of its columns.
+_OF_TABLES = ("title", "align", "mark")
 
 
 class _Absent(jinja2.StrictUndefined):
@@ -65,15 +73,32 @@ class _Absent(jinja2.StrictUndefined):
 
 
 @cache
+def _entries() -> dict[str, Any]:
+    """What the files hold by ``Table.NAME``."""
+    paths = files("starcal_uq.presentation.words").iterdir()
+    return {
+        f"{kind}.{name}": entry
+        for path in paths
+        if path.name.endswith(".toml")
+        for kind, entries in tomllib.loads(path.read_text("utf-8")).items()
+        for name, entry in entries.items()
+    }
+
+
+@cache
 def templates() -> dict[str, str]:
-    """Templates by ``Table.NAME``; of a check, value, bound and sentence as three lines."""
+    """Templates by ``Table.NAME``; of a check, value, bound and sentence as three lines, of a table
+    mark and cells as lines, and title and heads as those of ``Heads.NAME``.
+    """
     found = {}
-    for path in files("starcal_uq.presentation.words").iterdir():
-        if path.name.endswith(".toml"):
-            for kind, entries in tomllib.loads(path.read_text("utf-8")).items():
-                for name, text in entries.items():
-                    parts = [text] if isinstance(text, str) else text.values()
-                    found[f"{kind}.{name}"] = "¶".join(parts)
+    for name, entry in _entries().items():
+        parts = [entry] if isinstance(entry, str) else [*entry.values()]
+        kind, _, table = name.partition(".")
+        if kind == "Table":
+            cells = {head: text for head, text in entry.items() if head not in _OF_TABLES}
+            parts = [entry.get("mark", ""), *cells.values()]
+            found[f"Heads.{table}"] = "¶".join([entry.get("title", ""), *cells])
+        found[name] = "¶".join(parts)
     return found
 
 
@@ -113,8 +138,14 @@ def _environment() -> jinja2.Environment:
         "SCOPE_NAMES": SCOPE_NAMES,
         "TIMES_IN_NAMES": TIMES_IN_NAMES,
         "diagnose": Remedy("diagnose", (RUN,)),
+        "infinity": np.inf,
     }
     return environment
+
+
+def _lines(name: str, facts: AnyMapping) -> list[str]:
+    lines = _environment().get_template(name).render(facts).split("¶")
+    return [re.sub("[ \n]+", " ", line).strip(" ") for line in lines]
 
 
 def say(name: str, /, **facts: Any) -> str:
@@ -125,9 +156,30 @@ def say(name: str, /, **facts: Any) -> str:
     LookupError
         Where no template has this name.
     """
-    lines = _environment().get_template(name).render(facts).split("¶")
-    tidy = (re.sub("[ \n]+", " ", line).strip(" ") for line in lines)
-    return "\n".join(filter(None, tidy))
+    return "\n".join(filter(None, _lines(name, facts)))
+
+
+def table(
+    name: str, given: AnyMapping | None = None, without: Collection[str] = (), /, **columns: Any
+) -> TextTable:
+    """A table by its name, a row for each entry of the columns, which give facts to its cells as
+    those that are `given` do to all; the columns under the heads `without` are left out.
+    """
+    given = given or {}
+    title, *heads = _lines(f"Heads.{name}", given)
+    rows: Iterable[tuple[Any, ...]] = zip(*columns.values(), strict=True)
+    filled = [
+        _lines(f"Table.{name}", {**given, **dict(zip(columns, row, strict=True))}) for row in rows
+    ]
+    kept = [head not in without for head in heads]
+    align = _entries()[f"Table.{name}"].get("align", "l" + "r" * (len(heads) - 1))
+    return TextTable(
+        tuple(compress(heads, kept)),
+        tuple(tuple(compress(cells, kept)) for _, *cells in filled),
+        title,
+        "".join(compress(align, kept)),
+        tuple(mark for mark, *_ in filled) if any(mark for mark, *_ in filled) else (),
+    )
 
 
 def told(name: str, it: object, /, **facts: Any) -> str:

@@ -15,7 +15,6 @@ import numpy as np
 from starcal_uq.camera.distortion import COEFFICIENTS, parameter_called
 from starcal_uq.core.formatting import (
     count,
-    fixed,
     percent,
     pretty_unit,
     significant,
@@ -25,7 +24,7 @@ from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.axes import axis_label, axis_name, place, value_words
-from starcal_uq.presentation.words.sentences import say
+from starcal_uq.presentation.words.sentences import say, table
 from starcal_uq.propagation.coupling import COUPLED, PART
 from starcal_uq.studies.findings import Curve, Pair, place_of
 
@@ -274,15 +273,16 @@ def _changes_table(study: Study) -> TextTable:
     for name, sigma in sigmas(study).items():
         curves = study.sweep.curves(np.log(sigma))
         changes += [(name, curve, _sigma) for curve in curves if curve.matters]
-    rows = []
-    for name, curve, form in changes:
-        row = [name, axis_label(curve.axis)]
-        for i in (curve.most, curve.least):
-            row += [form(float(curve.median[i])), value_words(curve.values[i])]
-        power = fixed(curve.exponent, 2) if np.isfinite(curve.exponent) else _MISSING
-        rows.append((*row, significant(curve.factor), power))
-    heads = ("What", "Along", "Most", "At", "Least", "At", "Factor in sigma", "Power")
-    return TextTable(heads, tuple(rows), "What changes couplings and errors", "llrlrlrr")
+    names, curves, forms = zip(*changes, strict=True) if changes else ((), (), ())
+    ends = {
+        end: [
+            (form(float(c.median[i])), value_words(c.values[i]))
+            for c, form, i in zip(curves, forms, (getattr(c, end) for c in curves), strict=True)
+        ]
+        for end in ("most", "least")
+    }
+    along = [axis_label(curve.axis) for curve in curves]
+    return table("changes", name=names, it=curves, along=along, **ends)
 
 
 def _size(cost: float) -> str:
