@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -85,6 +85,16 @@ def ess_tail(values: FloatArray) -> float:
 def mcse_mean(values: FloatArray) -> float:
     """Monte Carlo standard error of the mean of draws (chain, draw)."""
     return _diagnostic("mcse", values, method="mean")
+
+
+def power_sensitivity(
+    values: FloatArray, weights: Sequence[FloatArray], powers: tuple[float, float]
+) -> float:
+    """How fast draws (n,) move per doubling of a power at 1: the cumulative Jensen-Shannon distance
+    to the draws with weights (n,) at a power below, and at one above.
+    """
+    rows = (np.atleast_2d(row) for row in (values, *weights))
+    return float(_array_stats().power_scale_sense(*rows, *powers))
 
 
 def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -161,7 +161,7 @@ class _Component:
 
 def _component(log_density: FloatArray, columns: Mapping[str, FloatArray]) -> _Component:
     """Sensitivity to one factor of the posterior, whose logarithm at the draws is given."""
-    from starcal_uq.inference.arviz import psis
+    from starcal_uq.inference.arviz import power_sensitivity, psis
 
     shift = log_density - log_density.mean()
     powers = (1.0 / (1.0 + _DELTA), 1.0 + _DELTA)
@@ -174,32 +174,7 @@ def _component(log_density: FloatArray, columns: Mapping[str, FloatArray]) -> _C
         # Standardised: 1e-15 px^-4 and 5852 px are alike then, and the distance does not depend on
         # scale.
         z = (values - values.mean()) / values.std()
-        per_doubling = [cjs_distance(z, w) / np.log2(1.0 + _DELTA) for w in weights]
-        distance.append(float(np.mean(per_doubling)))
+        distance.append(power_sensitivity(z, weights, powers))
         mean_shift.append(float(np.mean(z * shift)) * doubling)
         sd_change.append(0.5 * float(np.mean((z * z - 1.0) * shift)) * doubling)
     return _Component(np.array(distance), np.array(mean_shift), np.array(sd_change), float(khat))
-
-
-def cjs_distance(values: FloatArray, weights: FloatArray) -> float:
-    """Cumulative Jensen-Shannon distance, 0 to 1, between draws (n,) with equal weights and with
-    others that sum to 1.
-
-    The larger one of those of the values and of their negatives, as the divergence is not symmetric
-    in sign.
-    """
-    order = np.argsort(values)
-    width = np.diff(values[order])
-    ordered = weights[order]
-    below = np.cumsum(ordered)[:-1]
-    above = np.cumsum(ordered[::-1])[::-1][1:]
-    equal = np.arange(1, len(values)) / len(values)
-    return max(_cjs(width, equal, below), _cjs(width, 1.0 - equal, above))
-
-
-def _cjs(width: FloatArray, p: FloatArray, q: FloatArray) -> float:
-    middle = 0.5 * (p + q)
-    q = np.maximum(q, np.finfo(np.float64).tiny)
-    # The linear terms of the two divergences cancel in their sum.
-    divergence = float(np.sum(width * (p * np.log2(p / middle) + q * np.log2(q / middle))))
-    return float(np.sqrt(max(divergence, 0.0) / float(np.sum(width * (p + q)))))
