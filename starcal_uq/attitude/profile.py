@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from starcal_uq.attitude.rotations import left_error
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, CatalogueError
 from starcal_uq.core.files import listed, reading, shown, table_ending
+from starcal_uq.core.findings import clause
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.settings import Scalar, Sense, bounded
 from starcal_uq.core.tables import WHAT, read_cells
@@ -31,6 +33,8 @@ _NEARLY_UNIT = 1e-3
 _FAR_DEG = 30.0
 # A step so many times the usual one is told.
 _GAP = 10.0
+# What is odd about the times of a profile.
+Steps = Enum("Steps", "FAR MISSING")
 _MAX_FRAMES = 1_000_000
 
 
@@ -79,20 +83,12 @@ class AttitudeProfile(Shown):
         steps = np.diff(time)
         far = self.rate_deg_s * steps > _FAR_DEG
         if far.any():
-            messages += (
-                f"{plural(far.sum(), 'step')} of the profile turn the camera by more than "
-                f"{_FAR_DEG:g} degrees: "
-                "attitudes in between are taken on the shortest arc; give more samples if the "
-                "camera went otherwise.",
-            )
+            messages += (clause(Steps.FAR, n=far.sum(), most_deg=_FAR_DEG),)
         longest = int(np.argmax(steps))
         times = steps[longest] / float(np.median(steps))
         if times > _GAP:
-            messages += (
-                f"the profile has no attitude between {time[longest]:g} and "
-                f"{time[longest + 1]:g} s, {significant(times, 2)} times its usual step: what lies "
-                "in between is on the shortest arc.",
-            )
+            ends_s = time[longest : longest + 2]
+            messages += (clause(Steps.MISSING, ends_s=ends_s, times=times),)
         object.__setattr__(self, "messages", tuple(dict.fromkeys(messages)))
 
     @property

@@ -12,12 +12,13 @@ sigma are left out.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.findings import clause
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.outliers import star_residuals
 from starcal_uq.observations.frames import StarFrames
@@ -32,6 +33,7 @@ _LIMIT_SIGMA, _ROUNDS = 4.5, 4
 # Calibrations with a floor, until it changes by less than this share.
 _SETTLE_ROUNDS, _SETTLED = 4, 0.02
 _MIN_STARS = 30
+Floor = Enum("Floor", "OF_NOISE")
 
 
 @dataclass(frozen=True)
@@ -48,13 +50,7 @@ class NoiseFloor:
         return self.floor_px > 0.0 and self.p_value < LEAST_P_VALUE
 
     def __str__(self) -> str:
-        if not self.needed:
-            return "The residuals ask for no noise beyond what the stars state."
-        return (
-            f"Bright stars scatter by {significant(self.floor_px)} px per axis however well they "
-            "are measured; this "
-            "was added to the noise of every star."
-        )
+        return clause(Floor.OF_NOISE, it=self)
 
 
 def noise_floor(

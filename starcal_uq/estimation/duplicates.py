@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError, check_known
+from starcal_uq.core.findings import clause
 from starcal_uq.core.settings import Duplicates
 from starcal_uq.core.types import IntArray
 from starcal_uq.observations.repeats import Fingerprints, repeats, shared
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 DUPLICATES = get_args(Duplicates)
+# What frames have in common.
+Repeats = Enum("Repeats", "FRAMES")
 
 
 def fingerprints_of(
@@ -77,15 +81,8 @@ def repeated(what: str, pairs: IntArray, n_frames: int) -> str:
     """First part of a sentence about so many frames that hold the same as others; pairs (n, 2) of
     frame numbers.
     """
-    more = n_frames - 1
-    others = (
-        f", and {more} more repeat others"
-        if more > 1
-        else ", and one more repeats another"
-        if more
-        else ""
-    )
-    return f"frame {pairs[0, 1]} holds the same {what} as frame {pairs[0, 0]}{others}"
+    first, later = pairs[0]
+    return clause(Repeats.FRAMES, what=what, first=first, later=later, more=n_frames - 1)
 
 
 def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:

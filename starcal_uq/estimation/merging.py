@@ -47,7 +47,7 @@ NOISES = get_args(MergedNoise)
 # even with five frames. Runs of one camera stay within five.
 MAX_DISTANCE = 8.0
 # How runs differ.
-Apart = Enum("Apart", "ODD CAMERAS NOISES UNCHECKED")
+Apart = Enum("Apart", "ODD CAMERAS NOISES UNCHECKED SHARED")
 
 
 @one_thread()
@@ -214,20 +214,13 @@ def refuse_shared(
             ids = np.column_stack(
                 [calibrations[i].frame_ids[pairs[:, 0]], calibrations[j].frame_ids[pairs[:, 1]]]
             )
-            n = len(np.unique(pairs[:, 1]))
-            one = f"frame {ids[0, 1]} holds the same measurement as frame {ids[0, 0]} of {names[i]}"
-            more = (
-                f", and {n - 1} more of its {calibrations[j].n_frames} frames repeat others"
-                if n > 1
-                else ""
-            )
-            raise RepeatedFramesError(
-                f"{names[j]}: {one}{more}, which would count twice: leave the shared frames out "
-                "(duplicates='drop', --duplicates drop, where the runs hold their observations), "
-                "or, if you know them "
-                "to be exposures of their own, keep them (duplicates='keep').",
-                pairs=ids.tolist(),
-            )
+            facts = {
+                "names": (names[i], names[j]),
+                "frames": ids[0],
+                "more": len(np.unique(pairs[:, 1])) - 1,
+                "n_frames": calibrations[j].n_frames,
+            }
+            raise RepeatedFramesError(clause(Apart.SHARED, **facts), pairs=ids.tolist())
 
 
 def renumbered(frame_ids: Sequence[IntArray]) -> tuple[IntArray, list[int]]:

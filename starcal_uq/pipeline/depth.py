@@ -96,10 +96,3 @@ class Embedded:
     def for_level(self, n: int) -> StarCatalogue:
         """The brightest n of the sky, and what verifies their patterns."""
         return self.to(next(limit for most, limit in _SEARCHED.items() if n <= most))
-
-
-def depth_text(stars: StarCatalogue, identification: Identification) -> str:
-    """Which stars were searched for, and how many of them a field holds."""
-    limit = float(stars.mag.max()) if len(stars) else 0.0
-    n = stars_in_field(identification.nominal, limit)
-    return f"Searched for stars to G = {limit:.1f}, of which a field holds {n:.0f} on average."

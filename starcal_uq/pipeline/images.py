@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from starcal_uq.calibration.noise_floor import settle_noise
 from starcal_uq.core.errors import CalibrationError, IdentificationError, ObservationError
+from starcal_uq.core.findings import clause
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, bounded
 from starcal_uq.core.times import TIMES_IN_NAMES, julian_year, utc_text
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 CENTROIDS, IDENTIFICATION, MATCHED = "centroids.parquet", "identification.csv", "matched.parquet"
 # Where the embedded catalogue has its stars; images without a time are compared with these.
 _CATALOGUE_EPOCH = 2016.0
+# What a terminal shows while images are identified.
+Told = Enum("Told", "SITE DEPTH")
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 # Magnitudes; the embedded catalogue ends at the second.
 FAINTER_NEIGHBOURS, FAINTEST = 1.5, 10.0
@@ -232,7 +236,7 @@ def observations_from_centroids(
     identified, the calibration where they were identified once.
     """
     from starcal_uq.pipeline.cameras import of_one_camera
-    from starcal_uq.pipeline.depth import depth_text, identify_to_depth
+    from starcal_uq.pipeline.depth import identify_to_depth, stars_in_field
     from starcal_uq.pipeline.refine import identify_and_calibrate
     from starcal_uq.sky.catalogue import load_catalogue
     from starcal_uq.sky.neighbours import without_disturbed
@@ -266,9 +270,10 @@ def observations_from_centroids(
             )
     if seen is not None:
         seen(centroids, first)
-    if tell is not None and max_mag is None:
-        tell(depth_text(stars, first))
     limit = float(stars.mag.max())
+    if tell is not None and max_mag is None:
+        n_stars = stars_in_field(first.nominal, limit)
+        tell(clause(Told.DEPTH, mag=limit, n_stars=n_stars))
     # A neighbour need not be bright enough to be identified to displace a star.
     neighbours = load_catalogue(
         max_mag=max(limit, min(limit + FAINTER_NEIGHBOURS, FAINTEST)), epoch=year
@@ -289,25 +294,15 @@ def observations_from_centroids(
             # What a header says of the place is believed as long as the stars are above its
             # horizon.
             said, stated = stated, None
+            facts: AnyDict = {"site": said, "keys": (centroids.origin.place or {})["keys"]}
             try:
                 low = without_low_stars(obs, said)
             except ObservationError as error:
-                words = f"was not used: {error}"
+                facts["error"] = error
             else:
-                site, words = (
-                    said,
-                    (
-                        "was used for refraction; "
-                        f"{plural(low.origin.low_stars or 0, 'low star')} "
-                        "left out."
-                    ),
-                )
+                site, facts["n_low"] = said, low.origin.low_stars or 0
             if tell is not None:
-                keys = (centroids.origin.place or {})["keys"]
-                tell(
-                    f"note: The site in the headers ({keys}: {said}) {words} Another: --site "
-                    "SITE, none: --in-space."
-                )
+                tell(clause(Told.SITE, **facts))
         return make_apparent(obs if site is None else without_low_stars(obs, site), site=site)
 
     def to_catalogue(apparent: FloatArray, times: StrArray) -> FloatArray:

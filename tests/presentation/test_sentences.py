@@ -15,9 +15,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from starcal_uq.attitude.profile import Steps
 from starcal_uq.budgeting.budget import Remark
 from starcal_uq.budgeting.totals import Difference
 from starcal_uq.calibration.cameras import Mixed
+from starcal_uq.calibration.noise_floor import Floor
 from starcal_uq.calibration.plausibility import Slip
 from starcal_uq.calibration.screening.result import Rejections
 from starcal_uq.comparison.compare import Differs
@@ -25,10 +27,12 @@ from starcal_uq.comparison.covariance import Basis
 from starcal_uq.core import status
 from starcal_uq.diagnostics.verdict.limits import Limit
 from starcal_uq.diagnostics.verdict.remedies import Refusal
+from starcal_uq.estimation.duplicates import Repeats
 from starcal_uq.estimation.merging import Apart
 from starcal_uq.estimation.undetermined import Open
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.likelihood.noise_model import Noise
+from starcal_uq.pipeline.images import Told
 from starcal_uq.presentation.words.sentences import templates, told
 from starcal_uq.propagation.coupling import Trade
 
@@ -39,7 +43,7 @@ ABOVE = ("presentation", "runs", "paper", "cli")
 MAKERS = ("Check", "judged", "Order", "Finding", "clause")
 KINDS = {
     *(status.Code, status.Advice, status.Note, Difference, Limit, Refusal, Slip, Mixed, Open),
-    *(Basis, Differs, Apart, Rejections, Trade, Noise, Remark),
+    *(Basis, Differs, Apart, Rejections, Trade, Noise, Remark, Floor, Steps, Told, Repeats),
 }
 
 

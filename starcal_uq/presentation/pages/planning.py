@@ -12,7 +12,6 @@ import numpy as np
 from starcal_uq.budgeting.rows import confidence_text
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
-from starcal_uq.core.formatting import significant
 from starcal_uq.core.manifest import making
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.types import AnyDict, PathLike
@@ -30,8 +29,8 @@ from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import planning as words
-from starcal_uq.presentation.words.numbers import need_words, range_words, span
-from starcal_uq.presentation.words.sentences import SCOPE_NAMES, told
+from starcal_uq.presentation.words.numbers import span
+from starcal_uq.presentation.words.sentences import SCOPE_NAMES, table, told
 
 PAGE = "plan.html"
 # Settings that the record has as they are.
@@ -89,10 +88,9 @@ def write_plan(
         figures = new_folder(path / "figures")
         for name, svg in images.items():
             atomic_write_bytes(figures / f"{name}.svg", svg)
-        for name, table in tables.items():
-            if table is None:
-                continue
-            write_csv(table, path / f"{name}.csv")
+        for name, rows in tables.items():
+            if rows is not None:
+                write_csv(rows, path / f"{name}.csv")
         atomic_write_text(path / "plan.json", json.dumps(plan_record(plan), indent=1) + "\n")
         atomic_write_text(path / PAGE, text)
     return Path(folder) / PAGE
@@ -171,22 +169,13 @@ def render_plan(
 def _needs_table(plan: Plan) -> TextTable:
     """Frames needed, by part of the error; the part that was asked for is marked."""
     spread = plan.distortion
-    rows = tuple(
-        (
-            SCOPE_NAMES[need.scope],
-            need_words(need, need.frames),
-            need_words(need, need.frames_surely),
-            *(() if spread is None else (range_words(spread.frames_range(need.scope)),)),
-            significant(need.floor_arcsec, 3) if need.floor_arcsec > 0.0 else "0",
-        )
-        for need in plan.needs
-    )
-    over = () if spread is None else (f"Distortion of {span(spread)}",)
-    heads = ("Part of the error", "On average", "In 95 % of campaigns", *over, "Floor [arcsec]")
-    return TextTable(
-        heads,
-        rows,
-        marks=tuple("chosen" if need.scope == plan.scope else "" for need in plan.needs),
+    over = "" if spread is None else span(spread)
+    return table(
+        "needs",
+        {"over": over, "scope": plan.scope, "names": SCOPE_NAMES},
+        () if over else ("Distortion of",),
+        it=plan.needs,
+        frames=[spread and spread.frames_range(need.scope) for need in plan.needs],
     )
 
 
@@ -194,7 +183,7 @@ def _forecast_table(plan: Plan) -> TextTable:
     """The forecast by number of frames; the focal length once, in millimetres where the pitch is
     known.
     """
-    table = plan.to_dataframe().rename(columns=_HEADS)
-    left_out = "f [px]" if "f [mm]" in table else ""
-    columns = [head for head in _HEADS.values() if head in table and head != left_out]
-    return TextTable.of(table, columns=columns)
+    found = plan.to_dataframe().rename(columns=_HEADS)
+    left_out = "f [px]" if "f [mm]" in found else ""
+    columns = [head for head in _HEADS.values() if head in found and head != left_out]
+    return TextTable.of(found, columns=columns)

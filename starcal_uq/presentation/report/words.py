@@ -82,29 +82,22 @@ _PATHS = {"numpy": "NumPy", "numba": "compiled loops (Numba)"}
 
 def provenance_rows(results: Results) -> list[tuple[str, str]]:
     """What is needed to repeat the run."""
-    rows: list[tuple[str, str]] = [
-        ("Data, SHA-256", results.calibration.data_hash_of(results.observations))
+    cal = results.calibration
+    steps = {"Calibration": cal, "Sampling": results.posterior, "Diagnosis": results.diagnosis}
+    made = {name: of.provenance for name, of in steps.items() if of is not None}
+    path = cal.provenance.kernels
+    rows: list[tuple[str, object]] = [
+        ("Data, SHA-256", cal.data_hash_of(results.observations)),
+        ("Source of the data", results.observations.origin.source),
+        ("Nominal camera", results.camera_changed),
     ]
-    source = results.observations.origin.source
-    if source:
-        rows.append(("Source of the data", str(source)))
-    if results.camera_changed:
-        rows.append(("Nominal camera", results.camera_changed))
-    steps = [("Calibration", results.calibration.provenance)]
-    if results.posterior is not None:
-        steps.append(("Sampling", results.posterior.provenance))
-    if results.diagnosis is not None:
-        steps.append(("Diagnosis", results.diagnosis.provenance))
-    for name, step in steps:
+    for name, step in made.items():
         rows.append((f"{name}, time", step.created_utc or "unknown"))
-        if step.seed is not None:
-            rows.append((f"{name}, seed", str(step.seed)))
+        rows.append((f"{name}, seed", step.seed))
         rows.append((f"{name}, settings", _settings_text(step.settings)))
-    path = results.calibration.provenance.kernels
-    if path:
-        rows.append(("Sums over stars", _PATHS[path]))
-    rows.append(("Versions", steps[-1][1].software()))
-    return rows
+    rows.append(("Sums over stars", path and _PATHS[path]))
+    rows.append(("Versions", list(made.values())[-1].software()))
+    return [(name, str(value)) for name, value in rows if value not in (None, "")]
 
 
 def _settings_text(settings: AnyMapping) -> str:
