@@ -343,18 +343,7 @@ class Camera(Shown):
     def _of_kernel(cls, path: str, instrument: int | None) -> Camera:
         with reading(path, "an instrument kernel of SPICE", "check the file", CameraError):
             held = read_kernel(Path(path).read_text(encoding="utf-8", errors="replace"), instrument)
-            optics = fitted_optics(held)
-        return cls(
-            held.width_px,
-            held.height_px,
-            held.pixel_um,
-            None,
-            *optics.centre_px,
-            optics.distortion,
-            optics.coefficients,
-            optics.name,
-            optics.focal_px,
-        )
+            return cls(**fitted_optics(held))
 
     def save(self, path: PathLike, force: bool = False) -> None:
         """Write the camera to a TOML file without loss of digits.

@@ -199,7 +199,7 @@ def test_a_detector_turned_by_half_a_circle_turns_the_frame(tmp_path):
     ("old", "new", "said"),
     [
         ("FOCAL_LENGTH", "FL", "no camera with FOCAL_LENGTH and PIXEL_SAMPLES"),
-        ("CCD_CENTER", "CENTER", "lacks one of FOCAL_LENGTH, PIXEL_SIZE, PIXEL_LINES"),
+        ("CCD_CENTER", "CENTER", "INS-203126 lacks CCD_CENTER"),
         ("RAD_DIST_COEFF", "OD_K", "INS-203126_OD_K is a distortion whose formula depends"),
         ("( 150.08                   )", "( 'long' )", "could not convert string to float"),
         ("( 14.004, 13.995 )", "( 1, 2, 3 )", "INS-203126_PIXEL_SIZE has not 2 finite numbers"),
