@@ -178,7 +178,7 @@ class _Turned:
             return
         for head, gain, axes in zip(self.heads.names, self.gains, by_head, strict=True):
             rows = list(axes.values())
-            called = f"{name}, {head}"
+            called = f"{head}: {name}"
             if rows and _gaussian(rows):
                 self.keep(name, _together(rows, called, gain))
                 continue
@@ -258,7 +258,7 @@ def _alone(row: Contributor, name: str, head: str, column: FloatArray) -> list[C
     """An error about one axis of a head, which turns the body about a fixed axis."""
     made = []
     group, sign = row.group
-    together = f"{group}, {head}" if group else name
+    together = f"{head}: {group}" if group else name
     for axis, turn in zip(AXES, column, strict=True):
         figures = _figures(float(abs(turn) * getattr(row, key)) for key in _SIGMAS)
         figures["mean_arcsec"] = float(turn * row.mean_arcsec)

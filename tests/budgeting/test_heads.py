@@ -139,10 +139,10 @@ def test_budget_of_heads_is_that_of_drawn_errors(heads):
         expected = MEAN * (BEST @ TURNS @ np.ones(3)).sum(axis=0)[i]
         assert found.total(axis, "before alignment").mean_arcsec == pytest.approx(expected)
     names = {row.name for row in found.rows}
-    assert {f"{NEA}, A", f"{NEA}, B", "bracket", "launch and settling shift, B about X"} <= names
+    assert {f"A: {NEA}", f"B: {NEA}", "bracket", "B: launch and settling shift about X"} <= names
     # Nobody assessed the roll of the thermal distortion: it stays so where the body sees it.
     missing = {(row.name, row.axis) for row in found.rows if not row.assessed}
-    assert ("thermo-elastic distortion, A about Z", "roll") in missing
+    assert ("A: thermo-elastic distortion about Z", "roll") in missing
     assert found.total("roll").at_least
     assert not any("weighed" in note for note in found.notes)
 

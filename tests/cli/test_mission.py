@@ -121,7 +121,7 @@ def test_budget_of_two_heads(cli, run, tmp_path, small_budgets):
     cli("budget", "run")
     status, out, _ = cli("budget", "--heads", "heads.toml", "-o", "array.html", "-o", "array.csv")
     assert status == 0
-    assert "centroid noise (NEA), B" in out
+    assert "B: centroid noise (NEA)" in out
     array, alone = (sc.budgeting.Budget.load(tmp_path / n) for n in ("array.csv", "run/budget.csv"))
     assert array.total("Z").sigma_arcsec < 0.3 * alone.total("Z").sigma_arcsec
     assert "of the body" in (tmp_path / "array.html").read_text()
