@@ -38,6 +38,7 @@ def at_home(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
                 "model_comparison",
                 "own_images",
                 "paper",
+                "requirement",
             )
         ),
     ],

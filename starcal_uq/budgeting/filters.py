@@ -62,16 +62,19 @@ class FilterState:
 def filter_states(rows: Sequence[Contributor], behaviours: Behaviours) -> tuple[FilterState, ...]:
     """States after alignment by axis and kind; none where no row is known to change in time.
 
-    Rows of white noise with one time between frames are one state, and so are biases; every other
-    row has its own.
+    White noise of one time between frames is one state, and so are biases, and what has one period
+    or drifts over one time; every other row has its own. What is periodic within two frames is new
+    in each of them.
     """
+    white = [one.seconds for one in behaviours.values() if one.kind == WHITE]
+    step = max(white, default=0.0)
     parts: dict[tuple[str, ...], list[Contributor]] = {}
     for row in rows:
         counted = row.counts(SCOPES[1]) and row.assessed and row.applies and row.part == KNOWLEDGE
         if not (counted and row.sigma_arcsec > 0.0):
             continue
-        for kind, share, *times in _shares(row, behaviours):
-            own = "" if kind in (WHITE, BIAS) else row.name
+        for kind, share, *times in _shares(row, behaviours, step):
+            own = row.name if kind in (CORRELATED, NOT_STATED) else ""
             part = replace(row, sigma_arcsec=math.sqrt(share) * row.sigma_arcsec)
             if share > 0.0:
                 parts.setdefault((row.axis, kind, *map(str, times), own), []).append(part)
@@ -91,13 +94,17 @@ def filter_states(rows: Sequence[Contributor], behaviours: Behaviours) -> tuple[
     return tuple(states) if known else ()
 
 
-def _shares(row: Contributor, behaviours: Behaviours) -> list[tuple[str, float, float, float]]:
+def _shares(
+    row: Contributor, behaviours: Behaviours, step_s: float
+) -> list[tuple[str, float, float, float]]:
     """Kinds of a row with their share of the variance, time and misfit."""
     behaviour = behaviours.get((row.name, row.axis))
     if row.interpretation == "ensemble" or (behaviour and behaviour.kind == "constant"):
         return [(BIAS, 1.0, math.nan, math.nan)]
     if behaviour is None:
         return [(NOT_STATED, 1.0, math.nan, math.nan)]
+    if behaviour.kind == "periodic" and behaviour.seconds < 2.0 * step_s:
+        return [(WHITE, 1.0, step_s, math.nan)]
     if behaviour.kind not in _MEASURED:
         return [(behaviour.kind, 1.0, behaviour.seconds, math.nan)]
     white, seconds, misfit = behaviour.gauss_markov()

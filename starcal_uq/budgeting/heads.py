@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -182,7 +183,7 @@ class _Turned:
             if rows and _gaussian(rows):
                 self.keep(name, _together(rows, called, gain))
                 continue
-            for row in rows:
+            for row in filter(attrgetter("applies"), rows):
                 column = gain[:, AXES.index(row.axis)]
                 own = f"{called} about {_LETTERS[row.axis]}"
                 self.keep(name, _alone(row, own, head, column))

@@ -189,19 +189,23 @@ def test_rows_are_states_by_what_they_state():
     rows = (
         row("one", 3.0), row("two", 4.0), row("orbit", 1.0), row("slow", 2.0), row("odd", 5.0),
         row("constant", 6.0, interpretation="ensemble"), row("fixed", 8.0),
+        row("pixels", 12.0), row("season", 2.4),
         row("gone", 9.0, absorbed_by_alignment="yes"), row("control", 9.0, part="control"),
     )  # fmt: skip
     known = {
         "one": Behaviour("white", 0.2), "two": Behaviour("white", 0.2),
         "orbit": Behaviour("periodic", 5880.0), "slow": Behaviour("correlated", 50.0),
-        "fixed": Behaviour("constant"),
+        "fixed": Behaviour("constant"), "pixels": Behaviour("periodic", 0.3),
+        "season": Behaviour("periodic", 5880.0),
     }  # fmt: skip
     behaviours = {(name, "pitch"): behaviour for name, behaviour in known.items()}
     found = {one.kind: one for one in filter_states(rows, behaviours)}
     assert list(found) == ["white", "correlated", "periodic", "bias", "not stated"]
-    assert found["white"].sigma_arcsec == pytest.approx(5.0)
-    assert found["white"].density == pytest.approx(5.0 * np.sqrt(0.2))
-    assert found["white"].contributors == ("one", "two")
+    # With 3 and 4 arcsec of noise what changes within two frames; two rows of one period.
+    assert found["white"].sigma_arcsec == pytest.approx(13.0)
+    assert found["white"].density == pytest.approx(13.0 * np.sqrt(0.2))
+    assert found["white"].contributors == ("one", "two", "pixels")
+    assert found["periodic"].sigma_arcsec == pytest.approx(2.6)
     assert found["correlated"].density == pytest.approx(2.0 * np.sqrt(2.0 / 50.0))
     assert found["bias"].sigma_arcsec == pytest.approx(10.0)
     assert np.isnan(found["bias"].density)
