@@ -13,6 +13,7 @@ from starcal_uq.cli.console import STYLES, note, print_table, progress_bar, say,
 from starcal_uq.cli.options import check_same_sensor, parse_labels
 from starcal_uq.cli.settings import (
     SIGMA_PX,
+    BudgetFiles,
     CampaignSettings,
     ChoiceSettings,
     EffectSettings,
@@ -48,12 +49,10 @@ def check_output(out: Path | None, command: str, force: bool) -> None:
 
 
 def budget_command(
+    files: BudgetFiles,
     run: Path | None = None,
     heads: Path | None = None,
     file: Path | None = None,
-    out: list[Path] | None = None,
-    format: settings.BudgetFormat | None = None,
-    template: Path | None = None,
     confidence: float | None = None,
     temperature_profile: Path | None = None,
     seed: int = 0,
@@ -62,13 +61,10 @@ def budget_command(
     """Attitude error budget in the terms of ECSS; status 1 when a requirement is violated."""
     from starcal_uq.presentation.pages.budgeting import FORMATS
 
+    template, out = files.template, files.named(run)
     if template is not None and file is not None and template.resolve() == file.resolve():
         raise typer.BadParameter(f"--template would write over {file}: name another file.")
-    if format is not None:
-        if run is None:
-            raise typer.BadParameter("--format writes into RUN: name the file with -o.")
-        out = [*(out or []), run / f"budget.{format}"]
-    for path in out or []:
+    for path in out:
         if path.suffix.lower() not in FORMATS:
             raise typer.BadParameter(
                 f"{path}: the ending names the format; use one of {', '.join(FORMATS)}."
@@ -81,7 +77,7 @@ def budget_command(
                 "--temperature-profile to the budget of each."
             )
         found = sc.budgeting.array_budget(heads, confidence=confidence, seed=seed)
-        return _deliver(found, heads, [], out or [])
+        return _deliver(found, heads, [], out)
     if run is None or heads is not None:
         raise typer.BadParameter(
             "give the run folder RUN, or --heads FILE with those of the heads."
@@ -104,7 +100,7 @@ def budget_command(
         found = opened.error_budget
     else:
         found = opened.budget(**asked, seed=seed, force=force)
-    return _deliver(found, run, [run / "budget.csv"], out or [])
+    return _deliver(found, run, [run / "budget.csv"], out)
 
 
 def _deliver(found: Budget, of: Path, written: list[Path], out: list[Path]) -> Answer:

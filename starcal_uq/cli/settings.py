@@ -342,6 +342,23 @@ class ChoiceSettings:
     heads: Path | None = None
 
 
+@dataclass(frozen=True)
+class BudgetFiles:
+    """Files of the budget beside that of the run."""
+
+    out: list[Path] | None = None
+    format: settings.BudgetFormat | None = None
+    template: Path | None = None
+
+    def named(self, run: Path | None) -> list[Path]:
+        """All files to write but the starter's."""
+        if self.format is None:
+            return self.out or []
+        if run is None:
+            raise typer.BadParameter("--format writes into RUN: name the file with -o.")
+        return [*(self.out or []), run / f"budget.{self.format}"]
+
+
 def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> None:
     """An option that would be ignored is a mistake of the user's that should show."""
     if images:
