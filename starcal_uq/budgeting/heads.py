@@ -174,13 +174,15 @@ class _Turned:
         """One contributor of all heads."""
         every = [row for axes in by_head for row in axes.values()]
         if not any(row.assessed for row in every):
-            first = every[0]
-            self.rows.extend(replace(first, axis=axis, behaviour="") for axis in AXES)
+            self.rows.extend(every[: len(AXES)])
             return
         for head, gain, axes in zip(self.heads.names, self.gains, by_head, strict=True):
             rows = list(axes.values())
             called = f"{head}: {name}"
-            if rows and _gaussian(rows):
+            if not any(row.assessed for row in rows):
+                self.rows.extend(replace(row, name=called) for row in rows)
+                continue
+            if _gaussian(rows):
                 self.keep(name, _together(rows, called, gain))
                 continue
             for row in filter(attrgetter("applies"), rows):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,24 @@ def test_budget_of_heads_is_that_of_drawn_errors(heads):
     assert ("A: thermo-elastic distortion about Z", "roll") in missing
     assert found.total("roll").at_least
     assert not any("weighed" in note for note in found.notes)
+
+
+def test_what_nobody_assessed_is_said_once(heads):
+    """A row that one head lacks is missing for that head, one that all lack for all of them."""
+    silent = [Contributor("star catalogue", "FOV spatial", axis) for axis in AXES]
+    stated = [
+        dataclasses.replace(row, sigma_arcsec=1.0, mean_arcsec=0.0, source="file") for row in silent
+    ]
+    other = [Contributor("aberration residual", "aberration", axis) for axis in AXES]
+    found = sc.budgeting.array_budget(heads, [
+        dataclasses.replace(budget(0), rows=(*rows(0), *stated, *other)),
+        dataclasses.replace(budget(1), rows=(*rows(1), *silent, *other)),
+    ])  # fmt: skip
+    names = [row.name for row in found.rows if not row.assessed]
+    assert names.count("B: star catalogue") == names.count("aberration residual") == 3
+    assert "A: star catalogue" not in names and "B: aberration residual" not in names
+    # Its part of the first head counts: a head's weight is below one.
+    assert 0.0 < {row.name: row.sigma_arcsec for row in found.rows}["A: star catalogue"] < 1.0
 
 
 def test_a_common_row_is_not_averaged(heads):
