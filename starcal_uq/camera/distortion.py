@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from starcal_uq.camera.planes import EQUIDISTANT, PINHOLE, Plane
 from starcal_uq.core.errors import DistortionError
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 
 Displacement = Callable[[Any, Any, Sequence[Any]], tuple[Any, Any]]
 
@@ -329,6 +329,11 @@ def undistorted(model_name: str, theta: FloatArray) -> FloatArray:
     found = theta.copy()
     found[get_model(model_name).of_lens] = 0.0
     return found
+
+
+def scales_of(specs: Sequence[Parameter]) -> FloatArray:
+    """Units (p,) in which parameters are printed, in computation units."""
+    return floats([spec.scale for spec in specs])
 
 
 def parameters(model_name: str) -> tuple[Parameter, ...]:

@@ -452,6 +452,14 @@ class Calibration(Shown, Traced):
         """False for the result of a stream, whose stars are gone."""
         return len(self.residuals_px) > 0
 
+    @property
+    def with_noise(self) -> FloatArray:
+        """Start, estimate and sigma (3, p+1) of the parameters and of the noise, which has no
+        start; px units.
+        """
+        start = [*self.nominal.theta, np.nan]
+        return np.array([start, [*self.theta, self.sigma], [*self.sigmas, self.sigma_std]])
+
     def to_dataframe(self) -> pd.DataFrame:
         """One row per parameter: start, estimate, sigma, 95 % interval and unit; the noise is the
         last row.
@@ -463,9 +471,7 @@ class Calibration(Shown, Traced):
         return pd.DataFrame(
             {
                 "parameter": [*self.parameter_names, self.sigma_name],
-                "start": np.append(self.nominal.theta, np.nan),
-                "estimate": np.append(self.theta, self.sigma),
-                "sigma": np.append(self.sigmas, self.sigma_std),
+                **dict(zip(("start", "estimate", "sigma"), self.with_noise, strict=True)),
                 "low": low,
                 "high": high,
                 "unit": [*(p.unit for p in parameters(self.camera.distortion)), unit],

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import Parameter, next_simpler
+from starcal_uq.camera.distortion import Parameter, next_simpler, scales_of
 from starcal_uq.core.formatting import decimals_for
 from starcal_uq.core.remedy import PLAN, RUN, Remedies, Remedy, with_model
 from starcal_uq.core.status import (
@@ -222,7 +222,7 @@ def measure(
 
     n_sampled = chains.u.shape[-1]
     n_steps, n_walkers = chains.u.shape[1:3]
-    scale = np.array([parameter.scale for parameter in shown])
+    scale = scales_of(shown)
     scaled = draws[..., :n_sampled] / scale[:n_sampled]
     columns = [np.ascontiguousarray(scaled[..., i]) for i in range(n_sampled)]
 

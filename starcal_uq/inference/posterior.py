@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
+from starcal_uq.camera.distortion import Parameter, parameters, scales_of, sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import check_hdf5, ensure_new, reading, write_netcdf
@@ -424,7 +424,7 @@ class Posterior(Shown, Traced):
             "ess_tail": d.ess_tail,
             "scaled_unit": [p.scaled_unit for p in shown],
         }
-        scale = np.array([p.scale for p in shown])
+        scale = scales_of(shown)
         columns.update({f"scaled_{name}": columns[name] / scale for name in _NUMBERS})
         return pd.DataFrame(columns)
 

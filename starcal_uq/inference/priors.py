@@ -12,6 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -21,6 +22,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model, parameter_names, parameters, sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
+from starcal_uq.core.findings import clause
 from starcal_uq.core.toml import Key, Section, read_section
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
 from starcal_uq.maths.linear import correlation_of
@@ -212,7 +214,7 @@ class Priors(Shown, ABC):
 
         shown = [*parameters(self.distortion), sigma_parameter(self.per_star_sigma)]
         names = [p.name for p in shown]
-        noise = f"log-normal, median {self.sigma_median:g} with log sd {self.sigma_log_sd:g}"
+        noise = clause(Stated.NOISE, it=self)
         return pd.DataFrame(
             {
                 "parameter": names,
@@ -222,6 +224,10 @@ class Priors(Shown, ABC):
                 "statement": [*(self._statement(name) for name in names[:-1]), noise],
             }
         )
+
+
+# How the prior of a parameter is stated in words.
+Stated = Enum("Stated", "PHYSICAL NORMAL NOISE")
 
 
 def positive_number(name: str, value: Any) -> float:
@@ -350,16 +356,7 @@ class PhysicalPriors(Priors):
         return table
 
     def _statement(self, name: str) -> str:
-        if name in ("x0", "y0"):
-            centre = self.principal_point_centre_px["xy".index(name[0])]
-            return f"normal, {centre:g} px with sd {self.principal_point_px:.4g} px"
-        if name == "f":
-            return f"normal, {self.focal_px:g} px with sd {100 * self.focal_fraction:g} %"
-        sd, radius = self.distortion_corner_px, self.corner_radius_px
-        if name in ("stretch", "skew"):
-            mean = self.axes[("stretch", "skew").index(name)]
-            return f"normal, {mean:g} with sd {sd / radius:.3g}"
-        return f"normal, displacement 0 with sd {sd:.3g} px at {radius:.4g} px"
+        return clause(Stated.PHYSICAL, it=self, name=name)
 
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(PhysicalPriors))
@@ -473,5 +470,4 @@ class GaussianPriors(Priors):
 
     def _statement(self, name: str) -> str:
         mean, sd = self._moments_of(name)
-        origin = f", from {self.source['name']}" if "name" in self.source else ""
-        return f"normal, {mean:.8g} with sd {sd:.3g}, correlated with the others{origin}"
+        return clause(Stated.NORMAL, mean=mean, sd=sd, source=self.source.get("name"))

@@ -31,6 +31,7 @@ from starcal_uq.estimation.duplicates import Repeats
 from starcal_uq.estimation.merging import Apart
 from starcal_uq.estimation.undetermined import Open
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
+from starcal_uq.inference.priors import Stated
 from starcal_uq.likelihood.noise_model import Noise
 from starcal_uq.pipeline.images import Told
 from starcal_uq.presentation.words.sentences import templates, told
@@ -43,7 +44,7 @@ ABOVE = ("presentation", "runs", "paper", "cli")
 MAKERS = ("Check", "judged", "Order", "Finding", "clause")
 KINDS = {
     *(status.Code, status.Advice, status.Note, Difference, Limit, Refusal, Slip, Mixed, Open),
-    *(Basis, Differs, Apart, Rejections, Trade, Noise, Remark, Floor, Steps, Told, Repeats),
+    *(Basis, Differs, Apart, Rejections, Trade, Noise, Remark, Floor, Steps, Told, Repeats, Stated),
 }
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-from starcal_uq.camera.distortion import parameters
+from starcal_uq.camera.distortion import parameters, scales_of
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_csv
 from starcal_uq.core.formatting import p_words
@@ -65,9 +63,10 @@ def _parameter_table(found: CameraComparison) -> TextTable:
     specs = {p.name: p for model in found.models for p in parameters(model)}
     estimates = (found.theta_a, found.theta_b, found.sd_a, found.sd_b, found.sd_difference)
     shown = [specs[name] for name in found.parameter_names]
-    scale = np.array([spec.scale for spec in shown])
     names = ("a", "b", "sd_a", "sd_b", "sd")
-    scaled = {name: values / scale for name, values in zip(names, estimates, strict=True)}
+    scaled = {
+        name: values / scales_of(shown) for name, values in zip(names, estimates, strict=True)
+    }
     return table("compared", {"labels": found.labels}, spec=shown, **scaled)
 
 

@@ -5,11 +5,12 @@ begins.
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
+from starcal_uq.camera.distortion import Parameter, parameters, scales_of, sigma_parameter
 from starcal_uq.core.constants import INTERACTION
 from starcal_uq.core.formatting import (
     count,
@@ -18,7 +19,6 @@ from starcal_uq.core.formatting import (
     percent,
     plural,
     plus_minus,
-    pretty_unit,
     significant,
     with_sigma,
 )
@@ -51,7 +51,7 @@ def all_parameters(results: Results) -> tuple[Parameter, ...]:
 def parameter_rows(results: Results) -> list[Row]:
     """One row per parameter, and one for the focal length in millimetres."""
     cal, post, truth = results.calibration, results.posterior, results.truth
-    mean, sd = np.append(cal.theta, cal.sigma), np.append(cal.sigmas, cal.sigma_std)
+    start, mean, sd = cal.with_noise
     low, high = np.vstack([cal.interval(), cal.sigma_interval()]).T
     unknown = np.full(len(mean), np.nan)
     prior, prior_sd, true, z = unknown, unknown, unknown.copy(), unknown.copy()
@@ -59,7 +59,6 @@ def parameter_rows(results: Results) -> list[Row]:
         mean, sd = post.draws.mean(axis=0), post.sd
         low, high = np.quantile(post.draws, (0.025, 0.975), axis=0)
         prior, prior_sd = (of(post.parameter_names) for of in (post.priors.mean, post.priors.sd))
-    start = np.append(cal.nominal.theta, np.nan)
     if truth is not None:
         true[:-1], z[:-1] = truth.theta, truth_z(cal, truth, post)
     numbers = np.stack([mean, sd, low, high, prior, prior_sd, start, true], axis=1)
@@ -156,7 +155,7 @@ def diagnostics_table(post: Posterior) -> TextTable:
     """Convergence of every sampled parameter."""
     d, sampled = post.diagnostics, list(post.sampled)
     specs = [post.parameters[i] for i in sampled]
-    scale = np.array([spec.scale for spec in specs])
+    scale = scales_of(specs)
     return table(
         "diagnostics",
         it=specs,
@@ -177,9 +176,9 @@ def methods_table(results: Results) -> TextTable | None:
         return None
     d, sampled = post.diagnostics, list(post.sampled)
     specs = [post.parameters[i] for i in sampled]
-    scale = np.array([spec.scale for spec in specs])
+    scale = scales_of(specs)
     both = {
-        "calibration": (np.append(cal.theta, cal.sigma), np.append(cal.sigmas, cal.sigma_std)),
+        "calibration": cal.with_noise[1:],
         "laplace": (d.laplace_mean, d.laplace_sd),
         "psis": (d.psis_mean, d.psis_sd),
         "emcee": (post.draws.mean(axis=0), post.sd),
@@ -212,7 +211,7 @@ def stage_table(results: Results) -> TextTable:
 def pair_table(cal: Calibration) -> TextTable:
     """The paper's estimator beside the efficient one: its sigma and the price in precision."""
     specs = parameters(cal.camera.distortion)
-    scale = np.array([spec.scale for spec in specs])
+    scale = scales_of(specs)
     rows = table(
         "pairs",
         it=specs,
@@ -272,26 +271,25 @@ def _round_table(record: ImageRecord, cal: Calibration) -> TextTable | None:
     """One row per quantity, after the first and the last round; None where both have the same
     stars.
     """
-    both = first, last = record.rounds[0], record.rounds[-1]
+    both = _, last = record.rounds[0], record.rounds[-1]
     if last.n_stars and not (last.new or last.given_up):
         return None
+    specs = [
+        spec
+        for spec in parameters(cal.camera.distortion)
+        if all(spec.name in r.parameters for r in both)
+    ]
+    old, new = ([np.array(r.parameters[spec.name]) / spec.scale for spec in specs] for r in both)
+    found = table("rounds", it=specs, old=old, new=new)
     anew = f"{count(last.new)} identified anew, {count(last.given_up)} given up"
-    rows = [
+    unit = "times the stated noise" if last.sigma_name == "sigma_scale" else "px per axis"
+    rows = (
         ("Images identified", *(count(r.n_frames) for r in both), "", ""),
         ("Stars calibrated", *(count(r.n_stars) for r in both), anew, ""),
-    ]
-    for parameter in parameters(cal.camera.distortion):
-        if not all(parameter.name in r.parameters for r in both):
-            continue
-        (old, _), (new, sigma) = pairs = [r.parameters[parameter.name] for r in both]
-        values = [plus_minus(a / parameter.scale, b / parameter.scale) for a, b in pairs]
-        change = f"{fixed((new - old) / sigma, 1)} σ" if sigma > 0.0 else ""
-        unit = pretty_unit(parameter.scaled_unit)
-        rows.append((parameter.name, values[0], values[1], change, unit))
-    unit = "times the stated noise" if last.sigma_name == "sigma_scale" else "px per axis"
-    rows.append(("Noise", significant(first.sigma, 3), significant(last.sigma, 3), "", unit))
-    heads = ("", "Nominal camera", "Calibrated camera", "Change", "Unit")
-    return TextTable(heads, tuple(rows), align="lrrrl")
+        *found.rows,
+        ("Noise", *(significant(r.sigma, 3) for r in both), "", unit),
+    )
+    return replace(found, rows=rows)
 
 
 def derived_table(post: Posterior) -> TextTable:

@@ -6,7 +6,7 @@ import numpy as np
 
 from starcal_uq.calibration.screening.result import REASONS, Screening
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import parameters
+from starcal_uq.camera.distortion import parameters, scales_of
 from starcal_uq.core.formatting import (
     decimals_for,
     fixed,
@@ -38,8 +38,8 @@ def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTabl
     if truth is not None and truth.parameter_names != cal.parameter_names:
         truth = None
     specs = parameters(cal.camera.distortion)
-    scale = np.array([*(spec.scale for spec in specs), 1.0])
-    sd = np.append(cal.sigmas, cal.sigma_std) / scale
+    scale = np.append(scales_of(specs), 1.0)
+    start, value, sd = cal.with_noise / scale
     true = np.full(len(specs), np.nan) if truth is None else truth.theta
     unit = "px per axis" if cal.sigma_name == "sigma" else f"times the {noise_kind(cal)} noise"
     return table(
@@ -47,10 +47,10 @@ def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTabl
         {"it": cal},
         ("truth", "z") if truth is None else (),
         name=[*(spec.name for spec in specs), cal.sigma_name],
-        start=np.append(cal.nominal.theta, np.nan) / scale,
-        value=np.append(cal.theta, cal.sigma) / scale,
+        start=start,
+        value=value,
         sd=sd,
-        n=[decimals_for(value) for value in sd],
+        n=[*map(decimals_for, sd)],
         known=np.append(true, np.nan) / scale,
         z=np.append((cal.theta - true) / cal.sigmas, np.nan),
         unit=[*(pretty_unit(spec.scaled_unit) for spec in specs), unit],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from starcal_uq.camera.distortion import scales_of
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.sentences import table
@@ -11,7 +12,7 @@ from starcal_uq.presentation.words.sentences import table
 
 def posterior_table(post: Posterior) -> TextTable:
     """Mean, spread, interval and convergence of every parameter."""
-    scale = np.array([parameter.scale for parameter in post.parameters])
+    scale = scales_of(post.parameters)
     draws = post.draws / scale
     low, high = np.quantile(draws, (0.025, 0.975), axis=0)
     return table(

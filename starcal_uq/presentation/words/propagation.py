@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from starcal_uq.camera.distortion import Parameter
+from starcal_uq.camera.distortion import Parameter, scales_of
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.formatting import (
     fixed,
@@ -118,7 +118,7 @@ def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextT
     """What not knowing the others costs every parameter; sigmas in the units of `specs`, or in px
     units.
     """
-    scales = np.array([spec.scale for spec in specs] or np.ones(len(coupling.parameter_names)))
+    scales = scales_of(specs) if specs else np.ones(len(coupling.parameter_names))
     contraction = coupling.contraction
     return table(
         "coupling",
