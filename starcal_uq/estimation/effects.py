@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ from starcal_uq.attitude.rotations import (
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.findings import clause
 from starcal_uq.core.settings import WEIGHING
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
@@ -65,6 +67,8 @@ _FRAMES_OF_ZENITH = 100
 # Rounds in which the noise beside air is found; moves of the zeniths beside other effects, and the
 # gain, nat, that one has to bring.
 _ROUNDS, _MOVES, _LEAST_GAIN = 3, 8, 0.02
+# What a table does not allow.
+Refused = Enum("Refused", "EFFECT")
 
 
 @dataclass(frozen=True)
@@ -181,7 +185,7 @@ def with_effects_of(stars: Stars, cal: Calibration, wanted: Sequence[str]) -> Ca
     names = tuple(known) if selecting else asked
     for name in asked:
         if name not in known:
-            raise CalibrationError(_impossible(name, known))
+            raise CalibrationError(clause(Refused.EFFECT, name=name, known=[*known]))
     restricted = model.restricted(names, zeniths)
     refused: list[tuple[str, float]] = []
     logs, steps = forced(restricted, asked)
@@ -324,19 +328,6 @@ class Rest:
         """Root mean square, px, of the shifts by an effect."""
         own = self.exact.shifts(self.state, self.exact.of_effect(name, self.coefficients))
         return float(np.sqrt(np.mean(self.exact.frames.in_pixels(own[0]) ** 2)))
-
-
-def _impossible(name: str, known: Mapping[str, Effect]) -> str:
-    """Why a table does not allow an effect, and which it allows."""
-    lacking = "needs what does not vary in this table"
-    if name == "star":
-        lacking = "needs stars that are seen in several frames, or a column direction_mas"
-    if name == "zenith":
-        lacking = (
-            "needs directions in which refraction may be missing, and stars that were above one "
-            "horizon"
-        )
-    return f"the effect {name!r} {lacking}: use some of {', '.join(known)}."
 
 
 class _Linearised:

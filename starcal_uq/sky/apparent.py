@@ -17,12 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from enum import Enum
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
 from starcal_uq.core.errors import CatalogueError, ObservationError
+from starcal_uq.core.findings import clause
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import AnyDict, FloatArray, floats
@@ -50,6 +52,8 @@ _IN_SPACE_KM_S = 1.0
 _STARS_PER_FRAME = 4
 # Hours by which a zone's time differs from UTC at most.
 _ZONES = 14
+# Where stars are that cannot have been seen.
+Horizon = Enum("Horizon", "BELOW")
 
 
 def earth_velocity_km_s(time_utc: Any) -> FloatArray:
@@ -340,26 +344,21 @@ def _altitudes(
     below = np.flatnonzero(mean < 0.0)
     if len(below):
         first = below[0]
-        times = "" if obs.time_utc is None else f" at {obs.time_utc[starts[first]]} UTC"
-        others = f" (and {plural(len(below) - 1, 'other')})" if len(below) > 1 else ""
         # Times of a zone that were taken for UTC are off by hours, and no frame was taken through
         # the ground.
         zones = sorted(range(-_ZONES, _ZONES + 1), key=abs)
         hours = next(
             (h for h in zones if seen_from(site.later(h))[1].min() > LEAST_ALTITUDE_DEG), None
         )
-        zone = ""
-        if hours is not None:
-            way = "later" if hours > 0 else "earlier"
-            zone = f"; times {plural(abs(hours), 'hour')} {way} put all frames above it"
-        raise ObservationError(
-            f"The stars of frame {obs.frame_ids[first]}{others} were {-mean[first]:.0f} degrees "
-            "below the "
-            f"horizon of the site ({site}){times}: correct the site (north and east are "
-            "positive) or the time, which "
-            f"must be UTC{zone}.",
-            column="time_utc",
-        )
+        facts: AnyDict = {
+            "frame": obs.frame_ids[first],
+            "others": len(below) - 1,
+            "below_deg": -mean[first],
+            "site": site,
+            "time_utc": None if obs.time_utc is None else obs.time_utc[starts[first]],
+            "hours": hours,
+        }
+        raise ObservationError(clause(Horizon.BELOW, **facts), column="time_utc")
     return altitude
 
 

@@ -28,6 +28,7 @@ from starcal_uq.core import status
 from starcal_uq.diagnostics.verdict.limits import Limit
 from starcal_uq.diagnostics.verdict.remedies import Refusal
 from starcal_uq.estimation.duplicates import Repeats
+from starcal_uq.estimation.effects import Refused
 from starcal_uq.estimation.merging import Apart
 from starcal_uq.estimation.undetermined import Open
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
@@ -36,6 +37,7 @@ from starcal_uq.likelihood.noise_model import Noise
 from starcal_uq.pipeline.images import Told
 from starcal_uq.presentation.words.sentences import templates, told
 from starcal_uq.propagation.coupling import Trade
+from starcal_uq.sky.apparent import Horizon
 
 PACKAGE = Path(status.__file__).parents[1]
 WORDS = PACKAGE / "presentation" / "words"
@@ -45,6 +47,7 @@ MAKERS = ("Check", "judged", "Order", "Finding", "clause")
 KINDS = {
     *(status.Code, status.Advice, status.Note, Difference, Limit, Refusal, Slip, Mixed, Open),
     *(Basis, Differs, Apart, Rejections, Trade, Noise, Remark, Floor, Steps, Told, Repeats, Stated),
+    *(Horizon, Refused),
 }
 
 

@@ -177,7 +177,7 @@ def methods_table(results: Results) -> TextTable | None:
     d, sampled = post.diagnostics, list(post.sampled)
     specs = [post.parameters[i] for i in sampled]
     scale = scales_of(specs)
-    both = {
+    both: AnyDict = {
         "calibration": cal.with_noise[1:],
         "laplace": (d.laplace_mean, d.laplace_sd),
         "psis": (d.psis_mean, d.psis_sd),
