@@ -9,9 +9,9 @@ gives 2 m - 3 numbers beyond its attitude.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,9 +19,7 @@ from starcal_uq.budgeting.budget import in_time
 from starcal_uq.budgeting.file import BudgetFile, load_budget_file
 from starcal_uq.budgeting.indices import Index, seen_by
 from starcal_uq.budgeting.rows import ALIGNMENT, COMMON, NEA, REST, SCOPES, Contributor
-from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
-from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError, check_known, require
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray, PathLike
@@ -38,71 +36,45 @@ if TYPE_CHECKING:
 
 SETTINGS = ("noise", "stars", "frames", "temperature")
 # Factors on inputs: numbers, or arrays of one shape.
-Inputs = Mapping[str, float | FloatArray]
+Inputs = Mapping[str, Any]
 _THERMAL = "thermo-elastic"
-_STEP = 1e-4
-_SAME = 1e-6
-
-
-@dataclass(frozen=True)
-class BudgetSensitivity:
-    """How one total depends on one input.
-
-    Attributes
-    ----------
-    of_index, scope, axis : str
-        The total: error index with its times, scope, axis; mixed interpretation.
-    name, unit : str
-        One of ``noise``, ``stars`` (of a frame), ``frames`` (of the calibration), ``temperature``
-        (excursion behind the rows of class thermo-elastic), or a parameter of the camera, whose
-        input is its standard deviation.
-    value : float
-        The input as it is.
-    elasticity : float
-        Relative change of the total's standard deviation by that of the input.
-    per_unit_arcsec : float
-        Change of the bound of the total by one unit of the input.
-    error_per_unit_arcsec : float
-        Attitude error that the confidence of the budget keeps below, by an error of one unit of a
-        parameter (`starcal_uq.propagation.sensitivities`); of absolute errors, NaN elsewhere.
-    first_order, total_order : float
-        Sobol shares of the input in the variance of the total's standard deviation, alone and with
-        all others; NaN where they were not asked for.
-    """
-
-    of_index: str
-    scope: str
-    axis: str
-    name: str
-    unit: str
-    value: float
-    elasticity: float
-    per_unit_arcsec: float
-    error_per_unit_arcsec: float = float("nan")
-    first_order: float = float("nan")
-    total_order: float = float("nan")
+_STEP, _SAME, _SAMPLES = 1e-4, 1e-6, 256
+_HEADS = (
+    *("of_index", "scope", "axis", "input", "unit", "value", "elasticity", "per_unit_arcsec"),
+    *("error_per_unit_arcsec", "first_order", "total_order"),
+)
 
 
 @dataclass(frozen=True, eq=False)
-class BudgetSensitivities(Shown):
-    """`BudgetSensitivity` of every total and input."""
+class BudgetSensitivities:
+    """How the totals of a budget, in the mixed interpretation, depend on its inputs.
 
-    entries: tuple[BudgetSensitivity, ...]
+    Attributes
+    ----------
+    table : pandas.DataFrame
+        One row per total (``of_index``, ``scope``, ``axis``) and ``input``: ``noise``, ``stars``
+        (of a frame), ``frames`` (of the calibration), ``temperature`` (excursion behind the rows of
+        class thermo-elastic), or a parameter of the camera, of which the input is the standard
+        deviation. ``unit`` and ``value`` of the input; ``elasticity``, the relative change of the
+        total's standard deviation by that of the input; ``per_unit_arcsec``, the change of the
+        total's bound by one unit; ``error_per_unit_arcsec``, the attitude error that the confidence
+        of the budget keeps below by an error of one unit of a parameter
+        (`starcal_uq.propagation.sensitivities`; NaN for settings and windows); ``first_order`` and
+        ``total_order``, Sobol shares of the input in the variance of the standard deviation, NaN
+        where they were not asked for.
+    """
 
-    def of(
-        self, name: str, axis: str, scope: str = SCOPES[1], index: str = "AKE"
-    ) -> BudgetSensitivity:
-        """That of one input and total; KeyError where there is none."""
-        for entry in self.entries:
-            if (entry.name, entry.axis, entry.scope, entry.of_index) == (name, axis, scope, index):
-                return entry
-        raise KeyError(f"{name} of {index}, {axis}, {scope}")
+    table: pd.DataFrame
+
+    def of(self, name: str, axis: str, scope: str = SCOPES[1], index: str = "AKE") -> pd.Series:
+        """The row of one input and total; KeyError where there is none."""
+        keys = list(_HEADS[:4])
+        row: pd.Series = self.table.set_index(keys, drop=False).loc[(index, scope, axis, name)]
+        return row
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per total and input, with the attributes of a `BudgetSensitivity`."""
-        import pandas as pd
-
-        return pd.DataFrame([vars(entry) for entry in self.entries])
+        """The table."""
+        return self.table.copy()
 
 
 @bounded
@@ -116,7 +88,6 @@ def sensitivities(
     spectrum: ErrorSpectrum | None = None,
     temperature_k: float = float("nan"),
     vary: Mapping[str, float] | None = None,
-    n_samples: int = 256,
     seed: int = 0,
 ) -> BudgetSensitivities:
     """Sensitivities of every total of a budget.
@@ -140,8 +111,8 @@ def sensitivities(
         Half-widths, relative to the value, over which ``noise``, ``stars``, ``frames`` or
         ``temperature`` vary evenly, such as ``{"noise": 0.2, "stars": 0.3}``: Sobol shares are then
         found (`scipy.stats.sobol_indices`; Saltelli et al. 2010).
-    n_samples, seed : int
-        Samples behind the shares, a power of two, and their seed.
+    seed : int
+        Seed of the samples behind the shares.
 
     Raises
     ------
@@ -149,61 +120,55 @@ def sensitivities(
         For an unknown input, a half-width that is no share, or an index whose rows behave in time
         as `file` and `spectrum` do not say.
     """
-    for name, width in (vary or {}).items():
+    import pandas as pd
+
+    vary = vary or {}
+    for name, width in vary.items():
         check_known("an input", name, SETTINGS, BudgetError)
-        require(
-            BudgetError, (0.0 < width < 1.0, f"vary: {name} is {width!r}; give a share below 1.")
-        )
-    require(
-        BudgetError,
-        (
-            n_samples > 0 and n_samples & (n_samples - 1) == 0,
-            f"n_samples is {n_samples}: give a power of two, such as 256.",
-        ),
-    )
+        share = f"vary: {name} is {width!r}; give a share below 1."
+        require(BudgetError, (0.0 < width < 1.0, share))
     stated = file
     if not isinstance(stated, BudgetFile):
         stated = BudgetFile() if stated is None else load_budget_file(stated)
     frames = obs if mission is None else mission
-    sizes = _Sizes.of(post, frames, obs.n_stars / obs.n_frames)
+    mean_stars = obs.n_stars / obs.n_frames
+    sizes = _Sizes.of(post, frames, mean_stars)
     behaviours = in_time(budget.rows, stated, post.camera, spectrum)
     own = turns(post.calibrated_camera, frames)
-    inputs = _inputs(post, obs, temperature_k)
-    entries: list[BudgetSensitivity] = []
+    noise_unit = "px" if post.sigma_name == "sigma" else "of the stated noise"
+    values = float(np.mean(post.sigma_draws)), mean_stars, obs.n_frames, temperature_k
+    inputs = list(zip(SETTINGS, (noise_unit, "", "", "K"), values, strict=True))
+    known = zip(post.parameters, np.sqrt(np.diag(post.covariance)), strict=False)
+    inputs += [(parameter.name, parameter.unit, sd) for parameter, sd in known]
+    rows = []
     for label in dict.fromkeys(t.of_index for t in (*budget.totals, *budget.index_totals)):
         index = Index.of(label)
         seen, _ = seen_by(index, budget.rows, behaviours)
         for scope in SCOPES:
             counted = [r for r in seen if r.counts(scope) and r.assessed and r.applies]
-            shares = sizes.sobol(counted, vary, n_samples, seed) if vary and counted else {}
             totals = [budget.total(axis, scope, index=label) for axis in TOTAL_AXES]
-            for entry in sizes.of_totals(totals, counted, inputs):
-                if entry.name not in SETTINGS and not index.windowed:
-                    asked = entry.name, entry.axis, budget.confidence, scope == SCOPES[1]
-                    entry = replace(entry, error_per_unit_arcsec=own.error_arcsec(*asked))
-                if entry.name in shares:
-                    place = TOTAL_AXES.index(entry.axis)
-                    first, every = (float(share[place]) for share in shares[entry.name])
-                    entry = replace(entry, first_order=first, total_order=every)
-                entries.append(entry)
-    return BudgetSensitivities(tuple(entries))
-
-
-def _inputs(
-    post: Posterior, obs: Observations, temperature_k: float
-) -> dict[str, tuple[str, float]]:
-    """Unit and value of every input."""
-    noise_unit = "px" if post.sigma_name == "sigma" else "of the stated noise"
-    found = {
-        "noise": (noise_unit, float(np.mean(post.sigma_draws))),
-        "stars": ("", obs.n_stars / obs.n_frames),
-        "frames": ("", float(obs.n_frames)),
-        "temperature": ("K", float(temperature_k)),
-    }
-    names = post.camera_names
-    deviations = np.sqrt(np.diag(post.covariance)).tolist()
-    units = {parameter.name: parameter.unit for parameter in post.parameters}
-    return found | {n: (units[n], sd) for n, sd in zip(names, deviations, strict=True)}
+            if not counted:
+                continue
+            off = sizes.sigmas(counted, {}) - [total.sigma_arcsec for total in totals]
+            if np.any(np.abs(off) > _SAME * np.max([total.sigma_arcsec for total in totals])):
+                raise BudgetError(
+                    f"the totals of {label} rest on how rows behave in time: give the file and the "
+                    "spectrum that the budget was made with."
+                )
+            shares = sizes.sobol(counted, vary, seed) if vary else {}
+            for name, unit, value in inputs:
+                elasticity = sizes.elasticity(counted, name)
+                first, every = shares.get(name, np.full((2, 4), np.nan))
+                for place, total in enumerate(totals):
+                    error = np.nan
+                    if name not in SETTINGS and not index.windowed:
+                        asked = name, total.axis, budget.confidence, scope == SCOPES[1]
+                        error = own.error_arcsec(*asked)
+                    change = elasticity[place]
+                    bound = total.factor * total.sigma_arcsec * change / value
+                    found = (change, bound, error, first[place], every[place])
+                    rows.append((label, scope, total.axis, name, unit, value, *found))
+    return BudgetSensitivities(pd.DataFrame(rows, columns=list(_HEADS)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,16 +194,14 @@ class _Sizes:
             for place, axis in enumerate(AXES):
                 rows = turned[:, place]
                 moved = rows @ sigma
-                variance = float(np.sum(moved * rows))
-                if not variance > 0.0:
-                    continue
-                decided = float(np.sum((moved @ information) * moved)) / variance
-                data[name, axis] = min(decided, 1.0)
-                own = np.sum(moved * rows, axis=0) / variance
-                weights[name, axis] = dict(zip(post.camera_names, own.tolist(), strict=True))
+                own = np.sum(moved * rows, axis=0)
+                if own.sum() > 0.0:
+                    decided = np.sum((moved @ information) * moved) / own.sum()
+                    data[name, axis] = min(float(decided), 1.0)
+                    weights[name, axis] = dict(zip(post.camera_names, own / own.sum(), strict=True))
         return cls(data, weights, mean_stars)
 
-    def factor(self, row: Contributor, inputs: Inputs) -> FloatArray | float:
+    def factor(self, row: Contributor, inputs: Inputs) -> Any:
         """Factor on the sigma of a row when inputs change by factors, numbers or arrays of them."""
         noise, stars = inputs.get("noise", 1.0), inputs.get("stars", 1.0)
         informed = (2.0 * stars * self.mean_stars - 3.0) / (2.0 * self.mean_stars - 3.0)
@@ -268,64 +231,31 @@ class _Sizes:
         """Standard deviation (4, ...) of the total on `TOTAL_AXES`, arcsec: rows of a group err as
         one.
         """
-        sums: dict[tuple[str, str], FloatArray] = {}
+        sums: dict[tuple[str, str], Any] = {}
         for number, row in enumerate(rows):
             group, sign = row.group
-            place = group or str(number), row.axis
+            place = row.axis, group or str(number)
             amount = sign * row.sigma_arcsec * self.factor(row, inputs)
-            sums[place] = sums.get(place, np.zeros(())) + amount
-        squares = [
-            sum((size**2 for (_, own), size in sums.items() if own == axis), np.zeros(()))
-            for axis in AXES
-        ]
-        sigmas: FloatArray = np.sqrt(
-            np.stack(np.broadcast_arrays(*squares, 0.5 * (squares[0] + squares[1])))
-        )
-        return sigmas
+            sums[place] = sums.get(place, 0.0) + amount
+        x, y, z = (sum(s**2 for (own, _), s in sums.items() if own == axis) for axis in AXES)
+        return np.asarray(np.sqrt(np.stack(np.broadcast_arrays(x, y, z, 0.5 * (x + y)))))
 
-    def of_totals(
-        self,
-        totals: Sequence[Total],
-        rows: list[Contributor],
-        inputs: Mapping[str, tuple[str, float]],
-    ) -> Iterator[BudgetSensitivity]:
-        """What totals on `TOTAL_AXES`, made of some rows, depend on."""
-        before = self.sigmas(rows, {})
-        for total, sigma in zip(totals, before, strict=True):
-            if rows and not abs(sigma - total.sigma_arcsec) <= _SAME * total.sigma_arcsec:
-                raise BudgetError(
-                    f"the totals of {total.of_index} rest on how rows behave in time: give the file "
-                    "and the spectrum that the budget was made with."
-                )
-        turned = 2.0 * np.arctanh(_STEP)
-        for name, (unit, value) in inputs.items():
-            up, down = (self.sigmas(rows, {name: 1.0 + step}) for step in (_STEP, -_STEP))
-            for total, ratio in zip(totals, up / down, strict=True):
-                if not total.sigma_arcsec > 0.0:
-                    continue
-                elasticity = float(np.log(ratio) / turned)
-                bound = total.factor * total.sigma_arcsec
-                yield BudgetSensitivity(
-                    *(total.of_index, total.scope, total.axis, name, unit, value, elasticity),
-                    per_unit_arcsec=bound * elasticity / value,
-                )
+    def elasticity(self, rows: Sequence[Contributor], name: str) -> FloatArray:
+        """Relative change (4,) of the totals' standard deviations by that of one input."""
+        up, down = (self.sigmas(rows, {name: 1.0 + step}) for step in (_STEP, -_STEP))
+        return np.asarray(np.log(up / down) / (2.0 * np.arctanh(_STEP)))
 
     def sobol(
-        self, rows: list[Contributor], vary: Mapping[str, float], n_samples: int, seed: int
-    ) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """First-order and total shares (4,) of each input that varies."""
+        self, rows: Sequence[Contributor], vary: Mapping[str, float], seed: int
+    ) -> dict[str, FloatArray]:
+        """First-order and total shares (2, 4) of each input that varies."""
         from scipy.stats import sobol_indices, uniform
 
-        names = list(vary)
-
-        def totals(points: FloatArray) -> FloatArray:
-            return self.sigmas(rows, dict(zip(names, points, strict=True)))
-
         found = sobol_indices(
-            func=totals,
-            n=n_samples,
+            func=lambda points: self.sigmas(rows, dict(zip(vary, points, strict=True))),
+            n=_SAMPLES,
             dists=[uniform(1.0 - width, 2.0 * width) for width in vary.values()],
             rng=np.random.default_rng(seed),
         )
-        first, every = (np.reshape(v, (4, -1)) for v in (found.first_order, found.total_order))
-        return {name: (first[:, i], every[:, i]) for i, name in enumerate(names)}
+        both = np.stack([found.first_order, found.total_order]).reshape(2, 4, -1)
+        return dict(zip(vary, np.moveaxis(both, 2, 0), strict=True))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,9 +15,7 @@ from starcal_uq.core.files import ensure_new
 from starcal_uq.core.manifest import alone
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray, PathLike, Progress, floats
-from starcal_uq.simulation.exclusion import Exclusion
-from starcal_uq.simulation.frames import Tracker
-from starcal_uq.simulation.noise import Noise
+from starcal_uq.simulation.frames import Tracker, TrackerOptions
 from starcal_uq.simulation.rendering import Scene
 from starcal_uq.simulation.sensor import Sensor
 from starcal_uq.simulation.truth import check_time, write_frame
@@ -35,17 +33,14 @@ def render_frames(
     out_dir: PathLike,
     *,
     n_frames: int = 100,
-    min_stars: int = 10,
     sensor: Sensor | None = None,
     seed: int = 0,
     attitudes: FloatArray | None = None,
     rates_rad_s: ArrayLike | None = None,
     times_utc: Sequence[str] | None = None,
-    sigma_px: Noise = 0.05,
-    max_stars: int | None = None,
-    exclusion: Exclusion | None = None,
     force: bool = False,
     progress: Progress | None = None,
+    **options: Unpack[TrackerOptions],
 ) -> list[Path]:
     """Render frames at random attitudes into FITS files ``frame_00000.fits``, ``frame_00001.fits``,
     ...
@@ -64,8 +59,6 @@ def render_frames(
         Folder, made if it does not exist.
     n_frames : int
         Number of frames.
-    min_stars : int
-        Attitudes with fewer stars on the detector are drawn again.
     sensor : Sensor, optional
         Detector and PSF; ``Sensor()`` by default.
     seed : int
@@ -78,7 +71,7 @@ def render_frames(
         by default.
     times_utc : sequence of str, optional
         Middle of each exposure, UTC, ISO 8601; recorded only, the stars are not moved.
-    sigma_px, max_stars, exclusion
+    sigma_px, min_stars, max_stars, exclusion
         Noise, stars of a frame and exclusion of the `simulate` to be matched: stars within six times the noise
         of the edge do not count for `min_stars`. They add no noise, and leave out no star.
     force : bool
@@ -102,8 +95,8 @@ def render_frames(
         For arguments that do not fit together.
     """
     given = None if attitudes is None else floats(attitudes).reshape(-1, 3, 3)
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars, exclusion)
-    rotations, _ = tracker.frames(stars, np.random.default_rng(seed), n_frames, given)
+    rng = np.random.default_rng(seed)
+    rotations, _ = Tracker.of(camera, **options).frames(stars, rng, n_frames, given)
     n = len(rotations)
     scene = Scene(stars, camera, Sensor() if sensor is None else sensor)
     rates = scene.rate_rad_s if rates_rad_s is None else floats(rates_rad_s)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -228,12 +228,9 @@ def simulate(
     camera: Camera,
     *,
     n_frames: int = 1000,
-    min_stars: int = 10,
-    sigma_px: Noise = 0.05,
-    max_stars: int | None = None,
-    exclusion: Exclusion | None = None,
     seed: int = 0,
     attitudes: FloatArray | None = None,
+    **options: Unpack[TrackerOptions],
 ) -> Observations:
     """Simulate identified stars in frames at uniformly random attitudes.
 
@@ -245,15 +242,6 @@ def simulate(
         The truth.
     n_frames : int
         Number of frames.
-    min_stars : int
-        Attitudes with fewer stars in the field are drawn again (at least 3).
-    sigma_px : float, callable or NoiseModel
-        Gaussian centroid noise, px per axis; a function from magnitudes (n,) to noise (n,), or the
-        noise model of a calibration, is stated star by star in the table.
-    max_stars : int, optional
-        Stars of a frame, the brightest ones; all on the detector by default.
-    exclusion : Exclusion, optional
-        Cones around Sun, Moon and Earth that the boresight keeps out of.
     seed : int
         Repeats bit for bit.
     attitudes : (n_frames, 3, 3) array, optional
@@ -272,7 +260,21 @@ def simulate(
         When the field is too narrow for the catalogue to show `min_stars`.
     DistortionError
         When the camera's distortion folds over inside the field.
+
+    Other Parameters
+    ----------------
+    sigma_px : float, callable or NoiseModel
+        Gaussian centroid noise, px per axis, 0.05 by default; a function from magnitudes (n,) to
+        noise (n,), or the noise model of a calibration, is stated star by star in the table.
+    min_stars : int
+        Attitudes with fewer stars in the field are drawn again (at least 3; 10 by default).
+    max_stars : int, optional
+        Stars of a frame, the brightest ones; all on the detector by default.
+    exclusion : Exclusion, optional
+        Cones around Sun, Moon and Earth that the boresight keeps out of.
     """
+    tracker = Tracker.of(camera, **options)
+    min_stars = tracker.min_stars
     if min_stars < 3:
         raise SettingError(f"min_stars is {min_stars}: a frame needs at least 3 stars.")
     if attitudes is None:
@@ -280,15 +282,14 @@ def simulate(
             f"n_frames={n_frames}, min_stars={min_stars}", _BYTES_PER_STAR * n_frames * min_stars
         )
     rng = np.random.default_rng(seed)
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars, exclusion)
     frame, index, xy, sigma = tracker.observe(stars, rng, n_frames, attitudes)
     return Observations(
         frame=frame,
         x_px=xy[:, 0],
         y_px=xy[:, 1],
         **stars.named(index),
-        sigma_px=None if one_noise(sigma_px) is not None else sigma,
-        meta=simulated_meta(camera, sigma_px, seed),
+        sigma_px=None if one_noise(tracker.noise) is not None else sigma,
+        meta=simulated_meta(camera, tracker.noise, seed),
     )
 
 

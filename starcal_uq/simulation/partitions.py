@@ -11,7 +11,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.cluster import ClusterOptions, Scheduler, cluster
-from starcal_uq.core.errors import ObservationError, RunFolderError
+from starcal_uq.core.errors import ObservationError, RunFolderError, SettingError
 from starcal_uq.core.files import UNFINISHED, new_folder
 from starcal_uq.core.manifest import alone, making, read_manifest
 from starcal_uq.core.settings import bounded
@@ -90,11 +90,8 @@ def simulate_partitions(
     progress : callable, optional
         Called with (files done, files).
     """
-    if n_frames < 1 or partition_frames < 1 or min_stars < 3:
-        raise ValueError(
-            f"n_frames={n_frames}, partition_frames={partition_frames}, min_stars={min_stars}: "
-            "give at least one frame, and 3 stars."
-        )
+    if min_stars < 3:
+        raise SettingError(f"min_stars is {min_stars}: a frame needs at least 3 stars.")
     folder = Path(folder).resolve()
     known = {
         "min_stars": min_stars,

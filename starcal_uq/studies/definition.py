@@ -13,7 +13,7 @@ from functools import cached_property
 from importlib.resources import files
 from itertools import product
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 
@@ -46,6 +46,7 @@ from starcal_uq.studies.axes import (
     camera_of,
 )
 
+T = TypeVar("T", Camera, Sensor)
 MODES = ("fisher", "simulate")
 POSTERIORS = ("importance", "ensemble", "none")
 # One of each, in the order in which a reader would try them.
@@ -203,8 +204,13 @@ class StudyDefinition:
             if not isinstance(table, Mapping):
                 raise StudyError(f"{where}: {name} is no section; write [{name}] above its keys.")
         study = _STUDY.check(content.get("study", {}), f"{where}, section [study]")
-        camera = _camera(content, study.pop("camera", None), where, folder)
-        sensor = _sensor(content, study.pop("sensor", None), where, folder)
+        camera = _part(Camera, "camera", content, study.pop("camera", None), where, folder)
+        sensor = _part(Sensor, "sensor", content, study.pop("sensor", None), where, folder)
+        if camera is None:
+            raise StudyError(
+                f'{where}: the camera is missing; write a section [camera], or camera = "camera.toml" '
+                "in [study]."
+            )
         sweep, latin, latin_n = _swept(dict(content.get("sweep", {})), f"{where}, section [sweep]")
         given = _observation(content.get("observation", {}), f"{where}, section [observation]")
         priors = {
@@ -477,37 +483,22 @@ def _hash(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def _camera(content: AnyMapping, path: str | None, where: str, folder: Path | None) -> Camera:
-    if ("camera" in content) == (path is not None):
-        both = "given twice" if path is not None else "missing"
+def _part(
+    kind: type[T], name: str, content: AnyMapping, path: str | None, where: str, folder: Path | None
+) -> T | None:
+    """A camera or a sensor, of its own section or of a file; None where there is neither."""
+    if name in content and path is not None:
         raise StudyError(
-            f'{where}: the camera is {both}; write a section [camera], or camera = "camera.toml" '
-            "in [study]."
+            f"{where}: the {name} is given twice; leave out the section [{name}], or the key "
+            f"{name} of [study]."
         )
     try:
         if path is not None:
-            return Camera.load((folder or Path()) / path)
-        return Camera.from_dict(content["camera"])
-    except CameraError as error:
+            return kind.load((folder or Path()) / path)
+        return kind.from_dict(content[name]) if name in content else None
+    except (CameraError, SensorError) as error:
         raise StudyError(
-            str(error) if path is not None else f"{where}, section [camera]: {error}"
-        ) from None
-
-
-def _sensor(
-    content: AnyMapping, path: str | None, where: str, folder: Path | None
-) -> Sensor | None:
-    if "sensor" in content and path is not None:
-        raise StudyError(
-            f"{where}: the sensor is given twice; leave out the section [sensor] or the key sensor."
-        )
-    try:
-        if path is not None:
-            return Sensor.load((folder or Path()) / path)
-        return Sensor.from_dict(content["sensor"]) if "sensor" in content else None
-    except SensorError as error:
-        raise StudyError(
-            str(error) if path is not None else f"{where}, section [sensor]: {error}"
+            str(error) if path is not None else f"{where}, section [{name}]: {error}"
         ) from None
 
 
