@@ -5,14 +5,12 @@ say of each.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
-from starcal_uq.core.findings import clause
 from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.maths.linear import correlation_of, unit_inverse
 
@@ -27,8 +25,6 @@ COUPLED = 0.5
 PART = 0.25
 # Directions whose variance lies within these bounds are those of uncoupled parameters.
 ALONE = (0.7, 1.4)
-# What parameters do along a direction.
-Trade = Enum("Trade", "ALONE COUPLED")
 
 
 class HasCovariance(Protocol):
@@ -245,10 +241,22 @@ def weak_directions(correlation: FloatArray, names: tuple[str, ...]) -> tuple[We
 
 
 def _words(weights: FloatArray, variance: float, names: tuple[str, ...]) -> str:
-    """Say which parameters trade against each other along a direction."""
+    """Say which parameters trade against each other along a direction.
+
+    No template: workers of a study make these words for every cell, and need not load any.
+    """
     order = [i for i in np.argsort(-np.abs(weights)) if abs(weights[i]) >= PART]
     up = [names[i] for i in order if weights[i] > 0.0]
     down = [names[i] for i in order if weights[i] < 0.0]
-    alone = len(order) == 1 or ALONE[0] < variance < ALONE[1]
-    named = {"names": [names[i] for i in order], "up": up, "down": down}
-    return clause(Trade.ALONE if alone else Trade.COUPLED, variance=variance, **named)
+    if len(order) == 1 or ALONE[0] < variance < ALONE[1]:
+        return f"{' and '.join(names[i] for i in order)}: not coupled to the others"
+    trade = (
+        f"{' and '.join(up)} against {' and '.join(down)}"
+        if down
+        else f"{' and '.join(up)} together"
+    )
+    if variance > 1.0:
+        return (
+            f"{trade}: poorly determined, {variance:.2g} times the variance of uncoupled parameters"
+        )
+    return f"{trade}: well determined, {variance:.2g} times the variance of uncoupled parameters"

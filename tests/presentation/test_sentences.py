@@ -36,7 +36,6 @@ from starcal_uq.inference.priors import Stated
 from starcal_uq.likelihood.noise_model import Noise
 from starcal_uq.pipeline.images import Told
 from starcal_uq.presentation.words.sentences import templates, told
-from starcal_uq.propagation.coupling import Trade
 from starcal_uq.sky.apparent import Horizon
 
 PACKAGE = Path(status.__file__).parents[1]
@@ -46,7 +45,7 @@ ABOVE = ("presentation", "runs", "paper", "cli")
 MAKERS = ("Check", "judged", "Order", "Finding", "clause")
 KINDS = {
     *(status.Code, status.Advice, status.Note, Difference, Limit, Refusal, Slip, Mixed, Open),
-    *(Basis, Differs, Apart, Rejections, Trade, Noise, Remark, Floor, Steps, Told, Repeats, Stated),
+    *(Basis, Differs, Apart, Rejections, Noise, Remark, Floor, Steps, Told, Repeats, Stated),
     *(Horizon, Refused),
 }
 
