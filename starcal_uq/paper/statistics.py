@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq.core.formatting import fixed, percent, significant
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.intervals import HALF_WIDTH_95, wilson_interval
 
@@ -117,21 +116,10 @@ def words(row: AnyDict, bias: bool, claim: bool, coverage: bool) -> str:
     """Verdict on one parameter of one method, given which tests object."""
     if row["n"] < ENOUGH_REPLICATES:
         return TOO_FEW
-    parts = []
-    if bias:
-        sigmas = abs(row["bias_over_spread"])
-        if sigmas < _SLIGHT:
-            parts.append(f"slightly biased by {significant(sigmas)} of its sigmas")
-        else:
-            share = significant(row["claimed_over_rmse"])
-            parts.append(
-                f"biased by {significant(sigmas)} of its sigmas, claims {share} of its error"
-            )
-    if claim:
-        parts.append(claim_words(row["claimed_over_spread"]))
-    if coverage and not parts:
-        parts.append(f"its 95 % intervals hold the truth in {percent(row['coverage95'], 3)}")
-    return "; ".join(parts) or HONEST
+    from starcal_uq.presentation.words.sentences import say
+
+    tests = {"bias": bias, "claim": claim, "coverage": coverage}
+    return say("Replicates.verdict", row=row, slight=_SLIGHT, honest=HONEST, **tests)
 
 
 def classical_words(row: AnyDict, rejected: bool) -> str:
@@ -140,11 +128,8 @@ def classical_words(row: AnyDict, rejected: bool) -> str:
         return ""
     if row["n"] < ENOUGH_REPLICATES:
         return TOO_FEW
-    return claim_words(row["claimed_classical_over_spread"]) if rejected else HONEST
+    if not rejected:
+        return HONEST
+    from starcal_uq.presentation.words.sentences import say
 
-
-def claim_words(ratio: float) -> str:
-    """What a claim is against the spread."""
-    if ratio < 1.0:
-        return f"claims too little: {fixed(ratio, 2)} of its spread"
-    return f"claims too much: {significant(ratio, 3)} times its spread"
+    return say("Replicates.claim", ratio=row["claimed_classical_over_spread"])

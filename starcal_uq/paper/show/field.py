@@ -1,4 +1,4 @@
-"""Tables and headline of the field experiment."""
+"""Tables of the field experiment."""
 
 from __future__ import annotations
 
@@ -33,19 +33,6 @@ CAMERA_NAMES = {
     TRUE_CAMERA: "true camera",
 }
 _ANGLES = "arcsec, pitch / yaw / roll"
-
-
-def headline(found: FieldExperiment) -> str:
-    """How many printed numbers come out, in one sentence."""
-    table = found.table_3()
-    rates, agree = table["quantity"] == RATE, table["agrees"] != NEITHER
-    return (
-        f"Of the {len(table)} numbers of Table 3, {int(agree.sum())} come out: "
-        f"{int((agree & rates).sum())} of the "
-        f"{int(rates.sum())} rates at a tolerance of {found.tolerance_px:g} px, and "
-        f"{int((agree & ~rates).sum())} of "
-        f"the {int((~rates).sum())} errors, either against the true attitude or after alignment."
-    )
 
 
 def table_3(found: FieldExperiment) -> TextTable:

@@ -13,7 +13,6 @@ from starcal_uq.core.formatting import (
     MINUS,
     count,
     fixed,
-    join_words,
     percent,
     plus_minus,
     pretty_unit,
@@ -28,8 +27,8 @@ from starcal_uq.paper.judgement import Judged, Outcome, Trial, trial
 from starcal_uq.paper.published import LEAST_SQUARES, PAPER_METHODS, PROPOSED, SAMAAN, printed
 from starcal_uq.paper.readings import AS_PRINTED
 from starcal_uq.paper.statistics import ENOUGH_REPLICATES
-from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.sentences import told
 
 if TYPE_CHECKING:
     from starcal_uq.paper.interaction import InteractionStudy, Threshold
@@ -42,11 +41,10 @@ NAMES = {
     **{"reprojection_px": "reprojection error", "max_residual_px": "largest residual"},
 }
 METHOD_NAMES = {
+    PROPOSED: "the proposed method",
     LEAST_SQUARES: "least squares",
     SAMAAN: "Samaan’s method",
-    PROPOSED: "the proposed method",
 }
-_AGREE = (Outcome.REPRODUCED, Outcome.WITHIN_NOISE)
 _MARKS = {
     Outcome.AGAINST_TEXT: "warning",
     Outcome.BY_CHOICE: "warning",
@@ -90,32 +88,6 @@ def signed(z: float) -> str:
 
 def _minus(text: str) -> str:
     return text.partition("e")[0].replace("-", MINUS)
-
-
-def headline(found: Reproduction) -> str:
-    """How many printed numbers come out, in one sentence."""
-    n = {kind: len(found.outcome(kind)) for kind in Outcome}
-    parts = [f"{sum(n[kind] for kind in _AGREE)} agree with the experiment done again"]
-    if n[Outcome.AGAINST_TEXT]:
-        parts.append(f"{n[Outcome.AGAINST_TEXT]} only if the text is not followed")
-    if n[Outcome.BY_CHOICE]:
-        parts.append(
-            f"{n[Outcome.BY_CHOICE]} only under some reading that would fit almost any number"
-        )
-    parts.append(f"{n[Outcome.NOT_REPRODUCED]} under none of the readings tried")
-    return f"Of {len(found.judged)} printed numbers, {join_words(parts)}."
-
-
-def reproduction_text(found: Reproduction) -> str:
-    """The headline, and how many numbers of each method agree."""
-    parts: list[str] = []
-    for method in (PROPOSED, LEAST_SQUARES, SAMAAN):
-        mine = [one.outcome in _AGREE for one in found.judged if one.printed.method == method]
-        name = METHOD_NAMES[method]
-        parts.append(
-            f"{name[0].upper() if not parts else name[0]}{name[1:]}: {sum(mine)} of {len(mine)}"
-        )
-    return f"{headline(found)} {'; '.join(parts)}."
 
 
 def reading_words(one: Trial) -> str:
@@ -302,13 +274,13 @@ def replicates_text(found: Replicates) -> str:
         }
         named = {what: set(table["method"][rows]) for what, rows in wrong.items()}
         named = {"honest": set(found.labels).difference(*named.values()), **named}
-    template = template_environment().get_template("replicates.txt.j2")
-    return template.render(
-        found=found,
+    return told(
+        "replicates",
+        found,
         frames=found.provenance.settings.get("n_frames"),
         enough=ENOUGH_REPLICATES,
         groups={what: [one for one in found.labels if one in some] for what, some in named.items()},
-    ).strip()
+    )
 
 
 def replicates(found: Replicates) -> TextTable:
@@ -354,27 +326,6 @@ def replicates(found: Replicates) -> TextTable:
             "textbooks."
         ),
         "llrrrrrrrrrl",
-    )
-
-
-def study_text(study: InteractionStudy) -> str:
-    """Whose bias outweighs noise somewhere, and whose does nowhere."""
-    sides: dict[str, set[str]] = {}
-    for one in study.thresholds:
-        if one.kind == "bias":
-            sides.setdefault(one.method, set()).add(one.side)
-    nowhere = [method for method, found in sides.items() if found == {"never"}]
-    biased = [
-        f"{method}, which {HANDLING[method]} the distortion"
-        for method in sides
-        if method not in nowhere
-    ]
-    parts = [f"for {'; '.join(biased)}"] if biased else []
-    if nowhere:
-        parts.append(f"nowhere for {join_words(nowhere)}")
-    text = f"The bias of the optics exceeds one standard deviation of the noise {'; '.join(parts)}."
-    return text + (
-        " The study was interrupted: later replicates are missing." if study.interrupted else ""
     )
 
 

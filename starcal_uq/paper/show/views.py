@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from starcal_uq.core.display import View
 from starcal_uq.paper.field.result import FieldExperiment
-from starcal_uq.paper.interaction import InteractionStudy
+from starcal_uq.paper.interaction import HANDLING, InteractionStudy
 from starcal_uq.paper.replicates import Replicates
 from starcal_uq.paper.result import Reproduction
 from starcal_uq.paper.show import field, figures, tables
 from starcal_uq.presentation.html import card
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.sentences import told
 
 
 def _view(
@@ -27,7 +29,7 @@ def _view(
 VIEWS: Mapping[type, View] = {
     Reproduction: _view(
         "Ye & Yang 2017 reproduced",
-        tables.reproduction_text,
+        partial(told, "reproduction", names=tables.METHOD_NAMES),
         lambda found: tables.printed_numbers(found.judged),
         trajectories=figures.plot_trajectories,
         error_fields=figures.plot_error_fields,
@@ -38,13 +40,13 @@ VIEWS: Mapping[type, View] = {
     ),
     InteractionStudy: _view(
         "Interaction of optics and distortion",
-        tables.study_text,
+        partial(told, "interaction", handling=HANDLING),
         tables.thresholds,
         bias=figures.plot_interaction,
     ),
     FieldExperiment: _view(
         "Field experiment of Ye & Yang 2017",
-        field.headline,
+        partial(told, "field_experiment"),
         field.table_3,
         rates=figures.plot_rates,
         errors=figures.plot_errors,
