@@ -19,9 +19,8 @@ from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.observations.files import parquet_summary
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
 from starcal_uq.observations.written import write_partition
-from starcal_uq.simulation.exclusion import Exclusion
-from starcal_uq.simulation.frames import Tracker, simulated_meta
-from starcal_uq.simulation.noise import Noise, one_noise
+from starcal_uq.simulation.frames import Tracker, TrackerOptions, simulated_meta
+from starcal_uq.simulation.noise import one_noise
 
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
@@ -32,6 +31,10 @@ _FRAMES_WORTH_PROCESSES = 100_000
 _NAME = "part-{:06d}.parquet"
 
 
+class PartitionOptions(TrackerOptions, ClusterOptions, total=False):
+    """What takes the frames, and where the files are made."""
+
+
 @bounded
 def simulate_partitions(
     stars: StarCatalogue,
@@ -40,13 +43,9 @@ def simulate_partitions(
     *,
     n_frames: int,
     partition_frames: int = PARTITION_FRAMES,
-    min_stars: int = 10,
-    sigma_px: Noise = 0.05,
-    max_stars: int | None = None,
-    exclusion: Exclusion | None = None,
     seed: int = 0,
     force: bool = False,
-    **options: Unpack[ClusterOptions],
+    **options: Unpack[PartitionOptions],
 ) -> PartitionedObservations:
     """Simulate identified stars, as `simulate` does, into a folder of Parquet files.
 
@@ -56,7 +55,7 @@ def simulate_partitions(
 
     Parameters
     ----------
-    stars, camera, min_stars, sigma_px, max_stars, exclusion
+    stars, camera
         As for `simulate`.
     folder : path
         Folder, made if it does not exist.
@@ -83,6 +82,8 @@ def simulate_partitions(
 
     Other Parameters
     ----------------
+    min_stars, sigma_px, max_stars, exclusion
+        As for `simulate`, with the same defaults.
     scheduler : str or distributed.Client, optional
         Dask scheduler whose workers make the files; processes of this machine otherwise.
     workers : int, optional
@@ -90,24 +91,25 @@ def simulate_partitions(
     progress : callable, optional
         Called with (files done, files).
     """
-    if min_stars < 3:
-        raise SettingError(f"min_stars is {min_stars}: a frame needs at least 3 stars.")
+    tracker, run = _taker(camera, **options)
+    least = tracker.min_stars
+    if least < 3:
+        raise SettingError(f"min_stars is {least}: a frame needs at least 3 stars.")
     folder = Path(folder).resolve()
     known = {
-        "min_stars": min_stars,
+        "min_stars": least,
         "stars": stars.source,
         "n_stars": len(stars),
         "epoch": stars.epoch,
     }
-    if max_stars is not None:
-        known["max_stars"] = max_stars
-    if exclusion is not None:
-        known["exclusion"] = repr(exclusion)
-    if one_noise(sigma_px) is None:
-        known["noise"] = repr(sigma_px)
-    meta = simulated_meta(camera, sigma_px, seed) | known
+    if tracker.max_stars is not None:
+        known["max_stars"] = tracker.max_stars
+    if tracker.exclusion is not None:
+        known["exclusion"] = repr(tracker.exclusion)
+    if one_noise(tracker.noise) is None:
+        known["noise"] = repr(tracker.noise)
+    meta = simulated_meta(camera, tracker.noise, seed) | known
     unfinished = folder / UNFINISHED
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars, exclusion)
     make = _Maker(stars, tracker, unfinished, n_frames, partition_frames, seed, meta)
     names = [_NAME.format(number) for number in range(-(-n_frames // partition_frames))]
     with alone(folder):
@@ -129,10 +131,23 @@ def simulate_partitions(
             missing = [
                 number for number in range(len(names)) if not make.is_made(unfinished, number)
             ]
-            _make_all(make, missing, **options)
+            _make_all(make, missing, **run)
             for name in names:
                 os.replace(unfinished / name, stage / name)
     return open_partitions(folder)
+
+
+def _taker(
+    camera: Camera,
+    *,
+    scheduler: Scheduler = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    **options: Unpack[TrackerOptions],
+) -> tuple[Tracker, ClusterOptions]:
+    """What takes the frames, and where the files are made."""
+    run: ClusterOptions = {"scheduler": scheduler, "workers": workers, "progress": progress}
+    return Tracker.of(camera, **options), run
 
 
 @dataclass(frozen=True)
