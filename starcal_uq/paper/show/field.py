@@ -18,8 +18,8 @@ from starcal_uq.paper.field.published import (
     printed_field,
     printed_sensor,
 )
-from starcal_uq.paper.field.result import NEITHER
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.sentences import table
 
 if TYPE_CHECKING:
     from starcal_uq.paper.field.frames import FieldIdentification
@@ -32,60 +32,27 @@ CAMERA_NAMES = {
     "three_stage": "proposed",
     TRUE_CAMERA: "true camera",
 }
-_ANGLES = "arcsec, pitch / yaw / roll"
 
 
 def table_3(found: FieldExperiment) -> TextTable:
     """Every printed number of Table 3 beside ours."""
-    rows, marks = [], []
-    for row in found.table_3().to_dict("records"):
-        rate = row["quantity"] == RATE
-        what = "identified [%]" if rate else f"{row['quantity'].removesuffix('_arcsec')} [arcsec]"
-        ours = _ranged(row["ours"], row["low"], row["high"])
-        after = _ranged(row["aligned"], row["aligned_low"], row["aligned_high"])
-        rows.append((CAMERA_NAMES[row["method"]], what, row["printed"], ours, after, row["agrees"]))
-        marks.append("" if row["agrees"] == NEITHER else "pass")
-    return TextTable(
-        ("Camera", "", "Printed", "Ours (95 % range)", "After alignment", "Agrees"),
-        tuple(rows),
-        f"Rates at a tolerance of {found.tolerance_px:g} px with Wilson intervals; errors "
-        "against the true attitude, "
-        "and about the mean of all frames, with the range of 95 % of repetitions with other noise.",
-        "llrrrl",
-        tuple(marks),
-    )
+    given = {"names": CAMERA_NAMES, "ranged": _ranged, "tolerance_px": found.tolerance_px}
+    return table("field_3", given, it=found.table_3().to_dict("records"))
 
 
 def parts(found: FieldExperiment) -> TextTable:
     """What the errors consist of."""
-    rows = []
-    for name, one in found.errors.items():
-        sizes = (one.rms, np.abs(one.common), one.rest, one.noise, one.aligned)
-        rows.append((CAMERA_NAMES[name], *map(_triple, sizes)))
-    return TextTable(
-        ("Camera", "Total", "Common", "Rest", "Noise", "After alignment"),
-        tuple(rows),
-        f"Root mean squares over the identified frames ({_ANGLES}).",
-    )
+    given = {"names": CAMERA_NAMES, "triple": _triple}
+    return table("field_parts", given, camera=found.errors, it=found.errors.values())
 
 
 def sources(found: FieldExperiment) -> TextTable:
     """Each fault by itself."""
-    rows = [
-        (CAMERA_NAMES[camera], source, _triple(np.abs(group["common"])), _triple(group["rest"]))
-        for (camera, source), group in found.sources().groupby(["camera", "source"], sort=False)
-        if camera != TRUE_CAMERA
-    ]
-    return TextTable(
-        ("Camera", "Wrong", "Common", "Rest"),
-        tuple(rows),
-        (
-            f"One fault of each camera in an otherwise true one, without noise ({_ANGLES}); "
-            "together "
-            "they do less."
-        ),
-        "llrr",
-    )
+    groups = found.sources().groupby(["camera", "source"], sort=False)
+    some = [(*name, group) for name, group in groups if name[0] != TRUE_CAMERA]
+    cameras, faults, tables = zip(*some, strict=True)
+    given = {"names": CAMERA_NAMES, "triple": _triple}
+    return table("field_sources", given, camera=cameras, source=faults, it=tables)
 
 
 def rates(found: FieldExperiment) -> TextTable:
@@ -107,16 +74,9 @@ def rates(found: FieldExperiment) -> TextTable:
 
 def data_sheets(found: FieldExperiment) -> TextTable:
     """Other data sheets of the uncalibrated camera."""
-    rows = [
-        (f"{focal:g}", _rate(result), "–" if errors is None else _triple(errors.aligned))
-        for focal, (result, errors) in found.data_sheets.items()
-    ]
-    return TextTable(
-        ("Focal length [mm]", "Identified [%]", "After alignment"),
-        tuple(rows),
-        f"The uncalibrated camera with other nominal focal lengths ({_ANGLES}).",
-        "rrr",
-    )
+    results, errors = zip(*found.data_sheets.values(), strict=True)
+    given = {"rate": _rate, "triple": _triple}
+    return table("field_sheets", given, focal_mm=found.data_sheets, found=results, errors=errors)
 
 
 def cameras(found: FieldExperiment) -> TextTable:
@@ -145,15 +105,8 @@ def cameras(found: FieldExperiment) -> TextTable:
 
 def sensor(found: FieldExperiment) -> TextTable:
     """What is printed of the sensor, and what the reading makes of it."""
-    return TextTable(
-        ("Printed", "", "Kept", "How"),
-        tuple(
-            (name, text, "yes" if kept else "no", how)
-            for name, text, kept, how in printed_sensor(found.reading)
-        ),
-        found.reading.words,
-        "llll",
-    )
+    reading = found.reading
+    return table("field_sensor", {"words": reading.words}, it=printed_sensor(reading))
 
 
 def _rate(result: FieldIdentification) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,24 +12,20 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import (
     MINUS,
-    count,
     fixed,
-    percent,
     plus_minus,
     pretty_unit,
     significant,
-    with_sigma,
 )
 from starcal_uq.core.provenance import Provenance
-from starcal_uq.paper.checks import NO
 from starcal_uq.paper.errors import ERROR_READINGS
 from starcal_uq.paper.interaction import AXES, HANDLING, OPTICS
-from starcal_uq.paper.judgement import Judged, Outcome, Trial, trial
+from starcal_uq.paper.judgement import Judged, Trial, trial
 from starcal_uq.paper.published import LEAST_SQUARES, PAPER_METHODS, PROPOSED, SAMAAN, printed
 from starcal_uq.paper.readings import AS_PRINTED
 from starcal_uq.paper.statistics import ENOUGH_REPLICATES
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.sentences import told
+from starcal_uq.presentation.words.sentences import table, told
 
 if TYPE_CHECKING:
     from starcal_uq.paper.interaction import InteractionStudy, Threshold
@@ -44,11 +41,6 @@ METHOD_NAMES = {
     PROPOSED: "the proposed method",
     LEAST_SQUARES: "least squares",
     SAMAAN: "Samaan’s method",
-}
-_MARKS = {
-    Outcome.AGAINST_TEXT: "warning",
-    Outcome.BY_CHOICE: "warning",
-    Outcome.NOT_REPRODUCED: "fail",
 }
 # Coefficients are tiny, and are shown in powers of ten.
 _COEFFICIENTS = {p.name: p for p in parameters("brown")[3:]}
@@ -97,94 +89,28 @@ def reading_words(one: Trial) -> str:
 
 def printed_numbers(judged: Sequence[Judged]) -> TextTable:
     """Every printed number with its main and its best reading, and what became of it."""
-    rows = []
-    for one in judged:
-        number, main, best = one.printed, one.main, one.best
-        what = (
-            f"{number.place}: {METHOD_NAMES[number.method]}",
-            _named(number.quantity),
-            _minus(number.text),
-        )
-        ours, other = (
-            (_spread(t.mean, t.spread, number.quantity), signed(t.z)) for t in (main, best)
-        )
-        better = ("", "", "") if best is main else (*other, reading_words(best))
-        chance = "" if np.isnan(one.by_chance) else percent(one.by_chance)
-        rows.append((*what, str(one.noise_digits), *ours, *better, chance, one.outcome.value))
-    return TextTable(
-        (
-            "Place",
-            "Number",
-            "Printed",
-            "Noise digits",
-            "Ours",
-            "z",
-            "Best",
-            "z",
-            "Reading",
-            "Fits anything",
-            "Outcome",
-        ),
-        tuple(rows),
-        (
-            "Mean ± spread over seeds under the main reading and, where that one does not agree, "
-            "under the best of all."
-        ),
-        "llrrrrrrlrl",
-        tuple(_MARKS.get(one.outcome, "") for one in judged),
+    given = {"methods": METHOD_NAMES, "named": _named, "minus": _minus, "spread": _spread}
+    given |= {"signed": signed, "reading_words": reading_words}
+    return table(
+        "printed_numbers", given, it=judged, other=[one.best is not one.main for one in judged]
     )
 
 
 def table_2(found: Reproduction) -> TextTable:
     """Table 2 of the paper for every method."""
-    rows = []
-    for row in found.table_2().to_dict("records"):
-        scale, _ = _unit(row["quantity"])
-        ours, spread = row["ours"] / scale, row["spread"] / scale
-        one_run = with_sigma(ours, spread) if np.isfinite(spread) else significant(ours)
-        what = (
-            row["method"],
-            _named(row["quantity"]),
-            f"{row['truth'] / scale:g}".replace("-", MINUS),
-        )
-        sigmas = (_known(row[name] / scale) for name in ("sigma_claimed", "sigma_crlb"))
-        z = signed(row["z_printed"]) if row["printed"] else ""
-        over_seeds = _spread(row["mean"], row["spread"], row["quantity"])
-        rows.append((*what, one_run, over_seeds, *sigmas, _minus(row["printed"]), z))
-    return TextTable(
-        (
-            "Method",
-            "",
-            "Truth",
-            "This run",
-            "Over seeds",
-            "Claimed σ",
-            "Cramér–Rao bound",
-            "Printed",
-            "z",
-        ),
-        tuple(rows),
-        "One run, mean ± spread over seeds, and what the paper prints.",
-        "llrrrrrrr",
-    )
+    rows = found.table_2().to_dict("records")
+    given = {"named": _named, "minus": _minus, "spread": _spread, "known": _known, "signed": signed}
+    return table("table_2", given, it=rows, scale=[_unit(row["quantity"])[0] for row in rows])
 
 
 def methods(found: Reproduction) -> TextTable:
     """What each method does."""
-    rows = tuple((method.label, method.description) for method in found.run.methods)
-    return TextTable(("Method", "What it does"), rows, align="ll")
+    return table("paper_methods", it=found.run.methods)
 
 
 def row_tests(found: Reproduction) -> TextTable:
     """Each row of Table 2 as one draw."""
-    return TextTable(
-        ("Place", "Parameters", "Replicates", "T²", "p"),
-        tuple(
-            (row.place, str(row.p), count(row.n), significant(row.t2, 3), significant(row.p_value))
-            for row in found.rows
-        ),
-        "The parameters of each row, taken together, as one draw (Hotelling’s T², with rounding).",
-    )
+    return table("paper_rows", it=found.rows)
 
 
 def error_readings(found: Reproduction, quantity: str) -> TextTable:
@@ -223,15 +149,7 @@ def error_readings(found: Reproduction, quantity: str) -> TextTable:
 
 def checks(found: Reproduction) -> TextTable:
     """The paper against itself."""
-    return TextTable(
-        ("Statement", "Place", "Printed", "What follows from its other numbers", "Agrees"),
-        tuple(
-            (one.statement, one.place, one.text, one.follows, one.agrees) for one in found.checks
-        ),
-        "Printed parameters put into the paper’s own formulas.",
-        "llrll",
-        tuple("fail" if one.agrees == NO else "" for one in found.checks),
-    )
+    return table("paper_checks", it=found.checks)
 
 
 def errors(found: Reproduction) -> TextTable:
@@ -285,70 +203,26 @@ def replicates_text(found: Replicates) -> str:
 
 def replicates(found: Replicates) -> TextTable:
     """Bias, spread and claims of every method and parameter."""
+    rows = found.table().to_dict("records")
     by_name = {p.name: p for p in parameters(found.truth.distortion)}
-    rows = []
-    for row in found.table().to_dict("records"):
-        p = by_name[row["parameter"]]
-        bias, bias_se, spread, bound = (
-            row[name] / p.scale for name in ("bias", "bias_se", "spread", "crlb")
-        )
-        claimed, low, high = (
-            fixed(row[f"claimed_over_spread{end}"], 2) for end in ("", "_low", "_high")
-        )
-        textbook = row["claimed_classical_over_spread"]
-        what = (row["method"], f"{NAMES[p.name]} [{pretty_unit(p.scaled_unit)}]", count(row["n"]))
-        sizes = (significant(size) for size in (spread, bound, row["rmse_over_crlb"]))
-        efficiency = "–" if row["biased"] else fixed(row["efficiency"], 2)
-        claims = (
-            f"{claimed} ({low} to {high})",
-            fixed(textbook, 2) if np.isfinite(textbook) else "–",
-        )
-        mean = plus_minus(bias, bias_se)
-        rows.append(
-            (
-                *what,
-                mean,
-                *sizes,
-                efficiency,
-                *claims,
-                percent(row["coverage95"], 3),
-                row["verdict"],
-            )
-        )
-    return TextTable(
-        (
-            *("Method", "", "n", "Bias", "Spread", "Bound", "RMSE / bound", "Efficiency"),
-            *("Claimed / spread", "Textbook / spread", "Coverage", "Verdict"),
-        ),
-        tuple(rows),
-        (
-            "What every method does over seeds, against its own standard deviation and that of the "
-            "textbooks."
-        ),
-        "llrrrrrrrrrl",
-    )
+    specs = [by_name[row["parameter"]] for row in rows]
+    return table("replicates", it=rows, spec=specs, name=[NAMES[spec.name] for spec in specs])
 
 
 def thresholds(study: InteractionStudy) -> TextTable:
     """Where the bias of each method passes one standard deviation of its noise."""
-    units = {
-        "distortion": "px at the corner",
-        "field": "deg",
-        "frames": "frames",
-        "stars": "stars in a frame",
-    }
-    found = {(t.method, t.parameter, t.axis): t for t in study.thresholds if t.kind == "bias"}
-    rows = [
-        (method, NAMES[parameter], *(_side(found.get((method, parameter, axis))) for axis in AXES))
-        for method in HANDLING
-        for parameter in OPTICS
-        if any((method, parameter, axis) in found for axis in AXES)
-    ]
-    return TextTable(
-        ("Method", "", *(f"{axis} [{units[axis]}]" for axis in AXES)),
-        tuple(rows),
-        "Where the bias exceeds one standard deviation of the noise.",
-        "llllll",
+    by_axis: dict[tuple[str, str], dict[str, Threshold | None]] = {}
+    for one in study.thresholds:
+        if one.kind == "bias":
+            axes = by_axis.setdefault((one.method, one.parameter), dict.fromkeys(AXES))
+            axes[one.axis] = one
+    places = [place for place in product(HANDLING, OPTICS) if place in by_axis]
+    return table(
+        "thresholds",
+        {"side": _side},
+        method=[method for method, _ in places],
+        parameter=[NAMES[parameter] for _, parameter in places],
+        found=[by_axis[place] for place in places],
     )
 
 
