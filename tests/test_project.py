@@ -29,6 +29,7 @@ HEAVY = (
     "emcee",
     "jinja2",
     "matplotlib",
+    "numpy",
     "pandas",
     "pyarrow",
     "scipy",
@@ -60,9 +61,20 @@ def test_import_is_fast() -> None:
     assert min(seconds(ours) for _ in range(5)) < 1.5 * min(seconds(reference) for _ in range(5))
 
 
-def test_import_loads_nothing_heavy() -> None:
-    code = f"import sys, starcal_uq; print([name for name in {HEAVY} if name in sys.modules])"
+@pytest.mark.parametrize("module", ["starcal_uq", "starcal_uq.cli.commands"])
+def test_import_loads_nothing_heavy(module: str) -> None:
+    """Not for the package, and not for the help of a command."""
+    code = f"import sys, {module}; print([name for name in {HEAVY} if name in sys.modules])"
     assert run_python(code).strip() == "[]"
+
+
+def test_the_version_takes_no_command() -> None:
+    """Typer and the commands are not loaded for it."""
+    code = "import sys; sys.argv = ['starcal-uq', '--version']; import atexit; "
+    code += "atexit.register(lambda: print('typer' in sys.modules)); "
+    code += "import starcal_uq.cli.app as app; app.program()"
+    own = run_python("import starcal_uq; print(starcal_uq.__version__)").strip()
+    assert run_python(code).split() == ["starcal-uq", own, "False"]
 
 
 def test_every_public_name_exists() -> None:

@@ -43,9 +43,9 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from starcal_uq.core.provenance import installed_version
+        from starcal_uq.core.provenance import version_line
 
-        print(f"starcal-uq {installed_version('starcal-uq')}")
+        print(version_line())
         raise typer.Exit
 
 

@@ -12,7 +12,6 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.status import Advice, Level, Note, Order
 from starcal_uq.core.types import AnyDict, Progress
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from starcal_uq.calibration.screening.result import Screening
+    from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.partitions import PartitionedObservations

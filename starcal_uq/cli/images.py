@@ -21,7 +21,6 @@ from starcal_uq.cli.settings import (
 from starcal_uq.core import settings
 from starcal_uq.core.files import UNFINISHED, ensure_new, table_ending
 from starcal_uq.core.formatting import plural
-from starcal_uq.observations.files import WRITTEN
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -93,6 +92,7 @@ def identify_command(
     The stars are identified with the nominal camera and again with what they tell of it, as `run`
     does.
     """
+    from starcal_uq.observations.files import WRITTEN
     from starcal_uq.pipeline.images import observations_from_centroids, of_one_size
     from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
 

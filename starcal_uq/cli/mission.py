@@ -23,7 +23,6 @@ from starcal_uq.cli.settings import (
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
-from starcal_uq.core.manifest import refuse_others
 from starcal_uq.core.settings import KEYS
 from starcal_uq.core.types import AnyDict
 
@@ -43,6 +42,8 @@ def check_output(out: Path | None, command: str, force: bool) -> None:
     """Refuse a folder that holds something, and one of another command's results even with
     `force`.
     """
+    from starcal_uq.core.manifest import refuse_others
+
     if out is not None:
         refuse_others(out, (command,))
         check_new_folder(out, force)

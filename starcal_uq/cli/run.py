@@ -40,10 +40,8 @@ from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.conflicts import conflict, parsed
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.toml import read_section
-from starcal_uq.observations.files import READ
 
 if TYPE_CHECKING:
     from starcal_uq.identification.result import Identification
@@ -113,6 +111,8 @@ def run_command(
     if sampling.priors is not None:
         read_section(sampling.priors, "priors", PriorError, alone=False)
     *given, last = inputs
+    from starcal_uq.observations.files import READ
+
     table = last.suffix.lower() in READ
     other = bool(given) and last.is_file() and not table and not are_images([last])
     inputs, camera = (given, last) if last.suffix.lower() == ".toml" or other else (inputs, None)
@@ -216,6 +216,8 @@ def _calibrate(
     if from_images:
         run.keep_images(centroids, identified, inputs)
         _tell_other_cameras(run)
+        from starcal_uq.core.store import finished
+
         finished(run.folder.path)
     if run.screening is not None:
         show_screening(run.screening)

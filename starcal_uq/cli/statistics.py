@@ -11,7 +11,6 @@ from starcal_uq.cli.console import note, print_table, progress_bar, say, show_ca
 from starcal_uq.cli.settings import ValidationSettings
 from starcal_uq.core import settings
 from starcal_uq.core.files import atomic_write_bytes, write_csv
-from starcal_uq.core.manifest import making
 
 
 def validate_command(
@@ -26,6 +25,7 @@ def validate_command(
     With `-o`, replicates are kept as they are made: an interrupted command goes on, also with more
     of them.
     """
+    from starcal_uq.core.manifest import making
     from starcal_uq.presentation.words.diagnostics import validation_table
 
     sensor = sc.Camera.load(camera)

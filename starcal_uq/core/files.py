@@ -23,8 +23,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from starcal_uq.core.errors import MissingExtraError, ObservationError, RunFolderError, StarcalError
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.types import PathLike
@@ -460,6 +458,8 @@ def table_ending(path: Path, endings: tuple[str, ...] = ENDINGS) -> str:
 
 def as_plain(value: Any) -> Any:
     """For json.dumps: numpy values as Python's, anything else in words."""
+    import numpy as np
+
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 

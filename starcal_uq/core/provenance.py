@@ -6,12 +6,12 @@ import platform
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from starcal_uq.core.types import AnyDict
 
-from starcal_uq.core.types import AnyDict, FloatArray
+if TYPE_CHECKING:
+    from starcal_uq.core.types import FloatArray
 
 # The name of this distribution: of its packages, its folders, its documents.
 NAME = "starcal-uq"
@@ -127,6 +127,8 @@ class Provenance(dict[str, Any]):
 
 def in_order(factors: AnyDict | None, names: tuple[str, ...]) -> FloatArray | None:
     """Factors of a record as an array, in the order of these names; None where it has none."""
+    import numpy as np
+
     return None if factors is None else np.array([factors[name] for name in names])
 
 
@@ -141,10 +143,17 @@ class Traced:
 
 @lru_cache(maxsize=32)
 def installed_version(distribution: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(distribution)
     except PackageNotFoundError:
         return None
+
+
+def version_line() -> str:
+    """Name and version of the program."""
+    return f"{NAME} {installed_version(NAME)}"
 
 
 def installed_versions() -> dict[str, str | None]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias, get_args, get_origin
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args, get_origin
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-FloatArray: TypeAlias = NDArray[np.float64]
-IntArray: TypeAlias = NDArray[np.int64]
-BoolArray: TypeAlias = NDArray[np.bool_]
-StrArray: TypeAlias = NDArray[np.str_]
+    FloatArray: TypeAlias = NDArray[np.float64]
+    IntArray: TypeAlias = NDArray[np.int64]
+    BoolArray: TypeAlias = NDArray[np.bool_]
+    StrArray: TypeAlias = NDArray[np.str_]
 AnyDict: TypeAlias = dict[str, Any]
 AnyMapping: TypeAlias = Mapping[str, Any]
 PathLike: TypeAlias = str | os.PathLike[str]
@@ -22,8 +23,31 @@ Progress: TypeAlias = Callable[[int, int], None]
 Shapes: TypeAlias = Mapping[str, tuple[int | str, ...]]
 
 
+_ELEMENTS = {
+    "FloatArray": "float64",
+    "IntArray": "int64",
+    "BoolArray": "bool_",
+    "StrArray": "str_",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Types of arrays, for modules that compute; others, as the command line's help, do without
+    NumPy.
+    """
+    if name not in _ELEMENTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import numpy as np
+    from numpy import typing
+
+    of_elements: Any = typing.NDArray
+    return globals().setdefault(name, of_elements[getattr(np, _ELEMENTS[name])])
+
+
 def floats(values: Any) -> FloatArray:
     """Numbers as an array of doubles, the same array where it is one."""
+    import numpy as np
+
     return np.asarray(values, dtype=np.float64)
 
 

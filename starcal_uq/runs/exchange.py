@@ -24,6 +24,7 @@ from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_text, ensure_new, split_part, write_csv
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.remedy import RUN, Remedy
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.groups import write_arviz
@@ -36,6 +37,7 @@ from starcal_uq.runs.run import Run
 COVARIANCE = "starcal_uq covariance 1"
 
 
+@bounded
 def export(
     what: PathLike | Run | Calibration | Posterior | Camera,
     to: str,
