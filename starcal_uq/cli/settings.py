@@ -300,7 +300,9 @@ class TrackerSettings:
             exclusion = sc.simulation.Exclusion.of(sensor, self.time, position_km)
             noise = sensor.noise(camera) if stated_px is None else stated_px
         except SensorError as error:
-            raise typer.BadParameter(f"{self.sensor}: {str(error).partition(': ')[2]}") from None
+            words = str(error).partition(": ")[2]
+            words = words.replace("time_utc", "--time").replace("position_km", "--position-km")
+            raise typer.BadParameter(f"{self.sensor}: {words}") from None
         return {"sigma_px": noise, "exclusion": exclusion}
 
 

@@ -64,34 +64,33 @@ class Exclusion:
         CatalogueError
             For a time that is not readable.
         """
-        names = ("sun", "moon", "earth")
-        wanted = {name: float(getattr(sensor, f"{name}_exclusion_deg")) for name in names}
+        needs = {
+            "sun": ("time_utc", time_utc),
+            "moon": ("time_utc", time_utc),
+            "earth": ("position_km", position_km),
+        }
+        wanted = {name: float(getattr(sensor, f"{name}_exclusion_deg")) for name in needs}
         wanted = {name: angle for name, angle in wanted.items() if angle > 0.0}
-        for name, given, missing in (
-            ("sun", time_utc, "the time"),
-            ("moon", time_utc, "the time"),
-            ("earth", position_km, "the position of the spacecraft"),
-        ):
-            if name in wanted and given is None:
+        for name, angle in wanted.items():
+            key, given = needs[name]
+            if given is None:
                 raise SensorError(
-                    f"sensor: {name}_exclusion_deg is {wanted[name]:g}, but {missing} is not given; "
-                    f"state it, or set {name}_exclusion_deg = 0."
+                    f"sensor: {name}_exclusion_deg is {angle:g} and needs {key}; state it, or set "
+                    f"{name}_exclusion_deg = 0."
                 )
         if not wanted:
             return None
         place = np.zeros(3) if position_km is None else floats(position_km)
         if place.shape != (3,) or not np.isfinite(place).all():
-            raise SensorError(
-                f"exclusion: the position is {position_km!r}; give three numbers in km."
-            )
+            raise SensorError(f"sensor: position_km is {position_km!r}; give three numbers in km.")
         centres = {"earth": np.zeros(3)} if time_utc is None else _centres_km(time_utc)
         angles = dict(wanted)
         if "earth" in wanted:
             distance_km = float(np.linalg.norm(place))
             if distance_km <= _EARTH_RADIUS_KM:
                 raise SensorError(
-                    f"exclusion: the position is {distance_km:.0f} km from the Earth's centre, "
-                    "below its surface; give it in km from the centre, such as 6878,0,0."
+                    f"sensor: position_km is {distance_km:.0f} km from the Earth's centre, below "
+                    "its surface; give x, y and z in km from the centre, such as 6878, 0, 0."
                 )
             angles["earth"] += math.degrees(math.asin(_EARTH_RADIUS_KM / distance_km))
         seen = [centres[name] - place for name in wanted]

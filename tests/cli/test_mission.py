@@ -503,7 +503,7 @@ def test_a_plan_takes_its_noise_from_a_sensor(cli, inputs, tmp_path, small_plans
     for options, words in (
         (("--sensor", "sensor.toml", "--check", "10"), "leave out --sensor, or --check"),
         (("--time", "2026-11-26T12:00:00"), "add --sensor, or leave them out"),
-        (("--sensor", "baffle.toml"), "baffle.toml: sun_exclusion_deg is 60, but the time"),
+        (("--sensor", "baffle.toml"), "baffle.toml: sun_exclusion_deg is 60 and needs --time"),
         (("--sensor", "sensor.toml", "--position-km", "1,2"), "not three numbers in km"),
     ):
         named = [tmp_path / word if word.endswith(".toml") else word for word in options]
