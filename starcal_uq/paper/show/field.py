@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -81,26 +81,22 @@ def data_sheets(found: FieldExperiment) -> TextTable:
 
 def cameras(found: FieldExperiment) -> TextTable:
     """The cameras with claimed standard deviations."""
-    shown = {"x0": (1.0, 2), "y0": (1.0, 2), "f": (found.reading.truth.length_mm(1.0), 4)}
-    shown |= {"k1": (1e9, 2), "k2": (1e16, 1)}
-    rows = []
-    for name, group in found.camera_table().groupby("camera", sort=False):
-        cells = dict.fromkeys(shown, "–")
-        for row in group.to_dict("records"):
-            factor, decimals = shown[row["parameter"]]
-            sigma = (
-                f" ± {fixed(row['sigma'] * factor, decimals)}" if np.isfinite(row["sigma"]) else ""
-            )
-            cells[row["parameter"]] = fixed(row["value"] * factor, decimals) + sigma
-        rows.append((CAMERA_NAMES[name], *cells.values()))
-    offset = found.reading.offset_px
-    return TextTable(
-        ("Camera", "x₀ [px]", "y₀ [px]", "f [mm]", "k₁ [10⁻⁹ px⁻²]", "k₂ [10⁻¹⁶ px⁻⁴]"),
-        tuple(rows),
-        f"With claimed standard deviations; the paper counts pixels {offset} higher."
-        if offset
-        else "",
-    )
+    groups = found.camera_table().groupby("camera", sort=False)
+    rows = [
+        {row["parameter"]: (row["value"], row["sigma"]) for row in group.to_dict("records")}
+        for _, group in groups
+    ]
+    reading = found.reading
+    given = {"mm": reading.truth.length_mm(1.0), "offset": reading.offset_px, "shown": _shown}
+    return table("field_cameras", given, name=[CAMERA_NAMES[name] for name, _ in groups], it=rows)
+
+
+def _shown(pair: Any, factor: float, decimals: int) -> str:
+    """A value with its sigma, if it has one; a dash for a parameter that a camera lacks."""
+    if not pair:
+        return "–"
+    known = (number * factor for number in pair if np.isfinite(number))
+    return " ± ".join(fixed(number, decimals) for number in known)
 
 
 def sensor(found: FieldExperiment) -> TextTable:

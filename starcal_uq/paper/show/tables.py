@@ -58,8 +58,8 @@ def _named(quantity: str) -> str:
     return f"{NAMES[quantity]} [{_unit(quantity)[1]}]"
 
 
-def _known(value: float) -> str:
-    return significant(value) if np.isfinite(value) else "–"
+def _known(value: float, digits: int = 2) -> str:
+    return significant(value, digits) if np.isfinite(value) else "–"
 
 
 def _spread(value: float, spread: float, quantity: str = "") -> str:
@@ -154,43 +154,21 @@ def checks(found: Reproduction) -> TextTable:
 
 def errors(found: Reproduction) -> TextTable:
     """Errors of the one run, in px and arcsec."""
-    heads = {
-        **{
-            "method": "Method",
-            "eq16_px": "Eq. 16 [px]",
-            "eq16_max_px": "largest",
-            "eq16_noisy_px": "with noise",
-        },
-        **{
-            "residual_px": "Residuals [px]",
-            "map_px": "Directions [px]",
-            "map_max_px": "largest [px]",
-        },
-        **{"map_arcsec": "Directions [arcsec]", "map_max_arcsec": "largest [arcsec]"},
-        **{"across": "Rotation across [arcsec]", "roll_arcsec": "roll [arcsec]"},
-    }
-    frame = found.errors()
-    frame["across"] = np.hypot(frame["pitch_arcsec"], frame["yaw_arcsec"])
-    frame = frame.rename(columns=heads)[list(heads.values())]
-    title = (
-        "Errors without noise, unless it is named; directions over the detector, best rotation "
-        "removed."
-    )
-    return TextTable.of(frame, title)
+    return table("paper_errors", {"known": _known}, it=found.errors().to_dict("records"))
 
 
 def replicates_text(found: Replicates) -> str:
     """Who is honest, who is biased, and who claims too little or too much."""
     named: dict[str, set[str]] = {}
     if found.n_replicates >= ENOUGH_REPLICATES:
-        table = found.table()
-        little = table["claimed_over_spread"] < 1.0
+        rows = found.table()
+        little = rows["claimed_over_spread"] < 1.0
         wrong = {
-            "biased": table["biased"],
-            "claiming too little": table["claim_wrong"] & little,
-            "claiming too much": table["claim_wrong"] & ~little,
+            "biased": rows["biased"],
+            "claiming too little": rows["claim_wrong"] & little,
+            "claiming too much": rows["claim_wrong"] & ~little,
         }
-        named = {what: set(table["method"][rows]) for what, rows in wrong.items()}
+        named = {what: set(rows["method"][some]) for what, some in wrong.items()}
         named = {"honest": set(found.labels).difference(*named.values()), **named}
     return told(
         "replicates",
