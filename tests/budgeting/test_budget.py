@@ -630,7 +630,7 @@ def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None
     found = made(stated)
     write_budget(found, tmp_path / "budget.xlsx")
     book = load_workbook(tmp_path / "budget.xlsx")
-    assert book.sheetnames == ["Contributors", "Totals", "Requirements", "Notes"]
+    assert book.sheetnames == [*("Contributors", "Totals", "Live totals", "Requirements", "Notes")]
     sheet = book["Contributors"]
     header = [cell.value for cell in sheet[1]]
     assert sheet.freeze_panes == "B2" and sheet.auto_filter.ref and "Sigma [arcsec]" in header

@@ -441,6 +441,7 @@ def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
     assert "#" in (tmp_path / f"{what}.toml").read_text()
     load = {
         "camera": sc.Camera.load,
+        "sensor": sc.simulation.Sensor.load,
         "site": sc.sky.Site.load,
         "budget": sc.budgeting.load_budget_file,
         "study": StudyDefinition.load,
