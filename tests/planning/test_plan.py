@@ -115,7 +115,8 @@ def test_a_confidence_that_is_no_probability_is_refused():
 # --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("model", list(COEFFICIENTS))
+# A cubic lens imitates a tilt of the camera: its information has no inverse.
+@pytest.mark.parametrize("model", [name for name in COEFFICIENTS if "cubic" not in name])
 def test_information_is_that_of_a_calibration(model):
     obs = observations(model)
     cal = sc.calibrate(obs, camera(model))
