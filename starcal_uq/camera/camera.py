@@ -299,7 +299,7 @@ class Camera(Shown):
 
     @classmethod
     def load(cls, path: PathLike) -> Camera:
-        """Read a camera from a TOML file, or from one of OpenCV, ROS, Kalibr, mrcal or SPICE by its
+        """Read a camera from a TOML file, or from one of OpenCV, ROS, Kalibr, mrcal, GIANT or SPICE by its
         ending.
 
         A SPICE instrument kernel (``.ti``) with several cameras takes the NAIF ID of one of them
@@ -311,7 +311,7 @@ class Camera(Shown):
             If the file cannot be read or its content does not fit; the message names file, key and
             remedy.
         """
-        if os.fspath(path).endswith((".yaml", ".yml", ".cameramodel")):
+        if os.fspath(path).endswith((".yaml", ".yml", ".cameramodel", ".xml")):
             return cls._of_others(path)
         file, instrument = split_part(path)
         if file.lower().endswith(".ti"):
@@ -323,7 +323,7 @@ class Camera(Shown):
     @classmethod
     def _of_others(cls, path: PathLike) -> Camera:
         with reading(
-            path, "a camera of OpenCV, ROS, Kalibr or mrcal", "check the file", CameraError
+            path, "a camera of OpenCV, ROS, Kalibr, mrcal or GIANT", "check the file", CameraError
         ):
             held = read_pinhole(Path(path).read_text(encoding="utf-8"))
         try:

@@ -184,7 +184,8 @@ def _pinhole_file(to: str, camera: Camera, path: Path) -> tuple[float, str]:
     plain = Pinhole(*size, *bare.to_opencv(), held.pixel_um, held.name, fisheye)
     path.write_text(write_pinhole(plain, to), encoding="utf-8")
     stretch, skew = held.axes
-    if not skew:
+    # GIANT has the skew in its formula.
+    if not skew or to == "giant":
         return error, _said(error, form.title)
     # The functions of OpenCV, which are also those of ROS, read fx, fy, cx and cy alone.
     behind = (_grid(held, 2)[:, 1] - held.y0_px) / (1.0 + stretch)

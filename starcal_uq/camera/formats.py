@@ -1,21 +1,23 @@
-"""Camera files of OpenCV, ROS, Kalibr and mrcal: the same optics, each in its own words.
+"""Camera files of OpenCV, ROS, Kalibr, mrcal and GIANT: the same optics, each in its own words.
 
-All four hold a pinhole with OpenCV's dimensionless k1, k2, p1, p2, k3, and all but mrcal its fisheye;
+All hold a pinhole with OpenCV's dimensionless k1, k2, p1, p2, k3, and all but mrcal and GIANT its fisheye;
 their pixel origin is the centre of the first pixel. None has a place for the pixel pitch, which a
 comment keeps: ``# pixel_um: 6.9``.
 
 Sources: OpenCV, "FileStorage" and "Camera Calibration and 3D Reconstruction"; ROS,
 sensor_msgs/CameraInfo as camera_calibration_parsers writes it; Kalibr, "YAML formats"; mrcal,
-"Camera models".
+"Camera models"; GIANT, `giant.camera_models.opencv_model` and `camera_model.save`.
 """
 
 from __future__ import annotations
 
 import ast
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -54,9 +56,12 @@ class TextFormat:
     text: str
     pinhole: str = ""
     fisheye: str | None = None
+    order: tuple[int, ...] = ()  # Places in OpenCV's order of all twelve coefficients
 
 
 _ALL = ("k1", "k2", "p1", "p2", "k3")
+# OpenCV's k1, k2, p1, p2, k3, k4, k5, k6 and four of a thin prism, as GIANT has them.
+_GIANT = (0, 1, 4, 5, 6, 7, 2, 3, 8, 9, 10, 11)
 _PRISM, _MATRIX = ("s1", "s2"), ("stretch", "skew")
 TEXT_FORMATS = {
     "opencv": TextFormat(
@@ -144,6 +149,24 @@ projection_matrix:
 }}
 """,
     ),
+    "giant": TextFormat(
+        "GIANT",
+        ".xml",
+        (*_ALL, *_PRISM, *_MATRIX),
+        """\
+<CameraModels>
+  <{name} module="giant.camera_models.opencv_model" type="OpenCVModel">
+    <field_of_view>{half_diagonal_deg}</field_of_view>
+    <intrinsic_matrix>array([[{fx}, {skew}, {x0}], [0.0, {fy}, {y0}]])</intrinsic_matrix>
+    <distortion_coefficients>array([{terms}])</distortion_coefficients>
+    <temperature_coefficients>array([0.0, 0.0, 0.0])</temperature_coefficients>
+    <n_rows>{height}</n_rows>
+    <n_cols>{width}</n_cols>
+  </{name}>
+</CameraModels>
+{pitch_xml}""",
+        order=_GIANT,
+    ),
 }
 
 
@@ -154,10 +177,19 @@ def write_pinhole(camera: Pinhole, to: str) -> str:
     terms = camera.dist_coeffs.tolist()
     if len(terms) == len(_ALL):
         terms = [value for name, value in zip(_ALL, terms, strict=True) if name in form.kept]
+    if form.order:
+        terms = [(terms + [0.0] * 12)[place] for place in form.order]
+    # A name is free text; these files get what cannot end a line or a quotation.
+    name = re.sub(r"[^\w .+-]", "_", camera.name, flags=re.ASCII) or "star_camera"
+    if to == "giant":
+        name = re.sub(r"^(?![A-Za-z_])|\W+", "_", name)
+    pitch = "" if camera.pixel_um is None else f"# pixel_um: {camera.pixel_um!r}\n"
+    corner = math.hypot(camera.width_px, camera.height_px) / 2.0
     return form.text.format(
-        pitch="" if camera.pixel_um is None else f"# pixel_um: {camera.pixel_um!r}\n",
-        # A name is free text; these files get what cannot end a line or a quotation.
-        name=re.sub(r"[^\w .+-]", "_", camera.name, flags=re.ASCII) or "star_camera",
+        pitch=pitch,
+        pitch_xml=f"<!--\n{pitch}-->\n" if pitch else "",
+        name=name,
+        half_diagonal_deg=math.degrees(math.atan2(corner, matrix[0][0])),
         width=camera.width_px,
         height=camera.height_px,
         fx=matrix[0][0],
@@ -177,7 +209,8 @@ def read_pinhole(text: str) -> Pinhole:
     read = next((reader for key, reader in _READERS.items() if key in content), None)
     if read is None:
         raise ValueError(
-            "it has none of camera_matrix (OpenCV, ROS), cam0 (Kalibr) and lensmodel (mrcal)"
+            "it has none of camera_matrix (OpenCV, ROS), cam0 (Kalibr), lensmodel (mrcal) and "
+            "CameraModels (GIANT)"
         )
     width, height, name, intrinsics, coefficients, fisheye = read(content)
     numbers = [*intrinsics, *coefficients]
@@ -199,6 +232,8 @@ _Read = tuple[int, int, str, Sequence[float], Sequence[float], bool]
 
 def _content(text: str) -> Mapping[str, Any]:
     bare = re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE).strip()
+    if bare.startswith("<"):
+        return {"CameraModels": ElementTree.fromstring(bare)}
     if bare.startswith("{"):
         content = ast.literal_eval(bare)
     else:
@@ -261,9 +296,36 @@ def _mrcal(content: Mapping[str, Any]) -> _Read:
     return int(width), int(height), "", intrinsics[:4], intrinsics[4:], False
 
 
+def _giant(content: Mapping[str, Any]) -> _Read:
+    models = content["CameraModels"].findall(".//*[@type]")
+    kinds = {model.get("type") for model in models}
+    if len(models) != 1 or kinds != {"OpenCVModel"}:
+        raise ValueError(
+            f"it has {len(models)} cameras ({', '.join(sorted(map(str, kinds)))}), and one "
+            "OpenCVModel is read"
+        )
+
+    def numbers(name: str) -> list[float]:
+        return [
+            float(v) for v in re.findall(r"[-+.\d]+(?:e[-+]?\d+)?", models[0].findtext(name, ""))
+        ]
+
+    matrix, terms = numbers("intrinsic_matrix"), numbers("distortion_coefficients")
+    if len(matrix) != 6 or len(terms) != 12 or any(numbers("temperature_coefficients")):
+        raise ValueError(
+            "its OpenCVModel has no matrix of 2 x 3, not 12 coefficients, or a focal length that "
+            "follows the temperature"
+        )
+    (width,), (height,) = numbers("n_cols"), numbers("n_rows")
+    ordered = [terms[_GIANT.index(place)] for place in range(12)]
+    intrinsics = matrix[0], matrix[4], matrix[2], matrix[5], matrix[1]
+    return int(width), int(height), models[0].tag, intrinsics, ordered, False
+
+
 # By the key that none of the others has.
 _READERS: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
     "lensmodel": _mrcal,
     "cam0": _kalibr,
     "camera_matrix": _opencv,
+    "CameraModels": _giant,
 }

@@ -99,6 +99,7 @@ ExportFormat = Literal[
     "ros",
     "kalibr",
     "mrcal",
+    "giant",
     "tetra3rs",
     "tetra3",
     "sip",

@@ -55,7 +55,7 @@ def export(
         A run gives the mean of its posterior, or its estimate where there is no posterior. A path
         is that of a run folder, or of a camera.
     to : str
-        One of `FORMATS`. ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``tetra3rs``, ``tetra3``,
+        One of `FORMATS`. ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``giant``, ``tetra3rs``, ``tetra3``,
         ``sip``, ``spice`` and ``asdf`` hold the camera; ``covariance`` (JSON) parameters and their covariance,
         ``csv`` and ``netcdf`` the draws, ``arviz`` (netCDF) a thousand of them with all of ArviZ's
         groups, ``latex`` and ``markdown`` the table of the parameters.

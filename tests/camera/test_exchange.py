@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -50,7 +51,7 @@ CAMERAS = {
     ),
     "skewed": sc.Camera(1024, 768, 14.0, 60.0, 500, 390, "brown+axes", (-3e-8, 1e-15, -0.05, 2e-3)),
 }
-OPENCV_LIKE = ("opencv", "ros", "kalibr", "mrcal")
+OPENCV_LIKE = ("opencv", "ros", "kalibr", "mrcal", "giant")
 
 
 def pixels(camera):
@@ -201,12 +202,39 @@ def test_what_is_written_is_read_again(camera, to, tmp_path):
     fitted = fitted or (skewed and to in ("kalibr", "mrcal"))
     fitted = fitted or (camera.distortion == "thin_prism" and to in ("ros", "kalibr"))
     assert ("fitted" in made.note) == fitted
-    assert (made.error_px > 0.0) == (fitted or skewed)
+    assert (made.error_px > 0.0) == (fitted or (skewed and to != "giant"))
     if not fitted:
         # Skew too, which OpenCV's own functions leave out.
         assert np.allclose(back.to_opencv()[0], camera.to_opencv()[0], rtol=1e-14, atol=1e-14)
     if (camera.distortion, to) == ("brown3", "kalibr"):
         assert made.error_px > 0.05
+
+
+def test_the_camera_of_giant_projects_alike(camera, tmp_path):
+    """Its `OpenCVModel`, written again from its documentation, in NumPy alone."""
+    made = export_camera(camera, "giant", tmp_path / "c.xml")
+    model = ElementTree.parse(made.path).getroot()[0]
+    assert (model.get("module"), model.get("type")) == (
+        "giant.camera_models.opencv_model",
+        "OpenCVModel",
+    )
+    # As its own reader takes them: by their text in Python.
+    held = {node.tag: eval(node.text, {"array": np.array}) for node in model}
+    assert (held["n_cols"], held["n_rows"]) == (camera.width_px, camera.height_px)
+    k1, k2, k3, k4, k5, k6, p1, p2, s1, s2, s3, s4 = held["distortion_coefficients"]
+    seen = unproject(camera, pixels(camera))
+    x, y = (seen[:, :2] / seen[:, 2:]).T
+    r2 = x**2 + y**2
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    moved = np.stack(
+        [
+            radial * x + 2 * p1 * x * y + p2 * (r2 + 2 * x**2) + s1 * r2 + s2 * r2**2,
+            radial * y + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y + s3 * r2 + s4 * r2**2,
+            np.ones_like(x),
+        ]
+    )
+    theirs = (held["intrinsic_matrix"] @ moved).T
+    assert largest(theirs - pixels(camera)) <= made.error_px + 1e-9
 
 
 @pytest.mark.parametrize("to", ["opencv", "ros", "kalibr"])
@@ -223,7 +251,7 @@ def test_a_fisheye_is_written_and_read_without_loss(model, to, tmp_path):
     )
 
 
-@pytest.mark.parametrize("to", ["mrcal", "sip", "tetra3"])
+@pytest.mark.parametrize("to", ["mrcal", "giant", "sip", "tetra3"])
 def test_a_format_without_fisheye_refuses_a_field_that_no_pinhole_has(to, tmp_path):
     wide = sc.Camera(1024, 768, 5.0, 2.0, 500, 390, "f_theta")
     with pytest.raises(CameraError, match="too wide for a pinhole"):
@@ -251,6 +279,9 @@ def test_no_camera_is_lost_or_made_up(tmp_path):
         (text, "", "is empty"),
         (text, "{'lensmodel': 'LENSMODEL_CAHVOR'}", "CAHVOR"),
         (text, 2000 * "[", "is not a camera"),
+        (text, "<CameraModels><a type='OwenModel'/></CameraModels>", "one OpenCVModel is read"),
+        (text, "<CameraModels><a type='OpenCVModel'/></CameraModels>", "no matrix of 2 x 3"),
+        (text, "<CameraModels>", "is not a camera"),
     ):
         path.write_text(text.replace(old, new))
         with pytest.raises(CameraError, match=said):
