@@ -19,14 +19,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
-from starcal_uq.core.errors import (
-    CameraError,
-    CatalogueError,
-    PriorError,
-    SensorError,
-    StudyError,
-    check_known,
-)
+from starcal_uq.core.errors import PriorError, StarcalError, StudyError, check_known
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.remedy import Remedy
 from starcal_uq.core.settings import KEYS, LIMITS, StudyTemplate
@@ -294,7 +287,7 @@ class StudyDefinition:
                     axis.check(value, f"{where}, section [{section}]")
         try:
             self.exclusion  # noqa: B018
-        except (SensorError, CatalogueError) as error:
+        except StarcalError as error:
             raise StudyError(f"{where}: {error}") from None
         every = {**self.observation, **self.sweep, **self.latin}
         self._check_names(every, where)
@@ -496,7 +489,7 @@ def _part(
         if path is not None:
             return kind.load((folder or Path()) / path)
         return kind.from_dict(content[name]) if name in content else None
-    except (CameraError, SensorError) as error:
+    except StarcalError as error:
         raise StudyError(
             str(error) if path is not None else f"{where}, section [{name}]: {error}"
         ) from None
