@@ -337,7 +337,10 @@ def weights_of(cell: Cell) -> str:
     """
     settings = cell.settings
     effects = [settings.get(name) for name in EFFECT_AXES]
-    noise = settings["sigma_px"] if effects[0] else noise_shape(settings, 0.0)[0]
+    # A sensor may have no noise at all, which its cell finds.
+    noise = settings.get("sensor") or settings["sigma_px"]
+    if "sensor" not in settings and not effects[0]:
+        noise = noise_shape(settings, 0.0)[0]
     return repr((settings.get("stars"), noise, settings["direction_mas"], effects))
 
 

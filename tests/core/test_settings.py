@@ -25,7 +25,7 @@ from starcal_uq.core import settings
 from starcal_uq.core.errors import SettingError, StarcalError
 from starcal_uq.core.settings import LIMITS, Limit, bounded
 from starcal_uq.studies import StudyDefinition
-from starcal_uq.studies.axes import AXES
+from starcal_uq.studies.axes import AXES, SENSOR_AXES
 from starcal_uq.studies.definition import _STUDY
 
 PACKAGE = Path(sc.__file__).parent
@@ -189,7 +189,10 @@ def test_cells_at_the_limits_of_an_axis_have_numbers_or_a_reason(name):
     models |= dict.fromkeys(("stretch", "skew"), "brown+axes")
     models |= dict.fromkeys(("s1", "s2"), "thin_prism") | {"k4": "fisheye"}
     models |= {c.name: "cubic" for c in get_model("cubic").lens}
-    content["camera"]["distortion"] = models.get(name, "brown")
+    bare = sc.paper.paper_camera().replace(distortion="none", coefficients=())
+    content["camera"] = bare.to_dict() | {"distortion": models.get(name, "brown")}
+    if name in SENSOR_AXES:
+        content["sensor"] = {}
     found = sc.study(StudyDefinition.from_dict(content), workers=0)
     assert found.ok.sum() + sum(found.problems.values()) == found.n_cells
     assert not found.ok.any() or np.isfinite(found.values("sigma", parameter="f")[found.ok]).all()

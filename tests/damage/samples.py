@@ -141,12 +141,25 @@ IMAGES = [
     "image.jpg",
     "image.bmp",
 ]
+HEADS = """
+[[head]]
+name = "A"
+rotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+weighed_arcsec = [2.0, 2.0, 16.0]
+
+[[head]]
+name = "B"
+rotation = [0.0, 0.7071068, 0.0, 0.7071068]
+run = "run-b"
+"""
 # Format of another program, by the file.
 CAMERAS = {
     "opencv.yaml": "opencv",
     "ros.yml": "ros",
     "kalibr.yaml": "kalibr",
     "mrcal.cameramodel": "mrcal",
+    "giant.xml": "giant",
+    "kernel.ti": "spice",
 }
 SAMPLES = (
     *(Sample(name, _image, ("images.read_image", "images.read_images")) for name in IMAGES),
@@ -159,6 +172,7 @@ SAMPLES = (
         ("runs.load_priors", "Priors.from_toml"),
     ),
     Sample("chain.toml", lambda path: sc.runs.load_priors(path, _camera()), ("runs.load_priors",)),
+    Sample("heads.toml", sc.attitude.load_heads, ("attitude.load_heads",)),
     Sample("budget.toml", sc.budgeting.load_budget_file, ("budgeting.load_budget_file",)),
     Sample("study.toml", sc.studies.StudyDefinition.load, ("studies.StudyDefinition.load",)),
     Sample("observations.csv", sc.load_observations, ("load_observations",)),
@@ -398,6 +412,7 @@ def _write_results(folder: Path) -> None:
     (folder / "priors.toml").write_text(PRIORS)
     (folder / "chain.toml").write_text('[priors]\nprior_from = "earlier"\ninflation = 2.0\n')
     (folder / "budget.toml").write_text(BUDGET)
+    (folder / "heads.toml").write_text(HEADS)
     sc.studies.write_study_template("magnitude-noise", folder / "study.toml", force=True)
     posterior = sc.sample(
         observations(), _calibration(), n_walkers=16, n_steps=8, n_ensembles=2, seed=1
