@@ -35,9 +35,6 @@ from starcal_uq.maths.linear import mean_weights
 if TYPE_CHECKING:
     import pandas as pd
 
-if TYPE_CHECKING:
-    pass
-
 # Rows of a matrix that people round to six digits.
 _ORTHONORMAL = 1e-5
 # Parts of a quaternion, which need not have unit length.

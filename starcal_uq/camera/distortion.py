@@ -143,9 +143,14 @@ def _thin_prism(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
     return du + s1 * r2, dv + s2 * r2
 
 
+def powers(order: int, least: int = 2) -> list[tuple[int, int]]:
+    """Powers (p, q) of a polynomial of two variables with least <= p + q <= order."""
+    return [(n - q, q) for n in range(least, order + 1) for q in range(n + 1)]
+
+
 def _cubic(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
-    powers = [u**p * v**q for p, q in _POWERS]
-    du, dv = (sum(a * b for a, b in zip(half, powers, strict=True)) for half in (k[:7], k[7:]))
+    terms = [u**p * v**q for p, q in _POWERS]
+    du, dv = (sum(a * b for a, b in zip(half, terms, strict=True)) for half in (k[:7], k[7:]))
     return du, dv
 
 
@@ -159,7 +164,7 @@ _P2 = Coefficient("p2", "px^-1", 1e-7, "1e-7 px^-1", "decentring distortion alon
 _S1 = Coefficient("s1", "px^-1", 1e-7, "1e-7 px^-1", "thin prism along x", 2)
 _S2 = Coefficient("s2", "px^-1", 1e-7, "1e-7 px^-1", "thin prism along y", 2)
 # Names as in FITS headers with SIP: a_pq u^p v^q along x, b_pq u^p v^q along y.
-_POWERS = tuple((order - q, q) for order in (2, 3) for q in range(order + 1))
+_POWERS = powers(3)
 _CUBIC = tuple(
     Coefficient(
         f"{letter}{p}{q}",

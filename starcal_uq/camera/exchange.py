@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import Parameter, get_model, shared_names, with_axes
+from starcal_uq.camera.distortion import Parameter, get_model, powers, shared_names, with_axes
 from starcal_uq.camera.formats import TEXT_FORMATS, Pinhole, write_pinhole
 from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
@@ -282,14 +282,10 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
         worst = max(worst, error)
         for column, name in enumerate(names):
             header[f"{name}_ORDER"] = order
-            for (p, q), value in zip(_powers(order), coefficients[:, column], strict=True):
+            for (p, q), value in zip(powers(order), coefficients[:, column], strict=True):
                 if value:
                     header[f"{name}_{p}_{q}"] = value * scale ** (1 - p - q)
     return header, worst
-
-
-def _powers(order: int, least: int = 2) -> list[tuple[int, int]]:
-    return [(p, n - p) for n in range(least, order + 1) for p in range(n, -1, -1)]
 
 
 def _polynomial(
@@ -299,7 +295,7 @@ def _polynomial(
     with terms from the order `least` on.
     """
     for order in range(2, _MOST_ORDERS + 1):
-        terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in _powers(order, least)], axis=1)
+        terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in powers(order, least)], axis=1)
         found = floats(np.linalg.lstsq(terms, shift, rcond=None)[0])
         error = scale * float(np.max(np.linalg.norm(terms @ found - shift, axis=1)))
         if error < close_px:
@@ -346,7 +342,7 @@ def write_kernel(
         "SIP_BP_ORDER": order,
     }
     for column, letter in enumerate("AB"):
-        for (p, q), value in zip(_powers(order, 1), coefficients[:, column], strict=True):
+        for (p, q), value in zip(powers(order, 1), coefficients[:, column], strict=True):
             # Below it no pixel of the detector moves by the thousandth part of rounding.
             if abs(value) * scale > _EXACT_PX / 1e6:
                 values[f"SIP_{letter}P_{p}_{q}"] = float(value) * scale ** (1 - p - q)

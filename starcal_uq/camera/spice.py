@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcal_uq.camera.distortion import get_model, with_axes
+from starcal_uq.camera.distortion import get_model, powers, with_axes
 from starcal_uq.core.types import AnyDict, FloatArray, floats
 
 _BLOCK = re.compile(r"^\s*\\begindata(.*?)(?:^\s*\\begintext|\Z)", re.DOTALL | re.MULTILINE)
@@ -153,10 +153,9 @@ def _camera(instrument: int, words: Keywords) -> KernelCamera:
     x = numbers(10, "OD_T_X", default=[0, 1, 0, e6, e5, 0, e2, 0, e2, 0])
     y = numbers(10, "OD_T_Y", default=[0, 0, 1, 0, e6, e5, 0, e2, 0, e2])
     focal_px = numbers(1, "OOC_FOCAL_LENGTH", "FOCAL_LENGTH") * to_px
-    powers = [(n - q, q) for n in range(4) for q in range(n + 1)]
     terms = {
         power: focal_px @ xy * (focal_px[0, 0] / to_px[0, 0]) ** (sum(power) - 1)
-        for power, xy in zip(powers, np.stack([x, y], axis=1), strict=True)
+        for power, xy in zip(powers(3, 0), np.stack([x, y], axis=1), strict=True)
     }
     terms[0, 0] = terms[0, 0] + centre
     for match in () if "OOC_EM" in words else filter(None, map(_SIP.fullmatch, words)):

@@ -7,6 +7,7 @@ import math
 # Arc seconds in a radian.
 ARCSEC = 648_000.0 / math.pi
 LIGHT_SPEED_KM_S = 299792.458
+AU_KM = 149597870.7
 
 # Axes of an attitude error: left rotation vectors about camera +X, +Y and the boresight +Z.
 AXES = ("pitch", "yaw", "roll")

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from starcal_uq.core.constants import AU_KM
 from starcal_uq.core.errors import SensorError
 from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import BoolArray, FloatArray, floats
 from starcal_uq.simulation.sensor import Sensor
 
-_AU_KM = 149597870.7
 _EARTH_RADIUS_KM = 6378.137
 
 
@@ -114,7 +114,7 @@ def _centres_km(time_utc: Any) -> dict[str, FloatArray]:
     tt = float(days[0, 0]), float(days[0, 1])
     heliocentric, _ = erfa.epv00(*tt)
     return {
-        "sun": -_AU_KM * floats(heliocentric["p"]),
-        "moon": _AU_KM * floats(erfa.moon98(*tt)["p"]),
+        "sun": -AU_KM * floats(heliocentric["p"]),
+        "moon": AU_KM * floats(erfa.moon98(*tt)["p"]),
         "earth": np.zeros(3),
     }

@@ -233,18 +233,32 @@ class Sensor:
     @property
     def now(self) -> Sensor:
         """A new sensor at rest that sees and measures what this one does at its age."""
-        kept = (1.0 - self.transmission_loss_per_year) ** self.age_years
         changed: AnyDict = {
-            "zero_point_e_s": self.zero_point_e_s * kept,
-            "dark_e_px_s": self.dark_e_px_s + self.dark_growth_e_px_s * self.age_years,
+            "zero_point_e_s": self._zero_point_now_e_s,
+            "dark_e_px_s": self._dark_now_e_px_s,
         }
         own = {name: value for name, value in vars(self).items() if name not in _OF_USE}
         return Sensor(**own | changed)
 
     @property
+    def _zero_point_now_e_s(self) -> float:
+        """The zero point at the sensor's age."""
+        kept: float = (1.0 - self.transmission_loss_per_year) ** self.age_years
+        return self.zero_point_e_s * kept
+
+    @property
+    def _dark_now_e_px_s(self) -> float:
+        """The dark current at the sensor's age."""
+        return self.dark_e_px_s + self.dark_growth_e_px_s * self.age_years
+
+    def _smeared_sigma_px(self, smear_px: float) -> float:
+        """Standard deviation along the motion of a star that moves by `smear_px` in an exposure."""
+        return math.hypot(self.psf_sigma_px, smear_px / math.sqrt(12.0))
+
+    @property
     def uniform_e_px(self) -> float:
         """Electrons of sky and dark current in every pixel of one exposure."""
-        return (self.background_e_px_s + self.now.dark_e_px_s) * self.exposure_s
+        return (self.background_e_px_s + self._dark_now_e_px_s) * self.exposure_s
 
     @property
     def max_counts(self) -> int:
@@ -271,7 +285,7 @@ class Sensor:
 
     def electrons(self, mag: FloatArray | float) -> FloatArray:
         """Electrons of stars of these magnitudes in one exposure."""
-        return np.asarray(self.now.zero_point_e_s * self.exposure_s * 10.0 ** (-0.4 * floats(mag)))
+        return np.asarray(self._zero_point_now_e_s * self.exposure_s * 10.0 ** (-0.4 * floats(mag)))
 
     def hot_pixels(self, width_px: int, height_px: int) -> tuple[IntArray, FloatArray]:
         """Flat indices (row by row, ascending) and mean extra electrons in one exposure of the hot
@@ -296,7 +310,7 @@ class Sensor:
         has a Gaussian image of the same variance; the noise is the root mean square of both axes.
         """
         flux = self.electrons(mag)
-        along = math.hypot(self.psf_sigma_px, smear_px / math.sqrt(12.0))
+        along = self._smeared_sigma_px(smear_px)
         snr2, variance = np.zeros(flux.shape), np.zeros(flux.shape)
         for ey, dy in self._profiles(self.psf_sigma_px):
             for ex, dx in self._profiles(along):
@@ -414,7 +428,7 @@ class SensorNoise:
     def brightest_mag(self) -> float:
         """Magnitude at which a star in the centre of a pixel fills it."""
         sensor = self.sensor
-        along = math.hypot(sensor.psf_sigma_px, self.smear_px / math.sqrt(12.0))
+        along = sensor._smeared_sigma_px(self.smear_px)
         peak = 1.0
         for sigma_px in (along, sensor.psf_sigma_px):
             peak *= float(profiles(np.zeros(1), sigma_px, sensor.psf)[1].max())

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
+from starcal_uq.core.constants import ARCSEC, AU_KM, LIGHT_SPEED_KM_S
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.findings import clause
 from starcal_uq.core.formatting import plural
@@ -42,7 +42,7 @@ from starcal_uq.sky.site import Site
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
-AU_PER_DAY_KM_S = 149597870.7 / 86400.0
+AU_PER_DAY_KM_S = AU_KM / 86400.0
 # No spacecraft has exceeded 200 km/s; a velocity given in m/s does.
 MAX_VELOCITY_KM_S = 1000.0
 SUN_DISTANCE_AU = 1.0

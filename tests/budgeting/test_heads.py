@@ -172,18 +172,19 @@ def test_a_common_row_is_not_averaged(heads):
     assert np.abs(departures(found, simulated(BEST, bracket_apart=True))).max() > 0.04
 
 
+def noise_alone():
+    """Budgets of both heads with their centroid noise and nothing else."""
+    kept = [tuple(row for row in rows(head) if row.name == NEA) for head in (0, 1)]
+    return [Budget(own, (), (), 0.997, "", (), Provenance()) for own in kept]
+
+
 def test_gaussian_rows_keep_their_correlation(heads, tmp_path: Path):
     """The covariance of the noise of both heads, seen from another frame."""
     path = tmp_path / "heads.toml"
     frame = '[frame.skew]\nrotation = [0.2, -0.3, 0.5, 0.7]\n\n[[requirement]]\nname = "R"\n'
     frame += 'axis = "X"\nlimit_arcsec = 9.0\nframe = "skew"\n'
     path.write_text(FILE.split("[[contributor]]")[0] + frame)
-    noise = [
-        Budget(tuple(row for row in rows(head) if row.name == NEA), (), (), 0.997, "", (),
-               Provenance())
-        for head in (0, 1)
-    ]  # fmt: skip
-    found = sc.budgeting.array_budget(path, noise)
+    found = sc.budgeting.array_budget(path, noise_alone())
     covariance = np.linalg.inv(sum(
         turn @ np.linalg.inv(np.diag(s) @ own @ np.diag(s)) @ turn.T
         for turn, s, own in zip(TURNS, NOISE, (LEAN, np.eye(3)), strict=True)
@@ -215,12 +216,7 @@ def test_indices_follow_what_heads_state_in_time(heads, tmp_path: Path):
     path = tmp_path / "heads.toml"
     index = '[[index]]\nkind = "MKE"\nwindow_seconds = 20.0\n'
     path.write_text(FILE.split("[[contributor]]")[0] + index)
-    noise = [
-        Budget(tuple(row for row in rows(head) if row.name == NEA), (), (), 0.997, "", (),
-               Provenance())
-        for head in (0, 1)
-    ]  # fmt: skip
-    found = sc.budgeting.array_budget(path, noise)
+    found = sc.budgeting.array_budget(path, noise_alone())
     one, mean = found.total("X"), found.total("X", index="MKE 20 s")
     assert mean.sigma_arcsec == pytest.approx(one.sigma_arcsec / 10.0)
     assert not mean.at_most
