@@ -70,6 +70,20 @@ html_theme = "furo"
 html_title = f"starcal_uq {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+templates_path = ["_templates"]
+# The bar at the top of every page (`_templates/page.html`); the theme shows it where this is set.
+html_theme_options = {"announcement": "pages"}
+html_context = {
+    "top_pages": [
+        ("install", "Install"),
+        ("tour", "Tour"),
+        ("how-to/run", "How to"),
+        ("gallery", "Gallery"),
+        ("reference/api", "Python"),
+        ("reference/cli", "Commands"),
+        ("faq", "Questions"),
+    ]
+}
 
 
 def write_gallery(_app: object) -> None:

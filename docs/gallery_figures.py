@@ -1,7 +1,6 @@
-"""The figures of the gallery: every figure that a result draws, with the code that makes it.
+"""The gallery: every figure of every result, with the code that draws it.
 
-`conf.py` runs the code when it builds the documentation and writes the page; a test holds the list
-against the views.
+`conf.py` runs the code and writes the page at every build; a test compares the list with the views.
 """
 
 from __future__ import annotations
@@ -18,21 +17,19 @@ THUMBNAIL_PX = 260
 
 @dataclass(frozen=True)
 class Scene:
-    """Code that makes some results, and the code of their figures, by class and name of the
-    figure.
-    """
+    """Code that makes some results, and their figures by class and method: name, question, code."""
 
     title: str
     words: str
     code: str
-    figures: dict[str, tuple[str, str]]
+    figures: dict[str, tuple[str, str, str]]
     drawn: bool = True
 
 
 SCENES = (
     Scene(
         "A calibration",
-        "All of this section comes from one simulated campaign, and from what it says.",
+        "One simulated campaign, calibrated and sampled.",
         """\
 import starcal_uq as sc
 
@@ -44,35 +41,45 @@ cal = sc.calibrate(obs, camera)
 post = sc.sample(obs, cal, seed=1)""",
         {
             "Posterior.corner": (
-                "Which values are believed, pair by pair?",
+                "Posterior, pair by pair",
+                "Which values are plausible, pair by pair?",
                 "post.plot.corner(cal, truth)",
             ),
             "Posterior.prior_posterior": (
+                "Prior and posterior",
                 "What did the data add to the prior?",
                 "post.plot.prior_posterior(truth)",
             ),
             "Calibration.convergence": (
-                "How did the three stages get there?",
+                "Convergence of the stages",
+                "How did the three stages converge?",
                 "cal.plot.convergence(truth)",
             ),
-            "Calibration.residuals": ("What is left, and is it noise?", "cal.plot.residuals(obs)"),
+            "Calibration.residuals": (
+                "Residuals",
+                "What remains, and is it noise?",
+                "cal.plot.residuals(obs)",
+            ),
             "Coupling.correlation": (
+                "Parameter correlations",
                 "Which parameters trade against each other?",
                 "sc.coupling(post).plot.correlation()",
             ),
             "Coupling.correlations": (
-                "And with the attitude among them?",
+                "Correlations with attitude",
+                "Which parameters trade against attitude?",
                 "sc.coupling(post).plot.correlations()",
             ),
             "Coupling.couplings": (
-                "What does not knowing the others cost?",
+                "Cost of coupling",
+                "What does it cost not to know the other parameters?",
                 "sc.coupling(post).plot.couplings()",
             ),
         },
     ),
     Scene(
         "Effects beyond the camera",
-        "Real pictures of the sky, whose place nobody gave ([effects](explanation/effects.md)).",
+        "Real pictures of the sky, taken at an unknown site ([effects](explanation/effects.md)).",
         """\
 esa = sc.example_data("esa")
 table = sc.sky.make_apparent(esa.observations)
@@ -80,15 +87,20 @@ held = "noise,zenith,field,phase,magnitude"
 lens = sc.calibrate(table, esa.camera, effects=held)""",
         {
             "Calibration.effects": (
+                "Effects",
                 "What does each effect do?",
                 "lens.plot.effects(table, site=esa.site)",
             ),
-            "Effects.scales": ("How large are they?", "lens.effects.plot.scales()"),
+            "Effects.scales": (
+                "Sizes of effects",
+                "How large are the effects?",
+                "lens.effects.plot.scales()",
+            ),
         },
     ),
     Scene(
         "Attitude and budget",
-        "What the posterior means for directions and attitudes.",
+        "From the posterior to directions, attitudes and a budget.",
         """\
 from starcal_uq.budgeting.file import Requirement
 
@@ -97,15 +109,22 @@ need = Requirement("R-1", "cross-boresight", 60.0, 0.997)
 budget = sc.budget(post, obs, error, file=sc.budgeting.BudgetFile(requirements=(need,)))""",
         {
             "AttitudeError.contributors": (
+                "Attitude error by part",
                 "What does each part do to the attitude?",
                 "error.plot.contributors()",
             ),
-            "Budget.contributors": ("Who spends the budget?", "budget.plot.contributors()"),
+            "Budget.contributors": (
+                "Error budget",
+                "Which contributors use up the budget?",
+                "budget.plot.contributors()",
+            ),
             "FieldMap.maps": (
-                "Where on the detector?",
+                "Direction error over the detector",
+                "Where on the detector is the error large?",
                 "sc.propagation.field_map(post, obs).plot.maps()",
             ),
             "DistortionCurve.curve": (
+                "Distortion curve",
                 "How well is the distortion known, star by star?",
                 "sc.propagation.distortion_curve(post, obs).plot.curve()",
             ),
@@ -113,7 +132,7 @@ budget = sc.budget(post, obs, error, file=sc.budgeting.BudgetFile(requirements=(
     ),
     Scene(
         "An orbit's temperatures",
-        "A camera whose focal length follows the temperature, on an orbit of ninety minutes.",
+        "A camera whose focal length follows temperature, over an orbit of ninety minutes.",
         """\
 import dataclasses
 
@@ -133,6 +152,7 @@ orbit = sc.propagation.TemperatureProfile(t_s, 5.0 + 25.0 * np.sin(2.0 * np.pi *
 warmed = sc.propagate(sc.sample(warm, followed, seed=1), warm, temperature_profile=orbit)""",
         {
             "ThermalError.profile": (
+                "Error over an orbit's temperatures",
                 "What does the temperature do over an orbit?",
                 "warmed.thermal.plot.profile()",
             ),
@@ -154,33 +174,53 @@ profile = sc.attitude.AttitudeProfile(t_s, turns)
 slew = sc.simulation.profile_frames(stars, truth, profile)
 spectrum = sc.propagation.error_spectrum(post, slew, n_draws=20)""",
         {
-            "ErrorSpectrum.spectrum": ("At which frequencies?", "spectrum.plot.spectrum()"),
-            "ErrorSpectrum.time_series": ("And when?", "spectrum.plot.time_series()"),
+            "ErrorSpectrum.spectrum": (
+                "Error spectrum of a slew",
+                "At which frequencies is the error?",
+                "spectrum.plot.spectrum()",
+            ),
+            "ErrorSpectrum.time_series": (
+                "Error along a slew",
+                "When is the error large?",
+                "spectrum.plot.time_series()",
+            ),
         },
     ),
     Scene(
-        "Questions to the model",
-        "Is the model right, are the intervals, and do two calibrations agree?",
+        "Diagnosis",
+        "Are the model and the intervals right, and do two calibrations agree?",
         """\
 diagnosis = sc.diagnose(obs, cal, models=("none", "k1", "brown", "brown3"), n_starts=0)
 validation = sc.validate(camera, n_replicates=24, n_frames=20, workers=0)
 halves = sc.comparison.compare_halves(obs, camera)""",
         {
             "Diagnosis.diagnosis": (
-                "Does anything speak against the model?",
+                "All misfit tests",
+                "Is there evidence against the model?",
                 "diagnosis.plot.diagnosis()",
             ),
-            "Misfit.p_values": ("Which test does?", "diagnosis.misfit.plot.p_values()"),
-            "Jackknife.ratios": ("Are frames independent?", "diagnosis.jackknife.plot.ratios()"),
+            "Misfit.p_values": (
+                "p-values of the tests",
+                "Which test found it?",
+                "diagnosis.misfit.plot.p_values()",
+            ),
+            "Jackknife.ratios": (
+                "Jackknife over frames",
+                "Are frames independent?",
+                "diagnosis.jackknife.plot.ratios()",
+            ),
             "ModelComparison.models": (
+                "Distortion models compared",
                 "Would another model predict better?",
                 "diagnosis.comparison.plot.models()",
             ),
             "Validation.ranks": (
+                "Rank histograms",
                 "Are the intervals right for this sensor?",
                 "validation.plot.ranks()",
             ),
             "CameraComparison.difference": (
+                "Two calibrations compared",
                 "Do two halves of the data agree?",
                 "halves.plot.difference()",
             ),
@@ -188,7 +228,7 @@ halves = sc.comparison.compare_halves(obs, camera)""",
     ),
     Scene(
         "Plans",
-        "What a calibration will give, before there are data.",
+        "What a calibration will achieve, before any data.",
         """\
 plan = sc.plan(camera, stars, target_arcsec=20.0, n_geometries=300, n_campaigns=40)
 choice = sc.planning.choose_frames(camera, stars, n_frames=8, candidates=500, n_geometries=200)
@@ -196,18 +236,27 @@ check = sc.planning.check_forecast(
     camera, stars, n_frames=(10, 30), n_campaigns=10, n_geometries=300, workers=0
 )""",
         {
-            "Plan.forecast": ("How many frames does the target take?", "plan.plot.forecast()"),
-            "Plan.sweeps": ("What else would help?", "plan.plot.sweeps()"),
-            "FrameChoice.choice": ("Which frames are worth most?", "choice.plot.choice()"),
-            "ForecastCheck.check": ("Is the forecast right?", "check.plot.check()"),
+            "Plan.forecast": (
+                "Frames needed",
+                "How many frames does the target take?",
+                "plan.plot.forecast()",
+            ),
+            "Plan.sweeps": ("What else would help", "What else would help?", "plan.plot.sweeps()"),
+            "FrameChoice.choice": (
+                "Best frames to take",
+                "Which frames are worth most?",
+                "choice.plot.choice()",
+            ),
+            "ForecastCheck.check": (
+                "Forecast against simulation",
+                "Is the forecast right?",
+                "check.plot.check()",
+            ),
         },
     ),
     Scene(
         "Coupling studies",
-        (
-            "What couples with what, over fields, frames, stars and models "
-            "([studies](explanation/studies.md))."
-        ),
+        ("Couplings over fields, frames, stars and models ([studies](explanation/studies.md))."),
         """\
 sc.studies.write_study_template("frames-stars", "study.toml")
 study = sc.study("study.toml", workers=0)
@@ -229,22 +278,51 @@ with open("simulated.toml", "w") as file:
     ''')
 simulated = sc.study("simulated.toml", workers=0)""",
         {
-            "Study.maps": ("What do two axes do, at a glance?", "study.plot.maps()"),
-            "Study.map": ("One number over both", 'study.plot.map("frame_error_arcsec")'),
-            "Study.correlation": ("Does anything decouple the pairs?", "study.plot.correlation()"),
-            "Study.matrices": ("All correlations, cell by cell", "study.plot.matrices()"),
-            "Study.weakest": ("What is determined worst?", "study.plot.weakest()"),
-            "Study.inflation": ("Each sigma, others unknown and known", "study.plot.inflation()"),
-            "Study.needed": ("How many frames for a target?", "study.plot.needed()"),
-            "Study.simpler": ("Would a simpler model do?", "study.plot.simpler()"),
+            "Study.maps": ("Two axes at a glance", "What do two axes do?", "study.plot.maps()"),
+            "Study.map": (
+                "One quantity over two axes",
+                "How does one quantity vary over both axes?",
+                'study.plot.map("frame_error_arcsec")',
+            ),
+            "Study.correlation": (
+                "Correlation along the axes",
+                "Does anything decouple the pairs?",
+                "study.plot.correlation()",
+            ),
+            "Study.matrices": (
+                "Correlation matrix of each cell",
+                "What are all correlations, cell by cell?",
+                "study.plot.matrices()",
+            ),
+            "Study.weakest": (
+                "Weakest direction",
+                "Which combination is determined worst?",
+                "study.plot.weakest()",
+            ),
+            "Study.inflation": (
+                "Sigma, others known or unknown",
+                "How large is each sigma, with the others unknown and known?",
+                "study.plot.inflation()",
+            ),
+            "Study.needed": (
+                "Frames for a target",
+                "How many frames for a target?",
+                "study.plot.needed()",
+            ),
+            "Study.simpler": (
+                "Simpler models",
+                "Would a simpler model suffice?",
+                "study.plot.simpler()",
+            ),
             "Study.coverage": (
-                "Do simulated intervals hold the truth?",
+                "Coverage of simulated intervals",
+                "Do simulated intervals contain the truth?",
                 "simulated.plot.coverage()",
             ),
         },
     ),
     Scene(
-        "Ye & Yang (2017) again",
+        "Ye & Yang (2017) reproduced",
         (
             "The paper's experiments, here with fewer repetitions than [the page on "
             "it](explanation/paper.md)."
@@ -255,18 +333,35 @@ sizes = {"fields_deg": (7.0, 15.0), "frames": (12, 48), "max_mags": (5.5, 6.5)}
 sizes |= {"n_replicates": 3, "n_frames": 12}
 bias = sc.paper.interaction_study(distortion_scales=(0.0, 0.1, 1.0, 10.0), workers=0, **sizes)""",
         {
-            "Reproduction.trajectories": ("The paper's figure 3", "paper.plot.trajectories()"),
-            "Reproduction.error_fields": ("Its map of errors", "paper.plot.error_fields()"),
+            "Reproduction.trajectories": (
+                "Paper: convergence",
+                "How do the stages of the paper converge (its figure 3)?",
+                "paper.plot.trajectories()",
+            ),
+            "Reproduction.error_fields": (
+                "Paper: error maps",
+                "Where are the errors of each method?",
+                "paper.plot.error_fields()",
+            ),
             "Reproduction.printed_numbers": (
-                "Its numbers beside ours",
+                "Paper: printed numbers",
+                "Do we reproduce the paper's numbers?",
                 "paper.plot.printed_numbers()",
             ),
-            "Replicates.spread": ("Which method is worth what?", "paper.replicates.plot.spread()"),
-            "InteractionStudy.bias": ("When does distortion bias the optics?", "bias.plot.bias()"),
+            "Replicates.spread": (
+                "Paper: methods compared",
+                "How accurate is each method?",
+                "paper.replicates.plot.spread()",
+            ),
+            "InteractionStudy.bias": (
+                "Paper: bias by distortion",
+                "When does distortion bias the optics?",
+                "bias.plot.bias()",
+            ),
         },
     ),
     Scene(
-        "Its field experiment",
+        "Field experiment of Ye & Yang",
         (
             "Not drawn here, because it renders and identifies hundreds of images: `starcal-uq "
             "reproduce-field -o field`."
@@ -276,8 +371,16 @@ from starcal_uq.paper.field.experiment import field_experiment
 
 night = field_experiment("field")""",
         {
-            "FieldExperiment.rates": ("How many frames are identified?", "night.plot.rates()"),
-            "FieldExperiment.errors": ("How large are the errors?", "night.plot.errors()"),
+            "FieldExperiment.rates": (
+                "Paper: identification rate",
+                "How many frames are identified?",
+                "night.plot.rates()",
+            ),
+            "FieldExperiment.errors": (
+                "Paper: field errors",
+                "How large are the errors?",
+                "night.plot.errors()",
+            ),
         },
         drawn=False,
     ),
@@ -293,7 +396,7 @@ def _code(text: str) -> str:
 
 
 def write(page: Path, folder: Path) -> float:
-    """Draw everything into a folder, write the page, and tell the processor time, s."""
+    """Draw everything into a folder, write the page, and return the processor time, s."""
     import io
 
     from PIL import Image
@@ -309,8 +412,7 @@ def write(page: Path, folder: Path) -> float:
         sections.append(f"## {scene.title}\n\n{scene.words}\n\n{_code(scene.code)}")
         if scene.drawn:
             exec(scene.code, names)
-        for key, (question, code) in scene.figures.items():
-            result, _, name = key.partition(".")
+        for key, (name, question, code) in scene.figures.items():
             sections.append(f"({_anchor(key)})=\n### {question}\n")
             if scene.drawn:
                 data = png_bytes(figure_of(eval(code, names)), dpi=110)
@@ -318,18 +420,16 @@ def write(page: Path, folder: Path) -> float:
                 small = Image.open(io.BytesIO(data)).convert("RGB")
                 small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
                 small.save(folder / f"{_anchor(key)}-small.png", optimize=True)
-                alt = f"{result}: {name}. {question}"
+                alt = f"{name}. {question}"
                 where = f"{folder.name}/{_anchor(key)}"
                 options = f":alt: {alt}\n:target: '#{_anchor(key)}'\n"
-                thumbnails.append(
-                    f"```{{figure}} {where}-small.png\n{options}\n{result}<br>{name}\n```\n"
-                )
+                thumbnails.append(f"```{{figure}} {where}-small.png\n{options}\n{name}\n```\n")
                 sections.append(f"```{{image}} {where}.png\n:alt: {alt}\n:loading: lazy\n```\n")
             sections.append(_code(code))
     opening = """# Gallery
 
-Every figure that a result draws, with the code that makes it. A figure answers a question, which stands above it;
-`result.plot.<Tab>` lists those of a result, and each returns a Matplotlib figure or its axes to go on with.
+Every figure, with the question that it answers and the code that draws it. `result.plot.<Tab>`
+lists the figures of a result; each returns a Matplotlib figure or its axes.
 """
     grid = "::::{container} gallery\n" + "\n".join(thumbnails) + "::::\n"
     page.write_text("\n".join([opening, grid, *sections]), encoding="utf-8")
