@@ -1,4 +1,4 @@
-"""Does a printed number come out? Its distance from what an experiment gives over seeds, reading by
+"""Is a printed number reproduced? Its distance from what an experiment gives over seeds, reading by
 reading.
 
 A printed number is one draw of an experiment. Under a reading that is right it lies among our own
@@ -34,11 +34,11 @@ _ROUNDING = 1e-12
 class Outcome(Enum):
     """What became of a printed number; the value says it in words."""
 
-    REPRODUCED = "comes out"
+    REPRODUCED = "reproduced"
     WITHIN_NOISE = "within noise"
     AGAINST_TEXT = "only against the text"
     BY_CHOICE = "only by choice of reading"
-    NOT_REPRODUCED = "does not come out"
+    NOT_REPRODUCED = "not reproduced"
 
 
 class Trial(NamedTuple):

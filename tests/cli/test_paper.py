@@ -30,7 +30,7 @@ def test_reproduce_field_writes_a_page_and_tables(cli, tmp_path):
     size = ("--replicates", 20, "--frames", 20, "--workers", 1)
     status, out, _ = cli("reproduce-field", "-o", "field", *size, "--json")
     assert status == 0
-    assert "come out" in json.loads(out)["text"] and len(json.loads(out)["table_3"]) == 16
+    assert "are reproduced" in json.loads(out)["text"] and len(json.loads(out)["table_3"]) == 16
     assert len(pd.read_csv(tmp_path / "field" / "table_3.csv")) == 16
     assert (tmp_path / "field" / "field.html").exists()
     status, _, err = cli("reproduce-field", "-o", "field", *size)
