@@ -30,6 +30,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import HeadError, StarcalError, require
 from starcal_uq.core.toml import Key, Section, read_toml
 from starcal_uq.core.types import FloatArray, IntArray, PathLike
+from starcal_uq.maths.intervals import chi_square_both_sides
 from starcal_uq.maths.linear import mean_weights
 
 if TYPE_CHECKING:
@@ -78,12 +79,7 @@ class HeadTest:
         """Probability of a ratio as far from 1, either way, if they are; NaN where one head is
         alone.
         """
-        from scipy.special import chdtr, chdtrc
-
-        if not self.dof:
-            return float("nan")
-        tails = (float(tail(self.dof, self.chi_square)) for tail in (chdtr, chdtrc))
-        return min(1.0, 2.0 * min(tails))
+        return float(chi_square_both_sides(self.chi_square, self.dof))
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +169,7 @@ class HeadArray:
             Turn about the axes of the body by a unit error about those of a head, and the
             covariance of the sum if those that weigh are right, in their unit.
         """
-        weights, fused = self.weights(covariance)
+        weights, fused = body_weights(self.R_body_head, covariance)
         return weights @ self.R_body_head, fused
 
     def fuse(self, quaternions: FloatArray, covariance: FloatArray) -> FusedAttitudes:
@@ -192,15 +188,13 @@ class HeadArray:
             For arrays of another shape, and frames without any attitude.
         """
         q, cov, seen = self.by_frame(quaternions, covariance)
-        weights, fused = self.weights(cov)
-        reference = first_of_body(q, self.R_body_head, seen)
+        weights, fused = body_weights(self.R_body_head, cov)
+        apart, reference = apart_from(q, self.R_body_head, seen)
         for _ in range(_PASSES):
-            apart = apart_from(reference, q, self.R_body_head, seen)
-            mean = np.einsum("khij,khj->ki", weights, apart)
-            reference = quaternion_multiply(rotation_to_quaternion(exp_rotation(mean)), reference)
-        apart = apart_from(reference, q, self.R_body_head, seen)
-        information = np.linalg.inv(fused)[:, None] @ weights
-        squares = np.einsum("khi,khij,khj->k", apart, information, apart)
+            turn = exp_rotation(np.einsum("khij,khj->ki", weights, apart))
+            reference = quaternion_multiply(rotation_to_quaternion(turn), reference)
+            apart, _ = apart_from(q, self.R_body_head, seen, reference)
+        squares = np.einsum("khi,kij,khjl,khl->k", apart, np.linalg.inv(fused), weights, apart)
         return FusedAttitudes(reference, fused, seen.sum(axis=1), squares)
 
     def geometry(self, covariance: FloatArray) -> pd.DataFrame:
@@ -260,24 +254,22 @@ class HeadArray:
         )
         return q, np.where(seen[:, :, None, None], cov, np.nan), seen
 
-    def weights(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Weights of errors about the axes of the body, and the covariance of their mean."""
-        turns = self.R_body_head
-        return mean_weights(turns @ covariance @ np.swapaxes(turns, -1, -2))
 
-
-def first_of_body(q: FloatArray, rotations: FloatArray, seen: FloatArray) -> FloatArray:
-    """Attitude of the body (K, 4) by the first head that has one."""
-    of_body = quaternion_multiply(rotation_to_quaternion(rotations), q)
-    return np.asarray(of_body[np.arange(len(q)), np.argmax(seen, axis=1)])
+def body_weights(rotations: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weights of errors about the axes of the body, and the covariance of their mean."""
+    return mean_weights(rotations @ covariance @ np.swapaxes(rotations, -1, -2))
 
 
 def apart_from(
-    reference: FloatArray, q: FloatArray, rotations: FloatArray, seen: FloatArray
-) -> FloatArray:
-    """Left errors (K, H, 3) of the body from a reference, rad; zero where there is no attitude."""
+    q: FloatArray, rotations: FloatArray, seen: FloatArray, reference: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Left errors (K, H, 3) of the body from a reference, rad, zero where there is no attitude; and
+    the reference (K, 4): by the first head that has an attitude, where none is given.
+    """
     of_body = quaternion_multiply(rotation_to_quaternion(rotations), q)
-    return np.where(seen[:, :, None], left_error(of_body, reference[:, None]), 0.0)
+    if reference is None:
+        reference = of_body[np.arange(len(q)), np.argmax(seen, axis=1)]
+    return np.where(seen[:, :, None], left_error(of_body, reference[:, None]), 0.0), reference
 
 
 def load_heads(path: PathLike) -> HeadArray:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.heads import HeadArray, HeadTest, apart_from, first_of_body
+from starcal_uq.attitude.heads import HeadArray, HeadTest, apart_from, body_weights
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import HeadError, check_known, require
@@ -132,8 +132,8 @@ def misalignments(
     x = np.zeros((powers.shape[1], len(heads.names), 3))
     for step in range(_PASSES + 1):
         rotations = exp_rotation(np.einsum("kp,phi->khi", powers, x)) @ heads.R_body_head
-        apart = apart_from(first_of_body(q, rotations, seen), q, rotations, seen)
-        between = _between(rotations, cov, seen)
+        apart, _ = apart_from(q, rotations, seen)
+        between = _between(rotations, cov)
         residual = np.einsum("khiaj,kaj->khi", between, apart)
         if step == _PASSES:
             break
@@ -176,15 +176,16 @@ def _powers(temperature_c: FloatArray | None, size: int) -> tuple[FloatArray, fl
     return np.column_stack([np.ones(size), warmth - mean]), mean
 
 
-def _between(rotations: FloatArray, cov: FloatArray, seen: FloatArray) -> FloatArray:
+def _between(rotations: FloatArray, cov: FloatArray) -> FloatArray:
     """Information (K, H, 3, H, 3) on turns of the body by each head, with its attitude
     eliminated.
     """
-    turned = rotations @ cov @ np.swapaxes(rotations, -1, -2)
-    own = np.linalg.inv(np.where(seen[:, :, None, None], turned, np.eye(3)))
-    own = np.where(seen[:, :, None, None], own, 0.0)
-    joint = np.linalg.inv(own.sum(axis=1))
-    between: FloatArray = -np.einsum("khij,kjl,kalm->khiam", own, joint, own)
-    for head in range(own.shape[1]):
-        between[:, head, :, head] += own[:, head]
+    weights, fused = body_weights(rotations, cov)
+    alone = np.einsum("ha,ij->hiaj", np.eye(weights.shape[1]), np.eye(3))
+    between: FloatArray = np.einsum(
+        "kij,khjl,khlam->khiam",
+        np.linalg.inv(fused),
+        weights,
+        alone - weights[:, None].swapaxes(2, 3),
+    )
     return between

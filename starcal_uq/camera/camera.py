@@ -498,7 +498,7 @@ _KEYS = {
 class _CameraSection(Section):
     """Schema of the [camera] table, which names the coefficients of its distortion model."""
 
-    distortion: str
+    distortion: str = ""
 
     def unknown(self, key: str) -> str:
         own = [c.name for c in get_model(self.distortion).coefficients]
@@ -532,7 +532,7 @@ def _section(distortion: str, in_pixels: bool) -> Section:
         c.name: Key.number(KEYS["coefficient"], "the coefficient")
         for c in get_model(distortion).coefficients
     }
-    return _CameraSection({**keys, **own}, CameraError, distortion)
+    return _CameraSection({**keys, **own}, CameraError, distortion=distortion)
 
 
 def _checked(table: AnyMapping, where: str) -> AnyDict:

@@ -10,8 +10,9 @@ import tomllib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
@@ -136,12 +137,29 @@ class Key:
         return cls(kind, f"{words}, {range_}", required=required, ge=limit.low, le=limit.high)
 
 
+_TYPES = {kind.__name__: kind for kind in (float, int, str)}
+
+
 @dataclass(frozen=True)
 class Section:
     """Schema of a table: its keys, and the error to raise."""
 
     keys: Mapping[str, Key]
     error: type[StarcalError]
+    name: str = ""
+    header: str = ""
+
+    @classmethod
+    def of_data(cls, package: str | None, name: str, error: type[StarcalError]) -> Section:
+        """The schema that a package holds as data, ``NAME.toml``: keys, and comments for a file."""
+        content = tomllib.loads((files(package or "") / f"{name}.toml").read_text("utf-8"))
+        keys = {
+            key: Key.choice(**stated)
+            if "words" in stated
+            else Key(_TYPES[stated.pop("type")], **stated)
+            for key, stated in content["keys"].items()
+        }
+        return cls(keys, error, name, content["header"])
 
     @cached_property
     def _schema(self) -> type[BaseModel]:
@@ -178,3 +196,42 @@ class Section:
     def unknown(self, key: str) -> str:
         """What is said of a key that the section does not have."""
         return unknown_key(key, self.keys)
+
+
+class Stated:
+    """What people state in a table of a TOML file, which `SECTION` checks: base of a frozen record."""
+
+    SECTION: ClassVar[Section]
+
+    def __post_init__(self) -> None:
+        given = {
+            name: value.item() if hasattr(value, "item") else value
+            for name, value in self.to_dict().items()
+        }
+        for name, value in self.SECTION.check(given, self.SECTION.name).items():
+            object.__setattr__(self, name, value)
+
+    def to_dict(self) -> AnyDict:
+        """Keys and values of the table; what is not given is left out."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any], where: str = "") -> Self:
+        """From keys and values of the table, which `where` names in messages; what is left out has
+        its default. The error of the section for a key that is unknown, missing or wrong.
+        """
+        return cls(**cls.SECTION.check(table, where or cls.SECTION.name))
+
+    @classmethod
+    def load(cls, path: PathLike) -> Self:
+        """From a TOML file with this table. The error of the section if the file cannot be read or
+        its content does not fit; the message names file, key and remedy.
+        """
+        name = cls.SECTION.name
+        table = read_section(path, name, cls.SECTION.error)
+        return cls.from_dict(table, f"{path}, section [{name}]")
+
+    def save(self, path: PathLike, force: bool = False) -> None:
+        """Write a TOML file without loss of digits; `force` allows to write over one."""
+        section = self.SECTION
+        write_section(path, section.name, self.to_dict(), section.header, force)

@@ -26,6 +26,14 @@ def student_quantile(probability: float, dof: float) -> float:
     return float(stdtrit(max(dof, 1.0), 0.5 * (1.0 + probability)))
 
 
+def chi_square_both_sides(statistic: FloatArray | float, dof: FloatArray | float) -> FloatArray:
+    """Probability of a chi-square as far from its degrees of freedom, either way; NaN without any."""
+    from scipy.special import chdtr, chdtrc
+
+    p_value = 2.0 * np.minimum(chdtr(dof, statistic), chdtrc(dof, statistic))
+    return np.where(floats(dof) > 0.0, p_value, np.nan)
+
+
 def binomial_interval(successes: int, n: int, probability: float = 0.95) -> tuple[float, float]:
     """Exact interval for a fraction (Clopper & Pearson 1934)."""
     from scipy.stats import beta

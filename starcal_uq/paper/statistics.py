@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.maths.intervals import HALF_WIDTH_95, wilson_interval
+from starcal_uq.maths.intervals import HALF_WIDTH_95, chi_square_both_sides, wilson_interval
 
 # Of one false finding among all tests of a table.
 FAMILY_LEVEL = 0.01
@@ -104,12 +104,7 @@ def chi_p_value(ratio: float, n: int) -> float:
     """Two-sided p-value of ``s / sigma`` when sigma is the true standard deviation of n Gaussian
     values.
     """
-    from scipy.stats import chi2
-
-    if n < 2 or not np.isfinite(ratio):
-        return float("nan")
-    statistic = (n - 1) * ratio**2
-    return float(min(1.0, 2.0 * min(chi2.cdf(statistic, n - 1), chi2.sf(statistic, n - 1))))
+    return float(chi_square_both_sides((n - 1) * ratio**2, n - 1))
 
 
 def words(row: AnyDict, bias: bool, claim: bool, coverage: bool) -> str:

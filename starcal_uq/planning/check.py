@@ -16,6 +16,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, PlanningError
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.maths.intervals import chi_square_both_sides
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import N_FRAMES, Forecast, Forecaster, Outlook, spreads
 from starcal_uq.planning.information import random_frames
@@ -107,11 +108,9 @@ class ForecastCheck(Shown):
         """Numbers of frames (G,) whose squared errors are not what they should be: Bonferroni over
         all, at 1 %.
         """
-        from scipy.stats import chi2
-
         ratio, _, _ = self.nees_ratio()
         n = np.sum(np.isfinite(self.nees), axis=1) * self.n_parameters
-        p = 2.0 * np.minimum(chi2.cdf(ratio * n, n), chi2.sf(ratio * n, n))
+        p = chi_square_both_sides(ratio * n, n)
         return np.asarray(p < _FAMILY_LEVEL / len(n))
 
     @property

@@ -8,7 +8,6 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray, IntArray
 
-KINDS = ("gaussian", "sampled")
 # Light farther out than this many sigma is left away: 2e-9 of it along each axis.
 _REACH_SIGMAS = 6.0
 

@@ -5,67 +5,18 @@ in them.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.core.errors import SensorError
-from starcal_uq.core.toml import Key, Section, read_section, write_section
-from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, IntArray, PathLike, floats
-from starcal_uq.simulation.psf import KINDS, profiles
+from starcal_uq.core.toml import Section, Stated
+from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, IntArray, floats
+from starcal_uq.simulation.psf import profiles
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-
-_HEADER = """\
-# Sensor of a star camera.
-#
-# psf_sigma_px: standard deviation of the Gaussian image of a star, pixels. psf: "gaussian" (integrated over each pixel)
-# or "sampled" (density at the pixel's centre). zero_point_e_s: electrons per second of a star of magnitude 0; or
-# in its place aperture_mm (diameter), transmission and quantum_efficiency (400 to 900 nm, up to 1).
-# exposure_s: seconds. background_e_px_s, dark_e_px_s: electrons per pixel and second. read_noise_e: electrons, RMS.
-# gain_e_per_count: electrons per count. offset_counts: counts without light. bits: 1 to 16. full_well_e: electrons.
-# hot_pixel_fraction: part of all pixels. hot_pixel_e_s: their mean dark current, electrons per second.
-# hot_pixel_seed: which pixels they are.
-# rate_deg_s: rate of turn across the boresight during exposures. age_years: years in orbit, each of which takes the
-# share transmission_loss_per_year of the light and adds dark_growth_e_px_s to the dark current.
-# sun_exclusion_deg, moon_exclusion_deg, earth_exclusion_deg: least angle of the boresight from the centres of Sun and
-# Moon, and from the limb of the Earth; 0 for none.
-
-"""
-
-
-_E = "a number of electrons"
-_ANGLE = Key(float, "a number of degrees from 0 to below 180", ge=0.0, lt=180.0)
-_SECTION = Section(
-    {
-        "psf_sigma_px": Key(float, "a number of pixels from 0.1 to 100", ge=0.1, le=100.0),
-        "psf": Key.choice(KINDS),
-        "zero_point_e_s": Key(float, f"{_E} per second above 0", gt=0.0),
-        "aperture_mm": Key(float, "a number of mm, 0 where it is not stated", ge=0.0),
-        "transmission": Key(float, "a number above 0, at most 1", gt=0.0, le=1.0),
-        "quantum_efficiency": Key(float, "a number above 0, at most 1", gt=0.0, le=1.0),
-        "exposure_s": Key(float, "a number of seconds above 0", gt=0.0),
-        "background_e_px_s": Key(float, f"{_E} per pixel and second, 0 or more", ge=0.0),
-        "dark_e_px_s": Key(float, f"{_E} per pixel and second, 0 or more", ge=0.0),
-        "read_noise_e": Key(float, f"{_E}, 0 or more", ge=0.0),
-        "gain_e_per_count": Key(float, f"{_E} per count above 0", gt=0.0),
-        "offset_counts": Key(float, "a number of counts, 0 or more", ge=0.0),
-        "bits": Key(int, "a whole number from 1 to 16", ge=1, le=16),
-        "full_well_e": Key(float, f"{_E} above 0", gt=0.0),
-        "hot_pixel_fraction": Key(float, "a number from 0 to 1", ge=0.0, le=1.0),
-        "hot_pixel_e_s": Key(float, f"{_E} per second, 0 or more", ge=0.0),
-        "hot_pixel_seed": Key(int, "a whole number, 0 or more", ge=0),
-        "rate_deg_s": Key(float, "a number of degrees per second, 0 to 100", ge=0.0, le=100.0),
-        "age_years": Key(float, "a number of years, 0 to 100", ge=0.0, le=100.0),
-        "transmission_loss_per_year": Key(float, "a share from 0 to below 1", ge=0.0, lt=1.0),
-        "dark_growth_e_px_s": Key(float, f"{_E} per pixel, second and year, 0 or more", ge=0.0),
-        **{f"{body}_exclusion_deg": _ANGLE for body in ("sun", "moon", "earth")},
-    },
-    SensorError,
-)
-
 
 _ZERO_POINT_E_S = 2.6e6
 # Light of a star of G = 0: 3631 Jy of the AB system, of which Vega's system is 0.1137 mag away in G
@@ -108,7 +59,7 @@ def _zero_point_e_s(table: AnyMapping, where: str) -> float:
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(Stated):
     """A detector with a Gaussian point spread function and the same response in every pixel.
 
     The defaults are those of a small star tracker: behind `paper_camera`, a star of G = 6 has 1035
@@ -170,6 +121,8 @@ class Sensor:
         If a value is not a number or out of its range.
     """
 
+    SECTION = Section.of_data(__package__, "sensor", SensorError)
+
     psf_sigma_px: float = 1.0
     psf: str = "gaussian"
     zero_point_e_s: float = _ZERO_POINT_E_S
@@ -196,12 +149,7 @@ class Sensor:
     earth_exclusion_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        given = {
-            key: value.item() if isinstance(value, np.generic) else value
-            for key, value in vars(self).items()
-        }
-        for name, value in _SECTION.check(given, "sensor").items():
-            object.__setattr__(self, name, value)
+        super().__post_init__()
         object.__setattr__(self, "zero_point_e_s", _zero_point_e_s(vars(self), "sensor"))
 
     @classmethod
@@ -348,46 +296,18 @@ class Sensor:
 
     def replace(self, **changes: Any) -> Sensor:
         """A copy with some attributes changed."""
-        table = asdict(self) | changes
+        table = vars(self) | changes
         if table["aperture_mm"] and "zero_point_e_s" not in changes:
             del table["zero_point_e_s"]
         return self.from_dict(table)
 
-    def to_dict(self) -> AnyDict:
-        """The [sensor] table: plain values."""
-        return asdict(self)
-
     @classmethod
-    def from_dict(cls, table: AnyMapping) -> Sensor:
-        """A sensor from the [sensor] table; what is left out has its default.
-
-        Raises
-        ------
-        SensorError
-            For an unknown key or a value that does not fit.
+    def from_dict(cls, table: AnyMapping, where: str = "sensor") -> Sensor:
+        """A sensor from the [sensor] table, which `where` names in messages; what is left out has
+        its default. SensorError for an unknown key or a value that does not fit.
         """
-        return cls(**_SECTION.check(table, "sensor"))
-
-    @classmethod
-    def load(cls, path: PathLike) -> Sensor:
-        """Read a sensor from a TOML file with a [sensor] section.
-
-        Raises
-        ------
-        SensorError
-            If the file cannot be read or its content does not fit; the message names file, key and
-            remedy.
-        """
-        where = f"{path}, section [sensor]"
-        table = _SECTION.check(read_section(path, "sensor", SensorError), where)
-        _zero_point_e_s(table, where)
-        return cls(**table)
-
-    def save(self, path: PathLike, force: bool = False) -> None:
-        """Write the sensor to a TOML file without loss of digits; `force` allows to write over
-        one.
-        """
-        write_section(path, "sensor", self.to_dict(), _HEADER, force)
+        _zero_point_e_s(cls.SECTION.check(table, where), where)
+        return super().from_dict(table, where)
 
 
 @dataclass(frozen=True)
