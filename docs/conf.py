@@ -222,11 +222,7 @@ def write_reference(_app: object) -> None:
             errors = f"# sc.errors\n\n```{{eval-rst}}\n{directive}\n```\n"
             (place / "errors.md").write_text(errors, encoding="utf-8")
             rows.append(f"| [`sc.errors`]({pages[-1]}.md) | Errors that a user can act on. |")
-        told = (
-            (importlib.import_module(module).__doc__ or "").strip()
-            if wing
-            else "What a day's work needs."
-        )
+        told = (importlib.import_module(module).__doc__ or "").strip() if wing else "Common names."
         lines = [f"# {prefix.rstrip('.')}", "", told, "", "| | |", "|---|---|", *rows]
         lines += ["", "```{toctree}", ":hidden:", "", *pages, "```", ""]
         (folder / f"{wing or '_top'}.md").write_text("\n".join(lines), encoding="utf-8")

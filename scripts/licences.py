@@ -22,13 +22,12 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "licences.md
 EXTRAS = ("asdf", "cluster", "compiled", "excel", "images", "notebook", "raw", "tetra3rs")
 HEAD = """# Licences
 
-`starcal_uq` is under the MIT licence, but for one table: the example data (`stars.ecsv`) were measured in images by the
-European Space Agency and stand under CC BY-SA 3.0 IGO, as those do (`starcal_uq/pipeline/data/esa/NOTICE`).
+`starcal_uq` is under the MIT licence, except one table: the example data (`stars.ecsv`) were measured in images by the
+European Space Agency and are under CC BY-SA 3.0 IGO (`starcal_uq/pipeline/data/esa/NOTICE`).
 
-This is what comes with it, as a dependency or a dependency's dependency, in any of the supported versions of
-Python, and what the extras for users add, as the packages' own metadata say it (`make supply` makes this
-table). None of it is part of our files: each is installed as its authors publish it, and those under the LGPL
-(*casadi*, *sep*) can be replaced by the user.
+The table lists all direct and indirect dependencies in any supported version of Python, extras included, with the
+licences in their metadata (made by `make supply`). We distribute none of them. You can replace those under the LGPL
+(*casadi*, *sep*).
 
 | Package | Licence |
 |---|---|
