@@ -26,21 +26,16 @@ def at_home(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(NOTEBOOKS.parent))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
+        "coupling_study",
+        "error_budget",
+        "model_comparison",
+        "own_images",
         "quickstart",
-        *(
-            pytest.param(name, marks=pytest.mark.slow)
-            for name in (
-                "coupling_study",
-                "error_budget",
-                "model_comparison",
-                "own_images",
-                "paper",
-                "requirement",
-            )
-        ),
+        "requirement",
     ],
 )
 def test_it_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

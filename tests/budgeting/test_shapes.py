@@ -70,7 +70,7 @@ def test_deviates_have_unit_moments_and_the_stated_half_width(name: str) -> None
         assert np.mean(np.abs(sampled) < half_width(name, 0.997)) == pytest.approx(0.997, abs=5e-4)
 
 
-@pytest.mark.parametrize("tail", [2.5, GAUSSIAN_997, 3.2, 3.9, 4.55])
+@pytest.mark.parametrize("tail", [2.5, 3.2, 4.55])
 def test_a_sigma_that_varies_keeps_variance_and_reaches_the_stated_tail(tail: float) -> None:
     rng = np.random.default_rng(4)
     sampled = deviates("gaussian", rng.random(1_000_000), rng.standard_normal(1_000_000), tail)

@@ -12,21 +12,20 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from typer.main import get_command
 
 import starcal_uq as sc
+from starcal_uq.cli.commands import app
 from starcal_uq.cli.schemas import document
 from starcal_uq.core.settings import Starter
 from starcal_uq.studies.definition import StudyDefinition
 from tests.cli.conftest import check_document
 from tests.helpers.commands import SMALL, files
 from tests.helpers.outside import campaign
-from tests.helpers.scenes import observations
 
 
-def test_run_writes_everything_and_ends_with_its_summary(painting_cli, inputs, tmp_path):
-    status, out, err = painting_cli(
-        "run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", *SMALL
-    )
+def test_run_writes_everything_and_ends_with_its_summary(cli, inputs, tmp_path):
+    status, out, err = cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", *SMALL)
     assert status in (0, 1)
     for heading in ("Calibration", "posterior ± 1 sigma", "Attitude error", "Report:"):
         assert heading in out
@@ -45,8 +44,6 @@ def test_run_writes_everything_and_ends_with_its_summary(painting_cli, inputs, t
     page = run.report.read_text(encoding="utf-8")
     assert page.lstrip().lower().startswith("<!doctype html>")
     assert "http://" not in page.replace("http://www.w3.org", "")
-    for name in ("corner", "residuals"):
-        assert (run.figures / f"{name}.svg").stat().st_size > 20_000, "figures are painted"
     # The same verdict for programs.
     verdict = check_document(run.verdict.read_text("utf-8"), status)
     found = sc.Run(run.path).verdict
@@ -60,59 +57,10 @@ def test_run_writes_everything_and_ends_with_its_summary(painting_cli, inputs, t
         for check in verdict["checks"]
     )
     # The same seed repeats the posterior bit for bit, step by step too.
-    painting_cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "again")
-    painting_cli("sample", "again", *SMALL)
+    cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "again")
+    cli("sample", "again", *SMALL)
     again = sc.Posterior.load(tmp_path / "again" / "posterior.nc")
     assert np.array_equal(again.draws, sc.Posterior.load(run.posterior).draws)
-
-
-def test_steps_one_by_one_with_json(cli, inputs):
-    status, out, _ = cli(
-        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--json"
-    )
-    assert status == 0
-    table = json.loads(out)["calibration"]
-    assert table["status"] == "CONVERGED"
-    assert [row["parameter"] for row in table["parameters"]] == [
-        "x0",
-        "y0",
-        "f",
-        "k1",
-        "k2",
-        "sigma",
-    ]
-    status, out, _ = cli("coupling", "run")
-    assert status == 0
-    assert "what not knowing the others costs" in out
-    status, out, _ = cli("sample", "run", "--json", "--seed", "3", *SMALL)
-    assert status in (0, 1)
-    assert len(json.loads(out)["posterior"]["parameters"]) == 6
-    status, out, _ = cli("coupling", "run", "--json")
-    assert status == 0
-    assert 0.9 < json.loads(out)["coupling"]["parameters"][0]["contraction"] <= 1.0
-    status, out, _ = cli("propagate", "run", "--json", "--draws", "60")
-    assert status == 0
-    assert {row["axis"] for row in json.loads(out)["attitude"]["contributors"]} >= {
-        "pitch",
-        "yaw",
-        "roll",
-    }
-    status, out, _ = cli("report", "run", "--json")
-    assert status == 0
-    assert json.loads(out)["report"] == "run/report.html"
-
-
-def test_new_sampling_removes_what_the_old_one_led_to(cli, inputs, tmp_path):
-    cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
-    cli("sample", "run", *SMALL)
-    cli("propagate", "run", "--draws", "60")
-    assert (tmp_path / "run" / "attitude.csv").exists()
-    status, _, err = cli("sample", "run", *SMALL)
-    assert status == 2
-    assert "--force" in err
-    assert (tmp_path / "run" / "attitude.csv").exists()
-    cli("sample", "run", "--force", *SMALL)
-    assert not (tmp_path / "run" / "attitude.csv").exists()
 
 
 def test_simulate_writes_a_table_that_calibrates(cli, inputs, tmp_path):
@@ -141,25 +89,10 @@ def test_demo_ends_with_the_table_of_truth_and_the_report(cli, tmp_path):
     assert (tmp_path / "demo" / "report.html").exists()
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        (),
-        ("demo",),
-        ("simulate",),
-        ("calibrate",),
-        ("sample",),
-        ("coupling",),
-        ("propagate",),
-        ("report",),
-        ("run",),
-    ],
-)
-def test_help_teaches(cli, command):
-    status, out, _ = cli(*command, "--help")
-    assert status == 0
-    assert "Usage" in out
-    assert len(out.splitlines()) > 8
+def test_help_teaches(cli):
+    for command in ((), *((name,) for name in get_command(app).commands)):
+        status, out, _ = cli(*command, "--help")
+        assert status == 0 and "Usage" in out and len(out.splitlines()) > 8, command
 
 
 def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_command_that_writes_it(
@@ -203,31 +136,6 @@ def _cell(path, number, column, text):
     _line(path, number, ",".join(cells))
 
 
-def _drop_column(folder):
-    path = folder / "obs.csv"
-    lines = [line.split(",") for line in path.read_text().splitlines()]
-    index = lines[0].index("y_px")
-    path.write_text("\n".join(",".join(c[:index] + c[index + 1 :]) for c in lines) + "\n")
-
-
-def _short_frame(folder):
-    path = folder / "obs.csv"
-    lines = path.read_text().splitlines()
-    path.write_text(
-        "\n".join(lines[:3] + [line for line in lines[3:] if not line.startswith("0,")]) + "\n"
-    )
-
-
-def _duplicate_star(folder):
-    path = folder / "obs.csv"
-    lines = path.read_text().splitlines()
-    header = lines[0].split(",")
-    a, b = lines[1].split(","), lines[2].split(",")
-    for column in ("ra_deg", "dec_deg", "star_id"):
-        b[header.index(column)] = a[header.index(column)]
-    _line(path, 3, ",".join(b))
-
-
 def _text(name, old, new):
     def change(folder):
         path = folder / name
@@ -247,25 +155,14 @@ def _directory(folder):
     (folder / "obs.csv").mkdir()
 
 
+# One of each kind: what else may be wrong with a table or a camera stands with their loaders.
 MISTAKES = {
-    "missing column": (_drop_column, ["obs.csv", "y_px"]),
-    "text in a number column": (_cells(7, "x_px", "abc"), ["obs.csv", "line 7", "x_px", "abc"]),
     "NaN": (_cells(9, "dec_deg", "nan"), ["obs.csv", "line 9", "dec_deg"]),
-    "pixel outside the detector": (_cells(5, "y_px", "1030.0"), ["obs.csv", "line 5", "y_px"]),
-    "too few stars": (_short_frame, ["obs.csv", "frame 0"]),
-    "duplicate star": (_duplicate_star, ["obs.csv", "line 3"]),
-    "declination of 91": (_cells(4, "dec_deg", "91.0"), ["obs.csv", "line 4", "dec_deg", "91"]),
     "unknown key": (
         _text("camera.toml", "[camera]", "[camera]\nfocal_length = 70.0"),
         ["camera.toml", "focal_length"],
     ),
-    "missing key": (
-        _text("camera.toml", "focal_mm =", "# focal_mm ="),
-        ["camera.toml", "focal_mm"],
-    ),
-    "missing section": (_text("camera.toml", "[camera]", "[kamera]"), ["camera.toml", "camera"]),
     "broken TOML": (_text("camera.toml", "[camera]", "[camera"), ["camera.toml"]),
-    "empty file": (lambda folder: (folder / "obs.csv").write_text(""), ["obs.csv", "empty"]),
     "a directory": (_directory, ["obs.csv", "director"]),
     "missing file": (lambda folder: (folder / "obs.csv").unlink(), ["obs.csv"]),
 }
@@ -360,23 +257,6 @@ def test_files_of_another_kind_are_named_before_any_work(cli, inputs, tmp_path, 
         status, _, err = cli(*call.split(), "-o", "run")
         assert (status, len(err.splitlines())) == (2, 1) and err.startswith(f"error: {words}"), err
     assert not (inputs / "run").exists()
-
-
-def test_a_calibration_that_fails_leaves_no_folder(cli, inputs, tmp_path):
-    rng = np.random.default_rng(0)
-    obs = observations()
-    shuffled = rng.permutation(obs.n_stars)
-    import dataclasses
-
-    # Right ascensions keep the rows distinct; the declinations belong to other stars.
-    wrong = dataclasses.replace(
-        obs, dec_deg=-obs.dec_deg[shuffled], ra_deg=obs.ra_deg, star_id=None
-    )
-    wrong.save(inputs / "wrong.csv")
-    status, _, err = cli("calibrate", inputs / "wrong.csv", inputs / "camera.toml", "-o", "run")
-    assert status == 2
-    assert "error: the calibration" in err
-    assert not (tmp_path / "run").exists()
 
 
 def test_declared_directions_and_renamed_columns(cli, inputs):

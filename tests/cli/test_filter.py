@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 
 import numpy as np
@@ -92,13 +91,3 @@ def test_a_state_is_saved_on_the_way(table, tmp_path, monkeypatch):
     filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
 
     assert saved == [25, 50]
-
-
-def test_results_are_not_overwritten_unasked(table, tmp_path):
-    filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
-    before = (tmp_path / "run" / "calibration.json").read_bytes()
-    with pytest.raises(sc.errors.RunFolderError, match="not empty"):
-        filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
-    assert (tmp_path / "run" / "calibration.json").read_bytes() == before
-    filter_run(table, nominal(camera()), tmp_path / "run", method="samaan", force=True)
-    assert json.loads((tmp_path / "run" / "calibration.json").read_text())["method"] == "samaan"

@@ -39,6 +39,7 @@ def noisy_frame(tmp_path):
     return tmp_path / "frame.tiff"
 
 
+@pytest.mark.slow
 def test_a_model_that_is_asked_for_is_fitted_whatever_the_sheet_has(
     cli, noisy_frame, tmp_path, monkeypatch
 ):

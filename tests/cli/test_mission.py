@@ -91,25 +91,6 @@ def test_budget_in_all_formats(cli, run, tmp_path):
     assert ".xlsx" in err
 
 
-def test_violated_requirement_is_named_and_ends_with_status_1(cli, run, tmp_path):
-    (tmp_path / "mission.toml").write_text(REQUIREMENTS)
-    status, out, err = cli("budget", "run", "--budget", "mission.toml")
-    assert status == 1
-    assert "violated: 'R-1 impossible'" in err
-    assert "R-2 generous" in out
-    assert "R-2" not in err
-    (tmp_path / "kind.toml").write_text(REQUIREMENTS.replace("0.001", "1e4"))
-    status, out, err = cli("budget", "run", "--budget", "kind.toml", "--json")
-    assert status == 0
-    assert [row["verdict"] for row in json.loads(out)["budget"]["requirements"]] == ["open", "open"]
-    # The report of the run now has the section, and its figure.
-    status, _, _ = cli("report", "run")
-    assert status == 0
-    text = (run / "report.html").read_text("utf-8")
-    assert 'id="budget"' in text
-    assert "R-1 impossible" in text
-
-
 def test_budget_of_two_heads(cli, run, tmp_path, small_budgets):
     """One sensor twice, with boresights at right angles: the turn about either is known well."""
     (tmp_path / "heads.toml").write_text(
@@ -142,15 +123,6 @@ def test_run_refuses_a_wrong_budget_file_before_any_work(cli, inputs, tmp_path):
     assert status == 2
     assert "wrong.toml" in err
     assert not (tmp_path / "new").exists()
-
-
-def test_starter_file_lists_what_is_open_and_loads(cli, run, tmp_path):
-    status, out, _ = cli("budget", "run", "--template", "start.toml")
-    assert status == 0
-    assert "starcal-uq budget run --budget start.toml" in out
-    assert "thermo-elastic distortion" in (tmp_path / "start.toml").read_text("utf-8")
-    status, _, _ = cli("budget", "run", "--budget", "start.toml")
-    assert status == 0
 
 
 def test_a_budget_is_a_further_result_whose_requirements_are_checks_of_the_run(
@@ -300,7 +272,7 @@ def test_compare_two_runs_and_two_halves(cli, run, tmp_path):
 
 def test_plan_before_any_data(cli, run, tmp_path, small_plans):
     sc.paper.paper_start().save(tmp_path / "camera.toml")
-    options = ("--target-arcsec", 20, "--frames", 30, "--frames", 300, "--choose", 5, "-o", "plan")
+    options = ("--target-arcsec", 20, "--frames", 30, "--frames", 300, "-o", "plan")
     status, out, _ = cli("plan", "camera.toml", *options)
     assert status == 0
     assert "frames" in out
@@ -316,11 +288,6 @@ def test_plan_before_any_data(cli, run, tmp_path, small_plans):
         assert status == 0
         needs.append(json.loads(out)["plan"]["needs"][0]["frames"])
     assert needs[0] - needs[1] == pytest.approx(60, abs=30)
-    # Centroid noise alone is more than this.
-    status, out, _ = cli(
-        "plan", "camera.toml", "--target-arcsec", 0.1, "--scope", "total", "--frames", 30
-    )
-    assert status == 1
 
 
 def test_plan_of_two_heads(cli, tmp_path, small_plans):
@@ -372,8 +339,8 @@ def test_square_brackets_are_no_markup(cli, run, tmp_path):
     (tmp_path / "b.toml").write_text(REQUIREMENTS.replace("R-1 impossible", "R-1 [/x] rev [b]"))
     status, out, err = cli("budget", "run", "--budget", "b.toml")
     assert status == 1
-    assert "R-1 [/x] rev [b]" in out
-    assert "R-1 [/x] rev [b]" in err
+    assert "R-1 [/x] rev [b]" in out and "R-2 generous" in out
+    assert "violated: 'R-1 [/x] rev [b]'" in err and "R-2" not in err
     status, out, _ = cli("compare", "run", "--split", "halves", "--labels", "a[/x],b [red]")
     assert status == 0
     assert "a[/x] and b [red] agree" in out

@@ -5,10 +5,12 @@ listed here.
 from __future__ import annotations
 
 import ast
+import copy
 import dataclasses
 import re
 import shlex
 import shutil
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -381,12 +383,15 @@ ARGUMENTS = {
 }
 
 
+@cache
 def trees():
-    for path in sorted(PACKAGE.rglob("*.py")):
-        yield (
+    return [
+        (
             ".".join(path.relative_to(PACKAGE).with_suffix("").parts),
             ast.parse(path.read_text(encoding="utf-8")),
         )
+        for path in sorted(PACKAGE.rglob("*.py"))
+    ]
 
 
 def sentences(tree):
@@ -560,6 +565,7 @@ def written():
                 call.args[0], ast.Constant
             ):
                 continue
+            call = copy.deepcopy(call)
             for files in (arg for arg in call.args if isinstance(arg, ast.Tuple)):
                 files.elts = [
                     file if isinstance(file, (ast.Constant, ast.Name)) else ast.Constant("RUN")
@@ -637,4 +643,5 @@ def test_an_error_of_wrong_stars_ends_with_the_command_that_was_given(small, cli
     status, _, err = cli(*call)
     command = re.search(r"`starcal-uq (.*)`", err.splitlines()[-1])[1]
     assert status == 2 and shlex.split(command) == [*map(str, call), "--screen"]
+    assert not (tmp_path / "new").exists()
     assert cli(*shlex.split(command))[0] in (0, 1)

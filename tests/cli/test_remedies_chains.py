@@ -17,7 +17,6 @@ SLOW = (
     "radial wave, 0.3 px",
     "errors of the stars, 0.05 px",
     "2 % wrong stars",
-    "refraction, with times",
 )
 
 
@@ -30,6 +29,7 @@ def test_there_are_thirty_misfits():
     assert len(set(PLANTED)) >= 30
 
 
+@pytest.mark.slow
 def test_effects_take_up_what_was_planted(call, tmp_path):
     """The directions were declared apparent, and lack refraction: that is stated, and f is
     right.

@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 import pandas as pd
-import pytest
 
 import starcal_uq as sc
 from tests.helpers.commands import SMALL, files
@@ -64,11 +63,11 @@ def test_diagnose_stores_its_tables_and_the_report_shows_them(cli, inputs, tmp_p
         "--directions",
         "apparent",
     )
-    status, out, _ = cli("diagnose", "run", "--starts", 2, "--json")
+    status, out, _ = cli("diagnose", "run", "--starts", 1, "--json")
     assert status == 0
     diagnosis = json.loads(out)["diagnosis"]
     assert all(diagnosis[part] for part in ("misfit", "jackknife", "models", "predictive"))
-    assert diagnosis["starts"]["n"] == 2
+    assert diagnosis["starts"]["n"] == 1
     for name in (
         "diagnosis.json",
         "misfit.csv",
@@ -82,22 +81,6 @@ def test_diagnose_stores_its_tables_and_the_report_shows_them(cli, inputs, tmp_p
     # Another calibration in the same folder takes the old questions with it.
     cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--force")
     assert not (tmp_path / "run" / "diagnosis.json").exists()
-
-
-def test_merge_combines_two_halves(cli, inputs, tmp_path):
-    obs = observations()
-    for name, ids in (("a", obs.frame_ids[::2]), ("b", obs.frame_ids[1::2])):
-        obs.select_frames(ids).save(inputs / f"{name}.parquet")
-        cli("calibrate", inputs / f"{name}.parquet", inputs / "camera.toml", "-o", name)
-    status, out, _ = cli("merge", "a", "b", "-o", "both")
-    assert status == 0
-    assert "The runs agree" in out
-    merged = sc.Calibration.load(tmp_path / "both" / "calibration.json")
-    whole = sc.calibrate(obs, sc.paper.paper_start())
-    assert np.max(np.abs(merged.theta - whole.theta) / whole.sigmas) < 0.02
-    status, _, err = cli("merge", "a", "b", "-o", "a")
-    assert status == 2
-    assert "error: " in err
 
 
 def test_a_table_that_holds_its_frames_twice_is_refused(cli, inputs, tmp_path):
@@ -135,23 +118,6 @@ def test_screen_lists_what_it_left_out(cli, inputs, tmp_path):
     assert kept.n_stars + len(rejected) == len(table)
 
 
-@pytest.mark.parametrize("likelihood", ["pairs", "student_t"])
-def test_other_likelihoods_from_the_command_line(cli, inputs, tmp_path, likelihood):
-    cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
-    status, out, _ = cli("sample", "run", "--likelihood", likelihood, "--json", *SMALL)
-    assert status in (0, 1)
-    assert json.loads(out)["posterior"]["parameters"][0]["parameter"] == "x0"
-
-
-def test_unknown_likelihood_is_named(cli, inputs):
-    status, _, err = cli("sample", inputs, "--likelihood", "compressed")
-    assert status == 2
-    assert (
-        "--likelihood 'compressed' is unknown: use one of marginal, pairs, pairs_naive, student_t."
-        in err
-    )
-
-
 def test_robust_refinement(cli, inputs, tmp_path):
     status, _, _ = cli(
         "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--effects", "tails"
@@ -166,37 +132,3 @@ def test_robust_refinement(cli, inputs, tmp_path):
     assert (
         sc.Posterior.load(tmp_path / "run" / "posterior.nc").diagnostics.likelihood == "student_t"
     )
-
-
-def test_naive_pairs_warn_and_are_not_to_be_trusted(cli, inputs):
-    cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
-    status, _, err = cli("sample", "run", "--likelihood", "pairs_naive", *SMALL)
-    assert status == 1
-    assert "warning: " in err
-    assert "Traceback" not in err
-
-
-def test_a_posterior_becomes_the_next_prior(cli, inputs, tmp_path):
-    obs = observations()
-    obs.select_frames(obs.frame_ids[:30]).save(inputs / "ground.parquet")
-    obs.select_frames(obs.frame_ids[30:]).save(inputs / "orbit.parquet")
-    for name in ("ground", "orbit"):
-        cli("calibrate", inputs / f"{name}.parquet", inputs / "camera.toml", "-o", name)
-    cli("sample", "ground", *SMALL)
-    (tmp_path / "priors.toml").write_text('[priors]\nprior_from = "ground"\n')
-    status, _, err = cli("sample", "orbit", "--priors", "priors.toml", *SMALL)
-    assert status in (0, 1), err
-    chained = sc.Posterior.load(tmp_path / "orbit" / "posterior.nc")
-    ground = sc.Posterior.load(tmp_path / "ground" / "posterior.nc")
-    assert (chained.sd[:5] < ground.sd[:5]).all()
-    # The same data must not be used twice.
-    status, _, err = cli("sample", "ground", "--force", "--priors", "priors.toml", *SMALL)
-    assert status == 2
-    assert "error: priors.toml" in err
-
-
-def test_help_of_the_new_commands(cli):
-    for command in ("validate", "diagnose", "merge"):
-        status, out, _ = cli(command, "--help")
-        assert status == 0
-        assert "Usage" in out

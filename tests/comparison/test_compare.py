@@ -215,13 +215,6 @@ def test_order_changes_signs_only() -> None:
     assert one.p_parameters == pytest.approx(two.p_parameters, rel=1e-9)
 
 
-def test_no_difference_at_all() -> None:
-    truth = camera("brown").theta
-    found = compare(result(truth), result(truth, provenance=other()), **SMALL)
-    assert found.p_map == found.p_parameters == found.p_worst == 1.0
-    assert found.verdict == "agree"
-
-
 @lru_cache
 def calibrated(model: str = "brown", method: str = "efficient", part: str = "all") -> Calibration:
     obs = {

@@ -47,6 +47,14 @@ def test_interrupt_keeps_what_is_done(workers: int) -> None:
     assert found[:8] == EXPECTED[:8]
 
 
+def test_an_interrupt_before_the_first_result_is_an_interrupt() -> None:
+    def stop(_: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks(stop, 3, caller="f", chunk=1, workers=0)
+
+
 def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path: Path, root: Path) -> None:
     """The processes import the script, which starts processes."""
     script = tmp_path / "script.py"

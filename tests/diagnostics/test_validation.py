@@ -14,8 +14,6 @@ from starcal_uq.attitude.rotations import left_error
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import (
-    CatalogueError,
-    ClusterError,
     PriorError,
     RunFolderError,
     SamplingError,
@@ -234,15 +232,6 @@ def test_failed_replicates_are_counted_and_explained(good):
     )
 
 
-def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
-    def fail(*_, **__):
-        raise sc.errors.CalibrationError("the stars do not suffice: add some.")
-
-    monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail)
-    with pytest.raises(sc.errors.CalibrationError, match="no replicate gave a result; the"):
-        validate_study(study(), stars, 3, workers=0)
-
-
 def test_some_failures_leave_the_other_replicates(stars, monkeypatch):
     calls = []
 
@@ -290,22 +279,6 @@ def test_workers_do_not_change_a_bit_and_progress_is_told(stars):
     )
 
 
-def test_interrupt_keeps_what_is_done(stars):
-    settings = study(seed=11)
-
-    def press(done, total):
-        if done >= 3:
-            signal.raise_signal(signal.SIGINT)
-
-    found = validate_study(settings, stars, 200, workers=0, progress=press)
-    assert found.interrupted
-    assert 3 <= found.n_replicates < 200
-    assert f"interrupted after {found.n_replicates} of 200" in found.text
-    np.testing.assert_array_equal(
-        found.ranks[0], validate_study(settings, stars, 1, workers=0).ranks[0]
-    )
-
-
 def test_an_interrupted_validation_goes_on_with_what_it_kept(tmp_path):
     settings = {"n_frames": 4, "min_stars": 6, "seed": 11, "workers": 0}
 
@@ -313,9 +286,8 @@ def test_an_interrupted_validation_goes_on_with_what_it_kept(tmp_path):
         if done == 2:
             signal.raise_signal(signal.SIGINT)
 
-    assert sc.validate(
-        camera(), n_replicates=4, keep=tmp_path, progress=press, **settings
-    ).interrupted
+    part = sc.validate(camera(), n_replicates=4, keep=tmp_path, progress=press, **settings)
+    assert part.interrupted and "interrupted after 2 of 4" in part.text
     told = []
     resumed = sc.validate(
         camera(),
@@ -328,20 +300,6 @@ def test_an_interrupted_validation_goes_on_with_what_it_kept(tmp_path):
     _same(resumed, sc.validate(camera(), n_replicates=4, **settings))
     with pytest.raises(SamplingError, match="leave out `keep`"):
         sc.validate(camera(), keep=tmp_path, likelihood=lambda obs, cal: cal.compressed)
-
-
-def test_interrupt_before_the_first_result_is_an_interrupt(stars, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("starcal_uq.diagnostics.validation.validate.run_replicate", stop)
-    with pytest.raises(KeyboardInterrupt):
-        validate_study(study(), stars, 3, workers=0)
-
-
-def test_a_local_function_cannot_go_to_workers(stars):
-    with pytest.raises(ClusterError, match="top level, or use workers=0"):
-        validate_study(study(likelihood=lambda obs, cal: cal.compressed), stars, 20, workers=2)
 
 
 def test_validate_from_the_camera_alone():
@@ -359,11 +317,7 @@ def test_validate_from_the_camera_alone():
     ("options", "words"),
     [
         ({"truth": "posterior"}, "truth 'posterior' is unknown"),
-        ({"min_stars": 2}, "min_stars is 2"),
-        ({"sigma_px": 0.0}, "sigma_px is 0"),
-        ({"sigma_px": float("nan")}, "sigma_px is nan"),
         ({"likelihood": "student_t"}, "'student_t' cannot be validated"),
-        ({"assumed_sigma_px": -1.0}, "assumed_sigma_px is -1"),
     ],
 )
 def test_bad_settings_are_one_sentence(options, words):
@@ -374,12 +328,6 @@ def test_bad_settings_are_one_sentence(options, words):
 def test_priors_of_another_model_are_refused():
     with pytest.raises(PriorError, match="make them with"):
         validate(sc.paper.paper_camera(), priors=sc.Priors.default(camera("none")))
-
-
-def test_a_field_without_stars_says_so():
-    narrow = sc.paper.paper_camera().replace(focal_mm=2000.0)
-    with pytest.raises(CatalogueError, match="raise max_mag"):
-        validate(narrow, n_replicates=1, n_frames=5, max_mag=2.0, workers=0)
 
 
 def test_priors_that_make_no_camera_say_so(stars):

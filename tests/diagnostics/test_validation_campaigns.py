@@ -84,13 +84,3 @@ def test_biased_moves_are_found():
     assert excess(half) > 1.12
     # The moves without it are right, but for the 2 % of few draws.
     assert excess(without) < 1.06
-
-
-def test_noise_understated_by_a_tenth_is_found_by_coverage():
-    found = validate_study(
-        few_frames(assumed_sigma_px=0.045, n_steps=40), sc.load_catalogue(max_mag=6.0), 500
-    )
-    show("sigma understated", found)
-    assert not found.ok
-    assert found.nees_ratio > 1.15
-    assert np.mean(found.coverage[:5]) < 0.935

@@ -113,12 +113,8 @@ def test_without_posterior_the_headline_says_so(run):
     ("name", "changes"),
     [
         ("R-hat", {"rhat": np.full(6, 1.02)}),
-        ("Effective draws", {"ess_tail": np.full(6, 300.0)}),
-        ("Acceptance", {"acceptance": np.array([0.6, 0.6, 0.6, 0.02])}),
         ("Independent posterior", {"psis_khat": 0.9}),
-        ("Independent posterior", {"agreement_sd": 0.5}),
         ("Likelihood", {"compressed_max_difference": 3.0}),
-        ("Likelihood", {"compressed_khat": 0.9}),
         ("Kind of likelihood", {"likelihood": "pairs_naive"}),
     ],
 )
@@ -180,40 +176,6 @@ def test_data_that_were_given_are_not_asked_for(run):
     timed = dataclasses.replace(placed, time_utc=times)
     verdict = judge(timed, run.cal, requirements=[REFRACTION])
     assert verdict.headline == "Not usable, because catalogue directions failed."
-
-
-def with_draws(post, change):
-    draws = post.draws.copy()
-    change(draws)
-    # A new object: means and standard deviations are remembered.
-    return judged(dataclasses.replace(post, draws=draws))
-
-
-def test_derived_quantities_have_diagnostics_of_their_own(run):
-    """The rotation that the first ensemble implies is another one."""
-    quarter = len(run.post.draws) // run.post.n_ensembles
-
-    def shift(draws):
-        draws[:quarter, 0] += 0.5 * run.post.sd[0]
-
-    check = outcome("Derived quantities", run.obs, run.cal, with_draws(run.post, shift))
-    assert check.level is Level.FAIL
-    assert "Common rotation, yaw" in check.sentence
-    assert outcome("R-hat", run.obs, run.cal, with_draws(run.post, shift)).level is Level.PASS
-
-
-def test_draws_off_the_detector_or_folded_fail(run):
-    def push(draws):
-        draws[: len(draws) // 100, 0] += 600.0
-
-    def fold(draws):
-        draws[:, 3] = -2e-6
-
-    check = outcome("Bounds", run.obs, run.cal, with_draws(run.post, push))
-    assert check.level is Level.FAIL and "off the detector" in check.sentence
-    check = outcome("Bounds", run.obs, run.cal, with_draws(run.post, fold))
-    assert check.level is Level.FAIL and "folds" in check.sentence
-    assert outcome("Bounds", run.obs, run.cal, run.post).level is Level.PASS
 
 
 def test_digits_that_monte_carlo_error_reaches_warn(run):
@@ -344,11 +306,6 @@ class TestDiagnosis:
         assert "decentring" in limits(run.obs, run.cal, diagnosis=bent)[0]
 
 
-def test_an_unchecked_likelihood_warns(run):
-    post = with_diagnostics(run.post, compressed_max_difference=float("nan"))
-    assert outcome("Likelihood", run.obs, run.cal, post).level is Level.WARN
-
-
 def test_an_estimate_that_did_not_converge_fails_with_its_remedy(run):
     cal = dataclasses.replace(run.cal, status=sc.core.Status.MAX_ITERATIONS)
     check = outcome("Estimation", run.obs, cal)
@@ -412,26 +369,6 @@ def test_few_frames_and_an_empty_corner_warn(run):
     check = outcome("Coverage of the field", run.obs.select(half), cal)
     assert check.level is Level.WARN
     assert "extrapolated" in check.sentence
-
-
-def test_a_tight_prior_is_named(run):
-    tight = run.post.priors.replace(focal_fraction=1e-5)
-    check = outcome(
-        "Influence of the priors",
-        run.obs,
-        run.cal,
-        judged(dataclasses.replace(run.post, priors=tight)),
-    )
-    assert check.level is Level.WARN
-    assert check.value.endswith("(f)")
-    far = run.post.priors.replace(focal_px=run.post.priors.focal_px * 1.5)
-    check = outcome(
-        "Influence of the priors",
-        run.obs,
-        run.cal,
-        judged(dataclasses.replace(run.post, priors=far)),
-    )
-    assert check.level is Level.WARN
 
 
 def test_a_pattern_in_the_residuals_is_found_and_sized(run):

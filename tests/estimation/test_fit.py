@@ -159,14 +159,6 @@ def test_mirrored_axes_are_not_called_a_calibration():
     assert caught.value.status is Status.INCONSISTENT
 
 
-def test_shuffled_identifications_are_not_called_a_calibration():
-    obs = observations()
-    shuffled = np.random.default_rng(0).permutation(obs.n_stars)
-    wrong = dataclasses.replace(obs, ra_deg=obs.ra_deg[shuffled], dec_deg=obs.dec_deg[shuffled])
-    with pytest.raises(CalibrationError):
-        sc.calibrate(wrong, sc.paper.paper_start())
-
-
 def test_ipopt_keeps_the_principal_point_on_the_detector():
     """A handful of stars lets the optics run away; IPOPT's constraints hold."""
     from starcal_uq.estimation.stages import Search, constraints_for, joint_stage

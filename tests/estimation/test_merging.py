@@ -15,8 +15,7 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.provenance import data_hashes
-from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.estimation.merging import Consistency, consistency_of, merge, welch_james
+from starcal_uq.estimation.merging import consistency_of, merge, welch_james
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.sample import sample
 from starcal_uq.likelihood.compressed import Optimum, moved, optimum, total
@@ -285,21 +284,6 @@ def test_the_run_that_deviates_is_named() -> None:
     assert list(found.to_dataframe()["run"]) == ["a", "b", "c", "d"]
 
 
-def test_record_survives_json() -> None:
-    found = consistency_of(merge([calibrated(1), calibrated(2)]))
-    assert found is not None
-    plain = to_plain(found, null=True)
-    assert to_plain(from_plain(Consistency, plain), null=True) == plain
-    assert consistency_of(calibrated(1)) is None
-
-
-def test_total_of_one_part_is_the_part() -> None:
-    cal = calibrated(1)
-    theta = points(cal)
-    value = total([cal.compressed]).log_likelihood(theta, 0.05)
-    assert np.allclose(value, cal.compressed.log_likelihood(theta, 0.05), rtol=0.0, atol=1e-6)
-
-
 def old_p_value(runs: list[Optimum]) -> float:
     """The control: the F test of the version before, which has one noise for all runs."""
     p = len(runs[0].theta)
@@ -340,13 +324,12 @@ def test_agreement_is_tested_at_any_ratio_of_noises(noise, dof):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ratio", [1.0, 5.0])
-def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
+def test_merged_runs_of_unequal_noise_agree_and_cover() -> None:
     """100 pairs of runs from outside, the smaller with more noise."""
     new, old, squares = [], [], []
     for seed in range(100):
         runs, truth = [], np.zeros(5)
-        for part, (frames, sigma) in enumerate(((10, 0.05), (4, 0.05 * ratio))):
+        for part, (frames, sigma) in enumerate(((10, 0.05), (4, 0.25))):
             c = campaign(
                 np.random.default_rng((seed, part)),
                 n_frames=frames,
@@ -362,7 +345,7 @@ def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
         away = (merged.theta - truth) / merged.sigmas
         squares.append(float(away @ np.linalg.solve(merged.correlation, away)) / 5.0)
     print(
-        f"ratio {ratio:g}: KS {kstest(new, 'uniform').pvalue:.2g}, before "
+        f"KS {kstest(new, 'uniform').pvalue:.2g}, before "
         f"{kstest(old, 'uniform').pvalue:.2g}; below "
         f"0.001: {np.sum(np.less(new, 1e-3))}, before {np.sum(np.less(old, 1e-3))}; NEES/p "
         f"{np.mean(squares):.3f}"
@@ -370,7 +353,8 @@ def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
     assert kstest(new, "uniform").pvalue > 0.01
     # Five degrees of freedom each: the mean of 100 has a standard error of 0.063.
     assert abs(np.mean(squares) - 1.0) < 0.2
-    assert (kstest(old, "uniform").pvalue < 1e-3) == (ratio > 1.0)
+    # Control: the test that has one noise for all runs.
+    assert kstest(old, "uniform").pvalue < 1e-3
 
 
 def test_runs_that_hold_effects_are_not_merged() -> None:

@@ -115,13 +115,12 @@ def test_nothing_but_wrong_stars_is_refused() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["random", "neighbour"])
-def test_wrong_identifications_do_not_move_the_estimate(kind: str) -> None:
+def test_wrong_identifications_do_not_move_the_estimate() -> None:
     stars, truth = load_catalogue(max_mag=6.0, epoch=2026.9), camera()
     scaled, robust, gaussian = [], [], []
     for seed in range(40):
         clean = simulate(stars, truth, n_frames=40, min_stars=8, sigma_px=0.05, seed=80_000 + seed)
-        obs, _ = spoil(clean, 0.05, kind, seed)
+        obs, _ = spoil(clean, 0.05, "neighbour", seed)
         reference = calibrate(clean, nominal(truth))
         cal = calibrate(obs, nominal(truth), effects="tails")
         scaled.append((cal.theta - truth.theta) / cal.sigmas)

@@ -88,9 +88,9 @@ def test_tails_and_errors_of_the_stars_go_together():
 
 @pytest.mark.slow
 def test_intervals_of_parts_together_hold():
-    """Of 24 campaigns; the control has the tails alone."""
+    """Of 16 campaigns; the control has the tails alone."""
     z, plain = [], []
-    for seed in range(24):
+    for seed in range(16):
         c, obs, camera = starred(100 + seed)
         for kept, parts in ((z, ["star"]), (plain, [])):
             cal = sc.calibrate(obs, camera, effects=["tails", *parts])
@@ -163,7 +163,7 @@ def test_auto_adds_tails_to_noise_that_was_asked_for():
 
 @pytest.mark.slow
 def test_auto_takes_up_noise_and_tails_in_every_campaign_that_has_them():
-    for seed in range(100, 106):
+    for seed in range(100, 103):
         assert selected(uneven_gaussian, seed)[1].effects.names == ("noise",)
         assert selected(heavy, seed)[1].effects.names == ("tails",)
         assert selected(uneven_and_wrong, seed)[1].effects.names == ("noise", "tails")

@@ -121,12 +121,12 @@ def trial(snr, sigma):
     return xy, image, extract_centroids(Image(image, "trial"), gain_e_per_count=1.0)
 
 
-# ---- accuracy
-# --------------------------------------------------------------------------------------------------
+# --- accuracy
 
 
-@pytest.mark.parametrize("sigma", [0.8, 1.2, 2.0])
-@pytest.mark.parametrize("snr", [10, 30, 100, 300])
+@pytest.mark.parametrize(
+    ("snr", "sigma"), [(10, 0.8), (10, 2.0), (30, 1.2), (100, 2.0), (300, 0.8), (300, 1.2)]
+)
 def test_scatter_is_near_the_cramer_rao_bound_and_is_predicted(snr, sigma):
     xy, _, centroids = trial(snr, sigma)
     rows, error = matched(centroids, xy)
@@ -138,7 +138,7 @@ def test_scatter_is_near_the_cramer_rao_bound_and_is_predicted(snr, sigma):
     assert np.median(centroids.snr[rows]) == pytest.approx(snr, rel=0.1)
 
 
-@pytest.mark.parametrize("snr", [10, 30, 100, 300])
+@pytest.mark.parametrize("snr", [30, 300])
 def test_plain_moments_miss_the_bound(snr):
     """The control: the same frames, and what the test above would say of a moment."""
     xy, image, _ = trial(snr, 1.2)
@@ -156,7 +156,7 @@ def phase_errors(sigma):
     return xy, image, phase
 
 
-@pytest.mark.parametrize("sigma", [0.8, 1.0, 1.5, 2.5])
+@pytest.mark.parametrize("sigma", [0.8, 1.5, 2.5])
 def test_there_is_no_error_by_pixel_phase(sigma):
     xy, image, _ = phase_errors(sigma)
     rows, error = matched(extract_centroids(Image(image, "phases")), xy)
@@ -279,8 +279,7 @@ def test_windows_settle_where_sextractors_do():
     )
 
 
-# ---- flags and rejections
-# ------------------------------------------------------------------------------------------
+# --- flags and rejections
 
 
 @pytest.fixture(scope="module")
@@ -474,8 +473,7 @@ def test_options_out_of_range_are_named():
         extract_centroids([])
 
 
-# ---- reading images
-# ------------------------------------------------------------------------------------------------
+# --- reading images
 
 
 def test_fits_with_time_exposure_gain_and_saturation(tmp_path):
@@ -541,8 +539,7 @@ def test_errors_of_reading_are_sentences_with_a_remedy(tmp_path):
         read_image(tmp_path)
 
 
-# ---- the table
-# --------------------------------------------------------------------------------------------------
+# --- the table
 
 
 @pytest.fixture(scope="module")
@@ -608,8 +605,7 @@ def test_the_table_and_its_frames(table):
         table.select_frames([7])
 
 
-# ---- the real sky
-# --------------------------------------------------------------------------------------------------
+# --- the real sky
 
 
 def test_real_frames_agree_with_the_independent_centroids(real_data):
@@ -644,8 +640,7 @@ def test_coarse_counts_give_no_false_stars():
     assert n <= 6
 
 
-# ---- what headers and folders may do
-# -------------------------------------------------------------------------------
+# --- what headers and folders may do
 
 
 @pytest.mark.parametrize(

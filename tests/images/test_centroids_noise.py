@@ -156,8 +156,7 @@ def test_round_gaussians_are_never_windowed():
             assert not any("windowed" in text for text in found.messages)
 
 
-# ---- the gain from the noise of the background
-# -----------------------------------------------------------------------
+# --- the gain from the noise of the background
 
 
 def vignetted(rng, gain, *, drop=0.3, bias=100.0, size=768):
@@ -219,8 +218,7 @@ def test_the_measured_gain_gives_bright_stars_their_photon_noise(monkeypatch):
     assert any("gain is unknown" in text for text in without.messages)
 
 
-# ---- errors by pixel phase
-# -------------------------------------------------------------------------------------------
+# --- errors by pixel phase
 
 
 def test_sharp_stars_lose_their_error_by_pixel_phase():
@@ -276,8 +274,7 @@ def test_a_camera_that_stares_shows_its_stars_once():
     assert phase_error(x[:0], y[:0]).amplitude_px == 0.0
 
 
-# ---- the real sky
-# --------------------------------------------------------------------------------------------------
+# --- the real sky
 
 
 def residuals(frame, x, y, ra_deg, dec_deg, sigma):

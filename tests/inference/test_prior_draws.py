@@ -88,12 +88,13 @@ def test_a_prior_is_calibrated_when_cameras_are_drawn_from_it() -> None:
 
 
 def test_without_observations_only_the_prior_is_shown() -> None:
-    found = prior_predictive(DEFAULT.replace(principal_point_px=400.0), NOMINAL)
+    found = prior_predictive(DEFAULT.replace(principal_point_px=400.0), NOMINAL, n_draws=100)
     assert np.all(np.isnan(found.tail))
     assert "No observations" in found.text
     assert found.off_detector > 0.05
     # 20 times the default displacement folds most of these cameras.
-    assert prior_predictive(DEFAULT.replace(distortion_corner_px=700.0), NOMINAL).folded > 0.3
+    folding = DEFAULT.replace(distortion_corner_px=700.0)
+    assert prior_predictive(folding, NOMINAL, n_draws=100).folded > 0.3
 
 
 def test_predictive_check_repeats_and_refuses() -> None:

@@ -377,20 +377,6 @@ def test_too_short_a_run_fails_its_checks() -> None:
     assert "Too few effective draws" in sentence_of(post, "Effective draws", Level.FAIL)
 
 
-def test_surprising_results_are_said() -> None:
-    cal = gaussian_calibration()
-    priors = Priors.default(cal.nominal).replace(focal_fraction=0.001)
-    post = sample(None, cal, priors, **QUICK, evaluation="compressed")
-    assert "prior standard deviations away" in sentence_of(
-        post, "Influence of the priors", Level.WARN
-    )
-    off = cal.camera.replace(x0_px=-3.0).theta
-    likelihood = GaussianLikelihood(off, cal.information, cal.sigma, cal.dof)
-    away = gaussian_calibration(theta=off, compressed=likelihood)
-    post = sample(None, away, **QUICK, evaluation="compressed")
-    assert "off the detector" in sentence_of(post, "Bounds", Level.FAIL)
-
-
 @pytest.fixture(scope="module")
 def few_frames() -> tuple[Any, Any]:
     obs = observations(n_frames=8)

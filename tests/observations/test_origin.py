@@ -39,12 +39,16 @@ def reads_metadata(tree):
 
 def readers(folder):
     """Files outside `observations` that read metadata by key."""
-    paths = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*.py")}
+    texts = {
+        path.relative_to(folder).as_posix(): path.read_text(encoding="utf-8")
+        for path in folder.rglob("*.py")
+    }
     return {
         name
-        for name, path in paths.items()
+        for name, text in texts.items()
         if not name.startswith("observations/")
-        and reads_metadata(ast.parse(path.read_text(encoding="utf-8")))
+        and ".meta" in text
+        and reads_metadata(ast.parse(text))
     }
 
 

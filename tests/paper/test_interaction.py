@@ -155,39 +155,16 @@ def test_small_distortion_biases_in_proportion(study):
 # --- workers, interrupts ---
 
 
-def test_workers_do_not_change_a_bit_and_progress_is_told(study):
-    calls = []
-    both = interaction_study(
-        workers=2, progress=lambda done, total: calls.append((done, total)), **SMALL
-    )
-    assert both.table.equals(study.table)
-    # Nine points, of which three are where the axes cross.
-    assert calls[-1] == (3 * 6, 3 * 6)
-    other = interaction_study(
-        workers=0, **(SMALL | {"seed": 4, "frames": (), "max_mags": (), "fields_deg": ()})
-    )
-    assert other.table["bias"].iloc[-12] != study.table["bias"].iloc[24]
-
-
 def test_interrupt_keeps_what_is_done():
     def press(done, total):
-        if done >= 13:
+        if done >= 7:
             signal.raise_signal(signal.SIGINT)
 
     found = interaction_study(workers=0, progress=press, **(SMALL | {"n_replicates": 50}))
     assert found.interrupted
-    assert set(found.table["n"]) == {2, 3}
+    assert set(found.table["n"]) == {1, 2}
     assert "was interrupted" in found.text
     assert set(found.table["axis"]) == set(AXES)
-
-
-def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("starcal_uq.paper.interaction.run_one", stop)
-    with pytest.raises(KeyboardInterrupt):
-        interaction_study(workers=0, **SMALL)
 
 
 def test_a_method_that_fails_is_counted(monkeypatch):
@@ -215,9 +192,6 @@ def test_a_method_that_fails_is_counted(monkeypatch):
     [
         ({"start": camera("none")}, "give both the same model"),
         ({"truth": camera("none"), "start": camera("none")}, "with coefficients"),
-        ({"n_replicates": 1}, "n_replicates is 1"),
-        ({"min_stars": 3}, "min_stars is 3"),
-        ({"sigma_px": 0.0}, "sigma_px is 0"),
     ],
 )
 def test_bad_settings_are_one_sentence(options, words):
@@ -255,12 +229,6 @@ def test_text_and_html(study):
     assert len(study.thresholds) == 4 * 3 * (4 + 3)
     with pytest.raises(ValueError, match="no 'rmse' threshold"):
         study.threshold("distortion", "efficient", "f", "rmse")
-
-
-def test_figure(study):
-    figure = study.plot.bias()
-    assert len(figure.axes) == 12
-    assert all(ax.get_yscale() == "log" for ax in figure.axes)
 
 
 def test_save_and_load_lose_nothing(study, tmp_path):

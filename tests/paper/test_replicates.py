@@ -13,7 +13,6 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import (
     CalibrationError,
-    CatalogueError,
     RunFolderError,
     SamplingError,
     SettingError,
@@ -21,7 +20,6 @@ from starcal_uq.core.errors import (
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
-from starcal_uq.maths.intervals import holm, wilson_interval
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.replicates import METHODS, Method, Replicates, replicate, solve_all
 from starcal_uq.paper.statistics import HONEST, TOO_FEW, chi_interval, chi_p_value, summarise
@@ -34,16 +32,6 @@ PAIRS = tuple(
     method for method in METHODS if method.label in ("least squares", "three stages", "efficient")
 )
 SMALL = {"methods": PAIRS, "n_frames": 12, "seed": 4}
-ARRAYS = (
-    "replicate",
-    "estimates",
-    "claimed",
-    "classical",
-    "crlb",
-    "map_px",
-    "map_arcsec",
-    "reprojection_px",
-)
 
 
 @pytest.fixture(scope="module")
@@ -96,20 +84,6 @@ def test_interval_of_a_spread_covers():
     assert np.mean([chi_p_value(1.5 * s, n) < 0.05 for s in spread]) > 0.8
 
 
-def test_wilson_interval():
-    # Newcombe (1998), Statistics in Medicine 17, 857-872, table I: 81 of 263, 15 of 148, 0 of 20.
-    assert wilson_interval(81, 263) == pytest.approx((0.2553, 0.3662), abs=1e-4)
-    assert wilson_interval(15, 148) == pytest.approx((0.0624, 0.1605), abs=1e-4)
-    assert wilson_interval(0, 20) == pytest.approx((0.0, 0.1611), abs=1e-4)
-    assert wilson_interval(20, 20)[1] == 1.0
-
-
-def test_holm():
-    p = [0.01, 0.04, np.nan, 0.03, 0.005]
-    assert (holm(p) <= 0.05).tolist() == [True, False, False, False, True]
-    assert not (holm([np.nan]) <= 0.05).any()
-
-
 def test_efficiency_and_ratio_say_what_they_should():
     rng = np.random.default_rng(2)
     row = summarise(
@@ -129,17 +103,17 @@ def test_efficiency_and_ratio_say_what_they_should():
 
 
 def test_chance_is_not_called_a_finding():
-    """A hundred tables of honest methods: one in a hundred may object; single tests object in
-    nearly all.
+    """Fifty tables of honest methods: one in a hundred may object; single tests object in nearly
+    all.
     """
     rng = np.random.default_rng(3)
     objections, single = 0, 0
-    for _ in range(100):
+    for _ in range(50):
         table = artificial(rng.standard_normal((7, 100, 5)), 1.0).table()
         objections += bool((table["verdict"] != HONEST).any())
         single += bool((table[["bias_p", "claimed_p", "coverage95_p"]] < 0.05).to_numpy().any())
-    assert objections <= 4
-    assert single > 90
+    assert objections <= 2
+    assert single > 45
 
 
 def test_wrong_methods_are_called_by_their_fault():
@@ -260,18 +234,6 @@ def test_stages_are_not_taken_from_a_calibration_that_failed(monkeypatch):
         np.testing.assert_allclose(one.sigmas, other.sigmas, rtol=1e-12)
 
 
-@pytest.mark.parametrize("label", ["samaan", "samaan, diagonal", "griffith", "griffith, all"])
-def test_streams_give_filters_the_same(label):
-    method = next(method for method in METHODS if method.label == label)
-    obs = observations(n_frames=40)
-    stream = method.calibrate(obs, sc.paper.paper_start())
-    table = sc.calibrate(
-        obs, sc.paper.paper_start(), method=method.method, recursion=method.recursion
-    )
-    np.testing.assert_allclose(stream.theta, table.theta, rtol=1e-12)
-    np.testing.assert_allclose(stream.sigmas, table.sigmas, rtol=1e-9)
-
-
 def test_a_method_that_fails_is_counted(monkeypatch):
     calls = []
 
@@ -306,25 +268,6 @@ def test_a_method_that_never_works_is_an_error(monkeypatch):
 # --- workers, interrupts ---
 
 
-def _same(a, b):
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-
-
-def test_workers_do_not_change_a_bit_and_progress_is_told():
-    calls = []
-    alone = replicate(n_replicates=7, workers=0, **SMALL)
-    both = replicate(
-        n_replicates=7, workers=2, progress=lambda done, total: calls.append((done, total)), **SMALL
-    )
-    _same(alone, both)
-    assert calls[-1] == (7, 7)
-    shorter = replicate(n_replicates=3, workers=0, **SMALL)
-    np.testing.assert_array_equal(shorter.estimates, alone.estimates[:, :3])
-    other = replicate(n_replicates=3, workers=0, **(SMALL | {"seed": 6}))
-    assert (other.estimates != shorter.estimates).all()
-
-
 def test_interrupt_keeps_what_is_done():
     def press(done, total):
         if done >= 4:
@@ -338,33 +281,6 @@ def test_interrupt_keeps_what_is_done():
     np.testing.assert_array_equal(found.estimates[:, found.replicate < 2], first.estimates)
 
 
-def test_interrupted_replicates_go_on_with_what_was_kept(tmp_path):
-    def press(done, total):
-        if done == 2:
-            signal.raise_signal(signal.SIGINT)
-
-    assert replicate(n_replicates=4, workers=0, keep=tmp_path, progress=press, **SMALL).interrupted
-    told = []
-    resumed = replicate(
-        n_replicates=4,
-        workers=0,
-        keep=tmp_path,
-        progress=lambda done, _: told.append(done),
-        **SMALL,
-    )
-    assert told == [3, 4]
-    _same(resumed, replicate(n_replicates=4, workers=0, **SMALL))
-
-
-def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("starcal_uq.paper.replicates.run_replicate", stop)
-    with pytest.raises(KeyboardInterrupt):
-        replicate(n_replicates=3, workers=0, **SMALL)
-
-
 # --- surface ---
 
 
@@ -374,21 +290,11 @@ def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
         ({"methods": ()}, "no methods to compare"),
         ({"methods": METHODS[:1] * 2}, "several methods have the label 'least squares'"),
         ({"start": camera("none")}, "give both the same"),
-        ({"n_replicates": 1}, "n_replicates is 1"),
-        ({"min_stars": 2}, "min_stars is 2"),
-        ({"sigma_px": 0.0}, "sigma_px is 0"),
-        ({"sigma_px": float("nan")}, "sigma_px is nan"),
     ],
 )
 def test_bad_settings_are_one_sentence(options, words):
     with pytest.raises((SamplingError, SettingError), match=words):
         replicate(**options)
-
-
-def test_a_field_without_stars_says_so():
-    narrow = sc.paper.paper_camera().replace(focal_mm=2000.0)
-    with pytest.raises(CatalogueError, match="raise max_mag"):
-        replicate(truth=narrow, n_replicates=2, n_frames=5, max_mag=2.0, workers=0)
 
 
 def test_table(found):
@@ -492,6 +398,8 @@ def test_methods_that_ignore_or_decouple_are_biased_by_many_sigmas(many):
         assert abs(row["bias_over_spread"]) > 15.0
         assert row["coverage95"] == 0.0
         assert "biased by" in row["verdict"]
+        # What is claimed is the scatter about the wrong mean.
+        assert 0.8 < row["claimed_over_spread"] < 1.25
     for label in ("samaan", "samaan, diagonal"):
         # The distortion that is fitted to the wrong optics is eight times the true one.
         assert many.row(label, "k1")["bias"] > 5 * sc.paper.paper_camera().coefficients[0]

@@ -74,18 +74,6 @@ def fresh(**options: object) -> Plan:
 
 
 # --- quantiles of two axes
-# -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("confidence", "factor"), [(0.95, 2.44775), (0.997, 3.40856), (0.9973, 3.43933)]
-)
-def test_equal_axes_have_rayleighs_quantile(confidence, factor):
-    assert mixture_radius(4.0 * np.eye(2), confidence) == pytest.approx(2.0 * factor, rel=1e-5)
-
-
-def test_one_axis_has_the_gaussian_quantile():
-    assert mixture_radius(np.diag([0.0, 9.0]), 0.95) == pytest.approx(3.0 * 1.959964, rel=1e-5)
 
 
 def test_unequal_axes_and_mixtures_against_sampling():
@@ -112,7 +100,6 @@ def test_a_confidence_that_is_no_probability_is_refused():
 
 
 # --- information
-# --------------------------------------------------------------------------------------------------
 
 
 # A cubic lens imitates a tilt of the camera: its information has no inverse.
@@ -186,7 +173,6 @@ def test_window_of_the_detector():
 
 
 # --- forecast
-# --------------------------------------------------------------------------------------------------
 
 
 def test_paper_set_up():
@@ -354,7 +340,6 @@ def even_sky(n: int) -> sc.StarCatalogue:
 
 
 # --- frames for a target
-# ---------------------------------------------------------------------------------------------
 
 
 def test_frames_needed_keep_the_target_and_fewer_do_not():
@@ -424,7 +409,6 @@ def test_data_that_are_there_already_count():
 
 
 # --- sweeps
-# --------------------------------------------------------------------------------------------------
 
 
 def test_sweeps_change_one_thing():
@@ -473,7 +457,6 @@ def test_the_noise_model_of_a_calibration_gives_stars_the_noise_of_their_place()
 
 
 # --- distortion that the sheet leaves open
-# ---------------------------------------------------------------------------
 
 
 def sheet(percent: float = 0.0, distortion: str = "brown") -> sc.Camera:
@@ -599,7 +582,6 @@ def test_calibrations_of_a_second_make_err_as_much_more_with_barrel_distortion()
 
 
 # --- refusals, words and files
-# ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from starcal_uq.presentation.pages import printing
 from starcal_uq.presentation.report.drawing import FIGURES, Ahead, draw_figures
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.summary import terminal_summary, verdict_lines
-from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, weak_directions
+from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.onboard_error import EffectError, OnboardError
 from tests.helpers.scenes import camera, nominal, observations
@@ -209,6 +209,8 @@ def test_without_a_browser_a_pdf_takes_one_sentence(run, unpainted, monkeypatch,
 
 
 def test_figures_are_files_too(full):
+    for name in ("corner", "residuals"):
+        assert (full.figures / f"{name}.svg").stat().st_size > 20_000, "figures are painted"
     names = {path.stem for path in full.figures.glob("*.svg")}
     assert names == {
         "attitude",
@@ -255,20 +257,6 @@ def test_parameters_are_those_of_the_posterior(full):
     assert all(row["prior"] for row in rows)
 
 
-def test_digits_end_at_the_second_digit_of_sigma(full):
-    for row in parameter_rows(sc.Run(full.path).results):
-        assert len(row["sigma"].replace(".", "").lstrip("0")) == 2
-        assert len(row["estimate"].partition(".")[2]) == len(row["sigma"].partition(".")[2])
-
-
-def test_field_map_and_distortion_in_words(full):
-    text = page(full).text
-    assert "Equivalent principal point" in text
-    assert "the distortion is" in text
-    field = sc.Run(full.path).results.field_map
-    assert f"{significant(field.equivalent_principal_point_px[0])} px" in text
-
-
 def test_attitude_table(full):
     error = sc.Run(full.path).results.attitude
     rows = attitude_rows(error)
@@ -278,12 +266,6 @@ def test_attitude_table(full):
     held = [row["figures"][-1] for row in rows]
     assert all(len(row[group]) == 4 for row in held for group in ("sigma", "p95", "p997"))
     assert float(held[1]["sigma"][0]) == pytest.approx(error.common_arcsec[0], rel=0.05)
-
-
-def test_weak_direction_names_the_distortion(full):
-    rows = weak_directions(sc.Run(full.path).results.coupling)
-    assert rows[0]["words"].startswith("k1 against")
-    assert str(rows[0]["weights"][0][0]).startswith("<i>")
 
 
 def test_without_posterior_the_report_says_which_command_makes_it(run, unpainted):
@@ -453,11 +435,9 @@ def test_no_calibration_no_report(tmp_path):
         sc.report(sc.runs.RunFolder(tmp_path / "empty").create().path)
 
 
-@pytest.mark.parametrize("model", ["none", "brown_tangential", "inverse"])
+@pytest.mark.parametrize("model", ["none", "brown_tangential"])
 def test_every_model_and_a_given_noise(model, tmp_path):
-    """Nothing is written for five parameters: without coefficients, with four, and in the other
-    direction.
-    """
+    """Nothing is written for five parameters: without coefficients, and with four."""
     truth = camera(model)
     obs = observations(model, n_frames=60)
     run = sc.runs.RunFolder(tmp_path / "run").create()
@@ -469,22 +449,6 @@ def test_every_model_and_a_given_noise(model, tmp_path):
     assert f"Distortion model “{model}”" in text
     assert "was given as 0.05" in text
     assert len(parameter_rows(sc.Run(run.path).results)) == len(cal.theta) + 2
-
-
-def test_real_data(real_data, tmp_path):
-    """Centroids of a real camera: noise and optics as known, and the warning on undeclared
-    directions.
-    """
-    start = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
-    obs = sc.load_observations(real_data / "esa_tetra3_observations.csv", start)
-    run = sc.runs.RunFolder(tmp_path / "run").create()
-    obs.save(run.observations)
-    cal = sc.calibrate(obs, start)
-    cal.save(run.calibration)
-    sc.sample(obs, cal, seed=1, n_steps=50).save(run.posterior)
-    text = words(run)
-    assert "567 stars in 8 frames" in text
-    assert "Neither time nor observer velocity was declared" in text
 
 
 def both_figures(error) -> dict[str, list[str]]:

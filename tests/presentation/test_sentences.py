@@ -9,6 +9,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -57,12 +58,15 @@ def made(tree: ast.AST) -> Iterator[ast.Call]:
             yield node
 
 
-def below() -> Iterator[tuple[str, ast.Module]]:
-    """The modules of the wings below presentation."""
+@cache
+def below() -> list[tuple[str, ast.Module]]:
+    """The modules of the wings below presentation that make findings."""
+    found = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        place = path.relative_to(PACKAGE)
-        if place.parts[0] not in ABOVE:
-            yield str(place), ast.parse(path.read_text(encoding="utf-8"))
+        place, text = path.relative_to(PACKAGE), path.read_text(encoding="utf-8")
+        if place.parts[0] not in ABOVE and any(f"{maker}(" in text for maker in MAKERS):
+            found.append((str(place), ast.parse(text)))
+    return found
 
 
 def worded(tree: ast.AST) -> list[str]:

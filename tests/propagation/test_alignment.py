@@ -276,25 +276,3 @@ def test_an_alignment_that_is_none_is_refused() -> None:
             propagate(POST, frames, **options)  # type: ignore[arg-type]
     with pytest.raises(SettingError, match="alignment_frames is 0: give a whole number from 1"):
         propagate(POST, frames, alignment_frames=0)  # type: ignore[arg-type]
-
-
-def test_the_file_keeps_alignment_and_covariances(tmp_path) -> None:  # type: ignore[no-untyped-def]
-    found = propagate(POST, table(scenes()["slew"][1]), n_draws=20)  # type: ignore[arg-type]
-    found.save(tmp_path / "attitude.csv")
-    again = AttitudeError.load(tmp_path / "attitude.csv")
-    assert again.alignment == found.alignment
-    for name in (
-        "total_arcsec",
-        "rest_constant_arcsec",
-        "covariance_arcsec2",
-        "alignment_covariance_arcsec2",
-    ):
-        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
-    sigma = [np.sqrt(np.diag(matrix)) for matrix in found.covariance_arcsec2[:4]]
-    parts = [
-        found.nea_arcsec,
-        found.common_arcsec,
-        found.rest_arcsec,
-        found.calibration_total_arcsec,
-    ]
-    np.testing.assert_allclose(sigma, parts, rtol=1e-9)

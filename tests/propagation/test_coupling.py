@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -65,26 +63,6 @@ def test_directions_of_two_correlated_parameters(r):
         )
 
 
-def test_inflation_is_the_price_of_not_knowing_the_others(found):
-    scale = 1 / found.sigma_marginal
-    precision = np.linalg.inv(found.covariance * np.outer(scale, scale))
-    assert np.allclose(found.variance_inflation, np.diag(precision))
-    assert np.allclose(found.crlb_sigma, found.sigma_marginal, rtol=1e-6)
-    assert found.contraction is None
-
-
-def test_contraction_is_the_share_of_the_prior_variance_that_went(calibrated, found):
-    priors = SimpleNamespace(sd=lambda names: 3.0 * found.sigma_marginal)
-    names = ("camera", "covariance", "information", "rotation_per_theta", "attitude_noise")
-    contracted = sc.coupling(
-        SimpleNamespace(priors=priors, **{name: getattr(calibrated, name) for name in names})
-    )
-    assert np.allclose(contracted.contraction, 8.0 / 9.0, rtol=1e-12)
-    assert np.array_equal(contracted.covariance, found.covariance)
-    assert np.array_equal(contracted.to_dataframe()["contraction"], contracted.contraction)
-    assert "contraction" not in found.to_dataframe()
-
-
 def test_principal_point_and_boresight_are_one_near_gauge(calibrated, found):
     names = found.extended_names
     e = found.extended_correlation
@@ -119,13 +97,6 @@ def test_common_rotation_is_what_a_wrong_principal_point_does():
         turned = rotation_vector(likelihood.rotations_at(theta) @ base.transpose(0, 2, 1))
         expected = cal.rotation_per_theta[:, index] * step
         assert np.allclose(np.mean(turned, axis=0), expected, rtol=5e-3, atol=2e-9)
-
-
-def test_table_and_page(found):
-    table = found.to_dataframe()
-    assert list(table["parameter"]) == ["x0", "y0", "f", "k1", "k2"]
-    assert {"corr_pitch", "corr_yaw", "corr_roll", "variance_inflation"} <= set(table.columns)
-    assert "poorly determined" in found._repr_html_()
 
 
 @pytest.mark.parametrize("model", ["none", "brown_tangential"])

@@ -38,28 +38,6 @@ def paper_curve() -> DistortionCurve:
     return distortion_curve(gaussian_posterior(), observations(), n=41, n_draws=2000)
 
 
-def test_mean_is_the_formula() -> None:
-    """Distorted minus ideal is u (k1 u^2 + k2 u^4) at the ideal radius u of a point seen at radius
-    r.
-    """
-    found = paper_curve()
-    k1, k2 = camera("brown").coefficients
-    r = found.radius_px
-    u = r.copy()
-    for _ in range(20):
-        u = r - u * (k1 * u**2 + k2 * u**4)
-    np.testing.assert_allclose(
-        found.mean_px[0], r - u, atol=4 * found.sd_px[0].max() / np.sqrt(2000) + 1e-12
-    )
-    assert found.mean_px.shape == (1, 41)
-    np.testing.assert_allclose(
-        found.radius_px, np.arange(41) * np.hypot(523.5, 530.5) / 40.0, rtol=1e-12
-    )
-    f = camera("brown").theta[2]
-    assert found.arcsec_per_px[0] == pytest.approx(206264.806 / f)
-    assert found.arcsec_per_px[-1] < found.arcsec_per_px[0]
-
-
 def test_both_directions_of_a_model_give_the_same_sign() -> None:
     """``inverse`` maps distorted to ideal points; the curve shows distorted minus ideal all the
     same.

@@ -508,6 +508,8 @@ def test_a_file_holds_each_number_in_its_column(tmp_path: Path) -> None:
         else:
             assert (table[name] == np.broadcast_to(np.asarray(values, dtype=str), 20)).all(), name
     assert [bool(text) for text in table["misfit"]] == [True] + [False] * 19
+    before = dataclasses.replace(made, analytic_total_arcsec=None).to_dataframe()
+    np.testing.assert_allclose(before["first_order_arcsec"][12:15], np.hypot(*analytic[1:3]))
     untested = dataclasses.replace(made, misfit=None).to_written()
     for name in untested.columns:
         assert (untested[name].astype(str) == "not assessed").all() == ("with_misfit_found" in name)

@@ -97,21 +97,6 @@ def test_integral_is_the_variance_and_that_of_the_table() -> None:
     np.testing.assert_allclose(found.share_below(1.0), 1.0)
 
 
-def test_error_changes_slowly_and_a_shuffled_series_does_not() -> None:
-    found = spectrum()
-    assert (found.share_below(0.05) > 0.85).all()
-    assert (found.correlation_time_s > 5.0).all()
-    assert (found.autocorrelation[0] == 1.0).all()
-    # Control: the same frames in random order are white.
-    obs = frames()
-    order = np.random.default_rng(3).permutation(obs.n_frames)
-    shuffled = dataclasses.replace(obs, frame=order[obs.frame])
-    white = error_spectrum(posterior(), shuffled, np.arange(601.0), n_draws=5)
-    assert (white.correlation_time_s < 1.0).all()
-    np.testing.assert_allclose(white.share_below(0.05), 0.1, atol=0.05)
-    np.testing.assert_allclose(white.variance_arcsec2, found.variance_arcsec2, rtol=3e-3)
-
-
 def test_correlation_is_that_of_the_draws() -> None:
     post, obs = posterior(40), frames()
     found = error_spectrum(post, obs, n_draws=40)
@@ -121,14 +106,6 @@ def test_correlation_is_that_of_the_draws() -> None:
             rest[:, lag:] * rest[:, : len(found.time_s) - lag], axis=(0, 1)
         ) / np.mean(rest**2, (0, 1))
         np.testing.assert_allclose(found.autocorrelation[lag], expected, atol=0.03)
-
-
-def test_a_faster_slew_changes_the_error_faster() -> None:
-    """The same path of the sky in half the time: the same sizes, half the correlation time."""
-    slow = error_spectrum(posterior(), frames(0.1, 1201), n_draws=5)
-    fast = error_spectrum(posterior(), frames(0.2, 601), n_draws=5)
-    np.testing.assert_allclose(fast.rest_arcsec, slow.rest_arcsec, rtol=0.02)
-    np.testing.assert_allclose(slow.correlation_time_s / fast.correlation_time_s, 2.0, rtol=0.1)
 
 
 def test_averages_are_those_of_the_series() -> None:

@@ -91,7 +91,6 @@ def moments(image: np.ndarray[Any, Any]) -> tuple[float, float, np.ndarray[Any, 
 
 
 # --- light
-# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.8, 1.0, 2.5])
@@ -171,7 +170,6 @@ def test_a_profile_is_the_integral_of_the_gaussian() -> None:
 
 
 # --- smear
-# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("length_px", [0.5, 3.0, 20.0, 60.0])
@@ -233,7 +231,6 @@ def test_a_roll_smears_the_corner_and_not_the_boresight() -> None:
 
 
 # --- noise
-# --------------------------------------------------------------------------------------------------
 
 
 def noise_table(claimed: Sensor) -> np.ndarray[Any, Any]:
@@ -341,7 +338,6 @@ def test_the_default_star_of_magnitude_six_is_located_to_a_twentieth_of_a_pixel(
 
 
 # --- electronics
-# --------------------------------------------------------------------------------------------------
 
 
 def test_bright_stars_stop_at_the_full_well_and_at_the_end_of_the_converter() -> None:
@@ -411,7 +407,6 @@ def test_rendering_is_quick_beyond_its_noise_arrays(stars: StarCatalogue) -> Non
 
 
 # --- the sensor
-# --------------------------------------------------------------------------------------------------
 
 
 def test_a_psf_radius_becomes_a_sigma() -> None:
@@ -479,7 +474,6 @@ def test_what_cannot_be_rendered_is_said(options: dict[str, Any], message: str) 
 
 
 # --- files
-# --------------------------------------------------------------------------------------------------
 
 
 def test_frames_are_those_of_the_simulation(stars: StarCatalogue, tmp_path: Path) -> None:

@@ -161,7 +161,6 @@ def test_a_star_that_saturates_is_located_no_better_than_one_that_does_not() -> 
 
 
 # --- the photon limit
-# --------------------------------------------------------------------------------------------------
 
 
 def limits(sensor: Sensor, stars: sc.StarCatalogue, n_frames: int) -> tuple[np.ndarray, np.ndarray]:
@@ -229,7 +228,6 @@ def test_a_doctored_noise_is_found_below_the_limit() -> None:
 
 
 # --- the file
-# --------------------------------------------------------------------------------------------------
 
 
 def test_the_aperture_goes_through_the_file(tmp_path: Path) -> None:

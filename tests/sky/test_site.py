@@ -65,8 +65,7 @@ def stars():
     return sc.load_catalogue(max_mag=6.5, epoch=2026.9)
 
 
-# --------------------------------------------------------------------------------------------------
-# site
+# --- site
 
 
 def test_site_goes_through_its_file(tmp_path):
@@ -134,8 +133,7 @@ def test_wrong_sites_are_refused(tmp_path):
         Site(52.0, 4.0, temperature_c=288.0)
 
 
-# --------------------------------------------------------------------------------------------------
-# sky
+# --- sky
 
 
 def _astropy():
@@ -325,8 +323,7 @@ def test_the_table_of_real_stars(real_data):
     assert left(replace(cold, longitude_deg=-4.51)) > 5.0
 
 
-# --------------------------------------------------------------------------------------------------
-# observations
+# --- observations
 
 
 def test_make_apparent_at_a_site(stars):
@@ -411,8 +408,7 @@ def test_refraction_moves_f_and_the_site_puts_it_right(stars):
     assert wrong.theta[2] - CAMERA.theta[2] == pytest.approx(-predicted, abs=4.0 * wrong.sigmas[2])
 
 
-# --------------------------------------------------------------------------------------------------
-# identification
+# --- identification
 
 
 def _bootstrap(obs, stars, site, *, moved=True, flip=False):
@@ -498,8 +494,7 @@ def test_night_is_night():
     assert all(re.fullmatch(r"2026-11-25T\d\d:\d\d:00", time) for time in night(30))
 
 
-# --------------------------------------------------------------------------------------------------
-# report
+# --- report
 
 
 def _first_paragraph(obs, **meta):
@@ -571,8 +566,7 @@ def test_report_states_site_air_and_what_refraction_does(stars):
     assert "more than the sigma of f: state pressure and temperature" in sharper
 
 
-# --------------------------------------------------------------------------------------------------
-# images
+# --- images
 
 
 @pytest.mark.parametrize(

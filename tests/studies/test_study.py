@@ -18,7 +18,7 @@ from starcal_uq.simulation.sensor import Sensor
 from starcal_uq.studies import TEMPLATES, Study, StudyDefinition, cells, write_study_template
 from starcal_uq.studies.axes import camera_of
 from starcal_uq.studies.geometry import Geometry, GeometryKey, Heaven, statements, take_frames
-from tests.helpers.crashes import small_files, snapshots
+from tests.helpers.crashes import snapshots
 
 ARCSEC = 648_000.0 / np.pi
 
@@ -51,7 +51,6 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 # --- what a cell says
-# ------------------------------------------------------------------------------------------------
 
 
 def test_parameters_of_a_study_have_their_own_units(small: Study, tmp_path: Path) -> None:
@@ -326,7 +325,6 @@ def test_a_simpler_model_is_biased_as_a_fit_of_it_is() -> None:
 
 
 # --- cameras
-# --------------------------------------------------------------------------------------------------
 
 
 def test_other_pixels_are_the_same_optics() -> None:
@@ -359,7 +357,6 @@ def test_the_corner_moves_as_far_as_asked_for(model: str, size: float) -> None:
 
 
 # --- cells that have no numbers, cells that are there already
-# ---------------------------------------------------------
 
 
 def test_what_cannot_be_is_said_of_its_cell_and_the_study_goes_on() -> None:
@@ -454,31 +451,6 @@ def results(folder: Path) -> list[bytes]:
     return [(folder / name).read_bytes() for name in ("study.nc", "study.parquet", "report.html")]
 
 
-def test_a_full_disk_leaves_the_study_of_before(tmp_path: Path) -> None:
-    old = sc.study(definition(sweep={"frames": (250, 500)}), out=tmp_path, workers=0)
-    for largest in (3_000, 40_000):
-        with (
-            small_files(largest),
-            pytest.raises(RunFolderError, match=r"cannot be written .*free space"),
-        ):
-            sc.study(definition(seed=2), out=tmp_path, workers=0, force=True)
-        assert same(Study.load(tmp_path), old)
-    assert sc.study(definition(seed=2), out=tmp_path, workers=0).complete
-
-
-def test_a_file_of_the_user_stays(tmp_path: Path) -> None:
-    sheet = definition(sweep={"frames": (250,)})
-    (tmp_path / "study.parquet").write_text("mine")
-    with pytest.raises(RunFolderError, match="not empty"):
-        sc.study(sheet, out=tmp_path, workers=0)
-    with pytest.raises(RunFolderError, match=r"study\.parquet: is in the way of a result"):
-        sc.study(sheet, out=tmp_path, workers=0, force=True)
-    assert (tmp_path / "study.parquet").read_text() == "mine"
-    (tmp_path / "calibration.json").write_text("{}")
-    with pytest.raises(RunFolderError, match="results of another command"):
-        sc.study(sheet, out=tmp_path, workers=0, force=True)
-
-
 def test_an_interrupted_study_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("starcal_uq.studies.study._BATCH_S", 1e-9)
     whole = sc.study(definition(), workers=0)
@@ -529,7 +501,6 @@ def test_cells_that_differ_in_noise_frames_or_prior_share_their_frames(
 
 
 # --- definitions
-# --------------------------------------------------------------------------------------------------
 
 CAMERA = paper_camera().to_dict()
 
