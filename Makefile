@@ -66,7 +66,8 @@ lint-style:
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-docs: .venv/.installed-docs ## the documentation, into docs/_build/html; a warning is an error
+docs: .venv/.installed-docs ## the documentation, into docs/_build/html; a warning, or a word against docs/style.toml, is an error
+	$(BIN)/python scripts/prose.py
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env docs docs/_build/html
 
 bench: .venv/.installed-test ## the package beside its rivals, and with BENCH="--large --write" the tables of the documentation

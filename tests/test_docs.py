@@ -1,5 +1,5 @@
-"""The how-to pages: every command has an example, and what is not run at every build is of the
-lines that it shows.
+"""The pages: every command has an example, recordings match their lines, and prose keeps to the
+house style.
 """
 
 from __future__ import annotations
@@ -49,3 +49,21 @@ def test_examples_are_what_their_lines_print(example, tmp_path):
     assert example.output_of(f"echo {tmp_path}/run", tmp_path) == "run"
     with pytest.raises(RuntimeError, match="status 2"):
         example.output_of("exit 2", tmp_path)
+
+
+def test_prose_keeps_to_the_style():
+    """Of pages and notebooks; codespell and proselint run in `make docs`."""
+    from scripts.prose import against_style, pages, prose_of
+
+    found = pages()
+    assert {"README.md", "tour.md", "quickstart.ipynb"} <= {page.name for page in found}
+    slips = {str(page.relative_to(ROOT)): list(against_style(prose_of(page))) for page in found}
+    assert {page: slip for page, slip in slips.items() if slip} == {}
+
+
+def test_the_style_is_looked_for_in_prose_alone(tmp_path):
+    from scripts.prose import against_style, prose_of
+
+    page = tmp_path / "page.md"
+    page.write_text("# A\n\n```text\ngoes on\n```\n\n    goes on\n\n`goes on`\nThis goes\non.\n")
+    assert list(against_style(prose_of(page))) == [(10, "goes on", "continues")]
