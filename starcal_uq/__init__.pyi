@@ -42,6 +42,7 @@ from .runs.exchange import export as export
 from .runs.exchange import uncertain_values as uncertain_values
 from .runs.report import report as report
 from .runs.run import Run as Run
+from .runs.whole import run as run
 from .simulation.frames import simulate as simulate
 from .sky.catalogue import StarCatalogue as StarCatalogue
 from .sky.catalogue import load_catalogue as load_catalogue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -255,3 +256,15 @@ def progress_bar(label: str) -> Iterator[Progress | None]:
     with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task(label, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def working(label: str) -> Iterator[Progress | None]:
+    """A bar for a step; what the likelihood of a sampling warns of is printed after it."""
+    from starcal_uq.inference.named import NaivePairsWarning
+
+    with progress_bar(label) as progress, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", NaivePairsWarning)
+        yield progress
+    for warning in caught:
+        tell(f"warning: {warning.message}")

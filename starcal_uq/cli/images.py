@@ -3,31 +3,35 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
-from starcal_uq.cli.console import note, print_table, progress_bar, say, tell, warn_undeclared
+from starcal_uq.cli.console import (
+    note,
+    print_table,
+    progress_bar,
+    say,
+    tell,
+    warn_undeclared,
+    working,
+)
 from starcal_uq.cli.options import check_same_sensor
 from starcal_uq.cli.settings import (
     DetectionSettings,
     IdentificationSettings,
-    ImageSettings,
     PlaceSettings,
-    SkySettings,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import UNFINISHED, ensure_new, table_ending
 from starcal_uq.core.formatting import plural
 
 if TYPE_CHECKING:
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations
     from starcal_uq.pipeline.refine import ImageCalibration
+    from starcal_uq.runs.whole import Watch
 
 
 def centroid_command(
@@ -175,48 +179,19 @@ def inspect_command(
     return Answer({"run": run, "page": page, "frames": chosen.to_dataframe(), "text": chosen.text})
 
 
-def load_images(
-    images: list[Path],
-    camera_path: Path | None,
-    settings: ImageSettings,
-    sky: SkySettings,
-    model: str | None,
-    keep: Path,
-    seen: Callable[[Centroids, Identification | None], None],
-) -> tuple[Observations, Camera, Centroids, ImageCalibration]:
-    """Observations of images with the nominal camera, and what is worth telling; `keep` is a folder
-    to go on from.
+def watching(epoch: float | None = None) -> Watch:
+    """What a terminal shows while a run is made, of images whose stars are of an `epoch`, if one is
+    stated.
     """
-    from starcal_uq.pipeline.images import observations_from_images
+    from starcal_uq.runs.whole import Watch
 
-    known, camera = sky.options(), None if camera_path is None else sc.Camera.load(camera_path)
-    with progress_bar("images") as progress:
-        obs, centroids, found = observations_from_images(
-            images,
-            camera,
-            max_mag=settings.max_mag,
-            epoch=settings.epoch,
-            gain_e_per_count=settings.gain,
-            time_utc=sky.time,
-            bayer=settings.bayer,
-            focal_tolerance=0.03 if settings.focal_tolerance is None else settings.focal_tolerance,
-            engine=settings.engine or "pyramid",
-            model=model,
-            workers=None,
-            tell=tell,
-            seen=seen,
-            progress=progress,
-            keep=keep,
-            **known,
-        )
-    _say_epoch(centroids, settings.epoch)
-    for words in (found.identification.text, found.text):
-        tell(words)
-    _say_disturbed(obs)
-    # Of mirrored images x is counted from the right edge, and so is this camera's.
-    nominal = found.rounds[0][0].nominal
-    warn_undeclared(obs, nominal)
-    return obs, nominal, centroids, found
+    def identified(centroids: Centroids, found: ImageCalibration, obs: Observations) -> None:
+        _say_epoch(centroids, epoch)
+        for words in (found.identification.text, found.text):
+            tell(words)
+        _say_disturbed(obs)
+
+    return Watch(tell, working, identified, warn_undeclared)
 
 
 def _say_epoch(centroids: Centroids, epoch: float | None) -> None:

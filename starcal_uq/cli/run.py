@@ -5,9 +5,8 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -15,14 +14,13 @@ import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import (
     note,
-    progress_bar,
     show_calibration,
     show_screening,
     show_summary,
     tell,
     warn_air,
 )
-from starcal_uq.cli.images import load_images
+from starcal_uq.cli.images import watching
 from starcal_uq.cli.mission import tell_violations
 from starcal_uq.cli.settings import (
     EstimationSettings,
@@ -36,25 +34,13 @@ from starcal_uq.cli.settings import (
     settings_of,
     typed_words,
 )
-from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.conflicts import conflict, parsed
-from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
+from starcal_uq.core.errors import PriorError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.toml import read_section
 
 if TYPE_CHECKING:
-    from starcal_uq.identification.result import Identification
-    from starcal_uq.images.centroids import Centroids
-    from starcal_uq.observations.partitions import PartitionedObservations
-    from starcal_uq.observations.table import Observations
-    from starcal_uq.presentation.report.drawing import Ahead
     from starcal_uq.runs.run import Run
-
-# From so many stars on, half of the diagnosis is worth another process.
-_APART_STARS = 50_000
-# Frames on the page of a run that has failed.
-_FAILED_FRAMES = 24
 
 
 def demo(
@@ -65,6 +51,7 @@ def demo(
 ) -> Answer:
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
     from starcal_uq.presentation.report.drawing import Ahead
+    from starcal_uq.runs.whole import finish
 
     run = sc.Run(out, tell=note)
     command = {"command": "demo", "frames": frames, "seed": seed}
@@ -80,7 +67,7 @@ def demo(
             tell("Calibrating from f = 72 mm and the detector's centre ...")
             run.calibrate(obs, sc.paper.paper_start())
         show_calibration(run.calibration, truth)
-        _after_calibration(run, ahead, SamplingSettings(seed=seed), PropagationSettings())
+        finish(run, ahead, {}, seed=seed, watch=watching())
     return _conclude(run)
 
 
@@ -100,13 +87,14 @@ def run_command(
     """
     from starcal_uq.pipeline.images import are_images
     from starcal_uq.presentation.report.drawing import Ahead
+    from starcal_uq.runs.whole import calibrate_source, finish
 
     run = sc.Run(out, tell=note)
     if budget is not None:
         # A mistake in it should not show after the work.
         sc.budgeting.load_budget_file(budget)
-    if (profile := propagation.temperature_profile) is not None:
-        sc.propagation.load_temperature_profile(profile)
+    if propagation.temperature_profile is not None:
+        sc.propagation.load_temperature_profile(propagation.temperature_profile)
         _refuse_profile(estimation.effects)
     if sampling.priors is not None:
         read_section(sampling.priors, "priors", PriorError, alone=False)
@@ -148,17 +136,36 @@ def run_command(
     files = {f"input {number}": path for number, path in enumerate(inputs)}
     files |= {} if camera is None else {"camera": camera}
     command = command_of("run", settings, files)
+    options = {
+        **estimation.options(),
+        **sky.options(),
+        **images.options(),
+        **sampling.options(),
+        **vars(propagation),
+        "budget": budget,
+    }
+    if from_images:
+        # As many processes as there are processors.
+        options["workers"] = None
+    watch = watching(images.epoch)
     with run.making(command, force=force, words=typed_words(sys.argv[1:])), Ahead() as ahead:
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
-            # Priors may determine what the data leave open.
-            undetermined = sampling.priors is not None
-            _calibrate(run, inputs, camera, from_images, estimation, undetermined, sky, images)
+            calibrate_source(
+                run,
+                inputs,
+                None if camera is None else sc.Camera.load(camera),
+                options,
+                started=estimation.started,
+                watch=watch,
+                images=from_images,
+            )
+            if from_images:
+                _tell_other_cameras(run)
+            if run.screening is not None:
+                show_screening(run.screening)
         show_calibration(run.calibration, run.truth)
         warn_air(run.observations, run.calibration)
-        if profile is not None and not _follows_temperature(run):
-            note(f"The data ask for no effect of the temperature: {profile} is left out.")
-            propagation = replace(propagation, temperature_profile=None)
-        _after_calibration(run, ahead, sampling, propagation, budget)
+        finish(run, ahead, options, seed=sampling.seed, watch=watch)
     return _conclude(run)
 
 
@@ -169,58 +176,6 @@ def _refuse_profile(effects: str | None) -> None:
             f"--temperature-profile needs the effect temperature, which --effects {effects} leaves "
             "out: add it, or leave the profile out."
         )
-
-
-def _follows_temperature(run: Run) -> bool:
-    effects = run.calibration.effects
-    return effects is not None and "temperature" in effects.names
-
-
-def _calibrate(
-    run: Run,
-    inputs: list[Path],
-    camera: Path | None,
-    from_images: bool,
-    estimation: EstimationSettings,
-    undetermined: bool,
-    sky: SkySettings,
-    images: ImageSettings,
-) -> None:
-    """From the inputs to a calibration, with a bar."""
-    obs: Observations | PartitionedObservations
-    seen: list[Any] = []
-    try:
-        if from_images:
-            obs, nominal, centroids, identified = load_images(
-                inputs,
-                camera,
-                images,
-                sky,
-                estimation.model,
-                run.folder.path,
-                lambda *known: seen.append(known),
-            )
-        elif camera is not None:
-            obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
-        with progress_bar("passes over the files") as progress:
-            nominal = estimation.started(nominal)
-            run.calibrate(
-                obs, nominal, undetermined=undetermined, progress=progress, **estimation.options()
-            )
-    except (IdentificationError, CalibrationError) as error:
-        # Where no image could be measured there is nothing to be looked at.
-        if seen and seen[-1][0].origin.optics:
-            page = _keep_failed(run, inputs, camera, *seen[-1])
-            error.args = (f"{error} Every frame, with its detections and its reason: {page}",)
-        raise
-    if from_images:
-        run.keep_images(centroids, identified, inputs)
-        _tell_other_cameras(run)
-        from starcal_uq.core.store import finished
-
-        finished(run.folder.path)
-    if run.screening is not None:
-        show_screening(run.screening)
 
 
 # Options that hold for the images of another camera as well.
@@ -240,71 +195,6 @@ def _tell_other_cameras(run: Run) -> None:
         note(
             f"{images} of another camera ({other.words}) left out; to calibrate that one: {command}"
         )
-
-
-def _keep_failed(
-    run: Run,
-    inputs: list[Path],
-    camera: Path | None,
-    centroids: Centroids,
-    identification: Identification | None,
-) -> Path:
-    """What there is to be looked at of images that could not be calibrated: their table and a page
-    of their frames.
-    """
-    sheet = None if camera is None else sc.Camera.load(camera)
-    if sheet is None and identification is not None and identification.optics is not None:
-        sheet = identification.nominal
-    run.keep_images(centroids, identification, inputs, sheet)
-    return run.keep_frames(run.frames.telling(_FAILED_FRAMES), force=True)
-
-
-@one_thread()
-def _after_calibration(
-    run: Run,
-    ahead: Ahead,
-    sampling: SamplingSettings,
-    propagation: PropagationSettings,
-    budget: Path | None = None,
-) -> None:
-    """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
-    from starcal_uq.diagnostics.diagnose import diagnose_apart
-    from starcal_uq.presentation.report.drawing import (
-        AFTER_BUDGET,
-        AFTER_CALIBRATION,
-        AFTER_DIAGNOSIS,
-        AFTER_PROPAGATION,
-        AFTER_SAMPLING,
-    )
-
-    apart = None
-    # With fewer stars the other process would take longer to load what it needs than this one takes
-    # for all of it.
-    many = run.calibration.partitions is None and len(run.observations) >= _APART_STARS
-    if many and not run.did("diagnose"):
-        apart = ahead.begin(
-            partial(diagnose_apart, seed=sampling.seed), run.observations, run.calibration
-        )
-    tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
-    ahead.draw(run.calibrated, AFTER_CALIBRATION)
-    if run.images is not None:
-        ahead.draw_frames(run.shown_frames)
-    if not run.did("sample"):
-        sample_run(run, sampling, force=False)
-    ahead.draw(run.results, AFTER_SAMPLING)
-    if not run.did("coupling"):
-        run.couple()
-    if not run.did("propagate"):
-        run.propagate(seed=sampling.seed, **vars(propagation))
-    ahead.draw(run.results, AFTER_PROPAGATION)
-    if not run.did("diagnose"):
-        with progress_bar("diagnosis") as progress:
-            run.diagnose(seed=sampling.seed, progress=progress, apart=apart)
-    ahead.draw(run.results, AFTER_DIAGNOSIS)
-    if not run.did("budget"):
-        run.budget(file=budget, seed=sampling.seed)
-    ahead.draw(run.results, AFTER_BUDGET)
-    run.report(ahead.figures)
 
 
 def _conclude(run: Run) -> Answer:

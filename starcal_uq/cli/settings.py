@@ -17,9 +17,12 @@ from starcal_uq.cli.answers import Answer, deliver
 from starcal_uq.cli.console import quiet
 from starcal_uq.cli.options import (
     declared,
+    parse_columns,
     parse_dof,
+    parse_frames,
     parse_position,
     parse_start,
+    parse_velocity,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.conflicts import refusal, sampled_by_default
@@ -28,7 +31,6 @@ from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.runs.run import Run
     from starcal_uq.simulation.noise import Noise
 
 
@@ -125,6 +127,16 @@ class SkySettings(PlaceSettings):
     frames: str | None = None
     observer_velocity: str | None = None
 
+    def options(self) -> AnyDict:
+        """Settings of `sc.run` that say how stars are read."""
+        return {
+            **super().options(),
+            "time": self.time,
+            "columns": parse_columns(self.column),
+            "frames": parse_frames(self.frames),
+            "observer_velocity_km_s": parse_velocity(self.observer_velocity),
+        }
+
 
 @dataclass(frozen=True)
 class ImageSettings:
@@ -136,6 +148,11 @@ class ImageSettings:
     gain: float | None = None
     bayer: settings.Bayer | None = None
     engine: str | None = None
+
+    def options(self) -> AnyDict:
+        """Those that are given, as settings of `sc.run`."""
+        given = {"gain_e_per_count" if k == "gain" else k: v for k, v in vars(self).items()}
+        return {name: value for name, value in given.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -153,18 +170,11 @@ class SamplingSettings:
     moves: settings.Moves = "mixture"
     dof: str | None = None
 
-    def options(self, run: Run) -> AnyDict:
-        """Keyword arguments of `Run.sample`."""
-        from starcal_uq.runs.priors import read_priors
-
-        options: AnyDict = {
-            **vars(self),
-            "sigma": "sampled" if self.sigma is None else self.sigma,
-            "dof": parse_dof(self.dof),
-        }
-        if self.priors is not None:
-            options["priors"] = read_priors(run, self.priors)
-        return options
+    def options(self) -> AnyDict:
+        """Keyword arguments of `Run.sample` but the seed; priors as a file."""
+        given = {name: value for name, value in vars(self).items() if name != "seed"}
+        sigma = "sampled" if self.sigma is None else self.sigma
+        return {**given, "sigma": sigma, "dof": parse_dof(self.dof)}
 
 
 @dataclass(frozen=True)

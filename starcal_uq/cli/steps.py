@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,14 +23,9 @@ from starcal_uq.cli.console import (
     show_posterior,
     show_screening,
     show_summary,
-    tell,
     warn_air,
     warn_undeclared,
-)
-from starcal_uq.cli.options import (
-    parse_columns,
-    parse_frames,
-    parse_velocity,
+    working,
 )
 from starcal_uq.cli.settings import (
     EstimationSettings,
@@ -52,34 +46,20 @@ from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
-    from starcal_uq.runs.run import Run
 
 
 def load_table(
-    path: Path | list[Path], camera_path: Path, sky: SkySettings
+    path: Path, camera_path: Path, sky: SkySettings
 ) -> tuple[Observations | PartitionedObservations, Camera]:
-    """Observations of a table, several, or a folder of them, with the nominal camera; and what is
-    worth telling.
+    """Observations of a table, or a folder of them, with the nominal camera; and what is worth
+    telling.
     """
-    from starcal_uq.pipeline.tables import observations_from_table, partitions_from_folder
+    from starcal_uq.runs.whole import read_stars
 
-    known, camera = sky.options(), sc.Camera.load(camera_path)
-    known |= {
-        "columns": parse_columns(sky.column),
-        "observer_velocity_km_s": parse_velocity(sky.observer_velocity),
-        "time_utc": sky.time,
-    }
-    obs: Observations | PartitionedObservations
-    chosen = parse_frames(sky.frames)
-    if isinstance(path, Path) and path.is_dir():
-        obs = partitions_from_folder(path, camera, **known)
-    else:
-        obs = observations_from_table(path, camera, **known)
-        if chosen is not None:
-            obs = obs.in_ranges(chosen)
+    camera = sc.Camera.load(camera_path)
+    obs = read_stars(path, camera, **sky.options())
     warn_undeclared(obs, camera)
     return obs, camera
 
@@ -186,20 +166,18 @@ def sample_command(run: Path, sampling: SamplingSettings, force: bool = False) -
     """Sample the posterior with emcee from the calibration; an interrupted command goes on where it
     stopped.
     """
-    posterior = sample_run(sc.Run(run, tell=note), sampling, force=force)
+    from starcal_uq.runs.whole import sample_run
+
+    with working("sampling") as progress:
+        posterior = sample_run(
+            sc.Run(run, tell=note),
+            sampling.options(),
+            seed=sampling.seed,
+            force=force,
+            progress=progress,
+        )
     show_posterior(posterior)
     return Answer({"run": run, "posterior": posterior}, posterior.diagnostics.level.exit_status)
-
-
-def sample_run(run: Run, sampling: SamplingSettings, *, force: bool) -> Posterior:
-    """Sample with a bar, and print what the likelihood warns of."""
-    options = sampling.options(run)
-    with progress_bar("sampling") as progress, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", sc.inference.NaivePairsWarning)
-        posterior = run.sample(force=force, progress=progress, **options)
-    for warning in caught:
-        tell(f"warning: {warning.message}")
-    return posterior
 
 
 def coupling_command(run: Path, force: bool = False) -> Answer:

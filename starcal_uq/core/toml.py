@@ -96,11 +96,11 @@ def write_section(
     atomic_write_text(path, header + tomli_w.dumps({name: dict(table)}))
 
 
-def unknown_key(key: str, known: Collection[str]) -> str:
+def unknown_key(key: str, known: Collection[str], what: str = "key") -> str:
     """Remedy for a key that is unknown: the most similar one that is known, or all of them."""
     near = difflib.get_close_matches(key, known, n=1)
     hint = f"did you mean {near[0]}?" if near else f"remove it (known: {', '.join(known)})"
-    return f"key {key} is unknown; {hint}"
+    return f"{what} {key} is unknown; {hint}"
 
 
 class Key:

@@ -12,19 +12,17 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.times import utc_text
-from starcal_uq.observations.partitions import open_partitions
-from starcal_uq.observations.table import load_observations
+from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
+from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.sky.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.observations.partitions import PartitionedObservations
-    from starcal_uq.observations.table import Observations
     from starcal_uq.sky.site import Site
 
 
 def observations_from_table(
-    path: Path | Sequence[Path],
+    path: Path | Sequence[Path] | Observations,
     camera: Camera,
     *,
     columns: Mapping[str, str] | None = None,
@@ -41,17 +39,21 @@ def observations_from_table(
     each row's ``time_utc``. With a `site` on the ground, refraction and daily aberration are
     applied too, and stars lower than ten degrees left out; `in_space`, nothing need be said of
     refraction. Rows without a time are of `time_utc`. Paths and columns are as `load_observations`
-    takes them.
+    takes them; observations are taken as they are.
     """
-    obs = load_observations(path, camera=camera, columns=columns)
-    path = path if isinstance(path, Path) else path[0]
+    if isinstance(path, Observations):
+        obs, path = path, Path("observations")
+        obs.check(camera)
+    else:
+        obs = load_observations(path, camera=camera, columns=columns)
+        path = path if isinstance(path, Path) else path[0]
     if time_utc is not None:
         _refuse_timed(path, [obs])
     return _apparent(obs, path, directions, observer_velocity_km_s, site, in_space, time_utc)
 
 
 def partitions_from_folder(
-    path: Path,
+    path: Path | PartitionedObservations,
     camera: Camera,
     *,
     columns: Mapping[str, str] | None = None,
@@ -64,7 +66,10 @@ def partitions_from_folder(
     """Open a folder of partitions, whose directions are made apparent as `observations_from_table`
     does, when read.
     """
-    obs = open_partitions(path, camera, columns)
+    if isinstance(path, PartitionedObservations):
+        obs, path = path, Path("observations")
+    else:
+        obs = open_partitions(path, camera, columns)
     if directions is not None:
         obs = obs.with_origin(directions=directions)
     if in_space:

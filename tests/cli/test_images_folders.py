@@ -44,7 +44,7 @@ def test_a_model_that_is_asked_for_is_fitted_whatever_the_sheet_has(
     cli, noisy_frame, tmp_path, monkeypatch
 ):
     # What follows the calibration is not asked about.
-    monkeypatch.setattr("starcal_uq.cli.run._after_calibration", lambda *_, **__: None)
+    monkeypatch.setattr("starcal_uq.runs.whole.finish", lambda *_, **__: None)
     monkeypatch.setattr("starcal_uq.cli.run._conclude", lambda run: Answer({"run": run.path}))
     status, _, err = cli("run", noisy_frame, "camera.toml", "-o", "run", "--model", "none", *FAST)
     assert status in (0, 1), err

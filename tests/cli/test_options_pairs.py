@@ -12,9 +12,9 @@ import pytest
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli import run as cli_run
 from starcal_uq.cli.app import FAULT
 from starcal_uq.cli.commands import app
+from starcal_uq.runs import whole
 from tests.helpers.ground_scenes import SITE
 from tests.helpers.outside import campaign
 from tests.helpers.ties import gyro, write_columns
@@ -174,7 +174,7 @@ def asked(tables, cli, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(sc.Run, "calibrate", reached)
             if not read:
-                patch.setattr(cli_run, "load_table", reached)
+                patch.setattr(whole, "read_stars", reached)
             try:
                 status, _, err = cli(*words)
             except ReachedError:

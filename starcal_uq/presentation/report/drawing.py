@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Collection
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import ExitStack, suppress
 from functools import partial
 from multiprocessing import active_children
@@ -110,12 +110,13 @@ class Ahead:
     """Another process that draws the figures of a report while what comes after them is computed; a
     context, at whose end it is gone.
 
-    It never is the only way to a result: where it failed, or there is a single processor, the
-    caller does the work.
+    It never is the only way to a result: where it failed, there is a single processor or the
+    context is not entered, the caller does the work.
     """
 
     def __init__(self) -> None:
         self._end, self._drawn = ExitStack(), list[Callable[[], Any]]()
+        self._pool: Executor | None = None
 
     def __enter__(self) -> Ahead:
         self._pool = self._end.enter_context(processes(int(processors() > 1), "run"))

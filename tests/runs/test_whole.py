@@ -1,0 +1,96 @@
+"""One call in Python does what the command ``run`` does."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.cli.app import main
+from tests.helpers.scenes import observations
+
+FEW = {"n_steps": 20, "n_draws": 50, "n_ensembles": 2}
+TYPED = ("--steps", "20", "--draws", "50", "--ensembles", "2")
+
+
+@pytest.fixture
+def few(tmp_path):
+    """A table in memory and in a file, with its camera."""
+    stars = observations(n_frames=12)
+    stars.save(tmp_path / "obs.ecsv")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
+    return stars
+
+
+@pytest.fixture
+def cli(unpainted, monkeypatch, tmp_path):
+    """Run a command in one process; its exit status."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("starcal_uq.core.tasks.processes", lambda *_: nullcontext())
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["starcal-uq", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        return stop.value.code or 0
+
+    return call
+
+
+def test_the_call_has_the_numbers_of_the_command(few, cli):
+    made = sc.run(few, sc.paper.paper_start(), seed=3, **FEW)
+    assert cli("run", "obs.ecsv", "camera.toml", "-o", "run", *TYPED, "--seed", "3") in (0, 1)
+    typed = sc.Run("run")
+    assert np.array_equal(made.posterior.draws, typed.posterior.draws)
+    assert np.array_equal(made.attitude.headline_arcsec, typed.attitude.headline_arcsec)
+    assert made.error_budget.to_dataframe().equals(typed.error_budget.to_dataframe())
+    assert made.calibration.effects.names == typed.calibration.effects.names
+    assert made.verdict.headline == typed.verdict.headline
+    # Draws of another seed differ.
+    made.sample(n_steps=20, n_ensembles=2, seed=4, force=True)
+    assert not np.array_equal(made.posterior.draws, typed.posterior.draws)
+
+
+def test_a_run_is_shown_by_its_verdict_and_kept_as_long_as_it_is_asked_for(few, tmp_path, cli):
+    run = sc.run(few, sc.paper.paper_start(), effects="none", **FEW)
+    for shown in (repr(run), run._repr_html_()):
+        assert run.verdict.headline in shown and "Across the boresight" in shown
+    place = run.path
+    assert run.has("budget") and not run.has("report")
+    del run
+    gc.collect()
+    assert not place.parent.exists()
+
+
+@pytest.mark.slow
+def test_a_run_in_a_folder_has_a_report_and_the_command_that_repeats_it(few, tmp_path, cli):
+    files = (tmp_path / "obs.ecsv", tmp_path / "camera.toml")
+    run = sc.run(*files, out="run", effects=["tails"], seed=2, **FEW)
+    assert run.has("report") and run.place.words[:3] == ("run", *map(str, files))
+    draws = run.posterior.draws
+    assert cli(*run.place.words, "-o", "again") in (0, 1)
+    assert np.array_equal(draws, sc.Run("again").posterior.draws)
+    with pytest.raises(sc.StarcalError, match="force"):
+        sc.run(*files, out="run", **FEW)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"n_stps": 20}, r"n_stps is unknown; did you mean n_steps\?"),
+        ({"epoch": 2020.0}, "epoch belongs to images"),
+        ({"n_steps": 0}, "n_steps is 0"),
+        ({"temperature_profile": "p.csv", "effects": "tails"}, "needs the effect temperature"),
+        ({"effects": "tails", "method": "samaan"}, "exclude|needs"),
+        ({"camera": None}, "needs the nominal camera"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_in_one_sentence(few, settings, words):
+    given = {"camera": sc.paper.paper_start(), **settings}
+    with pytest.raises(sc.StarcalError, match=words) as refused:
+        sc.run(few, **given)
+    assert "\n" not in str(refused.value)
