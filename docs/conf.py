@@ -18,6 +18,10 @@ from sphinx.ext.napoleon import NumpyDocstring
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_ext"))
+# Pages that show commands import `shell` from there.
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(HERE / "_ext"), *filter(None, [os.environ.get("PYTHONPATH")])]
+)
 PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 project = "starcal_uq"
