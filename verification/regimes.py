@@ -193,7 +193,7 @@ def few(rng: np.random.Generator, options: Mapping[str, Any], method: str, befor
 
 
 def frame_scatter(rng: np.random.Generator, n_frames: int) -> Outcome:
-    """The test of the scatter of frames on clean data, and the one of before: leave-one-out against
+    """The test of the scatter of frames on clean data, and an earlier one: leave-one-out against
     chi-square.
     """
     c = campaign(rng, n_frames=n_frames)
@@ -204,7 +204,7 @@ def frame_scatter(rng: np.random.Generator, n_frames: int) -> Outcome:
     before = chdtrc(found.dof, found.dof * found.jackknife_ratio**2)
     alarms = {
         "Alarm (nominal 1 %)": bool(np.any((p * found.p_values < 0.01) & (found.ratio > 1.1))),
-        "Alarm before": bool(np.any((p * before < 0.01) & (found.jackknife_ratio > 1.1))),
+        "Alarm, earlier test": bool(np.any((p * before < 0.01) & (found.jackknife_ratio > 1.1))),
     }
     small = {
         f"p < 5 %: {n}": bool(v < 0.05)
@@ -291,10 +291,11 @@ def _named(found: sc.diagnostics.AirTest | None, short_px: float) -> Outcome:
         found is not None and flag for flag in (found and found.is_air, found and found.like_others)
     )
     figures = (
-        {"Of f too short, found": found.f_px / short_px} if found is not None and named else {}
+        {"Share of the f error found": found.f_px / short_px} if found is not None and named else {}
     )
     return Outcome(
-        figures=figures, shares={"Named": bool(named), "Not to be told from the lens": bool(open_)}
+        figures=figures,
+        shares={"Named": bool(named), "Indistinguishable from the lens": bool(open_)},
     )
 
 
@@ -497,7 +498,7 @@ def write(name: str, rows: Sequence[Mapping[str, str]], seed: int) -> None:
 
 
 def _together(rows: Sequence[Mapping[str, str]]) -> str:
-    """What the verdict said of all clean regimes together."""
+    """Shares of warnings and failures over all clean regimes."""
     counted = [
         row for row in rows if row["Regime"].startswith("clean") and row.get("Passed", "–") != "–"
     ]
