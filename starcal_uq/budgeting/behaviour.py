@@ -46,7 +46,7 @@ _WITHIN = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Behaviour:
-    """Behaviour of an error in time, whatever its size.
+    """Behaviour of an error in time, independent of its size.
 
     Attributes
     ----------
@@ -77,8 +77,8 @@ class Behaviour:
 
     @classmethod
     def of_text(cls, text: str) -> Behaviour | None:
-        """The behaviour that such a text states; None for spectra and series, which are not in
-        it.
+        """Behaviour described by a text; None for spectra and series, which the text does not
+        contain.
         """
         kind, _, seconds = text.partition(", ")
         if kind == "constant":
@@ -90,14 +90,14 @@ class Behaviour:
 
     @property
     def sigma_arcsec(self) -> float:
-        """Standard deviation of a spectrum or a series, arcsec; NaN where it is stated apart."""
+        """Standard deviation of a spectrum or a series, arcsec; NaN if it is stated separately."""
         if self.kind == "spectrum":
             return math.sqrt(float(np.trapezoid(self.power, self.frequency_hz)))
         return math.sqrt(float(np.sum(self.power))) if self.kind == "series" else math.nan
 
     @property
     def longest_s(self) -> float:
-        """Longest window about which the behaviour says something, s."""
+        """Longest window for which the behaviour is known, s."""
         if self.kind == "drift":
             return self.seconds
         return 0.25 / float(self.frequency_hz[0]) if self.kind == "series" else math.inf
@@ -127,7 +127,7 @@ class Behaviour:
         return np.asarray(kept**2)
 
     def left(self, window_s: float) -> float:
-        """Share of the variance around the mean of the window."""
+        """Share of the variance that remains around the mean of the window."""
         if self.kind == "drift":
             return (window_s / self.seconds) ** 2
         return max(1.0 - self.kept(window_s), 0.0)

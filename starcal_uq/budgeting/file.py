@@ -185,7 +185,7 @@ class Requirement:
 
 @dataclass(frozen=True)
 class BudgetFile:
-    """What a budget file states.
+    """Contents of a budget file.
 
     Attributes
     ----------

@@ -180,7 +180,7 @@ class Budget(Shown):
 
     @property
     def violations(self) -> tuple[Outcome, ...]:
-        """Requirements that are violated, by what is assessed alone."""
+        """Requirements violated by the assessed contributors alone."""
         return tuple(outcome for outcome in self.outcomes if outcome.verdict == "violated")
 
     @property
@@ -314,7 +314,7 @@ class Budget(Shown):
         return pd.DataFrame(rows, columns=columns)
 
     def to_dict(self) -> AnyDict:
-        """Plain values for JSON; what is not known is None, never zero and never NaN."""
+        """Plain values for JSON; unknown values are None, never zero or NaN."""
 
         def plain(table: pd.DataFrame) -> list[AnyDict]:
             records = table.to_dict("records")
@@ -393,7 +393,7 @@ class Budget(Shown):
 
     @classmethod
     def load(cls, path: PathLike) -> Budget:
-        """Read what `save` wrote, without loss.
+        """Read a budget written by `save`, without loss.
 
         Raises
         ------

@@ -124,7 +124,7 @@ class Contributor:
 
     @property
     def assessed(self) -> bool:
-        """False if nobody has put a number on it."""
+        """False if the contributor has no number."""
         return self.source != "not assessed"
 
     @property
@@ -140,7 +140,7 @@ class Contributor:
 
     @property
     def combination(self) -> str:
-        """How it enters the totals."""
+        """Way in which the row enters the totals."""
         if not self.assessed:
             return "not in the totals"
         if not self.applies:

@@ -47,7 +47,7 @@ _HEADS = (
 
 @dataclass(frozen=True, eq=False)
 class BudgetSensitivities:
-    """How the totals of a budget, in the mixed interpretation, depend on its inputs.
+    """Sensitivities of the totals of a budget, in the mixed interpretation, to its inputs.
 
     Attributes
     ----------

@@ -70,7 +70,7 @@ def budget_difference(before: Budget, after: Budget) -> pd.DataFrame:
 
 
 def allocation(budget: Budget, requirement: str) -> pd.DataFrame:
-    """A requirement shared out: how large each row may be if all rows grow, or shrink, alike.
+    """Allocation of a requirement: the size of each row if all rows grow or shrink by one factor.
 
     Parameters
     ----------

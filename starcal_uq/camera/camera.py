@@ -198,7 +198,7 @@ class Camera(Shown):
         return f"{self.length_mm(length_px):.{digits}g} mm"
 
     def contains(self, xy: ArrayLike) -> BoolArray:
-        """Whether each point lies on the detector, edges included.
+        """True for each point on the detector, edges included.
 
         Parameters
         ----------
@@ -232,9 +232,7 @@ class Camera(Shown):
         return self.replace(x0_px=x0, y0_px=y0, focal_px=f, coefficients=tuple(coefficients))
 
     def data_sheet(self) -> Camera:
-        """The camera as its data sheet gives it: principal point in the centre, no distortion;
-        the axes stay.
-        """
+        """Camera of the data sheet: principal point in the centre, no distortion, the same axes."""
         x0, y0 = self.centre_px
         return self.with_theta(undistorted(self.distortion, self.theta)).replace(x0_px=x0, y0_px=y0)
 
@@ -287,8 +285,8 @@ class Camera(Shown):
 
     @classmethod
     def from_dict(cls, table: AnyMapping) -> Camera:
-        """A camera from the [camera] table; distortion (brown), coefficients (zero) and name may be
-        left out.
+        """Camera from the [camera] table; distortion (brown), coefficients (zero) and name are
+        optional.
 
         Raises
         ------
@@ -360,7 +358,7 @@ class Camera(Shown):
         write_section(path, "camera", self.to_dict(), header, force)
 
     def to_opencv(self) -> tuple[FloatArray, FloatArray]:
-        """The same camera for OpenCV, whose pixel origin is ours.
+        """Matrix and coefficients of the camera for OpenCV, which has the same pixel origin.
 
         OpenCV distorts normalised coordinates: k1_cv = k1 f^2, k2_cv = k2 f^4, k3_cv = k3 f^6, p_cv
         = p f; its thin-prism terms s1 and s3 are our s1 f and s2 f. The coefficients of `f_theta`,

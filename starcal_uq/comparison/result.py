@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class CameraComparison(Shown):
-    """Directions of camera B minus those of camera A at the same pixels, the best rotation removed.
+    """Directions of camera B minus directions of camera A at the same pixels, best rotation
+    removed.
 
     p-values are NaN, and uncertainties of the difference too, where the covariance of the
     difference is not known.
@@ -132,7 +133,7 @@ class CameraComparison(Shown):
 
     @property
     def tested(self) -> bool:
-        """False where the covariance of the difference is not known."""
+        """False if the covariance of the difference is unknown."""
         return bool(np.isfinite(self.p_map))
 
     @property
@@ -149,9 +150,7 @@ class CameraComparison(Shown):
 
     @property
     def agree(self) -> bool | None:
-        """True where chance explains all differences, False where not, None where that was not
-        tested.
-        """
+        """True if chance explains all differences, False if not, None if this was not tested."""
         return None if not self.tested else self.verdict == "agree"
 
     @property

@@ -15,7 +15,7 @@ from starcal_uq.core.remedy import Remedies
 
 
 class Status(Enum):
-    """How an estimation ended; the value is the remedy, in words."""
+    """End of an estimation; the value is the remedy, in words."""
 
     CONVERGED = "converged"
     MAX_ITERATIONS = (
@@ -55,7 +55,7 @@ class Status(Enum):
 
     @property
     def remedy(self) -> str:
-        """What the user can do, in one clause."""
+        """Remedy, in one clause."""
         return self.value
 
 
@@ -214,7 +214,7 @@ class Words:
 
 @dataclass(frozen=True)
 class Check(Finding):
-    """One check: what was measured, what was asked for, and what follows.
+    """One check: the measured value, its bound, and the consequence.
 
     Attributes
     ----------
@@ -265,12 +265,12 @@ class Check(Finding):
 
     @property
     def value(self) -> str:
-        """What was found, with its unit."""
+        """Measured value, with its unit."""
         return self.words.value
 
     @property
     def bound(self) -> str:
-        """What was asked for, with its unit."""
+        """Required value, with its unit."""
         return self.words.bound
 
     @property
@@ -293,7 +293,7 @@ class Check(Finding):
 
     @property
     def question(self) -> Question:
-        """Question that it helps to answer."""
+        """Question that the check answers."""
         return self.code.value[1]
 
     @property

@@ -105,7 +105,7 @@ class MultiStart:
 
 @dataclass(frozen=True)
 class Diagnosis(Shown, Saved):
-    """What questions the model of a run.
+    """Results of all tests of the model of a run.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class Diagnosis(Shown, Saved):
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of the effects that the data would take up."""
+        """Names of the effects that the data support."""
         return () if self.extended is None else self.extended.effects.names
 
     @property
@@ -263,7 +263,7 @@ def diagnose(
     progress: Progress | None = None,
     apart: Callable[[], Apart | None] | None = None,
 ) -> Diagnosis:
-    """Question the model of a calibration in every way there is.
+    """Test the model of a calibration in every available way.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def explain(error: CalibrationError, obs: Observations) -> CalibrationError:
-    """The error of a calibration that failed, with what explains it where that is known.
+    """Error of a failed calibration, with its explanation where that is known.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def with_misfit(
     error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs: Observations
 ) -> AttitudeError:
-    """The attitude error with what the tests of the model found.
+    """Attitude error including the misfit found by the tests of the model.
 
     Where they find structure and the data would take up effects, it is the error of the camera that
     was calibrated without them, if the camera with these effects is right: through the geometry of

@@ -99,8 +99,8 @@ class Misfit(Shown):
 
     @property
     def p_value(self) -> float:
-        """Overall p-value: the smallest after Holm's correction. Overlap of the tests makes it err
-        to the safe side.
+        """Overall p-value: the smallest after Holm's correction; conservative, because the tests
+        overlap.
         """
         return min((test.p_holm for test in self.tests), default=1.0)
 

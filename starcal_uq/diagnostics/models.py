@@ -175,7 +175,7 @@ def compare_models(
     n_draws: int = _DRAWS,
     seed: int = 0,
 ) -> ModelComparison:
-    """Compare distortion models by how well they predict frames that were left out.
+    """Compare distortion models by cross-validation over frames.
 
     Parameters
     ----------

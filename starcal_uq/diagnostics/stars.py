@@ -51,8 +51,7 @@ _SEEN = 1.645 + 1.282
 
 @dataclass(frozen=True, eq=False)
 class StarTest(Shown):
-    """Errors that stars bring along: their size, the test for them, and uncertainties clustered on
-    the star.
+    """Position errors of stars: their size, their test, and uncertainties clustered by star.
 
     Attributes
     ----------

@@ -49,7 +49,7 @@ _HOURS = np.arange(-14.0, 14.1, 0.25)
 
 @dataclass(frozen=True)
 class TimeTest:
-    """What a wrong time has done to the directions.
+    """Effect of a wrong time on the directions.
 
     Attributes
     ----------
@@ -79,8 +79,8 @@ class TimeTest:
 
 @dataclass(frozen=True)
 class UnseenAberration:
-    """What annual aberration does to f if it was left out of the directions or applied twice, and
-    nothing shows it.
+    """Shift of f by annual aberration that is missing or applied twice and leaves no trace in the
+    residuals.
 
     Frames near one direction and date stretch by it alike, which is what a focal length does.
 

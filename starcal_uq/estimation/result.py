@@ -261,7 +261,7 @@ class Calibration(Shown, Traced):
 
     @property
     def remedy(self) -> str:
-        """What is wrong with a calibration that did not end well, and what helps, in one clause."""
+        """Fault and remedy of a calibration that did not end well, in one clause."""
         return remedy_of(self.status, self.undetermined, self.solver)
 
     @property
@@ -299,7 +299,7 @@ class Calibration(Shown, Traced):
 
     @property
     def noise_model(self) -> NoiseModel | None:
-        """How the noise varies, of a calibration with the effect ``noise``; None otherwise."""
+        """Model of the noise of a calibration with the effect ``noise``; None otherwise."""
         from starcal_uq.likelihood.noise_model import noise_model_of
 
         return noise_model_of(self)
@@ -386,7 +386,8 @@ class Calibration(Shown, Traced):
     def displacement(
         self, xy: ArrayLike, names: Collection[str] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """What effects of the place on the detector do beyond the camera: axes, field, pixel phase.
+        """Displacement by effects that depend on the place on the detector: axes, field, pixel
+        phase.
 
         Parameters
         ----------
@@ -440,8 +441,8 @@ class Calibration(Shown, Traced):
         )
 
     def data_hash_of(self, obs: Observations) -> str:
-        """Hash of the data that a table stands for: that of all partitions for the sample that was
-        kept of them.
+        """Hash of the data that a table represents: for a sample of partitions, the hash of all of
+        them.
         """
         if self.provenance.partitions.get("sample_sha256") == obs.data_hash:
             return str(self.provenance.data_sha256)

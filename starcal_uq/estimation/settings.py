@@ -61,7 +61,7 @@ class EstimationOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class EstimationSettings:
-    """How a calibration is made; `calibrate` describes the fields, which are its keywords.
+    """Settings of a calibration; `calibrate` describes the fields, which are its keywords.
 
     Raises
     ------
@@ -132,12 +132,12 @@ class EstimationSettings:
 
     @property
     def noise(self) -> bool:
-        """Whether the noise is to vary from star to star."""
+        """True if the noise may vary from star to star."""
         return "noise" in self.names
 
     @property
     def tails(self) -> bool:
-        """Whether residuals are to have the tails of a Student t."""
+        """True if residuals may have the tails of a Student t."""
         return "tails" in self.names
 
     def changed(self, **options: Any) -> EstimationSettings:

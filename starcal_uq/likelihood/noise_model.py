@@ -83,7 +83,7 @@ class NoiseModel:
 
     @property
     def varies(self) -> bool:
-        """Whether the data ask for more than one noise."""
+        """True if the noise is not uniform."""
         return bool(self.terms) or self.frame_dof is not None or self.axes is not None
 
     @property

@@ -58,7 +58,7 @@ _TINY = np.finfo(np.float64).tiny
 
 @dataclass(frozen=True, eq=False)
 class Fingerprints:
-    """What identifies the frames of a calibration: at most 12 stars each, 12 bytes a star.
+    """Fingerprints of the frames of a calibration: at most 12 stars each, 12 bytes a star.
 
     Attributes
     ----------
@@ -95,14 +95,14 @@ class Fingerprints:
 
     @classmethod
     def joined(cls, parts: Sequence[Fingerprints]) -> Fingerprints:
-        """Those of several runs, one after the other."""
+        """Fingerprints of several runs, one after the other."""
         return cls(
             *(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls))
         )
 
     def equal(self, other: Fingerprints, pairs: IntArray) -> bool:
-        """Whether all pairs (n, 2) of frames, those of `self` and of `other`, have their stars at
-        the same pixels.
+        """True if all pairs (n, 2) of frames, of `self` and `other`, have their stars at the same
+        pixels.
         """
         mine, theirs = self.padded(self.xy_px), other.padded(other.xy_px)
         return np.array_equal(mine[pairs[:, 0]], theirs[pairs[:, 1]], equal_nan=True)

@@ -374,7 +374,7 @@ class FrameChoice(Shown):
         )
 
     def worth(self) -> pd.DataFrame:
-        """What the choice is worth, one row per quantity.
+        """Gain of the choice, one row per quantity.
 
         Columns are 1 sigma ``before``, ``chosen``, with ``random`` frames (mean) and with the
         ``richest`` in stars, and ``factor``, random over chosen, with the range of 90 % of the

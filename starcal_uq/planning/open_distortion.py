@@ -44,7 +44,7 @@ _NEAR_FOLD = 0.9
 
 @dataclass(frozen=True, eq=False)
 class DistortionRange:
-    """What a plan gives over the distortion that its sheet leaves open, for D distortions.
+    """Forecasts over the range of an unknown distortion, for D distortions.
 
     Attributes
     ----------

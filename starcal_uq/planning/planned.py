@@ -67,7 +67,7 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Plan(Shown):
-    """What a calibration will give, before any data.
+    """Forecast of a calibration, before any data.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Plan(Shown):
 
     @bounded
     def expected(self, n_frames: int) -> Expected:
-        """What n frames will give; their information is that of so many average frames."""
+        """Forecast for n frames, with the information of n average frames."""
         total = n_frames * self.frame_information
         total = total if self.start_information is None else total + self.start_information
         covariance, p = scaled_inverse(total), len(self.camera.theta)

@@ -226,7 +226,7 @@ class AttitudeError(Shown):
 
     @property
     def effects(self) -> tuple[EffectError, ...]:
-        """What effects of the calibration do to attitudes, with the onboard model."""
+        """Attitude errors by the effects of the calibration, with the onboard model."""
         return () if self.aboard is None else self.aboard.effects
 
     @property
@@ -238,9 +238,7 @@ class AttitudeError(Shown):
 
     @property
     def alignment_arcsec(self) -> FloatArray:
-        """Standard deviation (3,) of the alignment itself, which stands in place of the common
-        rotation afterwards.
-        """
+        """Standard deviation (3,) of the alignment, which replaces the common rotation afterwards."""
         sigma: FloatArray = np.sqrt(np.diag(self.alignment_covariance_arcsec2))
         return sigma
 
@@ -294,7 +292,7 @@ class AttitudeError(Shown):
 
     @property
     def with_misfit_found_arcsec(self) -> FloatArray:
-        """Standard deviations (5, 4) with what the tests of the model found; NaN as long as that is
+        """Standard deviations (5, 4) including the misfit found by the tests of the model; NaN if
         not assessed.
         """
         found, held = self.misfit, self.if_model_holds_arcsec
@@ -426,7 +424,7 @@ class AttitudeError(Shown):
 
     @classmethod
     def load(cls, path: PathLike) -> AttitudeError:
-        """Read what `save` wrote.
+        """Read a table written by `save`.
 
         A table of a version that did not sample the interaction is read; the interaction is then
         not known (NaN).

@@ -108,8 +108,8 @@ class FieldMap(Shown, Saved):
 
     @property
     def equivalent_principal_point_arcsec(self) -> FloatArray | None:
-        """The same as an angle (2,): standard deviation of the yaw that x0 stands for, and of the
-        pitch of y0.
+        """The same as an angle (2,): standard deviation of the yaw equivalent to x0, and of the
+        pitch equivalent to y0.
         """
         angles = _root_diagonal(self.rotation_covariance_arcsec2)
         return None if angles is None else angles[[1, 0]]

@@ -66,7 +66,7 @@ class TemperatureProfile:
 
     @property
     def shares(self) -> FloatArray:
-        """Share of the time (T,) that each temperature stands for: half of both steps beside it."""
+        """Share of the time (T,) at each temperature: half of both neighbouring steps."""
         steps = np.diff(self.time_s)
         around = np.append(steps, 0.0) + np.insert(steps, 0, 0.0)
         return np.asarray(around / around.sum())

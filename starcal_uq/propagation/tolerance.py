@@ -115,7 +115,7 @@ class Sensitivities:
 
 
 def sensitivities(camera: Camera, obs: Observations) -> Sensitivities:
-    """What one unit of each parameter does to the attitudes of frames.
+    """Attitude errors of frames per unit of each camera parameter.
 
     Parameters
     ----------

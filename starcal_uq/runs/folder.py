@@ -254,12 +254,12 @@ class RunFolder:
         return Manifest(files, {entry.step: Provenance() for entry in files.values()})
 
     def resting_on(self, step: str) -> list[str]:
-        """Files that go when a step is done again, because they rest on its result."""
+        """Files deleted when a step is repeated, because they depend on its result."""
         gone = () if step in _ADDED else REST_ON[step]
         return [name for name, entry in self.manifest.files.items() if entry.step in gone]
 
     def is_older(self, step: str) -> bool:
-        """Whether a step is done, and something that it rests on was done after it."""
+        """True if a step is done, and a step on which it depends was done after it."""
         steps = list(self.manifest.steps)
         return step in steps and any(
             step in REST_ON[later] for later in steps[steps.index(step) + 1 :]

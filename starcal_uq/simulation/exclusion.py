@@ -101,7 +101,7 @@ class Exclusion:
         )
 
     def inside(self, rotations: FloatArray) -> BoolArray:
-        """Which boresights of attitudes R_cam_icrs (n, 3, 3) are in which cone, (n, B)."""
+        """True where the boresight of an attitude R_cam_icrs (n, 3, 3) lies in a cone, (n, B)."""
         cosine = rotations[:, 2] @ np.array(self.directions).T
         return np.asarray(cosine > np.cos(np.radians(self.angles_deg)))
 

@@ -42,7 +42,7 @@ def check_time(text: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """What a rendered frame shows.
+    """Truth of a rendered frame.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class FrameTruth:
 
     @property
     def observations(self) -> Observations:
-        """The table that perfect centroids and a perfect identification would give."""
+        """Table for perfect centroids and a perfect identification."""
         return Observations(
             frame=np.full(len(self), self.frame),
             x_px=self.x_px,
@@ -250,7 +250,7 @@ def _numbered(name: str, axes: str, values: FloatArray, text: str) -> list[tuple
 
 
 def read_truth(path: PathLike) -> FrameTruth:
-    """What a rendered frame shows, from its file.
+    """Read the truth of a rendered frame from its file.
 
     Raises
     ------
@@ -309,7 +309,7 @@ def read_truth(path: PathLike) -> FrameTruth:
 
 
 def truth_table(paths: Iterable[PathLike]) -> Observations:
-    """The table that perfect centroids and a perfect identification of these frames would give.
+    """Table for perfect centroids and a perfect identification of these frames.
 
     Raises
     ------

@@ -275,7 +275,7 @@ def make_apparent(
 def without_low_stars(
     obs: Observations, site: Site, least_altitude_deg: float = LEAST_ALTITUDE_DEG
 ) -> Observations:
-    """The stars that stand high enough above a site, in frames that keep at least four.
+    """Stars above a minimum altitude at a site, in frames that keep at least four.
 
     Parameters
     ----------

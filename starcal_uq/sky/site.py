@@ -82,7 +82,7 @@ class Site(Stated):
         )
 
     def later(self, hours: float) -> Site:
-        """The place that has the sky of so many hours later: one further east."""
+        """Place further east that has the sky of some hours later."""
         return replace(
             self, longitude_deg=(self.longitude_deg + HOUR_DEG * hours + 180.0) % 360.0 - 180.0
         )

@@ -96,7 +96,7 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class StudyDefinition:
-    """What is varied, around what, and how often.
+    """Definition of a study: the varied settings, the base case, and the repetitions.
 
     Attributes
     ----------
@@ -254,7 +254,7 @@ class StudyDefinition:
         return tables | ({"priors": self.priors} if self.priors else {})
 
     def check(self, where: str = "study") -> None:
-        """Raise `StudyError` for what fits no study; `where` names the file."""
+        """Raise `StudyError` for an invalid study; `where` names the file."""
         for good, text in (
             (self.mode in MODES, f"mode is {self.mode!r}; write one of {', '.join(MODES)}"),
             (

@@ -53,7 +53,7 @@ TEXTS = ("weak_words",)
 
 @dataclass(frozen=True, eq=False)
 class Study(Shown):
-    """What a study found.
+    """Results of a study.
 
     Attributes
     ----------
@@ -94,12 +94,12 @@ class Study(Shown):
 
     @property
     def complete(self) -> bool:
-        """False for a study that was interrupted: run it again, and it goes on."""
+        """False for an interrupted study; running it again continues it."""
         return not bool(self.data.attrs.get("missing_cells", 0))
 
     @property
     def problems(self) -> dict[str, int]:
-        """Reasons why cells have no numbers, with how many have each, the most frequent first."""
+        """Reasons for cells without numbers, with their counts, most frequent first."""
         return dict(self.sweep.failures)
 
     def values(

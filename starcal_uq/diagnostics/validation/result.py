@@ -167,7 +167,7 @@ class Validation(Shown, Saved):
 
     @property
     def nees_ratio_se(self) -> float:
-        """What chance alone moves `nees_ratio` by, one standard deviation.
+        """Standard deviation of `nees_ratio` by chance alone.
 
         With nu degrees of freedom for the noise, NEES is (nu - 2) / nu times p F(p, nu), and
         chi-square for many.

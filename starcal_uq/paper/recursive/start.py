@@ -111,7 +111,7 @@ RECURSIVE_METHODS = get_args(RecursiveMethod)
 
 @dataclass(frozen=True)
 class RecursionOptions:
-    """How a recursive method (``samaan``, ``griffith``) goes from frame to frame.
+    """Settings of a recursive method (``samaan``, ``griffith``).
 
     Attributes
     ----------

@@ -340,8 +340,7 @@ class RecursiveCalibration:
         return calibration
 
     def save(self, path: PathLike) -> None:
-        """Write the state to a file (``.npz``), atomically; `load` goes on from it as if nothing
-        had happened.
+        """Write the state to a file (``.npz``), atomically; `load` continues from it.
 
         Raises
         ------
