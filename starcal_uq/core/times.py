@@ -61,12 +61,13 @@ def julian_year(time_utc: Any) -> float:
     return float(2000.0 + (np.mean(tt.sum(axis=1)[inverse]) - 2451545.0) / 365.25)
 
 
-def utc_text(time: str) -> str:
-    """One UTC time as tables hold it, YYYY-MM-DDTHH:MM:SS[.f]; an offset such as "+02:00" is taken
-    out.
+def utc_text(time: Any) -> str:
+    """One UTC time (text, datetime or astropy Time) as tables hold it, YYYY-MM-DDTHH:MM:SS[.f]; an
+    offset such as "+02:00" is taken out.
 
     CatalogueError quotes one that is not readable, or a date alone.
     """
+    time = str(time.utc.isot if hasattr(time, "isot") else time)
     match = _ISO.fullmatch(time.strip())
     if match is not None and match[4] is None and match[7] is None:
         # Dates that do not exist are named as such.

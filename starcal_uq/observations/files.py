@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,7 +65,6 @@ def read_table(
     The columns are those of `only`; without `check`, rows are taken to have been checked before. Of
     a Parquet file, the rows can be those of some `frames` alone.
     """
-    check_mapping(mapping)
     path = Path(path)
     if os.path.isdir(path):
         raise ObservationError(
@@ -76,15 +76,38 @@ def read_table(
     names = {name: mapping.get(name, name) for name in COLUMNS}
     wanted = columns_for(names[name] for name in only)
     data = read_bytes(path, "a table of observations", ObservationError)
+    chosen = None if frames is None else (names["frame"], frames)
+    read = _read if ending in _OTHERS else read_cells
+    return checked_table(
+        *(path, partial(read, path, data, ending, wanted, chosen), camera, mapping, only),
+        check=check,
+        whole=frames is None,
+    )
+
+
+def checked_table(
+    path: Path,
+    read: Callable[[], RawTable],
+    camera: Camera | None,
+    mapping: Mapping[str, str],
+    only: Sequence[str] = tuple(COLUMNS),
+    *,
+    check: bool = True,
+    whole: bool = True,
+) -> tuple[AnyDict, AnyDict]:
+    """Checked columns and metadata of a table, all rows of it or some, as `read_table` gives those
+    of a file.
+    """
+    check_mapping(mapping)
+    names = {name: mapping.get(name, name) for name in COLUMNS}
     with reading(path, WHAT, REMEDY, ObservationError):
-        chosen = None if frames is None else (names["frame"], frames)
-        raw = (_read if ending in _OTHERS else read_cells)(path, data, ending, wanted, chosen)
+        raw = read()
         check_names(path, raw, names, mapping)
         if not len(raw.numbers):
             raise ObservationError(
                 f"{path}: the table has a header but no rows; give a table with observations."
             )
-        if frames is None and check:
+        if whole and check:
             _number_frames(raw, names["frame"])
         columns, problems, unknown_frame = convert_columns(
             path, raw, {name: names[name] for name in only}

@@ -10,7 +10,8 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,10 +20,12 @@ from numpy.typing import ArrayLike
 from starcal_uq.attitude.rotations import unit_vectors
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.settings import Directions
+from starcal_uq.core.times import utc_text
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, StrArray
 from starcal_uq.observations.checks import check_columns, raise_problems
 from starcal_uq.observations.columns import COLUMNS
-from starcal_uq.observations.files import read_table
+from starcal_uq.observations.files import checked_table, read_table
 from starcal_uq.observations.origin import Sourced
 from starcal_uq.observations.rows import FrameRows, check_lengths, locked, typed
 from starcal_uq.observations.written import astropy_table, write_table
@@ -317,6 +320,52 @@ class Observations(FrameRows, Sourced, Shown):
         obs = cls(**columns, meta=meta)
         obs.check(camera)
         return obs
+
+    @classmethod
+    def from_table(
+        cls,
+        table: Any,
+        *,
+        camera: Camera | None = None,
+        columns: Mapping[str, str] | None = None,
+        directions: Directions | None = None,
+        time: Any = None,
+    ) -> Observations:
+        """A table in memory, checked as one in a file is; also called `from_dataframe`.
+
+        Parameters
+        ----------
+        table
+            A DataFrame of pandas, polars or another library with Arrow's interface, a Table or
+            QTable of astropy, or a Dataset of xarray. Units that it states are converted, and a
+            column of astropy times is read as UTC.
+        camera, columns
+            As for `load_observations`.
+        directions : {"undeclared", "catalogue", "apparent"}, optional
+            What the directions are; by default what the table's metadata say.
+        time : str, datetime or astropy Time, optional
+            Middle of the exposure of the rows without a time, UTC.
+
+        Raises
+        ------
+        ObservationError
+            If a column is missing or a row is bad; rows are numbered from 1.
+        """
+        from starcal_uq.observations.memory import raw_table
+
+        read = partial(raw_table, table)
+        values, meta = checked_table(Path("table"), read, camera, columns or {})
+        obs = cls(**values, meta=meta)
+        if directions is not None:
+            obs = obs.with_origin(directions=directions)
+        return obs if time is None else obs.with_time(time)
+
+    from_dataframe = from_table
+
+    def with_time(self, time: Any) -> Observations:
+        """The same table with a time (UTC; text, datetime or astropy Time) for rows without one."""
+        there = np.full(len(self), "") if self.time_utc is None else self.time_utc
+        return replace(self, time_utc=np.where(there == "", utc_text(time), there))
 
     def __repr__(self) -> str:
         return (

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.times import utc_text
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.sky.site import check_sky
@@ -22,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def observations_from_table(
-    path: Path | Sequence[Path] | Observations,
+    path: Any,
     camera: Camera,
     *,
     columns: Mapping[str, str] | None = None,
@@ -30,7 +26,7 @@ def observations_from_table(
     observer_velocity_km_s: Sequence[float] | None = None,
     site: Site | None = None,
     in_space: bool = False,
-    time_utc: str | None = None,
+    time_utc: Any = None,
 ) -> Observations:
     """Read a table and make its directions apparent as far as the user has declared how.
 
@@ -39,14 +35,16 @@ def observations_from_table(
     each row's ``time_utc``. With a `site` on the ground, refraction and daily aberration are
     applied too, and stars lower than ten degrees left out; `in_space`, nothing need be said of
     refraction. Rows without a time are of `time_utc`. Paths and columns are as `load_observations`
-    takes them; observations are taken as they are.
+    takes them; observations and tables can be in memory, too (`Observations.from_table`).
     """
     if isinstance(path, Observations):
         obs, path = path, Path("observations")
         obs.check(camera)
-    else:
+    elif isinstance(path, Path | list):
         obs = load_observations(path, camera=camera, columns=columns)
         path = path if isinstance(path, Path) else path[0]
+    else:
+        obs, path = Observations.from_table(path, camera=camera, columns=columns), Path("table")
     if time_utc is not None:
         _refuse_timed(path, [obs])
     return _apparent(obs, path, directions, observer_velocity_km_s, site, in_space, time_utc)
@@ -61,7 +59,7 @@ def partitions_from_folder(
     observer_velocity_km_s: Sequence[float] | None = None,
     site: Site | None = None,
     in_space: bool = False,
-    time_utc: str | None = None,
+    time_utc: Any = None,
 ) -> PartitionedObservations:
     """Open a folder of partitions, whose directions are made apparent as `observations_from_table`
     does, when read.
@@ -120,11 +118,10 @@ def _apparent(
     observer_velocity_km_s: Sequence[float] | None,
     site: Site | None,
     in_space: bool,
-    time_utc: str | None,
+    time_utc: Any,
 ) -> Observations:
     if time_utc is not None:
-        there = np.full(len(obs), "") if obs.time_utc is None else obs.time_utc
-        obs = replace(obs, time_utc=np.where(there == "", utc_text(time_utc), there))
+        obs = obs.with_time(time_utc)
     if directions is not None:
         obs = obs.with_origin(directions=directions)
     # A table that says nothing of its directions is taken to hold a catalogue's.
