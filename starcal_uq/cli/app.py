@@ -57,6 +57,7 @@ def _main() -> None:
     from starcal_uq.cli.answers import begin
     from starcal_uq.cli.commands import app, usage_sentence
     from starcal_uq.cli.remedies import as_given
+    from starcal_uq.cli.runfiles import expand
     from starcal_uq.core.errors import StarcalError
     from starcal_uq.core.remedy import spoken
     from starcal_uq.core.tasks import caught_signal, interrupt
@@ -68,6 +69,7 @@ def _main() -> None:
     # them every 700 new ones for what could be thrown away takes a twentieth of the time.
     gc.set_threshold(50_000, 20, 50)
     try:
+        sys.argv[1:] = expand(sys.argv[1:], app)
         with spoken(as_given):
             code = app(standalone_mode=False)
         if code == 128 + signal.SIGINT:

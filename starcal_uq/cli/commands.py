@@ -19,6 +19,7 @@ from starcal_uq.cli import statistics as cli_statistics
 from starcal_uq.cli import steps as cli_steps
 from starcal_uq.cli import study as cli_study
 from starcal_uq.cli.answers import Answer
+from starcal_uq.cli.runfiles import typed
 from starcal_uq.cli.settings import unfolded
 from starcal_uq.core.conflicts import EARLIER
 from starcal_uq.core.files import shown
@@ -111,15 +112,23 @@ def usage_sentence(error: Exception) -> str:
             else parameter.display_name_raw
         )
         problems: list[AnyDict] = getattr(cause, "errors", list)()
-        return f"{name} {_problem(parameter, problems[0]['input']) if problems else error.message}"
+        # A value of a run file is corrected there.
+        file = "" if not typed() or _is_typed(parameter) else f"{typed()[1]}: "
+        words = _problem(parameter, problems[0]["input"]) if problems else error.message
+        return f"{file}{name} {words}"
     if isinstance(error, typer.BadParameter):
         return str(error.message)
     option, context = getattr(error, "option_name", ""), getattr(error, "ctx", None)
     if option in EARLIER and context is not None and context.command.name in ("calibrate", "run"):
         return f"{option} is no option any more: give --effects {EARLIER[option]} in its place."
-    words = getattr(error, "format_message", None)
-    message = words() if callable(words) else str(error)
+    form = getattr(error, "format_message", None)
+    message = form() if callable(form) else str(error)
     return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."
+
+
+def _is_typed(parameter: Any) -> bool:
+    """Whether an option stands on the command line beside a run file."""
+    return any(word.partition("=")[0] in (*parameter.opts, "--set") for word in typed())
 
 
 def _missing(context: Any, parameter: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import warnings
@@ -38,6 +39,9 @@ _IN_NOTEBOOK = "JPY_PARENT_PID" in os.environ
 # What is no terminal has no width of its own: tables get the room that they need there, or what
 # COLUMNS says.
 _WIDTH = None if (sys.stdout.isatty() and not _IN_NOTEBOOK) or "COLUMNS" in os.environ else 110
+# Kinds of lines on standard error that -q keeps: a user can act on them.
+_ACTED_ON = ("warning", "violated")
+_notes = True
 STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
 # Names of files, runs and requirements may hold square brackets and colons, which are no markup.
 out = Console(width=_WIDTH, markup=False, emoji=False, highlight=False)
@@ -54,6 +58,8 @@ def tell(words: str) -> None:
     colour.
     """
     kind = words.partition(":")[0]
+    if not _notes and kind not in _ACTED_ON:
+        return
     err.print(
         words,
         style={"note": "yellow", "warning": "yellow", "violated": "red"}.get(kind),
@@ -62,13 +68,23 @@ def tell(words: str) -> None:
 
 
 @contextmanager
-def quiet(wanted: bool) -> Iterator[None]:
-    """Keep standard output free for a document."""
-    out.quiet = wanted
+def talking(*, tables: bool, notes: bool, steps: bool) -> Iterator[None]:
+    """Choose what a command prints: tables on standard output, which documents need for themselves,
+    notes and bars on standard error, and a line of the log for every step.
+    """
+    global _notes
+    out.quiet, _notes = not (tables and notes), notes
+    log = logging.getLogger("starcal_uq")
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s"))
+    if steps:
+        log.addHandler(handler)
+        log.setLevel(logging.INFO)
     try:
         yield
     finally:
-        out.quiet = False
+        out.quiet, _notes = False, True
+        log.removeHandler(handler)
 
 
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
@@ -244,7 +260,7 @@ def progress_bar(label: str) -> Iterator[Progress | None]:
         TimeRemainingColumn,
     )
 
-    if not err.is_terminal or _IN_NOTEBOOK:
+    if not (err.is_terminal and _notes) or _IN_NOTEBOOK:
         yield None
         return
     columns = (

@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.resources import files
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 
@@ -234,6 +234,15 @@ def check_names(texts: list[str] | None) -> None:
             )
 
 
+def _refuse_edits(texts: list[str] | None) -> None:
+    """Refuse changes of a run file: where one is given, they are made before options are read."""
+    if texts:
+        raise typer.BadParameter(
+            f"{shown(texts[0])} changes a key of a run file: give the file first, as in "
+            "`run run.toml --set seed=7`."
+        )
+
+
 def check_word_or_file(text: str) -> None:
     if text not in ("random", "observed"):
         read_file(Path(text))
@@ -267,6 +276,7 @@ _CHECKS: Mapping[str, Callable[[Any], object]] = {
     "address": _check_text,
     "columns": parse_columns,
     "degrees of freedom": parse_dof,
+    "edits": _refuse_edits,
     "effects": check_effects,
     "engine": _known_to("identification.proposers:offered_engine"),
     "frames": parse_frames,
@@ -281,9 +291,33 @@ _CHECKS: Mapping[str, Callable[[Any], object]] = {
     "word or file": check_word_or_file,
 }
 _DECLARED = tomllib.loads((files("starcal_uq.cli") / "options.toml").read_text("utf-8"))
+# Commands with many options -> parameters that `--help` shows; `--help-all` shows the others too.
+COMMON: Mapping[str, list[str]] = _DECLARED.pop("common")
+# Parameters that are files or folders, or may be.
+PATHS = {
+    name
+    for table in _DECLARED.values()
+    for name, entry in table.items()
+    if "path" in entry or entry.get("check") == "word or file"
+}
 
 
-def declared(owner: str, name: str, kind: Any, panel: str | None = None) -> Any:
+_VALUES = {bool: "", Path: "FILE", float: "NUMBER", int: "N", str: "TEXT"}
+
+
+def _metavar_and_choices(kind: Any) -> tuple[str | None, str]:
+    """The word for a value in the help, and the sentence that lists the choices."""
+    kinds = [one for one in (get_args(kind) or (kind,)) if one is not type(None)]
+    if get_origin(kind) is Literal:
+        return "WORD", f" One of: {', '.join(map(str, kinds))}."
+    if len(kinds) == 1 and get_origin(kinds[0]) is Literal:
+        return _metavar_and_choices(kinds[0])
+    return (_VALUES.get(kinds[0]) if len(kinds) == 1 else None), ""
+
+
+def declared(
+    owner: str, name: str, kind: Any, panel: str | None = None, *, hidden: bool = False
+) -> Any:
     """The type of a parameter of a command, or of a record, as Typer takes it; `panel` is where it
     stands in the help.
     """
@@ -292,9 +326,13 @@ def declared(owner: str, name: str, kind: Any, panel: str | None = None) -> Any:
     if "limit" in entry:
         limit = (KEYS | LIMITS)[entry["limit"]]
         low, high = entry.get("least", limit.low), limit.high
+    metavar, choices = _metavar_and_choices(kind)
+    words = str(entry.get("help") or "").strip()
+    named = all(word.strip(" .") in words for word in choices.partition(":")[2].split(","))
     settings = {
-        "help": entry.get("help"),
-        "metavar": entry.get("metavar"),
+        "help": words if named else words + choices,
+        "metavar": entry.get("metavar", metavar),
+        "hidden": hidden,
         "min": low,
         "max": high,
         "parser": _PATHS.get(entry.get("path")),

@@ -6,10 +6,13 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from starcal_uq.core.conflicts import words_of
+from starcal_uq.cli.runfiles import typed
+from starcal_uq.core.conflicts import arguments_of, parsed, words_of
 from starcal_uq.core.provenance import NAME
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, Near, Remedy
+from starcal_uq.core.runfile import edited
 from starcal_uq.core.settings import joined_effects
+from starcal_uq.diagnostics.verdict.remedies import changed
 
 # Commands whose options have the names of the settings of a calibration.
 _CALIBRATING = ("calibrate", "run")
@@ -30,6 +33,10 @@ def as_given(remedy: Remedy) -> str:
         return remedy.command or remedy.call
     asked = {name: value for name, value in remedy.arguments.items() if name != "out"}
     words = sys.argv[1:]
+    if file := typed():
+        here = arguments_of(parsed(words)[1])
+        wanted = changed(here, arguments_of(parsed(words_of(remedy.options))[1]))
+        return shlex.join([NAME, *file, *words_of({"set": edited(here, wanted), "force": True})])
     if "effects" in asked:
         # An option that is given twice would hold the last list alone.
         words, given = _without_effects(words)

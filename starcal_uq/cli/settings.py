@@ -8,14 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer, deliver
-from starcal_uq.cli.console import quiet
+from starcal_uq.cli.console import talking
 from starcal_uq.cli.options import (
+    COMMON,
     declared,
     parse_columns,
     parse_dof,
@@ -423,17 +424,17 @@ def refuse_conflicts(settings: AnyDict) -> None:
         raise typer.BadParameter(words)
 
 
+# Words of a call that its results do not depend on.
+_OF_THE_CALL = ("-o", "--out", "--force", "--json", "-q", "--quiet", "-v", "--verbose")
+
+
 def typed_words(arguments: Sequence[str]) -> list[str]:
     """A command line that can be given anywhere: files by their whole path, without where and how
     it wrote.
     """
     words: list[str] = []
     for before, word in zip(["", *arguments], arguments, strict=False):
-        if (
-            before in ("-o", "--out")
-            or word in ("-o", "--out", "--force", "--json")
-            or word.startswith(("--out=", "-o"))
-        ):
+        if before in ("-o", "--out") or word in _OF_THE_CALL or word.startswith(("--out=", "-o")):
             continue
         # The value of an option may be the name of a folder that lies about.
         file = (
@@ -460,20 +461,36 @@ def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]
 
 
 def _option(
-    owner: str, name: str, kind: Any, default: Any, panel: str | None = None
+    owner: str, name: str, kind: Any, default: Any, panel: str | None = None, **shown: Any
 ) -> inspect.Parameter:
-    annotation = declared(owner, name, kind, panel)
+    annotation = declared(owner, name, kind, panel, **shown)
     return inspect.Parameter(
         name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
     )
 
 
+def _print_all(context: typer.Context, wanted: bool) -> None:
+    """Print the help of a command with the options that are rarely used."""
+    if not wanted:
+        return
+    rare = [one for one in context.command.params if getattr(one, "hidden", False)]
+    for one in rare:
+        one.hidden = False  # type: ignore[attr-defined]
+    try:
+        print(context.get_help())
+    finally:
+        for one in rare:
+            one.hidden = True  # type: ignore[attr-defined]
+    raise typer.Exit
+
+
 def unfolded(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
-    """What is called by the name of a command: one option for each field of its records, and
-    --json.
+    """The function that Typer calls for a command: one option for each field of its records, and
+    the options that every command has.
     """
     parameters: list[inspect.Parameter] = []
     records: dict[str, Any] = {}
+    common = COMMON.get(name)
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         record = parameter.annotation
         if not (isinstance(record, type) and is_dataclass(record)):
@@ -482,18 +499,43 @@ def unfolded(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
         hints, panel = get_type_hints(record), str(record.__doc__).partition(".")[0]
         records[parameter.name] = record
         parameters += [
-            _option(record.__name__, f.name, hints[f.name], f.default, panel)
+            _option(
+                *(record.__name__, f.name, hints[f.name], f.default, panel),
+                hidden=common is not None and f.name not in common,
+            )
             for f in fields(record)
         ]
-    parameters.append(_option(name, "json", bool, False))
+    for every in ("json", "quiet", "verbose"):
+        parameters.append(_option(name, every, bool, False, hidden=common is not None))
+    if name == "run":
+        # Is taken out with the run file before options are read.
+        parameters.append(_option(name, "edits", list[str] | None, None, hidden=True))
+    if common is not None:
+        whole = typer.Option(
+            "--help-all",
+            metavar="",
+            is_eager=True,
+            callback=_print_all,
+            help="Show every option and exit.",
+        )
+        parameters.append(
+            inspect.Parameter(
+                "help_all",
+                inspect.Parameter.KEYWORD_ONLY,
+                default=False,
+                annotation=Annotated[bool, whole],
+            )
+        )
 
     @wraps(command)
-    def run(json: bool, **given: Any) -> None:
+    def run(json: bool, quiet: bool, verbose: bool, **given: Any) -> None:
         settings = {
             name: record(**{field.name: given.pop(field.name) for field in fields(record)})
             for name, record in records.items()
         }
-        with quiet(json):
+        for of_the_call in ("help_all", "edits"):
+            given.pop(of_the_call, None)
+        with talking(tables=not json, notes=not quiet, steps=verbose):
             answer = command(**given, **settings)
         deliver(name, answer, json)
 

@@ -11,7 +11,7 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import say
-from starcal_uq.core import settings
+from starcal_uq.core import runfile, settings
 
 
 def new_command(
@@ -21,7 +21,7 @@ def new_command(
     near: tuple[float, float] | None = None,
     force: bool = False,
 ) -> Answer:
-    """Write a starter file with comments (camera, sensor, site, budget, study), or real data to try
+    """Write a starter file with comments (run, camera, sensor, site, budget, study), or real data to try
     everything on.
     """
     if template is not None and what != "study":
@@ -36,6 +36,9 @@ def new_command(
             for name in ("stars.ecsv", "camera.toml", "site.toml", "NOTICE (whose data)")
         )
         following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN"
+    elif what == "run":
+        runfile.write_template(path, force)
+        following = f"put in your files and options, then starcal-uq run {path}"
     elif what == "camera":
         start = sc.paper.paper_start()
         # The centre of the detector, where the paper has a corner of its four middle pixels.

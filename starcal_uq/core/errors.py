@@ -194,5 +194,9 @@ class ClusterError(StarcalError):
     """Processes, of this machine or of a Dask cluster, cannot do the work."""
 
 
+class RunFileError(StarcalError):
+    """A run file that cannot be read, or has a key that no option has."""
+
+
 class RunFolderError(StarcalError):
     """A run folder lacks a file, or holds one that would be overwritten."""

@@ -90,7 +90,7 @@ StudyTemplate = Literal[
 ]
 Convention = Literal["eq14", "eq6"]
 FieldReading = Literal["window", "full"]
-Starter = Literal["camera", "sensor", "site", "budget", "study", "example"]
+Starter = Literal["run", "camera", "sensor", "site", "budget", "study", "example"]
 ExampleName = Literal["esa"]
 ReportFormat = Literal["html", "pdf"]
 BudgetFormat = Literal["xlsx", "tex", "html", "pdf"]

@@ -38,6 +38,7 @@ from starcal_uq.core.manifest import (
 )
 from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, Remedy
+from starcal_uq.core.runfile import NAME as RUN_FILE
 from starcal_uq.core.status import Level, Question
 from starcal_uq.core.types import AnyDict, PathLike
 
@@ -143,6 +144,8 @@ class RunFolder:
         Tests for misfit, jackknife, comparison of models (JSON).
     rejected : Path
         Rows that screening left out, with their reasons (CSV).
+    run_file : Path
+        The options with which the command `run` repeats the run (TOML).
     verdict : Path
         Every check with value, bound, level and remedy (JSON).
     figures : Path
@@ -175,6 +178,7 @@ class RunFolder:
     budget = _File("budget.csv", "budget")
     diagnosis = _File("diagnosis.json", "diagnose")
     rejected = _File("rejected.csv", "calibrate", screening=True)
+    run_file = _File(RUN_FILE, "calibrate")
     verdict = _File("verdict.json", "report")
     figures = _File("figures", "report")
     report = _File("report.html", "report")

@@ -4,6 +4,7 @@ replaces it.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.field import FieldMap
     from starcal_uq.propagation.spectrum import ErrorSpectrum
 
+_LOG = logging.getLogger(__name__)
 P = ParamSpec("P")
 R = TypeVar("R")
 # Frames in a report, whose pictures are some hundred kilobytes together.
@@ -305,6 +307,9 @@ class StoredRun:
             self.has("observations"),
             tuple(Tried.of(one) for one in manifest.tried),
             self.calibration.partitions is not None,
+            file=str(self.path.resolve() / self.folder.run_file.name)
+            if self.has("run_file")
+            else "",
         )
 
     @property
@@ -399,7 +404,9 @@ class StoredRun:
             tell=self._tell,
             words=self._words,
         ) as files:
+            _LOG.info("%s: writing to %s", step, self.path)
             yield files
+        _LOG.info("%s: done", step)
         if "report" in REST_ON[step]:
             self._forget()
         if "budget" in REST_ON[step]:

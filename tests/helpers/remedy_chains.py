@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 import starcal_uq as sc
+from starcal_uq.cli.commands import app
+from starcal_uq.cli.runfiles import expand
 from starcal_uq.core.conflicts import conflict, named, parsed
 from tests.helpers.ground_scenes import NOMINAL, ground_frames
 from tests.helpers.outside import campaign
@@ -151,6 +153,12 @@ def printed(out: str) -> tuple[str, ...]:
     )
 
 
+def options_of(words: Sequence[str]) -> dict[str, tuple[str | None, ...]]:
+    """Options of a command line; those of a run file, with its edits, are those that it holds."""
+    options = parsed(expand(words, app))[1]
+    return {name: values for name, values in options.items() if name != "--out"}
+
+
 def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
     """Follow the first command that is printed, literally, until there is none; all are checked on
     the way.
@@ -164,7 +172,7 @@ def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
         for line in lines:
             status, out, err = call(line)
             assert status in (0, 1), (line, status, err[-400:])
-        options = parsed(lines[-1])[1]
+        options = options_of(lines[-1])
         assert options not in [step.options for step in steps], (lines[-1], "was there before")
         assert all(len(values) == 1 for name, values in options.items() if name != "--column"), (
             lines[-1]
@@ -183,7 +191,7 @@ def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
             if command.split(" && ")[-1].startswith("starcal-uq run ")
         ]
         for command in runs:
-            _, asked = parsed(shlex.split(command.split(" && ")[-1]))
+            asked = options_of(shlex.split(command.split(" && ")[-1])[1:])
             assert conflict(named(asked)) is None, command
             assert asked not in [*(step.options for step in steps), options], command
             assert not {"UTC", "SITE", "OBS", "CAMERA"} & set(shlex.split(command)), command

@@ -23,6 +23,7 @@ from starcal_uq.core.conflicts import (
 )
 from starcal_uq.core.findings import Finding
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, SITE, SOME_IMAGES, UTC, Near, Remedies, Remedy
+from starcal_uq.core.runfile import edited
 from starcal_uq.core.settings import WEIGHING, EffectName, effect_names, joined_effects
 from starcal_uq.core.status import Advice, Check, Code, Level, Order
 from starcal_uq.core.types import AnyDict
@@ -109,8 +110,7 @@ def cause_of(check: Check) -> str:
     """
     if check.code in _CAUSES:
         return _CAUSES[check.code]
-    steps = [step for one in check.remedies for step in one.steps or (one,)]
-    made = [step.arguments for step in steps if step.action in _CALIBRATING]
+    made = [one.arguments for one in check.remedies if one.action in _CALIBRATING]
     asked = {name for given in made for name in (*given, *effect_names(given.get("effects")))}
     return next((cause for cause, options in _OF_OPTIONS.items() if options & asked), NUMERICS)
 
@@ -151,6 +151,7 @@ class Place:
     tried: tuple[Tried, ...] = ()  # Runs that this one has replaced, the latest last
     partitioned: bool = False  # Whether the data are a folder of files
     held: tuple[str, ...] = ()  # Effects of its calibration
+    file: str = ""  # The run file that repeats it
 
     @property
     def made(self) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -224,6 +225,9 @@ class Place:
             out = self.run if self.words[0] == "run" else f"{self.run}-2"
             options = changed(given, asked, self.effects)
             steps = (Remedy("run", files, options | {"out": out, "force": True}),)
+            if self.file:
+                edits = {"set": edited(given, options), "force": True}
+                steps = (Remedy("run", (self.file,), edits),)
         elif OBS in remedy.files and self.observations:
             files = (f"{self.run}/observations.parquet", f"{self.run}/camera.toml")
             steps = (Remedy("run", files, {"out": f"{self.run}-2", **asked, "force": True}),)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.files import check_new_folder, write_csv
+from starcal_uq.core.files import atomic_write_text, check_new_folder, write_csv
+from starcal_uq.core.runfile import written
 from starcal_uq.core.types import Progress
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.weights import weighed
@@ -137,6 +138,8 @@ def write(
             calibrated=calibration.camera,
             calibration=calibration,
         )
+        if run._making and run._words[:1] == ("run",):
+            atomic_write_text(files.run_file, written(run._words))
         if screened is not None:
             screened.save_rejected(files.rejected)
         if history is not None:
