@@ -394,20 +394,20 @@ WITHOUT_NAMESAKE = {
         "weights"
     ),
     "identification": "brightness engine growth match nearby outcome pairs proposers pyramid result sheet",
-    "images": "background detection extract fits fits_files image optics pixel_phase pixels psf raw",
+    "images": "background detection extract fits fits_files image pixel_phase pixels psf raw",
     "inference": "derived surrogate",
     "likelihood": (
         "arrays effect_likelihood effect_sums elimination expansion fitted_effects "
         "frame_products ipopt loops/common loops/frames loops/unrolled "
         "noise_model paths shapes star_errors zenith"
     ),
-    "maths": "circular linear",
+    "maths": "linear",
     "observations": "checks columns frames rows splits written",
     "paper": (
         "camera checks commands errors judgement published readings result show/figures "
         "show/pages show/tables show/views statistics"
     ),
-    "pipeline": "cameras displacement images refine",
+    "pipeline": "cameras images",
     "planning": "check costs effects forecast information open_distortion",
     "presentation": (
         "html pages/comparison pages/gallery pages/notebook pages/planning "
@@ -419,7 +419,7 @@ WITHOUT_NAMESAKE = {
         "steps/misfit steps/mission steps/pages steps/posterior"
     ),
     "simulation": "campaign contamination mission pointing psf truth",
-    "sky": "cds gaia names neighbours positions refraction",
+    "sky": "cds gaia names positions",
     "studies": "axes cells definition geometry result store",
 }
 

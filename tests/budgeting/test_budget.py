@@ -707,11 +707,6 @@ def test_other_endings_are_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_report_gets_one_name(stated: Path) -> None:
-    context = budget_context(made(stated))
-    assert set(context) == {"budget"} and context["budget"]["violated"] is True
-
-
 def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Path) -> None:
     found = made(stated, misfit=NOTHING_FOUND)
     figure = found.plot.contributors()

@@ -11,7 +11,7 @@ from scipy import stats
 
 from starcal_uq.budgeting.file import Requirement
 from starcal_uq.budgeting.result import Outcome
-from starcal_uq.budgeting.rows import Contributor
+from starcal_uq.budgeting.rows import GAUSSIAN_997, Contributor
 from starcal_uq.budgeting.sampling import draw
 from starcal_uq.budgeting.shapes import (
     half_width,
@@ -19,6 +19,7 @@ from starcal_uq.budgeting.shapes import (
 )
 from starcal_uq.budgeting.totals import (
     Total,
+    _heaviest,
     covariance,
     total,
     totals,
@@ -248,6 +249,13 @@ def test_the_combination_of_a_row_is_said() -> None:
     ):
         assert row("bend", 1.0, correlation_group=group).combination == words
     assert row("bend", 1.0, source="not assessed").combination == "not in the totals"
+
+
+def test_the_heaviest_tail_weighs_its_size() -> None:
+    large, long = row("large", 10.0, tail_997=3.2), row("long", 8.0, tail_997=4.5)
+    assert _heaviest([large, long]) is long
+    assert _heaviest([large, row("small", 0.1, tail_997=4.5)]) is large
+    assert _heaviest([row("noise", 10.0, tail_997=GAUSSIAN_997)]) is None
 
 
 def test_totals_scale_with_their_rows_and_their_sentences_stay() -> None:

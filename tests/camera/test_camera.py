@@ -11,7 +11,7 @@ import pytest
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, model_names, simpler_models
-from starcal_uq.core.errors import CameraError, RunFolderError
+from starcal_uq.core.errors import CameraError
 
 PAPER = Camera(1024, 1024, 12.0, 70.2262, 500.0, 530.0, "brown", (2.0e-10, -3.5e-15))
 TABLE = {
@@ -222,15 +222,6 @@ def test_unreadable_files(tmp_path):
     (tmp_path / "latin.toml").write_bytes(b"[camera]\nname = '\xe9'\n")
     with pytest.raises(CameraError, match="not UTF-8"):
         Camera.load(tmp_path / "latin.toml")
-
-
-def test_save_asks_before_it_overwrites(tmp_path):
-    path = write(tmp_path / "camera.toml", "mine")
-    with pytest.raises(RunFolderError, match="--force"):
-        PAPER.save(path)
-    assert path.read_text(encoding="utf-8") == "mine"
-    PAPER.save(path, force=True)
-    assert Camera.load(path) == PAPER
 
 
 def matrix(fx=5000.0, fy=5000.0, skew=0.0):

@@ -12,12 +12,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
-from scipy.spatial import cKDTree
 
 import starcal_uq as sc
 from starcal_uq.pipeline.images import counted, epoch_of, observations_from_images
 from starcal_uq.pipeline.refine import identify_and_calibrate
-from starcal_uq.sky.neighbours import disturbed_stars, without_disturbed
+from starcal_uq.sky.neighbours import without_disturbed
 
 N_IMAGES = 16
 ESA = Path(__file__).resolve().parents[3] / "shared" / "data" / "esa-tetra3"
@@ -285,26 +284,6 @@ def test_real_frames_from_images_to_observations(cli, tmp_path):
             assert off * 3600.0 < 25.0, "a wrong identification"
     assert n > 400
     assert found.n_stars / 8 >= 30
-
-
-def test_stars_beside_a_neighbour_are_left_out():
-    truth = sc.paper.paper_camera()
-    stars = sc.load_catalogue(max_mag=7.0)
-    obs = sc.simulate(stars, truth, n_frames=40, min_stars=10, seed=2)
-    mask = disturbed_stars(obs, stars, truth)
-    assert 0 < mask.sum() < 0.05 * obs.n_stars
-    kept = without_disturbed(obs, stars, truth)
-    assert kept.meta["disturbed_stars"] >= mask.sum()
-    # For the others, the nearest neighbour moves the light by less than a fifth of 0.05 px, or is
-    # out of reach.
-    distance, index = cKDTree(stars.directions_icrs).query(kept.directions_icrs, k=2)
-    near, flux = (
-        distance[:, 1] * truth.focal_px,
-        10.0 ** (-0.4 * (stars.mag[index[:, 1]] - kept.mag)),
-    )
-    assert np.all((near * flux / (1.0 + flux) <= 0.2 * 0.05 + 1e-9) | (near > 3.99))
-    # Wider star images reach farther.
-    assert disturbed_stars(obs, stars, truth, psf_sigma_px=3.0).sum() > mask.sum()
 
 
 @pytest.mark.slow

@@ -408,21 +408,6 @@ def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path, small_plans):
     assert "only the rest counts: more than ten million" in document["plan"]["text"]
 
 
-def test_a_gap_in_a_profile_is_told(cli, run, tmp_path):
-    time = np.r_[np.arange(20.0), 5020.0 + np.arange(20.0)]
-    half = np.radians(0.01 * time) / 2
-    turn = {"time_s": time, "qx": np.sin(half), "qy": 0.0, "qz": 0.0, "qw": np.cos(half)}
-    pd.DataFrame(turn).to_csv(tmp_path / "gap.csv", index=False)
-    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--draws", 60, "--force")
-    assert status == 2
-    assert "the longest gap begins at 19 s" in err
-    status, _, err = cli(
-        "propagate", "run", "--attitudes", "gap.csv", "--rate", 0.1, "--draws", 60, "--force"
-    )
-    assert status == 0
-    assert "no attitude between 19 and 5020 s" in err
-
-
 def test_propagate_tells_what_it_found_odd(cli, run, tmp_path):
     cli("budget", "run")
     half = np.radians(np.arange(10.0)) / 2

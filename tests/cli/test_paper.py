@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 
+@pytest.mark.slow
 def test_reproduce_writes_a_report_and_tables(cli, tmp_path, monkeypatch):
     monkeypatch.setattr("starcal_uq.paper.reproduction.N_READING_DRAWS", 2)
     monkeypatch.setattr("starcal_uq.paper.show.pages.DPI", 60)

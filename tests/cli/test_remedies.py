@@ -579,14 +579,15 @@ def written():
             yield eval(call, dict(CAPITALS))
 
 
-def test_every_command_in_a_sentence_can_be_executed(execute, root):
+@pytest.mark.parametrize("parse", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_every_command_in_a_sentence_can_be_executed(execute, root, parse):
     commands = {re.sub(r"\{\}", "RUN", command) for command in named(r"`starcal-uq ([^`]*)`")}
     commands |= {one.command.removeprefix("starcal-uq ") for one in written()}
     # Those that make the files of a run.
     commands |= {file.remedy.command.removeprefix("starcal-uq ") for file in FILES.values()}
     assert commands == COMMANDS.keys() | ELSEWHERE.keys()
     for command, more in COMMANDS.items():
-        execute(command, more)
+        execute(command, more, parse=parse)
     for command, file in ELSEWHERE.items():
         assert f'"{command.split()[0]}"' in (root / file).read_text(encoding="utf-8"), command
 

@@ -14,7 +14,6 @@ from tests.helpers.remedy_chains import PLANTED, SMALL, follow, plant
 
 QUICK = ("decentring, 0.5 px", "refraction, without times")
 SLOW = (
-    "radial wave, 0.3 px",
     "errors of the stars, 0.05 px",
     "2 % wrong stars",
 )
@@ -41,7 +40,7 @@ def test_effects_take_up_what_was_planted(call, tmp_path):
     assert abs(cal.theta[2] - CAMERA.focal_px) < 3.0 * cal.sigmas[2]
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", [pytest.param(QUICK[0], marks=pytest.mark.slow), QUICK[1]])
 def test_what_is_printed_without_effects_is_followed_to_its_end(name, call, tmp_path):
     steps = follow(call, (*plant(name, tmp_path), "--effects", "none"), tmp_path)
     if name == "decentring, 0.5 px":

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 
-import numpy as np
 import pandas as pd
 
 import starcal_uq as sc
-from tests.helpers.commands import SMALL, files
-from tests.helpers.scenes import camera, observations
+from tests.helpers.commands import files
+from tests.helpers.scenes import camera
 
 
 def test_validate_writes_figure_table_and_verdict(cli, inputs, tmp_path, monkeypatch):
@@ -97,38 +96,3 @@ def test_a_table_that_holds_its_frames_twice_is_refused(cli, inputs, tmp_path):
     assert cli(*call, "drop")[0] == 0
     assert sc.Run(tmp_path / "run").observations.n_frames == table["frame"].nunique()
     assert cli(*call, "perhaps", "--force")[0] == 2
-
-
-def test_screen_lists_what_it_left_out(cli, inputs, tmp_path):
-    table = pd.read_csv(inputs / "obs.csv")
-    table.loc[5, ["ra_deg", "dec_deg"]] = [
-        (table.loc[5, "ra_deg"] + 40.0) % 360.0,
-        -table.loc[5, "dec_deg"],
-    ]
-    table.loc[5, "star_id"] = "wrong"
-    table.to_csv(inputs / "wrong.csv", index=False)
-    status, _, _ = cli(
-        "calibrate", inputs / "wrong.csv", inputs / "camera.toml", "-o", "run", "--screen"
-    )
-    assert status == 0
-    rejected = pd.read_csv(tmp_path / "run" / "rejected.csv")
-    assert "wrong" in set(rejected["star_id"])
-    assert rejected["reason"].notna().all()
-    kept = sc.load_observations(tmp_path / "run" / "observations.parquet")
-    assert kept.n_stars + len(rejected) == len(table)
-
-
-def test_robust_refinement(cli, inputs, tmp_path):
-    status, _, _ = cli(
-        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--effects", "tails"
-    )
-    assert status == 0
-    cal = sc.Calibration.load(tmp_path / "run" / "calibration.json")
-    plain = sc.calibrate(observations(), sc.paper.paper_start())
-    assert np.max(np.abs(cal.theta - plain.theta) / plain.sigmas) < 1.0
-    # Sampling takes the likelihood of the calibration unless another is named.
-    status, _, _ = cli("sample", "run", "--json", *SMALL)
-    assert status in (0, 1)
-    assert (
-        sc.Posterior.load(tmp_path / "run" / "posterior.nc").diagnostics.likelihood == "student_t"
-    )

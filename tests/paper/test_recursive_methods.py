@@ -85,14 +85,6 @@ def test_least_squares_is_stage_one():
     assert cal.sigma > 1.3 * efficient.sigma
 
 
-@pytest.mark.parametrize("solver", ["minpack", "ipopt"])
-def test_least_squares_with_every_solver(solver):
-    obs = observations()
-    cal = sc.calibrate(obs, sc.paper.paper_start(), method="least_squares", solver=solver)
-    reference = sc.calibrate(obs, sc.paper.paper_start(), method="least_squares")
-    assert np.max(np.abs(cal.theta - reference.theta) / cal.sigmas) < 1e-4
-
-
 def test_least_squares_prints_the_focal_length_of_the_paper():
     """70.2122 mm in its Table 2, without distortion; 1000 frames scatter by 0.0002 mm."""
     obs = observations(n_frames=1000, seed=2017)

@@ -131,24 +131,18 @@ def test_a_frame_in_two_places_is_named(tmp_path, ending, batch_rows):
 @pytest.mark.parametrize("batch_rows", [20, 10_000])
 def test_bad_rows_are_named_with_their_place_in_the_file(tmp_path, ending, batch_rows):
     obs, bad = observations(), 500
-    word, number = ("row", bad + 1) if ending == ".parquet" else ("line", bad + 2)
-    cases = [
-        ("x_px", 5000.0, "5000.0 is outside the detector"),
-        ("dec_deg", 91.0, "91.0 is outside -90..90 deg"),
-        ("ra_deg", float("nan"), "the value is missing"),
-        ("y_px", float("inf"), "inf is not a finite number"),
-    ]
-    for column, value, words in cases:
+    number = bad + 1 if ending == ".parquet" else bad + 2
+    cases = {"x_px": 5000.0, "dec_deg": 91.0, "ra_deg": float("nan"), "y_px": float("inf")}
+    for column, value in cases.items():
         values = getattr(obs, column).copy()
         values[bad] = value
         path = write(obs, tmp_path / f"bad{ending}", **{column: values})
-        with pytest.raises(
-            ObservationError, match=f"bad{ending}, {word} {number}, column {column}: .*{words}"
-        ) as caught:
+        with pytest.raises(ObservationError) as caught:
             list(stream_frames(path, camera(), batch_rows=batch_rows))
         assert (caught.value.row, caught.value.column) == (number, column)
-        with pytest.raises(ObservationError, match=f"{word} {number}, column {column}: .*{words}"):
+        with pytest.raises(ObservationError) as loaded:
             sc.load_observations(path, camera())
+        assert str(loaded.value) == str(caught.value)
 
 
 def test_frames_before_a_bad_row_are_given_out(tmp_path):
@@ -170,47 +164,40 @@ def test_other_complaints_are_those_of_the_loader(tmp_path):
     two = obs.select(np.arange(obs.n_stars) != 0).select(
         np.arange(obs.n_stars - 1) >= obs.stars_per_frame[0] - 3
     )
-    path = write(two, tmp_path / "two.parquet")
-    with pytest.raises(
-        ObservationError, match=r"row 1, column frame: frame 0 has 2 stars, and 3 are needed"
-    ):
-        list(stream_frames(path, batch_rows=9))
-    twice = obs.ra_deg.copy(), obs.dec_deg.copy()
-    for values in twice:
+    twice = {name: getattr(obs, name).copy() for name in ("ra_deg", "dec_deg")}
+    for values in twice.values():
         values[1] = values[0]
-    path = write(obs, tmp_path / "twice.parquet", ra_deg=twice[0], dec_deg=twice[1])
-    with pytest.raises(ObservationError, match="the same direction occurs twice in frame 0"):
-        list(stream_frames(path, batch_rows=9))
-    path = tmp_path / "short.csv"
-    path.write_text("frame,x_px,y_px,ra_deg\n0,1,2,3\n")
-    with pytest.raises(ObservationError, match="column dec_deg is missing"):
-        list(stream_frames(path))
-    path.write_text("frame,x_px,y_px,ra_deg,dec_deg\n0,1,2,3\n")
-    with pytest.raises(
-        ObservationError, match=r"short\.csv, line 2: 4 values under a header of 5 columns"
-    ):
-        list(stream_frames(path))
-    path.write_text("frame,x_px,y_px,ra_deg,dec_deg\n")
-    with pytest.raises(ObservationError, match="has no rows"):
-        list(stream_frames(path))
-    path.write_text("")
-    with pytest.raises(ObservationError, match="is empty"):
-        list(stream_frames(path))
-    path.write_text('frame,x_px,y_px,ra_deg,dec_deg\n0,"1,2,3,4\n')
-    with pytest.raises(ObservationError, match=r"line 2: the row cannot be read"):
-        list(stream_frames(path))
-    path.write_bytes(b"frame,x_px,y_px,ra_deg,dec_deg\n0,\xff,2,3,4\n")
-    with pytest.raises(ObservationError, match="UTF-8"):
-        list(stream_frames(path))
-    path = tmp_path / "broken.parquet"
-    path.write_bytes(b"PAR1 and then nothing")
-    with pytest.raises(ObservationError, match="is not a readable table"):
-        list(stream_frames(path))
-    sigma = np.full(obs.n_stars, 0.1)
-    text = [f"{s}" if k < 400 else "" for k, s in enumerate(sigma)]
+    head = b"frame,x_px,y_px,ra_deg,dec_deg\n"
+    files = {
+        "short.csv": b"frame,x_px,y_px,ra_deg\n0,1,2,3\n",
+        "ragged.csv": head + b"0,1,2,3\n",
+        "empty.csv": b"",
+        "quoted.csv": head + b'0,"1,2,3,4\n',
+        "broken.parquet": b"PAR1 and then nothing",
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    paths = [
+        write(two, tmp_path / "two.parquet"),
+        write(obs, tmp_path / "twice.parquet", **twice),
+        *(tmp_path / name for name in files),
+    ]
+    for path in paths:
+        with pytest.raises(ObservationError) as streamed:
+            list(stream_frames(path, batch_rows=9))
+        with pytest.raises(ObservationError) as loaded:
+            sc.load_observations(path)
+        assert str(streamed.value) == str(loaded.value)
+    # A stream knows neither whether rows follow nor the line of what it cannot decode.
+    for content, words in ((head, "has no rows"), (head + b"0,\xff,2,3,4\n", "UTF-8")):
+        (tmp_path / "odd.csv").write_bytes(content)
+        with pytest.raises(ObservationError, match=words):
+            list(stream_frames(tmp_path / "odd.csv"))
+    text = ["0.1" if k < 400 else "" for k in range(obs.n_stars)]
     path = write(obs, tmp_path / "gaps.csv", sigma_px=text)
-    with pytest.raises(ObservationError, match="column sigma_px"):
+    with pytest.raises(ObservationError) as caught:
         list(stream_frames(path, batch_rows=50))
+    assert (caught.value.row, caught.value.column) == (402, "sigma_px")
 
 
 @pytest.mark.extra("images")

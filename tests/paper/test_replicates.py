@@ -336,15 +336,6 @@ def test_accuracy_over_the_field(found):
     np.testing.assert_allclose(found.map_arcsec / found.map_px, 35.1, rtol=0.02)
 
 
-def test_html_and_figure(found):
-    html = found._repr_html_()
-    assert "griffith, all" in html and "10" in html
-    figure = found.plot.spread()
-    labels = [tick.get_text() for tick in figure.axes[0].get_yticklabels()]
-    assert labels == [method.label for method in METHODS][::-1]
-    assert len(figure.axes) == 10
-
-
 def test_save_and_load_lose_nothing(found, tmp_path):
     path = tmp_path / "replicates.npz"
     found.save(path)

@@ -98,30 +98,6 @@ def test_decentring_is_shown_along_azimuths() -> None:
     )
 
 
-def test_shows_itself() -> None:
-    from matplotlib.figure import Figure
-
-    found = paper_curve()
-    assert isinstance(found.plot.curve(), Figure)
-    assert "whole" not in found._repr_html_()
-    assert "px" in found.text
-    assert "arcsec" in found.text
-    table = found.to_dataframe()
-    assert list(table.columns[:4]) == ["azimuth_deg", "radius_px", "mean_px", "sd_px"]
-    assert len(table) == 41
-    for name in ("mean", "sd"):
-        np.testing.assert_allclose(
-            table[f"{name}_arcsec"], table[f"{name}_px"] * found.arcsec_per_px, rtol=1e-12
-        )
-    assert 600 < found.star_radius_px < 745
-    assert np.isnan(distortion_curve(gaussian_posterior(), n=3, n_draws=50).star_radius_px)
-    decentred = distortion_curve(
-        gaussian_posterior("brown_tangential", DECENTRED), n=11, n_draws=100
-    )
-    assert isinstance(decentred.plot.curve(), Figure)
-    assert "from the x axis" in decentred.text
-
-
 def test_what_has_no_curve_is_said() -> None:
     with pytest.raises(ValueError, match="at least 2 radii"):
         distortion_curve(gaussian_posterior(), n=1)

@@ -58,24 +58,6 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
         FieldMap.load(tmp_path / "none.npz")
 
 
-def test_shows_itself() -> None:
-    from matplotlib.figure import Figure
-
-    found = paper_map()
-    assert "best rotation removed" in found._repr_html_()
-    table = found.to_dataframe()
-    assert len(table) == 625
-    assert list(table.columns[:4]) == [
-        "x_px",
-        "y_px",
-        "sigma_absolute_arcsec",
-        "sigma_compensated_arcsec",
-    ]
-    row = table[(table["x_px"] == found.x_px[3]) & (table["y_px"] == found.y_px[7])]
-    assert row["sigma_compensated_arcsec"].item() == found.sigma_compensated_arcsec[7, 3]
-    assert isinstance(found.plot.maps(), Figure)
-
-
 def test_what_cannot_be_mapped_is_said() -> None:
     with pytest.raises(ValueError, match="at least 2 grid points"):
         field_map(posterior(), observations(), n=1)

@@ -9,55 +9,31 @@ import re
 import shutil
 from dataclasses import replace
 
-import erfa
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import starcal_uq as sc
 from starcal_uq.core.errors import ObservationError, SiteError
 from starcal_uq.core.times import utc_text
 from starcal_uq.diagnostics.verdict.observed import corrected
-from starcal_uq.images.optics import common_place, place_of
 from starcal_uq.images.read import read_image, time_in_name
-from starcal_uq.pipeline.displacement import as_measured, mirrored, undisplaced
 from starcal_uq.pipeline.images import observations_from_images, with_time
-from starcal_uq.pipeline.refine import identify_and_calibrate
 from starcal_uq.sky.apparent import (
-    aberrate,
     apparent_directions,
-    catalogue_directions,
-    earth_velocity_km_s,
     make_apparent,
     without_low_stars,
 )
 from starcal_uq.sky.positions import unit_vectors
 from starcal_uq.sky.refraction import (
-    altitude_deg,
-    refract,
     refraction_constants,
     shrinking,
-    site_among_stars,
 )
 from starcal_uq.sky.site import Site
-from tests.helpers.ground_scenes import CAMERA, NOMINAL, SITE, as_centroids, ground_frames, night
+from tests.helpers.ground_scenes import CAMERA, NOMINAL, SITE, ground_frames
 
 TIME = "2019-07-29T20:47:26"
 ARCSEC = 648000.0 / np.pi
 NOORDWIJK = Site(latitude_deg=52.2, longitude_deg=4.42, temperature_c=20.0, name="Noordwijk")
-
-
-def above(site: Site, time: str, lowest_deg: float, n: int = 300, seed: int = 1) -> np.ndarray:
-    """Random directions above an altitude."""
-    vectors = np.random.default_rng(seed).normal(size=(20 * n, 3))
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    zenith, _ = site_among_stars(site, time)
-    return vectors[altitude_deg(vectors, zenith) > lowest_deg][:n]
-
-
-def rotated_onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    rotation, _ = Rotation.align_vectors(b, a)
-    return rotation.apply(a)
 
 
 @pytest.fixture(scope="module")
@@ -133,196 +109,6 @@ def test_wrong_sites_are_refused(tmp_path):
         Site(52.0, 4.0, temperature_c=288.0)
 
 
-# --- sky
-
-
-def _astropy():
-    from astropy.coordinates import EarthLocation
-    from astropy.time import Time
-    from astropy.utils import iers
-
-    return EarthLocation, Time, iers
-
-
-def test_site_against_astropy():
-    EarthLocation, Time, iers = _astropy()
-    times = [TIME, "2026-11-21T03:04:05.6"]
-    with (
-        iers.conf.set_temp("auto_download", False),
-        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
-    ):
-        place = EarthLocation.from_geodetic(SITE.longitude_deg, SITE.latitude_deg, SITE.height_m)
-        time = Time(times, scale="utc")
-        time.delta_ut1_utc = 0.0
-        position, velocity = place.get_gcrs_posvel(time)
-    zenith, ours = site_among_stars(SITE, times)
-    assert zenith.shape == ours.shape == (2, 3)
-    expected = velocity.xyz.to_value("km/s").T
-    # Astropy differentiates nothing but leaves precession out of the axis as well: 1e-6 of 0.44
-    # km/s.
-    assert np.abs(ours - expected).max() < 2e-5
-    assert np.linalg.norm(ours, axis=1) == pytest.approx(
-        0.465 * np.cos(np.radians(SITE.latitude_deg)), rel=2e-3
-    )
-    # The geocentric direction differs from the zenith by the flattening, 0.19 degrees times sin(2
-    # latitude).
-    there = position.xyz.value.T
-    there /= np.linalg.norm(there, axis=1, keepdims=True)
-    angle = np.degrees(np.arccos(np.sum(zenith * there, axis=1)))
-    assert angle == pytest.approx(0.1924 * abs(np.sin(np.radians(2 * SITE.latitude_deg))), rel=0.01)
-    one, _ = site_among_stars(SITE, times[1])
-    assert np.allclose(one, zenith[1], rtol=0, atol=1e-15)
-    # UT1 - UTC turns the zenith: 15 arcsec a second times the cosine of the latitude.
-    moved, _ = site_among_stars(SITE, TIME, ut1_minus_utc_s=0.5)
-    turned = np.linalg.norm(moved - zenith[0]) * ARCSEC
-    assert turned == pytest.approx(7.52 * np.cos(np.radians(SITE.latitude_deg)), rel=0.01)
-
-
-@pytest.mark.parametrize("site", [SITE, NOORDWIJK])
-def test_apparent_directions_against_astropy(site):
-    """Astropy's AltAz with pressure, after the best rotation: what is left is the Sun's deflection
-    of light.
-    """
-    from astropy import units as u
-    from astropy.coordinates import AltAz, SkyCoord
-
-    EarthLocation, Time, iers = _astropy()
-    directions = above(site, TIME, 12.0)
-    time = TIME if site is NOORDWIJK else "2019-07-30T04:00:00"
-    directions = above(site, time, 12.0)
-    ours = apparent_directions(directions, time, site=site)
-    with (
-        iers.conf.set_temp("auto_download", False),
-        iers.conf.set_temp("iers_degraded_accuracy", "ignore"),
-    ):
-        frame = AltAz(
-            obstime=Time(time, scale="utc"),
-            location=EarthLocation.from_geodetic(
-                site.longitude_deg, site.latitude_deg, site.height_m
-            ),
-            pressure=site.air_pressure_hpa * u.hPa,
-            temperature=site.air_temperature_c * u.deg_C,
-            relative_humidity=site.relative_humidity,
-            obswl=site.wavelength_um * u.micron,
-        )
-        sky = SkyCoord(*directions.T, representation_type="cartesian", frame="icrs")
-        sky = SkyCoord(sky.spherical.lon, sky.spherical.lat, frame="icrs")
-        seen = sky.transform_to(frame)
-        astropy = unit_vectors(seen.az.deg, seen.alt.deg)
-    # Azimuth runs from north over east: a left-handed system.
-    astropy[:, 1] *= -1.0
-    left = np.linalg.norm(rotated_onto(ours, astropy) - astropy, axis=1) * ARCSEC
-    high = seen.alt.deg > 20.0
-    assert left[high].max() < 0.012
-    assert left.max() < 0.15
-    assert (
-        np.abs(altitude_deg(ours, site_among_stars(site, time)[0]) - seen.alt.deg).max() * 3600.0
-        < 16.0
-    )
-    # The control: without refraction, seconds of arc are left.
-    control = aberrate(directions, earth_velocity_km_s(time))
-    assert np.linalg.norm(rotated_onto(control, astropy) - astropy, axis=1).max() * ARCSEC > 20.0
-
-
-def test_refraction_is_the_formula_and_erfas():
-    zenith = np.array([0.0, 0.0, 1.0])
-    z_seen = np.radians(np.array([0.0, 10.0, 45.0, 60.0, 75.0, 80.0]))
-    # The conditions of the table in the documentation of erfa's refco: 58.18 arcsec at 45 degrees.
-    site = Site(
-        50.0,
-        0.0,
-        pressure_hpa=1005.0,
-        temperature_c=7.0,
-        relative_humidity=0.8,
-        wavelength_um=0.574,
-    )
-    a, b = refraction_constants(site)
-    expected = a * np.tan(z_seen) + b * np.tan(z_seen) ** 3
-    z_vacuum = z_seen + expected
-    directions = np.column_stack([np.sin(z_vacuum), np.zeros(6), np.cos(z_vacuum)])
-    seen = refract(directions, zenith, (a, b))
-    assert np.arctan2(seen[:, 0], seen[:, 2]) == pytest.approx(z_seen, abs=1e-12)
-    assert expected[2] * ARCSEC == pytest.approx(58.18, abs=0.01)
-    # All over the sky, below the horizon too, lengths stay one.
-    sky = np.random.default_rng(2).normal(size=(1000, 3))
-    sky /= np.linalg.norm(sky, axis=1, keepdims=True)
-    assert np.linalg.norm(refract(sky, zenith, (a, b)), axis=1) == pytest.approx(1.0, abs=1e-14)
-    assert np.isfinite(refract(np.array([zenith, -zenith]), zenith, (a, b))).all()
-    # erfa's whole chain, which takes one step of Newton's method where this takes four.
-    astrom = erfa.apio(0.0, 0.0, 0.0, np.radians(50.0), 0.0, 0.0, 0.0, a, b)
-    _, zenith_distance, *_ = erfa.atioq(*_cirs(directions[1:5], np.radians(50.0)), astrom)
-    assert zenith_distance == pytest.approx(z_seen[1:5], abs=0.01 / ARCSEC)
-
-
-def _cirs(up: np.ndarray, latitude: float) -> tuple[np.ndarray, np.ndarray]:
-    """Right ascension and declination, at hour angle zero of Greenwich, of directions given by x
-    south, z up.
-    """
-    south, z = up[:, 0], up[:, 2]
-    x = np.cos(latitude) * z + np.sin(latitude) * south
-    y = up[:, 1]
-    w = np.sin(latitude) * z - np.cos(latitude) * south
-    return np.arctan2(y, x), np.arctan2(w, np.hypot(x, y))
-
-
-@pytest.mark.parametrize("altitude", [90.0, 60.0, 45.0, 25.0])
-def test_how_much_small_angles_shrink(altitude):
-    constants = refraction_constants(NOORDWIJK)
-    zenith, small = np.array([0.0, 0.0, 1.0]), 1e-3
-    z = np.radians(90.0 - altitude)
-    centre = np.array([np.sin(z), 0.0, np.cos(z)])
-    up, side = np.array([-np.cos(z), 0.0, np.sin(z)]), np.array([0.0, 1.0, 0.0])
-    parts = []
-    for axis in (up, side):
-        ends = np.array([centre + sign * small * axis for sign in (1, -1)])
-        ends /= np.linalg.norm(ends, axis=1, keepdims=True)
-        seen = refract(ends, zenith, constants)
-        before, after = (np.linalg.norm(pair[0] - pair[1]) for pair in (ends, seen))
-        parts.append(1.0 - after / before)
-    assert float(shrinking(altitude, constants)) == pytest.approx(np.mean(parts), rel=5e-3)
-    if altitude == 45.0:
-        # The textbook: R = A tan z to a thousandth, hence (A / 2) (1 + 1 / cos^2 z).
-        assert float(shrinking(45.0, constants)) == pytest.approx(1.5 * constants[0], rel=0.01)
-
-
-def test_catalogue_directions_are_the_inverse():
-    for site, lowest in ((SITE, 10.5), (None, -90.0)):
-        directions = above(SITE, TIME, lowest)
-        seen = apparent_directions(directions, TIME, site=site)
-        back = catalogue_directions(seen, TIME, site=site)
-        assert np.linalg.norm(back - directions, axis=1).max() * ARCSEC < 1e-4
-        assert np.linalg.norm(seen - directions, axis=1).max() * ARCSEC > 15.0
-
-
-def test_the_table_of_real_stars(real_data):
-    """Its apparent directions are those of air at 0 °C over 51.96° N, 4.51° E, without diurnal
-    aberration.
-    """
-    with (real_data / "esa_tetra3_observations.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
-    column = {
-        name: np.array([float(row[name]) for row in rows])
-        for name in rows[0]
-        if name.endswith("deg")
-    }
-    catalogue = unit_vectors(column["ra_deg"], column["dec_deg"])
-    expected = unit_vectors(column["ra_apparent_deg"], column["dec_apparent_deg"])
-
-    def left(site: Site) -> float:
-        zenith, _ = site_among_stars(site, TIME)
-        ours = refract(
-            aberrate(catalogue, earth_velocity_km_s(TIME)), zenith, refraction_constants(site)
-        )
-        return float(np.linalg.norm(ours - expected, axis=1).max()) * ARCSEC
-
-    cold = Site(51.96, 4.51, pressure_hpa=1013.25, temperature_c=0.0, wavelength_um=0.55)
-    assert left(cold) < 0.06
-    # The controls: another pressure, another place.
-    assert left(replace(cold, pressure_hpa=1000.0)) > 0.5
-    assert left(replace(cold, latitude_deg=52.96)) > 0.5
-    assert left(replace(cold, longitude_deg=-4.51)) > 5.0
-
-
 # --- observations
 
 
@@ -347,15 +133,6 @@ def test_make_apparent_at_a_site(stars):
         make_apparent(obs, (0.0, 0.3, 0.0), site=SITE)
     with pytest.raises(ObservationError, match="no column 'time_utc'"):
         make_apparent(replace(obs, time_utc=None), site=SITE)
-
-
-def test_what_a_site_adds_survives_a_file(stars, tmp_path):
-    obs = make_apparent(ground_frames(stars, np.array([50.0])), site=SITE)
-    for name in ("obs.parquet", "obs.ecsv"):
-        obs.save(tmp_path / name)
-        again = sc.load_observations(tmp_path / name)
-        assert again.meta["site"] == obs.meta["site"]
-        assert again.meta["atmosphere"] == obs.meta["atmosphere"]
 
 
 def test_stars_below_the_horizon_mean_a_wrong_site_or_time(stars):
@@ -406,92 +183,6 @@ def test_refraction_moves_f_and_the_site_puts_it_right(stars):
     predicted = make_apparent(obs, site=SITE).meta["atmosphere"]["shrinking"] * CAMERA.focal_px
     assert predicted > 10.0 * wrong.sigmas[2]
     assert wrong.theta[2] - CAMERA.theta[2] == pytest.approx(-predicted, abs=4.0 * wrong.sigmas[2])
-
-
-# --- identification
-
-
-def _bootstrap(obs, stars, site, *, moved=True, flip=False):
-    table = as_centroids(obs)
-    table = mirrored(table, CAMERA.width_px) if flip else table
-    return identify_and_calibrate(
-        table,
-        NOMINAL,
-        stars,
-        prepare=lambda found: make_apparent(found, site=site),
-        to_catalogue=(lambda seen, times: catalogue_directions(seen, times, site=site))
-        if moved
-        else None,
-    )
-
-
-def _named(obs):
-    return set(zip(obs.frame.tolist(), obs.star_id.tolist(), strict=True))
-
-
-def test_second_identification_looks_where_stars_are_seen(stars):
-    site = replace(SITE, pressure_hpa=1013.25)
-    obs = ground_frames(stars, np.random.default_rng(5).uniform(18.0, 31.0, 30), seed=3, site=site)
-    found = _bootstrap(obs, stars, site)
-    assert found.identification.n_identified == 30
-    assert not _named(found.observations) - _named(obs)
-    # Hardly a star that was found is given up, and the places are those that were measured.
-    given_up = len(_named(found.rounds[0][1]) - _named(found.observations))
-    # The others have a neighbour too near to tell which is which.
-    assert found.observations.n_stars > 0.98 * obs.n_stars
-    measured = dict(
-        zip(
-            zip(obs.frame, obs.star_id, strict=True),
-            zip(obs.x_px, obs.y_px, strict=True),
-            strict=True,
-        )
-    )
-    rows = zip(found.observations.frame, found.observations.star_id, strict=True)
-    places = np.column_stack([found.observations.x_px, found.observations.y_px])
-    assert np.array_equal([measured[row] for row in rows], places)
-    assert np.all(np.abs((found.calibration.theta - CAMERA.theta) / found.calibration.sigmas) < 4.0)
-    # The control: compared with the catalogue as it stands, the calibrated camera's tolerance loses
-    # stars.
-    control = _bootstrap(obs, stars, site, moved=False)
-    lost = len(_named(control.rounds[0][1]) - _named(control.observations))
-    assert lost > given_up
-    assert control.observations.n_stars < found.observations.n_stars - 8
-
-
-def test_mirrored_images_keep_their_camera(stars):
-    obs = ground_frames(stars, np.random.default_rng(5).uniform(40.0, 80.0, 12), seed=4)
-    found = _bootstrap(obs, stars, SITE, flip=True)
-    assert found.identification.parity == "mirrored"
-    assert [r[0].n_identified for r in found.rounds] == [12, 12]
-    assert not _named(found.observations) - _named(obs)
-    # x is counted from the right edge of the mirrored image: the calibration is that of the camera
-    # itself.
-    assert np.all(np.abs((found.calibration.theta - CAMERA.theta) / found.calibration.sigmas) < 4.0)
-
-
-def test_moved_centroids_are_where_the_catalogue_has_them(stars):
-    obs = ground_frames(stars, np.array([25.0, 60.0, 40.0]), sigma_px=0.0)
-    table = as_centroids(obs)
-    seen = make_apparent(obs, site=SITE).select_frames([0, 1])
-    moved = undisplaced(table, seen, CAMERA, lambda u, t: catalogue_directions(u, t, site=SITE))
-    # The pixels of the catalogue's directions through the true camera, at the best attitude.
-    for number in (0, 1):
-        rows = table.frame == number
-        b = sc.camera.unproject(CAMERA, np.column_stack([moved.x_px[rows], moved.y_px[rows]]))
-        r = obs.directions_icrs[obs.frame == number]
-        left = np.linalg.norm(rotated_onto(r, b) - b, axis=1) * CAMERA.focal_px
-        assert np.median(left) < 1e-5
-        shift = np.hypot(moved.x_px[rows] - table.x_px[rows], moved.y_px[rows] - table.y_px[rows])
-        assert 0.03 < shift.max() < 1.0
-    untouched = table.frame == 2
-    assert np.array_equal(moved.x_px[untouched], table.x_px[untouched])
-    back = as_measured(replace(obs, x_px=moved.x_px, y_px=moved.y_px), moved, table)
-    assert np.array_equal(back.x_px, obs.x_px)
-
-
-def test_night_is_night():
-    assert len(night(30)) == 30
-    assert all(re.fullmatch(r"2026-11-25T\d\d:\d\d:00", time) for time in night(30))
 
 
 # --- report
@@ -585,55 +276,6 @@ def test_report_states_site_air_and_what_refraction_does(stars):
 )
 def test_times_in_names_of_files(name, time):
     assert time_in_name(name) == time
-
-
-def earth_fixed(latitude, longitude, height):
-    """Geocentric place in metres, WGS 84."""
-    lat, lon, flat = np.radians(latitude), np.radians(longitude), 1.0 / 298.257223563
-    e2 = flat * (2.0 - flat)
-    n = 6378137.0 / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
-    level = (n + height) * np.cos(lat)
-    return level * np.cos(lon), level * np.sin(lon), (n * (1.0 - e2) + height) * np.sin(lat)
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        {"SITELAT": "52 13 12", "SITELONG": "4 25 12", "SITEELEV": 10},
-        {"SITELAT": 52.22, "SITELONG": 4.42, "SITEELEV": "10"},
-        {"SITELAT": "+52:13:12.0", "SITELONG": "-355:34:48", "SITEELEV": 10.0},
-        {"SITELAT": "52d13m12s N", "SITELONG": "04d25m12s E", "SITEELEV": 10.0},
-        {"LAT-OBS": 52.22, "LONG-OBS": 4.42, "ALT-OBS": 10.0},
-        dict(
-            zip(("OBSGEO-X", "OBSGEO-Y", "OBSGEO-Z"), earth_fixed(52.22, 4.42, 10.0), strict=True)
-        ),
-    ],
-)
-def test_a_place_in_a_header(header):
-    place = place_of(header)
-    assert (place["latitude_deg"], place["longitude_deg"]) == pytest.approx((52.22, 4.42), abs=1e-6)
-    assert place["height_m"] == pytest.approx(10.0, abs=1e-3)
-    west = place_of({"SITELAT": "-24 36 00", "SITELONG": "70 24 00 W"})
-    assert (west["latitude_deg"], west["longitude_deg"]) == pytest.approx((-24.6, -70.4))
-    assert common_place([{}, place]) == place
-    assert common_place([west, place]) == common_place([{}]) == {}
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        {},
-        {"SITELAT": 0.0, "SITELONG": 0.0},
-        {"SITELAT": "unknown", "SITELONG": "4 25 12"},
-        {"SITELAT": 95.0, "SITELONG": 4.0},
-        {"SITELAT": "52 77 12", "SITELONG": "4 25 12"},
-        {"OBSGEO-X": 1.0, "OBSGEO-Y": 2.0, "OBSGEO-Z": 3.0},
-        {"SITELAT": 52.0, "SITELONG": 4.0, "SITEELEV": 400_000.0},
-    ],
-    ids=str,
-)
-def test_no_place_in_a_header(header):
-    assert place_of(header) == {}
 
 
 @pytest.mark.slow

@@ -12,13 +12,11 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError, StudyError
-from starcal_uq.core.manifest import read_manifest
 from starcal_uq.paper import paper_camera
 from starcal_uq.simulation.sensor import Sensor
 from starcal_uq.studies import TEMPLATES, Study, StudyDefinition, cells, write_study_template
 from starcal_uq.studies.axes import camera_of
 from starcal_uq.studies.geometry import Geometry, GeometryKey, Heaven, statements, take_frames
-from tests.helpers.crashes import snapshots
 
 ARCSEC = 648_000.0 / np.pi
 
@@ -120,20 +118,6 @@ def test_sigma_follows_noise_exactly_and_frames_by_the_root(small: Study) -> Non
     np.testing.assert_allclose(sigma[0] / sigma[3], 2.0, rtol=0.15)
     assert small.ok.all()
     assert small.axes == ("frames", "sigma_px")
-
-
-def test_cells_of_the_papers_set_up(small: Study) -> None:
-    """DESIGN's figures for 1000 frames at 0.05 px."""
-    cell = small.data.isel(cell=3)
-    correlation = cell["correlation"]
-    assert float(correlation.sel(parameter="f", parameter_2="k1")) == pytest.approx(-0.94, abs=0.01)
-    assert float(correlation.sel(parameter="k1", parameter_2="k2")) == pytest.approx(
-        -0.97, abs=0.01
-    )
-    assert float(cell["sigma"].sel(parameter="f")) == pytest.approx(0.028, rel=0.15)
-    assert float(cell["sigma"].sel(parameter="x0")) == pytest.approx(0.15, rel=0.15)
-    assert str(cell["weak_words"].values).startswith("k1 against k2 and f")
-    assert float(cell["variance_inflation"].sel(parameter="k1")) > 20.0
 
 
 def test_a_cell_agrees_with_a_plan(small: Study) -> None:
@@ -395,60 +379,6 @@ def test_only_new_cells_are_computed_and_results_come_back(
     assert loaded.data.identical(other.data)
     assert loaded.definition.axes == definition().axes
     assert len(loaded.table()) == 30
-
-
-def same(found: Study, wanted: Study) -> bool:
-    """Equal but for the time that cells took."""
-    names = [name for name in wanted.data.data_vars if name != "seconds"]
-    return bool(found.data[names].equals(wanted.data[names])) and found.complete == wanted.complete
-
-
-def test_a_forced_study_replaces_that_of_before_when_it_is_complete(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At every moment; stopped, it goes on with the cells that it has, and each is computed
-    once.
-    """
-    monkeypatch.setattr("starcal_uq.studies.study._BATCH_S", 1e-9)
-    folder = tmp_path / "work" / "out"
-    old = sc.study(definition(sweep={"frames": (250, 500)}), out=folder, workers=0, more=page)
-    (folder / "notes.txt").write_text("mine")
-    before = results(folder)
-    calls, wanted = counted(monkeypatch), definition(sweep={"frames": (250, 400, 500)}, seed=2)
-
-    def stop(done: int, _total: int) -> None:
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with snapshots(folder.parent, tmp_path / "states") as states:
-        part = sc.study(wanted, out=folder, workers=0, force=True, progress=stop, more=page)
-        assert not part.complete and part.ok.sum() == 2
-        assert same(Study.load(folder), old)
-        new = sc.study(wanted, out=folder, workers=0, more=page)
-    assert len(calls) == 3 and new.complete
-    assert {path.name for path in folder.iterdir()} == {
-        *("cells", "study.nc", "study.parquet", "report.html", "run.json", "notes.txt")
-    }
-    assert len(list((folder / "cells").iterdir())) == 1
-    after = results(folder)
-    found = [results(state / "out") == after for state in states]
-    assert all(results(state / "out") in (before, after) for state in states)
-    assert found == sorted(found) and 5 < sum(found) < len(found) - 5
-    # Wherever it was stopped, it is the same in the end, and old cells are not taken for new ones.
-    first_new = found.index(True)
-    for state in (states[first_new - 1], states[-2]):
-        assert same(sc.study(wanted, out=state / "out", workers=0, more=page), new)
-        assert len(list((state / "out" / "cells").iterdir())) == 1
-
-
-def page(found: Study, folder: Path) -> None:
-    (folder / "report.html").write_text(f"{found.n_cells} cells of seed {found.definition.seed}")
-
-
-def results(folder: Path) -> list[bytes]:
-    """What a folder holds of a study, once those are in their places whose writer was stopped."""
-    read_manifest(folder)
-    return [(folder / name).read_bytes() for name in ("study.nc", "study.parquet", "report.html")]
 
 
 def test_an_interrupted_study_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
