@@ -83,6 +83,7 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
     assert "needs the nominal camera" in err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("centroids_once")
 def test_the_commands_one_by_one_give_what_run_gives(cli, frames, tmp_path):
     """To the last bit: centroid, identify and calibrate beside the steps of `run` up to its

@@ -273,7 +273,6 @@ def in_a_corner(rng):
 
 LEFT_OPEN = {
     "one radius": (on_a_ring, {}, "brown", "do not tell k1 and k2 apart: stars at more radii are"),
-    "one radius, without noise": (on_a_ring, {"sigma_px": 1e-07}, "brown", "stars at more radii"),
     "the middle of the field": (in_the_middle, {}, "k1", "k1.* are needed, or a distortion model"),
     "a field of half a degree, 64 px": (
         lambda rng: rng.uniform(-28.0, 28.0, (2, 10)),

@@ -273,7 +273,13 @@ def sheet(focal_error: float) -> sc.Camera:
     )
 
 
-@pytest.mark.parametrize("camera", [None, sheet(1.1)], ids=["no sheet", "10 % off"])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        pytest.param(None, id="no sheet"),
+        pytest.param(sheet(1.1), id="10 % off", marks=pytest.mark.slow),
+    ],
+)
 def test_virgo_has_a_rival_with_the_same_stars(
     stars: StarCatalogue, camera: sc.Camera | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,10 +34,14 @@ def one_by_one(obs):
     return [obs.select_frames([k]) for k in obs.frame_ids]
 
 
-@pytest.mark.parametrize("model", USUAL)
 @pytest.mark.parametrize(
-    ("method", "options", "stated"),
-    [(*one, stated) for one, stated in zip(BASELINES, [True, False, False, True], strict=True)],
+    ("method", "options", "stated", "model"),
+    [
+        (*one, stated, model)
+        for one, stated in zip(BASELINES, [True, False, False, True], strict=True)
+        # Of those that ignore or decouple the distortion one kind of each shows it.
+        for model in (USUAL if one[1] is ALL else ("none", "brown_tangential", "inverse"))
+    ],
 )
 def test_every_method_on_every_model(model, stated, method, options):
     truth, obs = camera(model), observations(model, max_mag=6.5)
