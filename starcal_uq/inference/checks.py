@@ -116,8 +116,8 @@ def check_compression(
 
     With a sample of frames the expansion is compared on these, and stated is what they tell for
     all, with `_SAMPLE_ERRORS` standard errors on top. That the compressed likelihood holds all
-    frames, as `exact` does, is then seen at two points on the surface that no direction is missing
-    in.
+    frames is seen by the sum of squares that the calibration knows of its own table; of other data,
+    `exact` is compared at two points on the surface that no direction is missing in.
 
     `target`: its origin is the mode.
     `draws` (n, p+1): posterior draws, (n, p+2) where one parameter is added.
@@ -155,7 +155,9 @@ def check_compression(
     found, slack = known(target.natural(_surface(target.dim)))
     on_surface = float(np.max(np.abs(found) + slack))
     whole = 0.0
-    if sample is not None:
+    if sample is not None and sample.whole is not None:
+        whole = sample.whole
+    elif sample is not None:
         diagonal = np.full((1, target.dim), _REACH_SD / np.sqrt(target.dim))
         whole = float(
             np.max(np.abs(differences(target.natural(np.concatenate([diagonal, -diagonal])))))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,27 +40,29 @@ class ExactMarginal:
     over the stars is enough for a point.
     """
 
-    def __init__(
-        self, obs: Observations | StarFrames, cal: Calibration, rotations: FloatArray | None = None
-    ) -> None:
+    def __init__(self, obs: Observations, cal: Calibration) -> None:
+        self._obs, self._cal = obs, cal
+
+    @cached_property
+    def _one(self) -> MarginalLikelihood:
+        """The likelihood of all stars, which is made when it is first evaluated."""
+        obs, cal = self._obs, self._cal
         model, theta = cal.camera.distortion, cal.theta
-        if cal.ties is not None and not isinstance(obs, StarFrames):
+        if cal.ties is not None:
             ties = Ties.of(obs.frame_ids, cal.ties.known)
-            self._one: MarginalLikelihood = TiedLikelihood(obs, model, ties, cal.ties.sigma)
-            self._one.use_rotations(quaternion_to_rotation(cal.quaternions))
-            return
-        if cal.effects and cal.effects.fitted and not isinstance(obs, StarFrames):
+            tied = TiedLikelihood(obs, model, ties, cal.ties.sigma)
+            tied.use_rotations(quaternion_to_rotation(cal.quaternions))
+            return tied
+        if cal.effects and cal.effects.fitted:
             effects = cal.effects.of(obs, cal.camera)
             frames = StarFrames.from_observations(obs, axes=True)
             at = (theta, quaternion_to_rotation(cal.quaternions), cal.sigma)
-            self._one = EffectLikelihood(frames, model, effects, cal.effects.ratio(cal.sigma), *at)
-            return
-        self._one = MarginalLikelihood(obs, model, axes=True)
-        if rotations is None and len(cal.quaternions) == self._one.frames.n_frames:
-            rotations = quaternion_to_rotation(cal.quaternions)
-        if rotations is not None:
-            self._one.use_rotations(rotations)
-        self._one.use_sums(*self._one.sums(theta))
+            return EffectLikelihood(frames, model, effects, cal.effects.ratio(cal.sigma), *at)
+        one = MarginalLikelihood(obs, model, axes=True)
+        if len(cal.quaternions) == one.frames.n_frames:
+            one.use_rotations(quaternion_to_rotation(cal.quaternions))
+        one.use_sums(*one.sums(theta))
+        return one
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """Log likelihood (n,) at theta (n, p) and sigma (n,)."""
@@ -88,16 +90,24 @@ class FrameSample:
             else None
         )
         frames = StarFrames.from_observations(some, axes=True)
-        frame = np.repeat(np.arange(some.n_frames), frames.sizes)
-        plain = replace(cal, effects=None, ties=None)
-        self._batches = []
-        for first in range(min(BATCHES, some.n_frames)):
-            batch = frames.select(frame % BATCHES == first)
-            start = None if rotations is None else rotations[first::BATCHES]
-            exact = ExactMarginal(batch, plain, start)
-            likelihood = MarginalLikelihood(batch, cal.camera.distortion)
-            expanded = compress(likelihood, whole.theta_hat, covariance, start)
-            self._batches.append((exact, expanded, self.of_frames / batch.n_frames))
+        self._exact = MarginalLikelihood(frames, cal.camera.distortion)
+        if rotations is not None:
+            self._exact.use_rotations(rotations)
+        self._exact.use_sums(*self._exact.sums(whole.theta_hat))
+        n_batches = min(BATCHES, some.n_frames)
+        self._batch = np.arange(some.n_frames) % BATCHES
+        of_stars = np.repeat(self._batch, frames.sizes)
+        self._stand_for = self.of_frames / np.bincount(self._batch)
+        self.whole = _off_at_the_estimate(obs, cal)
+        self._expanded = [
+            compress(
+                MarginalLikelihood(frames.select(of_stars == batch), cal.camera.distortion),
+                whole.theta_hat,
+                covariance,
+                None if rotations is None else rotations[batch::BATCHES],
+            )
+            for batch in range(n_batches)
+        ]
         self._at: Callable[[FloatArray], FloatArray] = np.asarray
 
     def evaluated(self, at: Callable[[FloatArray], FloatArray]) -> FrameSample:
@@ -111,15 +121,27 @@ class FrameSample:
         n).
         """
         theta = self._at(theta)
-        return np.array(
-            [
-                (exact.log_likelihood(theta, sigma) - expanded.log_likelihood(theta, sigma))
-                * stands_for
-                for exact, expanded, stands_for in self._batches
-            ]
-        )
+        expanded = [batch.log_likelihood(theta, sigma) for batch in self._expanded]
+        # All batches in one pass for each point
+        exact = [
+            np.bincount(self._batch, self._exact.by_frame(point, float(noise)))
+            for point, noise in zip(theta, sigma, strict=True)
+        ]
+        return np.asarray((np.transpose(exact) - expanded) * self._stand_for[:, None])
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """The compressed log likelihood of all frames, and what it leaves out (n,)."""
         left_out: FloatArray = self.left_out(theta, sigma).mean(axis=0)
         return self._summed(self._at(theta), sigma) + left_out
+
+
+def _off_at_the_estimate(obs: Observations, cal: Calibration) -> float | None:
+    """Difference of the compressed likelihood from the sum of squares that another pass over all
+    stars has found at the estimate, nat; None where the calibration does not know it.
+    """
+    beside = (cal.effects and cal.effects.names, cal.ties, cal.noise_model, cal.partitions)
+    if any(beside) or obs.data_hash != cal.provenance.data_sha256:
+        return None
+    whole = cal.compressed
+    squares = float(whole.sum_of_squares(whole.whiten(cal.theta))[0])
+    return abs(squares - cal.chi2) / (2.0 * cal.sigma**2)

@@ -220,6 +220,17 @@ class MarginalLikelihood:
             -0.5 * sums.cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * sums.log_determinant
         )
 
+    def by_frame(self, theta: FloatArray, sigma: float) -> FloatArray:
+        """Log likelihood (K,) of each frame at theta (p,)."""
+        frames, e = self.frames, np.empty((2, self.frames.n_stars))
+        sums, attitudes = self.sums(theta, e)
+        if not np.isfinite(sums.cost):
+            return np.full(frames.n_frames, -np.inf)
+        squares = frames.sum(np.sum(e**2, axis=0))
+        dof = 2.0 * frames.informed - 3.0
+        volume = attitudes.log_determinant
+        return np.asarray(-0.5 * squares / sigma**2 - dof * np.log(sigma) - 0.5 * volume)
+
     def log_likelihoods(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """Log likelihood (n,) at theta (n, p) and sigma (n,), many points of a small table at a
         time.

@@ -19,6 +19,15 @@ if TYPE_CHECKING:
 _NOTHING = 1e-8
 
 
+def ranges_of_frames(starts: IntArray, max_stars: int) -> list[tuple[int, int]]:
+    """Ranges of frames with about `max_stars` stars each; frame k has the stars ``starts[k]:starts[k + 1]``."""
+    n_stars = int(starts[-1])
+    n_parts = max(1, -(-n_stars // max_stars))
+    targets = np.linspace(0, n_stars, n_parts + 1)
+    edges = np.unique(np.searchsorted(starts, targets))
+    return [(int(a), int(b)) for a, b in pairwise(edges)]
+
+
 @dataclass(frozen=True)
 class StarFrames:
     """Measured pixels (2, N), px, and unit vectors `r` (3, N), ICRS, contiguous by frame.
@@ -79,11 +88,18 @@ class StarFrames:
         return int(self.pixel.shape[1])
 
     @cached_property
-    def n_informed(self) -> int:
-        """Number of stars that have a say: a weight is nothing beside one 1e8 times as large."""
+    def informed(self) -> IntArray:
+        """Number of stars of each frame (K,) that have a say: a weight is nothing beside one 1e8
+        times as large.
+        """
         if self.weight is None:
-            return self.n_stars
-        return int(np.count_nonzero(self.weight > _NOTHING * np.max(self.weight)))
+            return self.sizes
+        return np.add.reduceat(self.weight > _NOTHING * np.max(self.weight), self.starts[:-1])
+
+    @property
+    def n_informed(self) -> int:
+        """Number of stars that have a say."""
+        return int(self.informed.sum())
 
     @property
     def n_frames(self) -> int:
@@ -152,10 +168,7 @@ class StarFrames:
 
     def parts(self, max_stars: int = 100_000) -> list[tuple[int, int]]:
         """Ranges of frames with about `max_stars` stars each, so that memory stays bounded."""
-        n_parts = max(1, -(-self.n_stars // max_stars))
-        targets = np.linspace(0, self.n_stars, n_parts + 1)
-        edges = np.unique(np.searchsorted(self.starts, targets))
-        return [(int(a), int(b)) for a, b in pairwise(edges)]
+        return ranges_of_frames(self.starts, max_stars)
 
     def rotated(self, rotations: FloatArray) -> FloatArray:
         """Catalogue directions in the camera frame: ``b = R r`` with R_cam_icrs (K, 3, 3); (3,

@@ -16,6 +16,7 @@ from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.shapes import View
+from starcal_uq.observations.frames import ranges_of_frames
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -23,11 +24,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 _STARS_AT_ONCE = 1_000_000
-# Stars whose columns of shapes are held at once.
+# Stars whose columns are held at once.
 _COLUMNS_AT_ONCE = 10_000
-# Half a pixel: the map is so smooth that the central difference errs by (h / f)^2, while rounding
-# stays below 1e-12.
-_STEP_PX = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,31 +53,23 @@ class FrameGeometry:
         """Linearise QUEST on these frames."""
         obs = weighed(obs, post)
         noise_px, weights = _noise(post, obs)
-        model, xy, starts = post.camera.distortion, obs.xy, obs.frame_starts
+        xy, starts = obs.xy, obs.frame_starts
         w = np.ones(obs.n_stars) if weights is None else weights
-        b, inverse, response = responses(model, post.mean, obs, w)
-        steps = _STEP_PX * np.eye(2)
-        per_pixel = [
-            (
-                unproject_theta(model, post.mean, xy + step)
-                - unproject_theta(model, post.mean, xy - step)
-            )
-            / (2.0 * _STEP_PX)
-            for step in steps
-        ]
         root = np.eye(2) if obs.noise_axes is None else np.linalg.cholesky(obs.noise_axes)
-        torque = np.stack([(w * noise_px)[:, None] * np.cross(b, column) for column in per_pixel])
-        torque = np.einsum("anj,ab->bnj", torque, root)
-        turns = np.einsum("nij,anj->ani", np.repeat(inverse, np.diff(starts), axis=0), torque)
-        return cls(
-            post=post,
-            obs=obs,
-            weights=weights,
-            noise_px=noise_px,
-            response=response,
-            noise_response=turns,
-            noise_covariance=_frame_sums(np.einsum("ani,anj->nij", turns, turns), starts),
-        )
+        response = np.empty((obs.n_frames, 3, len(post.mean)))
+        turns, covariance = np.empty((2, obs.n_stars, 3)), np.empty((obs.n_frames, 3, 3))
+        for first, last in ranges_of_frames(starts, _COLUMNS_AT_ONCE):
+            stars, edges = slice(starts[first], starts[last]), starts[first : last + 1]
+            at = post.camera.distortion, post.mean, xy[stars], edges - starts[first]
+            b, per_theta, inverse, response[first:last] = responses(*at, w[stars])
+            # A shift of the pixel is one of the principal point the other way.
+            per_pixel = np.einsum("nja,ab->bnj", -per_theta[:, :, :2], root)
+            torque = (w * noise_px)[stars, None] * np.cross(b, per_pixel)
+            own = np.einsum("nij,anj->ani", np.repeat(inverse, np.diff(edges), axis=0), torque)
+            turns[:, stars] = own
+            squares = np.einsum("ani,anj->nij", own, own)
+            covariance[first:last] = _frame_sums(squares, edges - starts[first])
+        return cls(post, obs, weights, noise_px, response, turns, covariance)
 
     @property
     def of_stars(self) -> FloatArray | None:
@@ -148,17 +138,18 @@ class FrameGeometry:
 
 
 def responses(
-    model: str, theta: FloatArray, obs: Observations, weights: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Directions (N, 3) of the stars, inverse information (K, 3, 3) of each attitude, and its turn
-    (K, 3, p) by one unit of each parameter, rad per px unit.
+    model: str, theta: FloatArray, xy: FloatArray, starts: IntArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Directions (N, 3) of stars at pixels (N, 2), their derivatives (N, 3, p), the inverse
+    information (K, 3, 3) of each attitude, and its turn (K, 3, p) by one unit of each parameter,
+    rad per px unit.
     """
-    b, per_theta = unproject_jacobian(model, theta, obs.xy)
-    starts, w = obs.frame_starts, weights[:, None, None]
+    b, per_theta = unproject_jacobian(model, theta, xy)
+    w = weights[:, None, None]
     information = _frame_sums(w * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts)
     inverse = np.asarray(np.linalg.inv(information), dtype=np.float64)
     by_theta = _frame_sums(w * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts)
-    return b, inverse, inverse @ np.swapaxes(by_theta, 1, 2)
+    return b, per_theta, inverse, inverse @ np.swapaxes(by_theta, 1, 2)
 
 
 def _noise(post: Posterior, obs: Observations) -> tuple[FloatArray, FloatArray | None]:

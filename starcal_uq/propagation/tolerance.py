@@ -130,5 +130,6 @@ def sensitivities(camera: Camera, obs: Observations) -> Sensitivities:
     DistortionError
         Where the distortion folds over in the observed field.
     """
-    _, _, response = responses(camera.distortion, camera.theta, obs, np.ones(obs.n_stars))
+    stars = obs.xy, obs.frame_starts, np.ones(obs.n_stars)
+    *_, response = responses(camera.distortion, camera.theta, *stars)
     return Sensitivities(camera, response * ARCSEC)

@@ -8,7 +8,7 @@ import pytest
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera import projection
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, parameters
 from tests.helpers.scenes import MODELS, camera
 
 RNG = np.random.default_rng(5)
@@ -144,3 +144,16 @@ def test_a_direction_behind_the_camera_has_no_image():
     xy = projection.project(camera(), np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
     assert np.isnan(xy[0]).all()
     assert np.allclose(xy[1], [500.0, 530.0])
+
+
+@pytest.mark.parametrize("model", ["brown_tangential", "inverse", "fisheye", "brown+axes"])
+def test_a_shift_of_pixels_is_one_of_the_principal_point(model: str) -> None:
+    """Rotations of noise are made of the derivatives of the principal point."""
+    theta = np.array([500.0, 530.0, 5850.0, *[p.scale for p in parameters(model)[3:]]])
+    if model.endswith("axes"):
+        theta[-2:] = 1e-3
+    xy = np.random.default_rng(1).uniform(0.0, 1023.0, (50, 2))
+    _, jacobian = projection.unproject_jacobian(model, theta, xy)
+    for axis, step in enumerate(0.5 * np.eye(2)):
+        up, down = (projection.unproject_theta(model, theta, xy + s) for s in (step, -step))
+        np.testing.assert_allclose(up - down, -jacobian[..., axis], rtol=1e-5, atol=1e-10)
