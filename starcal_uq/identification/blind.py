@@ -14,6 +14,7 @@ All work is counted: so many patterns of so many frames, so many of them matched
 from __future__ import annotations
 
 import hashlib
+from bisect import bisect
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -73,6 +74,10 @@ _FOCAL_STEP = 1.17
 # Candidates of a frame and parity that are matched with all stars, and the camera tolerances then.
 _MATCHED = 12
 _FOCAL, _CENTRE, _DISTORTION = 0.02, 0.02, 0.004
+# Patterns of so many stars are looked up first, in levels that are soon made and then in all; what
+# they show ends the search where chance does so less often than this, log10, and it then matches
+# beyond doubt.
+_FIRST_STARS, _FIRST_LEVELS, _CLEAR = 11, 5000, -5.0
 # Candidates that explain as much as chance does less often than this, log10, are tried with a lens
 # that bends.
 _WORTH_GROWING = -5.0
@@ -228,12 +233,16 @@ class BlindSearch:
         return [n for n in LEVELS if n <= most and _useful(n, self.width * self.height, focal_px)]
 
     def candidates(
-        self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]
+        self,
+        u: FloatArray,
+        sigma_px: FloatArray,
+        quads: IntArray,
+        sizes: list[int],
+        focal_px: tuple[float, float],
     ) -> _Seen:
         """What patterns of a frame, points (n, 2) from the middle, brightest first, have like ones
         on these levels.
         """
-        quads = _frame_quads(u)
         found = [
             part
             for focal, low, high in self._focal_steps(focal_px)
@@ -271,13 +280,11 @@ class BlindSearch:
         rays = unit_directions(u, np.array([focal]))[0]
         codes, quads, size = codes_of(rays, quads)
         faintest = quads.max(axis=1) + 1
+        least, most = _LEAST_IN_FIELD * faintest, _MOST_IN_FIELD * np.maximum(faintest, 12)
         for n in sizes:
-            # Stars of the level in the field, at the longest and the shortest focal length.
-            least, most = (n * self.width * self.height / (4.0 * pi * f * f) for f in (high, low))
-            use = np.flatnonzero(
-                (_MOST_IN_FIELD * np.maximum(faintest, 12) > least)
-                & (_LEAST_IN_FIELD * faintest < most)
-            )
+            # Stars of the level in the field, for a focal length of one pixel.
+            stars = n * self.width * self.height / (4.0 * pi)
+            use = np.flatnonzero((most > stars / high**2) & (least < stars / low**2))
             if not len(use):
                 continue
             level = self.levels[n]
@@ -287,10 +294,8 @@ class BlindSearch:
             mine = np.repeat(use[some], [len(hit) for hit in hits[some]])
             theirs = np.fromiter(chain.from_iterable(hits[some]), dtype=np.int64)
             f = focal * size[mine] / level.size_rad[theirs]
-            expected = n * self.width * self.height / (4.0 * pi * f * f)
-            ok = (f >= low) & (f <= high)
-            ok &= expected > _LEAST_IN_FIELD * faintest[mine]
-            ok &= expected < _MOST_IN_FIELD * np.maximum(faintest[mine], 12)
+            expected = stars / f**2
+            ok = (f >= low) & (f <= high) & (expected > least[mine]) & (expected < most[mine])
             if ok.any():
                 yield level, quads[mine[ok]], level.quads[theirs[ok]], f[ok]
 
@@ -335,16 +340,30 @@ class BlindSearch:
         """The best attitude of a frame and focal length of the camera, where there is one that
         counts.
         """
-        from scipy.spatial import cKDTree
-
         if len(u) < _LEAST_STARS:
             return None
-        seen = self.candidates(u, sigma_px, sizes, focal_px)
+        quads = _frame_quads(u)
+        first = quads[quads.max(axis=1) < _FIRST_STARS]
+        made = bisect(sizes, _FIRST_LEVELS)
+        for levels in (sizes[:made], sizes[made:]) if len(first) < len(quads) else ():
+            seen = self.candidates(u, sigma_px, first, levels, focal_px)
+            found = self._best(u, sigma_px, seen, _CLEAR)
+            if found is not None and found.log10_false < _ALONE:
+                return found
+        best = self._best(u, sigma_px, self.candidates(u, sigma_px, quads, sizes, focal_px), -1.0)
+        return best if best is not None and best.log10_false < _COUNTS else None
+
+    def _best(
+        self, u: FloatArray, sigma_px: FloatArray, seen: _Seen, log10_chance: float
+    ) -> Solved | None:
+        """The surest of the first candidates, of those that chance makes less often than this."""
+        from scipy.spatial import cKDTree
+
         best: Solved | None = None
         tree = cKDTree(u)
         tried: list[tuple[float, FloatArray]] = []
         for row in np.argsort(seen.log10_chance, kind="stable"):
-            if len(tried) == _MATCHED or seen.log10_chance[row] >= -1.0:
+            if len(tried) == _MATCHED or seen.log10_chance[row] >= log10_chance:
                 break
             focal, rotation = float(seen.focal_px[row]), seen.rotation[row]
             # Patterns of one solution say the same.
@@ -362,7 +381,7 @@ class BlindSearch:
                 best = solved
                 if solved.log10_false < _ALONE:
                     break
-        return best if best is not None and best.log10_false < _COUNTS else None
+        return best
 
     def _match(
         self, tree: cKDTree, sigma_px: FloatArray, focal: float, rotation: FloatArray

@@ -82,6 +82,8 @@ _SURE = -9.0
 # A lens that bends is worth a second look at all frames where it explains so many times the stars
 # of one, or where so many frames are missed.
 _MORE, _MISSED = 1.1, 0.1
+# Stars that could be matched may lie just outside the detector: those inside are fewer by a seventh.
+_WHOLE = 1.14 * _MORE
 
 
 class StarsByDepth(Protocol):
@@ -327,13 +329,15 @@ class _Attempt:
         if not solved:
             return self
         k, match = max(solved, key=lambda one: len(one[1]))
+        missed = len(self._failed()) > _MISSED * len(self.results)
+        if not missed and _is_whole(match, self.tolerance):
+            return self
         focal_px = self.field.camera.focal_px
         grown = self.grown(k, matched_patch(match, focal_px, self.stars.directions_icrs))
         if grown is None:
             return self
         other = self.bent(k, grown, self.nominal)
         more = len(grown.patch.centroid) > _MORE * len(match)
-        missed = len(self._failed()) > _MISSED * len(self.results)
         beyond = self.tolerance.distortion_px + other.tolerance.distortion_px
         bends = not any(self.camera.coefficients) and abs(grown.bend_px) > beyond
         if not (more or missed or bends):
@@ -495,6 +499,16 @@ def _with(
     if told:
         return camera, tolerance
     return camera, bending(tolerance, sheet, optics.distortion_px)
+
+
+def _is_whole(match: Match, tolerance: CameraTolerance) -> bool:
+    """Whether a match leaves no star to be found, in a lens that bends by what is allowed for."""
+    bend_px = abs(float(match.state.shared[3]))
+    return (
+        _WHOLE * len(match) > match.n_possible
+        and match.noise_scale == 1.0
+        and bend_px < _WHOLE * tolerance.distortion_px
+    )
 
 
 def _useful(results: Iterable[Found]) -> list[Match]:

@@ -37,6 +37,7 @@ from starcal_uq.images.psf import (
 # the time.
 _KERNEL_HALF_SIGMAS, _KERNEL_HALF_MAX = 2.5, 5
 _MAX_DETECTIONS = 5000
+_ROWS_AT_ONCE = 64
 # A width is preferred to that of the PSF if it lowers chi squared by this much.
 _CHI2_MARGIN = 9.0
 _BLOB_SIGMAS = 3.0
@@ -162,20 +163,16 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     """SExtractor's detections in the image filtered by the PSF, the brightest first."""
     with extra("images", "star images"):
         import sep
-    from scipy.ndimage import correlate1d
-
     half = int(np.clip(np.ceil(_KERNEL_HALF_SIGMAS * sigma), 1, _KERNEL_HALF_MAX))
     line = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
     # The noise that is left of noise 1.
     left = np.sum(line**2) / line.sum() ** 2
     if frame.parity is not None:
         left *= _mosaic_noise(line)
-    filtered = frame.counts
-    for axis in (0, 1):
-        filtered = correlate1d(filtered, line / line.sum(), axis, mode="constant")
     threshold = np.float32(options.threshold_sigma * left)
+    filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
     # Whatever is found is among these, rounding included.
-    n_above = np.count_nonzero(filtered > np.float32(0.9999) * threshold * frame.noise)
+    n_above = np.count_nonzero(filtered > np.float32(0.9999) * threshold * frame.noise.min())
     # sep prepares a list for all pixels that it may have to keep, which takes longer than a small
     # image.
     most = sep.get_extract_pixstack()
@@ -204,6 +201,22 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     )[1:]
     objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
     return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
+
+
+def _filtered(counts: Any, line: Any) -> Any:
+    """Counts filtered by the product of a `line` with itself, dark beyond the edges.
+
+    Blocks of rows stay in the processor's cache, where sums of shifted rows take half the time of
+    SciPy's filter, which goes line by line in double precision.
+    """
+    more = len(line) - 1
+
+    def along(rows: Any) -> Any:
+        return sum(weight * rows[k : len(rows) - more + k] for k, weight in enumerate(line))
+
+    padded, size = np.pad(counts, more // 2), _ROWS_AT_ONCE
+    tops = range(0, len(counts), size)
+    return np.concatenate([along(along(padded[k : k + size + more]).T).T for k in tops])
 
 
 def _mosaic_noise(line: Any) -> float:

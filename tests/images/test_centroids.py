@@ -218,7 +218,7 @@ def test_an_image_is_passed_over_once_and_stars_are_fitted_together(monkeypatch)
 
         return call
 
-    for module, name in ((sep, "Background"), (sep, "extract"), (scipy.ndimage, "correlate1d")):
+    for module, name in ((sep, "Background"), (sep, "extract"), (detection, "_filtered")):
         monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
     solve = star_fits._solve
     monkeypatch.setattr(
@@ -227,7 +227,7 @@ def test_an_image_is_passed_over_once_and_stars_are_fitted_together(monkeypatch)
         lambda normal, right: (fits.append(len(normal)), solve(normal, right))[1],
     )
     assert len(matched(extract_centroids(image, gain_e_per_count=1.0), xy)[0]) == len(xy)
-    assert passes == {"Background": 1, "extract": 1, "correlate1d": 2}
+    assert passes == {"Background": 1, "extract": 1, "_filtered": 1}
     # Width, shape and places: some ten steps for each star, all stars in one call.
     assert sum(fits) < 12 * len(xy) and len(fits) < 40
 
@@ -262,6 +262,14 @@ def test_detections_are_those_of_sextractor():
     # Which part gets a pixel between two is drawn by lot.
     lone = same & (theirs["flag"] & 1 == 0)
     np.testing.assert_allclose(ours["flux"][index[lone]], theirs["flux"][lone], rtol=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(64, 65), (130, 9), (3, 200)])
+def test_the_filter_is_a_convolution_with_darkness_beyond_the_edges(shape):
+    counts = np.random.default_rng(0).standard_normal(shape).astype(np.float32)
+    line = np.array([0.1, 0.25, 0.3, 0.25, 0.1], dtype=np.float32)
+    expected = scipy.ndimage.correlate(counts, np.outer(line, line), mode="constant")
+    np.testing.assert_allclose(detection._filtered(counts, line), expected, atol=1e-6)
 
 
 def test_windows_settle_where_sextractors_do():
