@@ -4,7 +4,7 @@
 #   ALT_PYTHON=...  the second interpreter for `make test-other`; `none` leaves that run out
 #   WORKERS=...     processes that share the tests (0: one, without sharing)
 #   DEMO_OUT=...    the folder that `make demo` writes
-#   BENCH=...       options of `make bench`, such as "--quick" or "--only calibrate"
+#   BENCH=...       options of `make bench`, such as "--write", "--large" or "--only calibrate"
 #   SUPPLY=...      options of `make supply`, such as "--all", "--python 3.12" or "--only wheel lowest"
 
 PYTHON ?=
@@ -70,7 +70,7 @@ docs: .venv/.installed-docs ## the documentation, into docs/_build/html; a warni
 	$(BIN)/python scripts/prose.py
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env docs docs/_build/html
 
-bench: .venv/.installed-test ## the package beside its rivals, and with BENCH="--large --write" the tables of the documentation
+bench: .venv/.installed-test ## the package beside its rivals, and with BENCH=--write the tables of the documentation
 	$(BIN)/python benchmarks/run.py $(BENCH)
 
 bench-rivals: .bench/.installed ## an environment for the rivals that are not in ours; mrcal comes with the system

@@ -1,8 +1,8 @@
 """Contestants in turns, ratios with spread.
 
-Every contestant has a process of its own, in the interpreter that it needs. After a first call,
-which does not count (imports, compilation, caches), they take turns: A B C A B C, so that a busy
-machine is busy for all. A ratio is taken in each turn; given are the median and the quartiles of
+Every contestant has a process of its own, in the interpreter that it needs. The first call (imports,
+compilation, caches) is kept apart; then they take turns: A B C A B C, so that a busy machine is busy
+for all. A ratio is taken in each turn; given are the median and the quartiles of
 these.
 """
 
@@ -16,11 +16,13 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-CONTESTANTS = Path(__file__).resolve().parent / "contestants"
+ROOT = Path(__file__).resolve().parents[1]
+CONTESTANTS = ROOT / "benchmarks" / "contestants"
 ONE_THREAD = {
     **dict.fromkeys(
         ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
@@ -41,9 +43,8 @@ class Contestant:
     # before, one of the environments of rivals, the system's.
     python: str = "own"
     options: Mapping[str, Any] = field(default_factory=dict)  # Keywords of the function
-    first: bool = True  # Whether a first call goes before those that count
     environment: Mapping[str, str] = field(default_factory=dict)  # Variables of the environment
-    every: int = 1  # It takes part in every so many turns: a slow one need not be repeated as often
+    how: str = ""  # What it is made of: extras of the package, libraries of rivals
 
 
 @dataclass(frozen=True)
@@ -135,17 +136,22 @@ def take_turns(
     repeats: int,
     start: Callable[[Contestant], Worker | str],
     tell: Callable[[str], None] = lambda text: None,
+    seconds: float = float("inf"),
 ) -> list[Runs]:
-    """Time contestants in turns; `start` makes the worker of one, or says why there is none."""
+    """Time contestants in turns; `start` makes the worker of one, or says why there is none.
+
+    No turn but the first begins later than `seconds` after the start.
+    """
+    began = perf_counter()
     workers = [start(c) for c in contestants]
     runs = [Runs(c.label) for c in contestants]
     try:
         for turn in range(-1, repeats):
+            if turn > 0 and perf_counter() - began > seconds:
+                break
             for contestant, worker, run in zip(contestants, workers, runs, strict=True):
                 if isinstance(worker, str) or worker.missing is not None:
                     run.missing = worker if isinstance(worker, str) else worker.missing
-                    continue
-                if (turn < 0 and not contestant.first) or (turn > 0 and turn % contestant.every):
                     continue
                 tell(
                     f"{contestant.label}, "
@@ -212,7 +218,8 @@ def interpreter(python: str, root: Path, cache: Path) -> tuple[list[str], dict[s
         return [sys.executable], {"PYTHONPATH": str(cache / "before")}
     if python in ("rivals", "cedar"):
         path = cache / python / "bin" / "python"
-        return ([str(path)], {}) if path.exists() else "`make bench-rivals` has not been run"
+        # Some of them may be here as well; who is not says so.
+        return [str(path if path.exists() else sys.executable)], {}
     path = Path("/usr/bin/python3")
     # mrcal keeps arrays on the stack: 10,000 frames need more of it than the usual 8 MB.
     roomy = ["sh", "-c", 'ulimit -s unlimited; exec "$0" "$@"', str(path)]

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks import run as bench
-from benchmarks.harness import Contestant, Runs, Turn, ratio, spread
+from benchmarks.answers import judged_frames, same_estimate
+from benchmarks.harness import CONTESTANTS, Contestant, Runs, Turn, ratio, spread, take_turns
 
 # A machine that is up to ten times slower in some turns than in others.
 LOAD = (1.0, 10.0, 3.0, 1.0, 7.0)
@@ -51,16 +52,12 @@ def planted(monkeypatch, tmp_path):
         name="planted",
         what="Planted",
         contestants=tuple(Contestant(name, f"x:{name}") for name in names),
-        same=bench.same_estimate(),
+        same=same_estimate(),
         repeats=5,
         targets=(
-            bench.Target("twice as fast", "twice", 1.99),
-            bench.Target("three times as fast", "twice", 3.0),
-            bench.Target("small", peak_mb=49.0),
-            bench.Target("quick", seconds=0.31, clock="processor"),
-            bench.Target("quick by the clock on the wall", seconds=0.31),
-            bench.Target("the wrong one beside the slow one", "twice", 3.9, "wrong"),
-            bench.Target("faster than what is not there", "absent", 1.0),
+            bench.Target("no longer than the other", "twice"),
+            bench.Target("60 MB", peak=True),
+            bench.Target("as fast as what is not there", "absent"),
         ),
     )
 
@@ -76,14 +73,36 @@ def test_contestants_take_turns_and_the_load_of_the_machine_cancels(planted):
     assert ours["processor"]["median"] == pytest.approx(0.3)  # without the first call
     assert (twice["same"], wrong["same"]) == (True, False)
     assert absent["missing"] == "it is not installed"
-    assert [t["met"] for t in found["targets"]] == [True, False, False, True, False, True, None]
+    assert ours["first_processor"] == pytest.approx(10.0)
+    assert found["targets"] == [
+        {
+            "target": "no longer than the other",
+            "measured": "300 ms (600 ms)",
+            "rival": "twice: 600 ms (1.2 s), 2 times ours",
+        },
+        {"target": "60 MB", "measured": "50 MB", "rival": "–"},
+        {
+            "target": "as fast as what is not there",
+            "measured": "300 ms (600 ms)",
+            "rival": "absent: not measured",
+        },
+    ]
+
+
+def test_a_row_begins_no_turn_after_its_time(planted):
+    def start(contestant):
+        return Planted(contestant.call, {}, None, None, {})
+
+    found = take_turns(planted.contestants[:2], 5, start, seconds=0.0)
+    assert [len(runs.turns) for runs in found] == [1, 1]
+    assert Planted.order == ["ours", "twice"] * 2
 
 
 def test_a_row_says_what_differs_and_who_is_missing(planted):
     text = bench.table([bench.run_row(planted)])
-    assert "| absent | not measured: it is not installed |" in text
+    assert "| absent |  | not measured: it is not installed |" in text
     assert "**another answer**: 5 σ" in text
-    assert "| twice | 600 ms | 1.2 s | **2** (2 to 2) |" in text
+    assert "| twice |  | 20 s | 600 ms | 1.2 s | **2** (2 to 2) | 50 |" in text
 
 
 def test_writing_keeps_rows_that_were_not_run(planted, monkeypatch, tmp_path):
@@ -91,14 +110,12 @@ def test_writing_keeps_rows_that_were_not_run(planted, monkeypatch, tmp_path):
     page.write_text(Path(bench.PAGE).read_text(encoding="utf-8"), encoding="utf-8")
     monkeypatch.setattr(bench, "PAGE", page)
     monkeypatch.setattr(bench, "RESULTS", tmp_path / "results.json")
-    monkeypatch.setattr(
-        bench, "rows", lambda quick=False: [planted, replace(planted, name="other")]
-    )
+    monkeypatch.setattr(bench, "rows", lambda: [planted, replace(planted, name="other")])
     assert bench.main(["--only", "other", "--repeats", "1", "--write"]) == 0
     assert bench.main(["--only", "planted", "--repeats", "1", "--write"]) == 0
     text = page.read_text(encoding="utf-8")
     assert text.index("`planted`") < text.index("`other`")
-    assert "**no**" in text.partition("<!-- /targets -->")[0]
+    assert "| 60 MB | 50 MB |" in text.partition("<!-- /targets -->")[0]
     # Written again it is the same.
     assert bench.main(["--only", "planted", "--repeats", "1", "--write"]) == 0
     assert page.read_text(encoding="utf-8") == text
@@ -117,30 +134,18 @@ def test_ratios_count_what_was_done_and_take_common_turns_only():
     assert spread([5.0, 1.0, 3.0]).median == 3.0
 
 
-def test_growth_is_fitted_through_all_sizes():
-    sizes = (10, 100, 1000)
-    row = bench.Row(
-        "growth", "Growth", tuple(Contestant(f"{n}", "x:y", options={"n_frames": n}) for n in sizes)
-    )
-    for power in (0.9, 1.2):
-        listed = [{"turns": 1, "processor": {"median": 1e-3 * n**power}} for n in sizes]
-        said = bench.judged(row, bench.Target("slowly", exponent=1.05), listed)
-        assert (said["measured"], said["met"]) == (f"{power:.2f}", power < 1.05)
-
-
 def test_every_row_has_a_name_of_its_own_and_rivals_that_its_targets_name():
-    for quick in (False, True):
-        rows = bench.rows(quick)
-        assert len({row.name for row in rows}) == len(rows)
-        for row in rows:
-            labels = [c.label for c in row.contestants]
-            assert len(set(labels)) == len(labels)
-            assert {t.rival for t in row.targets} - {None} <= set(labels[1:])
-            assert {t.of for t in row.targets} - {None} <= set(labels[1:])
-            for contestant in row.contestants:
-                file, _, function = contestant.call.partition(":")
-                source = (bench.CONTESTANTS / f"{file}.py").read_text(encoding="utf-8")
-                assert f"\ndef {function}(" in source
+    rows = bench.rows()
+    assert len({row.name for row in rows}) == len(rows)
+    for row in rows:
+        labels = [c.label for c in row.contestants]
+        assert len(set(labels)) == len(labels)
+        assert {t.rival for t in row.targets} - {None} <= set(labels[1:])
+        for contestant in row.contestants:
+            file, _, function = contestant.call.partition(":")
+            source = (CONTESTANTS / f"{file}.py").read_text(encoding="utf-8")
+            assert f"\ndef {function}(" in source
+            assert contestant.how
 
 
 def test_frames_are_judged_by_their_stars_and_their_middle(tmp_path):
@@ -170,7 +175,7 @@ def test_frames_are_judged_by_their_stars_and_their_middle(tmp_path):
     past = [np.cos(np.radians(0.1)), np.sin(np.radians(0.1)), 0.0]
 
     def judged(**changes):
-        return bench.judged_frames(table, [right | changes])
+        return judged_frames(table, [right | changes])
 
     assert judged() == [(pytest.approx(0.0, abs=1e-4), 40, 40)]
     assert judged(stars=other.tolist()) == [(pytest.approx(0.0, abs=1e-4), 37, 40)]

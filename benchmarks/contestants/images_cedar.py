@@ -31,7 +31,7 @@ def _images(folder: str) -> list[Any]:
     ]
 
 
-def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
+def centroids(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
     """`get_centroids_from_image` with its defaults; no covariances."""
     loaded = _images(images)
 

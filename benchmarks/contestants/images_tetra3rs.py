@@ -25,7 +25,7 @@ def _images(folder: Path) -> list[np.ndarray]:
     return [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) for path in paths]
 
 
-def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
+def centroids(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
     """`extract_centroids` with its defaults; no covariances, no correction of the pixel phase."""
     loaded = _images(images)
 

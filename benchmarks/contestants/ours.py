@@ -32,7 +32,8 @@ def calibrate(folder: Path, **options: Any) -> Callable[[], Result]:
 
     def run() -> Result:
         cal = sc.calibrate(obs, camera, **options)
-        return {"theta": cal.theta, "covariance": cal.covariance, "sigma": cal.sigma}
+        path = cal.provenance["kernels"]
+        return {"theta": cal.theta, "covariance": cal.covariance, "sigma": cal.sigma, "path": path}
 
     return run
 
@@ -194,57 +195,97 @@ def unproject(folder: Path, *, points: int) -> Callable[[], Result]:
     return lambda: {"b": sc.camera.unproject(camera, xy)[:1000]}
 
 
-def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
-    """Stars of images that are in memory."""
+def _loaded(images: str) -> list[Any]:
+    """The images of a folder, in memory."""
     if not Path(images).is_dir():
         raise Missing(f"{images} is not on this machine")
-    loaded = [sc.images.read_image(path) for path in sorted(Path(images).glob("*.tif*"))]
+    paths = [path for end in ("tif*", "png") for path in sorted(Path(images).glob(f"*.{end}"))]
+    return [sc.images.read_image(path) for path in paths]
+
+
+def centroids(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
+    """Stars of images, each alone."""
+    loaded = _loaded(images)
 
     def run() -> Result:
-        found = sc.images.extract_centroids(loaded)
-        return {"frames": len(loaded), "found": len(found.x_px)}
+        found = [sc.images.extract_centroids(image) for image in loaded]
+        return {"frames": len(loaded), "found": sum(len(f.x_px) for f in found)}
 
     return run
 
 
+def _alone(tables: list[Any], camera: Any, stars: Any) -> Callable[[], list[Any]]:
+    """Identification of tables of one frame, each by itself."""
+    identify = sc.identification.identify
+    return lambda: [identify(table, camera, stars, cache=False) for table in tables]
+
+
 def identify_unknown(folder: Path, *, images: str, field: float) -> Callable[[], Result]:
-    """Stars of images of a camera without a sheet, for fields of 0.5 to 90 degrees."""
-    if not Path(images).is_dir():
-        raise Missing(f"{images} is not on this machine")
-    table = sc.images.extract_centroids(images)
-    stars = sc.load_catalogue(max_mag=7.0, epoch=2019.6)
+    """Stars of images of a camera without a sheet, each frame alone, of fields of 0.5 to 90 degrees."""
+    tables = [sc.images.extract_centroids(image) for image in _loaded(images)]
+    identified = _alone(tables, None, sc.load_catalogue(max_mag=7.0, epoch=2019.6))
 
     def run() -> Result:
-        done = sc.identification.identify(table, None, stars, cache=False)
-        wrong = done.n_identified * (abs(done.camera.fov_deg[0] / field - 1.0) > 0.02)
-        return {"frames": len(done.frames), "found": done.n_identified, "wrong": wrong}
+        fields = [done.camera.fov_deg[0] for done in identified() if done.n_identified]
+        wrong = sum(abs(found / field - 1.0) > 0.02 for found in fields)
+        return {"frames": len(tables), "found": len(fields), "wrong": wrong}
 
     return run
 
 
 def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
-    """Stars of images identified from their centroids."""
-    if not Path(images).is_dir():
-        raise Missing(f"{images} is not on this machine")
-    nominal = sc.Camera.load(camera)
-    found = sc.images.extract_centroids(images, camera=nominal)
+    """Stars of images with a sheet, each frame alone."""
+    tables = [sc.images.extract_centroids(image) for image in _loaded(images)]
     stars = sc.load_catalogue(max_mag=7.0, epoch=2019.6)
+    identified = _alone(tables, sc.Camera.load(camera), stars)
+    return lambda: {
+        "frames": len(tables),
+        "found": sum(done.n_identified for done in identified()),
+    }
+
+
+def field(folder: Path, *, degrees: float, max_mag: float) -> Callable[[], Result]:
+    """A simulated frame of a field, without a sheet, from its centroids."""
+    stars = sc.load_catalogue(max_mag=max_mag, epoch=2026.0)
+    focal = 1024 / (2.0 * np.tan(np.radians(degrees / 2.0)))
+    camera = sc.Camera(1024, 1024, 10.0, None, 511.5, 511.5, focal_px=focal)
+    truth = sc.simulate(stars, camera, n_frames=1, sigma_px=0.2, seed=4)
+    mag = dict(zip(stars.star_id.tolist(), stars.mag.tolist(), strict=True))
+    flux = 10.0 ** (-0.4 * np.array([mag[name] for name in truth.star_id.tolist()]))
+    zero = np.zeros(len(flux))
+    columns = {"var_x_px2": zero + 0.04, "var_y_px2": zero + 0.04, "cov_xy_px2": zero}
+    columns |= {"flux": flux, "snr": zero + 50.0, "peak": flux}
+    flags = dict.fromkeys(("saturated", "blended", "edge"), zero > 1.0)
+    numbers = {name: [1.0] for name in ("background", "noise", "psf_sigma_px")}
+    words = {name: [""] for name in ("image", "time_utc", "problem")}
+    table = sc.images.Centroids(
+        frame=zero.astype(int),
+        x_px=truth.x_px,
+        y_px=truth.y_px,
+        frame_ids=[0],
+        **columns,
+        **flags,
+        **numbers,
+        **words,
+        meta={"optics": {"width_px": 1024, "height_px": 1024}},
+    )
+    identified = _alone([table], None, stars)
 
     def run() -> Result:
-        done = sc.identification.identify(found, nominal, stars, cache=False)
-        return {
-            "frames": len(done.frames),
-            "found": sum(f.status == "identified" for f in done.frames),
-        }
+        (done,) = identified()
+        right = dict(zip(truth.x_px.tolist(), truth.star_id.tolist(), strict=True))
+        named = zip(
+            done.observations.x_px.tolist(), done.observations.star_id.tolist(), strict=True
+        )
+        wrong = any(right[x] != name for x, name in named)
+        return {"frames": 1, "found": done.n_identified, "wrong": int(wrong)}
 
     return run
 
 
 def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
     """Images to attitudes, one by one."""
-    if not Path(images).is_dir():
-        raise Missing(f"{images} is not on this machine")
-    loaded = [sc.images.read_image(path) for path in sorted(Path(images).glob("*.tif*"))]
+    loaded = _loaded(images)
     nominal, stars = sc.Camera.load(camera), sc.load_catalogue(max_mag=7.0, epoch=2019.6)
 
     def run() -> Result:

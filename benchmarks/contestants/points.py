@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -55,36 +54,5 @@ def unproject(folder: Path, *, points: int) -> Callable[[], Result]:
         plane = cv2.undistortPoints(xy, matrix, distortion, None, None, matrix, stop)[:, 0]
         b = np.column_stack([(plane - [X0, Y0]) / F, np.ones(points)])
         return {"b": (b / np.linalg.norm(b, axis=1, keepdims=True))[:1000]}
-
-    return run
-
-
-def calibrate(folder: Path) -> Callable[[], Result]:
-    """`cv2.calibrateCamera`, the stars as points far away, the views' translations as free as it
-    leaves them.
-    """
-    cv2, _, _ = _opencv()
-    with np.load(folder / "stars.npz") as data:
-        starts, xy, r, start = data["starts"], data["xy"], data["r"], data["start"]
-        rotations, size = data["rotations"], data["size"]
-    views = [slice(a, b) for a, b in pairwise(starts)]
-    # In the camera's frame at the start the points lie in front.
-    stars = [(1e3 * r[v] @ rotations[k].T).astype(np.float32) for k, v in enumerate(views)]
-    seen = [xy[v].astype(np.float32) for v in views]
-    x0, y0, f = start[:3]
-    matrix = np.array([[f, 0.0, x0], [0.0, f, y0], [0.0, 0.0, 1.0]])
-    flags = (
-        cv2.CALIB_USE_INTRINSIC_GUESS
-        | cv2.CALIB_FIX_ASPECT_RATIO
-        | cv2.CALIB_ZERO_TANGENT_DIST
-        | cv2.CALIB_FIX_K3
-    )
-
-    def run() -> Result:
-        _, k, d, _, _ = cv2.calibrateCamera(
-            stars, seen, size.tolist(), matrix.copy(), np.zeros(5), flags=flags
-        )
-        f = k[0, 0]
-        return {"theta": [k[0, 2], k[1, 2], f, d.ravel()[0] / f**2, d.ravel()[1] / f**4]}
 
     return run

@@ -16,9 +16,9 @@ Result = dict[str, Any]
 
 
 def ensemble(
-    folder: Path, *, move: str, walkers: int = 32, steps: int = 1500, burn: int = 200
+    folder: Path, *, walkers: int = 32, steps: int = 1500, burn: int = 200
 ) -> Callable[[], Result]:
-    """One ensemble; `move` is ``StretchMove`` (emcee's default) or ``DEMove``."""
+    """One ensemble, with emcee's default move."""
     import emcee
 
     density = Likelihood(folder)
@@ -28,7 +28,7 @@ def ensemble(
     def run() -> Result:
         seed = next(seeds)
         rng, path = np.random.RandomState(seed), kept / f"{seed}.npy"
-        sampler = emcee.EnsembleSampler(walkers, 6, density, moves=getattr(emcee.moves, move)())
+        sampler = emcee.EnsembleSampler(walkers, 6, density)
         start = emcee.State(rng.standard_normal((walkers, 6)), random_state=rng.get_state())
         sampler.run_mcmc(start, burn + steps, skip_initial_state_check=True)
         draws = density.parameters(sampler.get_chain(discard=burn))
