@@ -280,8 +280,8 @@ class Check(Finding):
 
     @property
     def advice(self) -> str:
-        """What to do with the instrument or the data, an order: before the command, or where none
-        helps; else empty. Of a check that did not pass, remedy and advice are never both empty.
+        """Advice about the instrument or the data: before the command, or if no command helps; else
+        empty. A check that did not pass has a remedy, an advice, or both.
         """
         told = "" if self.told is None else self.told.advice
         return " ".join(filter(None, (told, *(order.sentence for order in self.orders))))
@@ -304,9 +304,9 @@ class Check(Finding):
 
     @property
     def remedy(self) -> str:
-        """Command or Python call that may mend it, several joined by " or "; empty where it passed
-        or nothing of the kind helps. OBS, CAMERA, SITE and RUN stand for the user's files, ``obs``,
-        ``camera`` and ``cal`` for results.
+        """Command or Python call that may correct it, several joined by " or "; empty if the check
+        passed or none helps. OBS, CAMERA, SITE and RUN are the user's files, ``obs``, ``camera``
+        and ``cal`` results.
         """
         return " or ".join(text for text, _ in self.ways)
 

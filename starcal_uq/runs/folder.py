@@ -237,7 +237,7 @@ class RunFolder:
 
     @property
     def manifest(self) -> Manifest:
-        """What the run holds; of a folder made by a version without records, the files by their
+        """Contents of the run; for a folder made by a version without records, the files by their
         names.
         """
         found = read_manifest(self.path)
@@ -286,7 +286,7 @@ class RunFolder:
         tell: Callable[[str], None] | None = None,
         words: Sequence[str] = (),
     ) -> Iterator[RunFolder]:
-        """Yield a folder for the files of a step, which take their places all at once if the block
+        """Yield a folder for the files of a step, which appear in the run all at once if the block
         succeeds.
 
         Parameters
@@ -336,8 +336,7 @@ class RunFolder:
     def making(
         self, command: Mapping[str, object], force: bool, words: Sequence[str] = ()
     ) -> Iterator[RunFolder]:
-        """Yield the folder in which one command makes a whole run, which goes on where it was
-        interrupted.
+        """Yield the folder in which one command makes a whole run; an interrupted one is continued.
 
         That is this folder. Where it holds another run, it is a hidden one inside, whose files take
         their places all at once when the run is complete; an error, a kill or a full disk leaves

@@ -68,7 +68,7 @@ class Site(Stated):
 
     @property
     def assumed(self) -> tuple[str, ...]:
-        """What of pressure and temperature is that of the standard atmosphere."""
+        """Names of pressure and temperature, as far as the standard atmosphere replaces them."""
         given = {"pressure": self.pressure_hpa, "temperature": self.temperature_c}
         return tuple(name for name, value in given.items() if value is None)
 

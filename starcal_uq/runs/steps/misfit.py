@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @writing
 def diagnose(run: StoredRun, /, *, force: bool = False, **options: Any) -> Diagnosis:
-    """Question the model; writes ``diagnosis.json``, with the tables as CSV beside it.
+    """Test the model; writes ``diagnosis.json``, with the tables as CSV beside it.
 
     The attitude error is written again with what was found, and a budget that rested on it is
     removed.

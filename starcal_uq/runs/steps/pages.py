@@ -105,8 +105,7 @@ def notebook(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Write an executed notebook of whatever the run holds, ``RUN/report.ipynb``, to go on
-    from.
+    """Write an executed notebook of the run's results, ``RUN/report.ipynb``, to continue from.
 
     It is of the run as it is now, and goes when that changes, if it is in the folder.
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def sample(
     run: StoredRun, /, *, force: bool = False, progress: Progress | None = None, **options: Any
 ) -> Posterior:
-    """Sample the posterior and write it; an interrupted call goes on from its checkpoint.
+    """Sample the posterior and write it; an interrupted call continues from its checkpoint.
 
     Parameters
     ----------
