@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.budgeting.behaviour import Behaviour
-from starcal_uq.budgeting.file import BudgetFile, Requirement, checked_confidence, load_budget_file
+from starcal_uq.budgeting.file import BudgetFile, Requirement, checked_confidence, stated_in
 from starcal_uq.budgeting.filters import filter_states
 from starcal_uq.budgeting.indices import Behaviours, Index, seen_by
 from starcal_uq.budgeting.posterior import (
@@ -129,13 +129,7 @@ def budget(
     if temperature_profile is not None:
         thermal = thermal_error(attitude.thermal_response, temperature_profile)
         attitude = replace(attitude, thermal=thermal)
-    stated = (
-        file
-        if isinstance(file, BudgetFile)
-        else BudgetFile()
-        if file is None
-        else load_budget_file(file)
-    )
+    stated = stated_in(file)
     chosen = confidence_of(stated, confidence, n_samples)
     if misfit is not None and attitude.misfit is None:
         from starcal_uq.diagnostics.found import with_misfit

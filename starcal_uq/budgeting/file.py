@@ -230,6 +230,13 @@ class BudgetFile:
     sensor_path: str = ""
 
 
+def stated_in(file: BudgetFile | PathLike | None) -> BudgetFile:
+    """A budget file that is read already, that of a path, or none, which states nothing."""
+    if file is None:
+        return BudgetFile()
+    return file if isinstance(file, BudgetFile) else load_budget_file(file)
+
+
 def _read(data: Any, where: str, section: Section) -> AnyDict:
     """Checked values of one table, texts without the space around them."""
     if not isinstance(data, Mapping):

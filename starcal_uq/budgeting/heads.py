@@ -11,7 +11,7 @@ smaller with many heads: it stands in the file of the heads, as in that of a bud
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from pathlib import Path
@@ -22,6 +22,7 @@ from starcal_uq.attitude.heads import HeadArray, load_heads
 from starcal_uq.budgeting.behaviour import Behaviour
 from starcal_uq.budgeting.budget import Remark, combination, confidence_of, from_file, row_notes
 from starcal_uq.budgeting.file import BudgetFile, load_budget_file
+from starcal_uq.budgeting.posterior import axis_correlations
 from starcal_uq.budgeting.result import Budget, by_contributor
 from starcal_uq.budgeting.rows import NEA, Contributor
 from starcal_uq.budgeting.sampling import N_SAMPLES
@@ -186,9 +187,8 @@ class _Turned:
                 self.keep(name, _together(rows, called, gain))
                 continue
             for row in filter(attrgetter("applies"), rows):
-                column = gain[:, AXES.index(row.axis)]
                 own = f"{called} about {_LETTERS[row.axis]}"
-                self.keep(name, _alone(row, own, head, column))
+                self.keep(name, _alone(row, own, head, gain))
 
     def keep(self, name: str, rows: Sequence[Contributor]) -> None:
         """Rows of a contributor, which behave as the file states, or as their heads do."""
@@ -213,62 +213,41 @@ def _gaussian(rows: Sequence[Contributor]) -> bool:
 
 
 def _together(rows: Sequence[Contributor], name: str, gain: FloatArray) -> list[Contributor]:
-    """Axes of a Gaussian error about those of the body."""
-    mean = np.zeros(3)
-    for row in rows:
-        mean[AXES.index(row.axis)] = row.mean_arcsec
-    mean = gain @ mean
-    figures = [_sigmas(rows, gain, key) for key in _SIGMAS]
-    sigma, correlation = figures[0]
+    """An error of Gaussian axes, or of one axis alone, about the axes of the body."""
+    mean = gain[:, [AXES.index(row.axis) for row in rows]] @ [row.mean_arcsec for row in rows]
+    figures = {}
+    for key in _SIGMAS:
+        own = covariance([replace(row, sigma_arcsec=getattr(row, key)) for row in rows])
+        figures[key] = gain @ own @ gain.T
+    correlations = axis_correlations(figures[_SIGMAS[0]], np.ones(3))
     return [
         replace(
             rows[0],
             name=name,
             axis=axis,
             mean_arcsec=float(mean[i]),
-            axis_correlation=tuple(map(float, correlation[i])) if sigma.any() else (),
+            axis_correlation=correlations[i],
             tail_997=max(row.tail_997 for row in rows),
             applies=any(row.applies for row in rows),
-            **own,
+            **{key: math.sqrt(max(matrix[i, i], 0.0)) for key, matrix in figures.items()},
         )
         for i, axis in enumerate(AXES)
-        for own in [_figures(float(found[i]) for found, _ in figures)]
     ]
 
 
-def _figures(sigmas: Iterable[float]) -> AnyDict:
-    return dict(zip(_SIGMAS, sigmas, strict=True))
-
-
-def _sigmas(
-    rows: Sequence[Contributor], gain: FloatArray, key: str
-) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (3,) about the axes of the body by one of the figures of rows, and their
-    correlations (3, 3).
-    """
-    if any(math.isnan(getattr(row, key)) for row in rows):
-        return np.full(3, math.nan), np.eye(3)
-    matrix = covariance([replace(row, sigma_arcsec=getattr(row, key)) for row in rows])
-    matrix = gain @ matrix @ gain.T
-    sigma = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    scale = np.where(sigma > 0.0, sigma, 1.0)
-    correlation = matrix / np.outer(scale, scale)
-    np.fill_diagonal(correlation, 1.0)
-    return sigma, correlation
-
-
-def _alone(row: Contributor, name: str, head: str, column: FloatArray) -> list[Contributor]:
+def _alone(row: Contributor, name: str, head: str, gain: FloatArray) -> list[Contributor]:
     """An error about one axis of a head, which turns the body about a fixed axis."""
-    made = []
     group, sign = row.group
     together = f"{head}: {group}" if group else name
-    for axis, turn in zip(AXES, column, strict=True):
-        figures = _figures(float(abs(turn) * getattr(row, key)) for key in _SIGMAS)
-        figures["mean_arcsec"] = float(turn * row.mean_arcsec)
-        source, signed = row.source, together if sign * turn > 0.0 else f"-{together}"
+    made = []
+    for moved, turn in zip(
+        _together([row], name, gain), gain[:, AXES.index(row.axis)], strict=True
+    ):
+        signed = together if sign * turn > 0.0 else f"-{together}"
+        own: AnyDict = {"correlation_group": signed, "axis_correlation": ()}
         if abs(turn) < _NOTHING:
             # It is known to be nothing about this axis.
-            figures, source, signed = dict.fromkeys(figures, 0.0), "file", ""
-        moved = replace(row, name=name, axis=axis, axis_correlation=(), source=source)
-        made.append(replace(moved, correlation_group=signed, **figures))
+            own |= dict.fromkeys(("mean_arcsec", *_SIGMAS), 0.0)
+            own |= {"source": "file", "correlation_group": ""}
+        made.append(replace(moved, **own))
     return made

@@ -308,9 +308,11 @@ def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[
     """Lines of the correlation matrix, off-diagonal elements scaled down by what is added
     independently; or nothing.
     """
-    sigma = np.sqrt(np.diag(covariance))
-    if not (np.isfinite(covariance).all() and (sigma > 0.0).all()):
+    variances = np.diag(covariance)
+    if not (np.isfinite(covariance).all() and (variances > 0.0).any()):
         return ((),) * len(AXES)
+    # What is zero about an axis leans on no other.
+    sigma = np.sqrt(np.where(variances > 0.0, variances, 1.0))
     matrix = covariance / np.outer(sigma, sigma) * np.outer(scale, scale)
     np.fill_diagonal(matrix, 1.0)
     return tuple(tuple(float(value) for value in line) for line in matrix)

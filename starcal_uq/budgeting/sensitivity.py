@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.budgeting.budget import in_time
-from starcal_uq.budgeting.file import BudgetFile, load_budget_file
+from starcal_uq.budgeting.file import BudgetFile, stated_in
 from starcal_uq.budgeting.indices import Index, seen_by
 from starcal_uq.budgeting.rows import ALIGNMENT, COMMON, NEA, REST, SCOPES, Contributor
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
@@ -127,9 +127,7 @@ def sensitivities(
         check_known("an input", name, SETTINGS, BudgetError)
         share = f"vary: {name} is {width!r}; give a share below 1."
         require(BudgetError, (0.0 < width < 1.0, share))
-    stated = file
-    if not isinstance(stated, BudgetFile):
-        stated = BudgetFile() if stated is None else load_budget_file(stated)
+    stated = stated_in(file)
     frames = obs if mission is None else mission
     mean_stars = obs.n_stars / obs.n_frames
     sizes = _Sizes.of(post, frames, mean_stars)
@@ -231,13 +229,13 @@ class _Sizes:
         """Standard deviation (4, ...) of the total on `TOTAL_AXES`, arcsec: rows of a group err as
         one.
         """
-        sums: dict[tuple[str, str], Any] = {}
-        for number, row in enumerate(rows):
+        sums: dict[str, dict[str, Any]] = {axis: {} for axis in AXES}
+        for row in rows:
             group, sign = row.group
-            place = row.axis, group or str(number)
-            amount = sign * row.sigma_arcsec * self.factor(row, inputs)
-            sums[place] = sums.get(place, 0.0) + amount
-        x, y, z = (sum(s**2 for (own, _), s in sums.items() if own == axis) for axis in AXES)
+            of_axis, amount = sums[row.axis], sign * row.sigma_arcsec * self.factor(row, inputs)
+            place = group or str(len(of_axis))
+            of_axis[place] = of_axis.get(place, 0.0) + amount
+        x, y, z = (sum(amount**2 for amount in of_axis.values()) for of_axis in sums.values())
         return np.asarray(np.sqrt(np.stack(np.broadcast_arrays(x, y, z, 0.5 * (x + y)))))
 
     def elasticity(self, rows: Sequence[Contributor], name: str) -> FloatArray:

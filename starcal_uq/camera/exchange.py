@@ -21,6 +21,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, get_model, powers, shared_names, with_axes
 from starcal_uq.camera.formats import TEXT_FORMATS, Pinhole, write_pinhole
+from starcal_uq.camera.nearest import nearest_theta
 from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.camera.spice import NO_INSTRUMENT, kernel_text
@@ -94,36 +95,25 @@ def _grid(camera: Camera, points: int) -> FloatArray:
 
 
 def nearest(camera: Camera, distortion: str, without: tuple[str, ...] = ()) -> tuple[Camera, float]:
-    """The camera with this distortion model that differs least over the detector, and by how much
-    at most, px.
+    """The camera with this forward model of a pinhole that differs least over the detector, and by
+    how much at most, px.
 
     All its parameters but those `without` are fitted to the directions of a grid of pixels; the
     orientation of the camera stays.
     """
-    from scipy.optimize import least_squares
-
-    model = get_model(distortion)
     known = dict(zip(camera.parameter_names, camera.theta, strict=True))
     common = set(shared_names(camera.distortion, distortion)) - set(without)
+    names = [c.name for c in get_model(distortion).coefficients]
     start = camera.replace(
         distortion=distortion,
-        coefficients=tuple(known[c.name] if c.name in common else 0.0 for c in model.coefficients),
+        coefficients=tuple(known[name] if name in common else 0.0 for name in names),
     )
     pixels = _grid(camera, _POINTS)
     seen = unproject(camera, pixels)
-    # Parameters of like size: pixels, and displacements at the corner.
-    radius = camera.corner_radius_px
-    scale = np.array([1.0, 1.0, 1.0, *(radius**-c.order for c in model.coefficients)])
-    scale *= [name not in without for name in start.parameter_names]
-
-    def off(step: FloatArray) -> FloatArray:
-        moved = start.with_theta(start.theta + scale * step)
-        return np.asarray(project(moved, seen) - pixels).ravel()
-
-    step = least_squares(
-        off, np.zeros(len(scale)), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
-    ).x
-    found = start.with_theta(start.theta + scale * step)
+    theta, _ = nearest_theta(
+        distortion, start.theta, seen[:, :2] / seen[:, 2:], pixels, fixed=without
+    )
+    found = start.with_theta(theta)
     between = _grid(camera, 2 * _POINTS + 1)
     return found, float(
         np.max(np.linalg.norm(project(found, unproject(camera, between)) - between, axis=1))
@@ -278,29 +268,40 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
         header.update({f"CD{axis}_{i}": float(value) for i, value in enumerate(step, 1)})
     worst = 0.0
     for names, start, end in ((("A", "B"), measured, ideal), (("AP", "BP"), ideal, measured)):
-        order, coefficients, error = _polynomial(start / scale, (end - start) / scale, scale)
+        terms, error = _sip_terms(names, start, end, scale)
+        header.update(terms)
         worst = max(worst, error)
-        for column, name in enumerate(names):
-            header[f"{name}_ORDER"] = order
-            for (p, q), value in zip(powers(order), coefficients[:, column], strict=True):
-                if value:
-                    header[f"{name}_{p}_{q}"] = value * scale ** (1 - p - q)
     return header, worst
 
 
-def _polynomial(
-    at: FloatArray, shift: FloatArray, scale: float, least: int = 2, close_px: float = _CLOSE_PX
-) -> tuple[int, FloatArray, float]:
-    """Lowest order, coefficients (n, 2) and largest error (px) of polynomials for a displacement,
-    with terms from the order `least` on.
+def _sip_terms(
+    names: Sequence[str],
+    start: FloatArray,
+    end: FloatArray,
+    scale: float,
+    least: int = 2,
+    close_px: float = _CLOSE_PX,
+) -> tuple[dict[str, float], float]:
+    """Coefficients and order of the polynomials that carry points (n, 2) to others, px, by the
+    names of a header or a kernel, with terms from the order `least` on, and their largest error,
+    px. Their order is the least that is near enough.
     """
+    at, shift = start / scale, (end - start) / scale
     for order in range(2, _MOST_ORDERS + 1):
-        terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in powers(order, least)], axis=1)
+        places = powers(order, least)
+        terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in places], axis=1)
         found = floats(np.linalg.lstsq(terms, shift, rcond=None)[0])
         error = scale * float(np.max(np.linalg.norm(terms @ found - shift, axis=1)))
         if error < close_px:
             break
-    return order, found, error
+    held: dict[str, float] = {}
+    for column, name in enumerate(names):
+        held[f"{name}_ORDER"] = order
+        for (p, q), value in zip(places, found[:, column].tolist(), strict=True):
+            # Below it no pixel of the detector moves by the millionth part of rounding.
+            if abs(value) * scale > _EXACT_PX / 1e6:
+                held[f"{name}_{p}_{q}"] = value * scale ** (1 - p - q)
+    return held, error
 
 
 def write_kernel(
@@ -323,9 +324,8 @@ def write_kernel(
     pixels, seen = _grid(camera, _POINTS), _in_front(camera)
     centre = np.array([camera.x0_px, camera.y0_px])
     ideal, scale = camera.focal_px * seen[:, :2] / seen[:, 2:], camera.corner_radius_px
-    order, coefficients, error = _polynomial(
-        ideal / scale, (pixels - centre - ideal) / scale, scale, 1, _EXACT_PX / 1e3
-    )
+    names = ("SIP_AP", "SIP_BP")
+    terms, error = _sip_terms(names, ideal, pixels - centre, scale, 1, _EXACT_PX / 1e3)
     corners = unproject(camera, _grid(camera, 2)[[0, 1, 3, 2]])
     values: dict[str, object] = {
         "FOCAL_LENGTH": camera.focal_mm,
@@ -338,14 +338,8 @@ def write_kernel(
         "FOV_CLASS_SPEC": "'CORNERS'",
         "BORESIGHT": (0.0, 0.0, 1.0),
         "FOV_BOUNDARY_CORNERS": tuple(corners.ravel().tolist()),
-        "SIP_AP_ORDER": order,
-        "SIP_BP_ORDER": order,
+        **terms,
     }
-    for column, letter in enumerate("AB"):
-        for (p, q), value in zip(powers(order, 1), coefficients[:, column], strict=True):
-            # Below it no pixel of the detector moves by the thousandth part of rounding.
-            if abs(value) * scale > _EXACT_PX / 1e6:
-                values[f"SIP_{letter}P_{p}_{q}"] = float(value) * scale ** (1 - p - q)
     known = "".join(f"   {spec.name:8} {sd:12.4g} {spec.unit}\n" for spec, sd in sigmas)
     path.write_text(kernel_text(instrument, values, known), encoding="ascii")
     return error, _said(error, f"SPICE instrument kernel of INS{instrument}")

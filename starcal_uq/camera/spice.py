@@ -18,11 +18,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from starcal_uq.camera.distortion import get_model, powers, with_axes
+from starcal_uq.camera.nearest import nearest_theta
 from starcal_uq.core.types import AnyDict, FloatArray, floats
 
 _BLOCK = re.compile(r"^\s*\\begindata(.*?)(?:^\s*\\begintext|\Z)", re.DOTALL | re.MULTILINE)
@@ -171,8 +173,7 @@ def fitted_optics(kernel: KernelCamera) -> AnyDict:
     detector, or of the nearest one.
 
     The camera's frame may be turned about the boresight, as its name states: a `Camera` has its
-    x axis along the rows of the detector. All models are polynomials of the ideal point that
-    are linear in their coefficients, so that the parameters follow by linear least squares.
+    x axis along the rows of the detector.
     """
     centre, *linear = (kernel.terms[power] for power in ((0, 0), (1, 0), (0, 1)))
     matrix = np.stack(linear, axis=1)
@@ -198,9 +199,17 @@ def fitted_optics(kernel: KernelCamera) -> AnyDict:
     axes = [float(upper[1, 1] / focal - 1.0), float(upper[0, 1] / focal)]
     if np.max(np.abs(axes)) < _ROUNDING:
         axes = []
-    ideal = focal * slopes @ turn
-    lens = offsets @ np.linalg.inv(upper).T * focal - ideal
-    model, coefficients, error = _fitted_lens(ideal, lens)
+    found: list[tuple[float, str, FloatArray]] = []
+    for name in _MODELS:
+        model = with_axes(name) if axes else name
+        lens = np.zeros(len(get_model(name).lens))
+        theta = np.concatenate([centre, [focal], lens, axes])
+        fixed = ("x0", "y0", "f", "stretch", "skew")
+        theta, error = nearest_theta(model, theta, slopes @ turn, offsets + centre, fixed)
+        found.append((error, model, theta))
+        if error < _CLOSE_PX:
+            break
+    error, model, theta = min(found, key=itemgetter(0))
     notes = [kernel.frame]
     if abs(angle) > _ROUNDING:
         notes.append(f"frame turned by {np.degrees(angle):.9g} deg about its z axis")
@@ -214,27 +223,7 @@ def fitted_optics(kernel: KernelCamera) -> AnyDict:
         "focal_px": focal,
         "x0_px": float(centre[0]),
         "y0_px": float(centre[1]),
-        "distortion": with_axes(model) if axes else model,
-        "coefficients": (*coefficients, *axes),
+        "distortion": model,
+        "coefficients": tuple(theta[3:].tolist()),
         "name": ", ".join(notes),
     }
-
-
-def _fitted_lens(ideal: FloatArray, lens: FloatArray) -> tuple[str, tuple[float, ...], float]:
-    """Name, coefficients and largest error (px) of the first model that has a displacement
-    (n, 2), px, or of the nearest.
-    """
-    found: list[tuple[str, tuple[float, ...], float]] = []
-    for name in _MODELS:
-        model = get_model(name)
-        units = np.eye(len(model.lens)).tolist()
-        u, v = ideal.T
-        columns = [np.concatenate(model.displacement(u, v, unit)) for unit in units]
-        basis = np.reshape(columns, (len(units), lens.size)).T
-        size = np.max(np.abs(basis), axis=0)
-        k = np.linalg.lstsq(basis / size, lens.T.ravel(), rcond=None)[0] / size
-        error = float(np.max(np.abs(basis @ k - lens.T.ravel())))
-        found.append((name, tuple(k.tolist()), error))
-        if error < _CLOSE_PX:
-            break
-    return min(found, key=lambda one: one[2])

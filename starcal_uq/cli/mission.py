@@ -232,10 +232,6 @@ def plan_command(
             raise typer.BadParameter(
                 "--choose and --check plan calibrations without effects: leave them out."
             )
-    if tracker.sensor is not None and check is not None:
-        raise typer.BadParameter(
-            "--check simulates one noise for all stars: leave out --sensor, or --check."
-        )
     sheet, known = sc.Camera.load(camera), None
     noise: Noise = SIGMA_PX
     if after is not None:
@@ -278,10 +274,10 @@ def plan_command(
             simulated = sc.planning.check_forecast(
                 sheet,
                 stars,
-                sigma_px=SIGMA_PX if campaign.sigma is None else campaign.sigma,
                 n_frames=sizes,
                 n_campaigns=check,
                 progress=progress,
+                **seen,
                 **common,
             )
     page = None if out is None else write_page(found, out, choice=choice, check=simulated)

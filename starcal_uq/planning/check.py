@@ -15,12 +15,12 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, PlanningError
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.maths.intervals import chi_square_both_sides
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import N_FRAMES, Forecast, Forecaster, Outlook, spreads
 from starcal_uq.planning.information import random_frames
-from starcal_uq.simulation.frames import Campaign, Tracker
+from starcal_uq.simulation.frames import Tracker, TrackerOptions, simulate
 from starcal_uq.simulation.replicates import TrialOptions, Trials
 
 if TYPE_CHECKING:
@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 
     from starcal_uq.camera.camera import Camera
     from starcal_uq.sky.catalogue import StarCatalogue
+
+
+class CheckOptions(TrackerOptions, TrialOptions, total=False):
+    """The tracker, and how trials are run."""
+
 
 _CHUNK = 5
 _INTERVAL = (0.025, 0.975)
@@ -158,14 +163,11 @@ def check_forecast(
     camera: Camera,
     stars: StarCatalogue,
     *,
-    sigma_px: float = 0.05,
     n_frames: Sequence[int] = N_FRAMES,
-    min_stars: int = 10,
-    max_stars: int | None = None,
     n_campaigns: int = 50,
     n_geometries: int = 3000,
     seed: int = 0,
-    **run: Unpack[TrialOptions],
+    **options: Unpack[CheckOptions],
 ) -> ForecastCheck:
     """Simulate and calibrate campaigns, and compare what they state and how far they err with the
     forecast of `plan`.
@@ -175,12 +177,14 @@ def check_forecast(
 
     Parameters
     ----------
-    camera, stars, sigma_px, n_frames, min_stars, max_stars, n_geometries
-        Sheet, sky and settings as `plan` takes them; one noise for all stars, px.
+    camera, stars, n_frames, n_geometries
+        Sheet, sky and settings as `plan` takes them.
     n_campaigns : int
         Campaigns of each number of frames.
     seed : int
         The same seed gives the same result for any number of processes.
+    sigma_px, min_stars, max_stars, exclusion
+        As `plan` takes them.
     workers, progress, keep
         As in `validate`.
 
@@ -199,11 +203,12 @@ def check_forecast(
         raise PlanningError(
             f"n_campaigns is {n_campaigns}: give at least 2, and at least one number of frames."
         )
-    tracker = Tracker(camera, sigma_px, min_stars, max_stars)
+    given: AnyDict = {**options}
+    run = {name: given.pop(name) for name in TrialOptions.__annotations__ if name in given}
+    tracker = Tracker.of(camera, **given)
     mission = random_frames(stars, tracker, n_frames=n_geometries, seed=seed)
     forecaster = Forecaster(mission, Outlook(seed=seed))
-    campaigns = [Campaign(n, min_stars, sigma_px, max_stars=max_stars) for n in n_frames]
-    trial = partial(_campaign, camera, stars, campaigns, n_campaigns)
+    trial = partial(_campaign, camera, stars, n_frames, n_campaigns, given)
     trials = Trials(trial, "check_forecast", _CHUNK, (_Calibrated,))
     # Other streams than those of the forecast.
     outcomes = trials.run(len(n_frames) * n_campaigns, [seed, 4], whole=True, **run)
@@ -239,13 +244,15 @@ class _Calibrated(NamedTuple):
 def _campaign(
     camera: Camera,
     stars: StarCatalogue,
-    campaigns: list[Campaign],
+    n_frames: Sequence[int],
     n_campaigns: int,
+    options: TrackerOptions,
     number: int,
     seeds: np.random.SeedSequence,
 ) -> _Calibrated:
     """Simulate and calibrate a campaign of that number."""
-    seed = seeds.generate_state(1, np.uint64)[0]
-    obs = campaigns[number // n_campaigns].simulate(stars, camera, seed)
+    seed = int(seeds.generate_state(1, np.uint64)[0])
+    size = n_frames[number // n_campaigns]
+    obs = simulate(stars, camera, n_frames=size, seed=seed, **options)
     cal = calibrate(obs, camera.data_sheet(), model=camera.distortion)
     return _Calibrated(cal.theta - camera.theta, cal.covariance, float(cal.dof))

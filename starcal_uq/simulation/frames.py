@@ -47,15 +47,14 @@ _TREE_COSINE = 0.5
 class Campaign:
     """Data of one calibration, as simulated studies take them.
 
-    Frames, the least stars in each (3 or more), centroid noise in px per axis, the sensor's
-    magnitude limit, and the most stars that are used of a frame, the brightest ones.
+    Frames, the least stars in each (3 or more), centroid noise in px per axis, and the sensor's
+    magnitude limit.
     """
 
     n_frames: int
     min_stars: int = 10
     sigma_px: float = 0.05
     max_mag: float = 6.0
-    max_stars: int | None = None
 
     def check(self, error: type[StarcalError]) -> None:
         """Raise `error` for a number that cannot work."""
@@ -78,14 +77,12 @@ class Campaign:
             n_frames=self.n_frames,
             min_stars=self.min_stars,
             sigma_px=self.sigma_px,
-            max_stars=self.max_stars,
             seed=int(seed),
         )
 
     def settings(self, stars: StarCatalogue | None) -> AnyDict:
         """Entries of a provenance; `stars` are None where the embedded catalogue is used."""
-        given = {name: value for name, value in asdict(self).items() if value is not None}
-        return {**given, "stars": "embedded" if stars is None else stars.source}
+        return {**asdict(self), "stars": "embedded" if stars is None else stars.source}
 
 
 class TrackerOptions(TypedDict, total=False):

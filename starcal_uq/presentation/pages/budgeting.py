@@ -13,6 +13,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, cell_text
+from starcal_uq.core.formatting import join_words
 from starcal_uq.core.status import Level
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.presentation.figures.budgeting import plot_budget
@@ -123,8 +124,8 @@ def sheet_html(budget: Budget) -> str:
 
 
 def write_xlsx(budget: Budget, path: PathLike) -> None:
-    """A workbook with the sheets Contributors, Totals, Live totals, Requirements (if any) and Notes;
-    numbers are numbers. The rule of the live totals is formulas over the contributors.
+    """A workbook with the sheets Contributors, Totals, Live totals, Requirements and Filter (if there
+    are any) and Notes; numbers are numbers. The rule of the live totals is formulas over the contributors.
     """
     with extra("excel", "Excel workbooks", "write .csv or .html"):
         from openpyxl import Workbook
@@ -144,6 +145,10 @@ def write_xlsx(budget: Budget, path: PathLike) -> None:
         colours = {Level.FAIL: _RED, Level.WARN: _AMBER, Level.PASS: _GREEN}
         outcomes = [colours[outcome.level] for outcome in budget.outcomes]
         _sheet(book, "Requirements", requirements, outcomes)
+    if budget.filter:
+        states = budget.filter_dataframe()
+        states["contributors"] = states["contributors"].map(join_words)
+        _sheet(book, "Filter", states, [""] * len(states))
     created = budget.provenance.created_utc
     lines = [budget.title, created, told("budget", budget), *tables(budget)["explanations"]]
     notes = pd.DataFrame({"notes": [line for line in (*lines, *budget.notes) if line]})

@@ -53,7 +53,7 @@ def tables(budget: Budget) -> AnyDict:
         "classes": class_rows(budget),
         "totals": total_rows(budget),
         "indices": index_rows(budget),
-        "filter": filter_table(budget).html() if budget.filter else "",
+        "filter": filter_table(budget) if budget.filter else None,
         "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
         "requirements": table("outcomes", it=budget.outcomes, sampled=sampled).records,
         "headline": told("budget", budget),

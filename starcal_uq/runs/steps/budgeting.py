@@ -55,11 +55,11 @@ def budget(
         If the file is wrong.
     """
     from starcal_uq.budgeting.budget import budget
-    from starcal_uq.budgeting.file import BudgetFile, load_budget_file
+    from starcal_uq.budgeting.file import stated_in
 
-    stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
+    stated = stated_in(file)
     posterior, attitude = run.posterior, run.attitude
-    if stated is not None and stated.sensor is not None and attitude.seen is None:
+    if stated.sensor is not None and attitude.seen is None:
         attitude = replace(attitude, seen=seen_by(run))
     made = budget(
         posterior,
