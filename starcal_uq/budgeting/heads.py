@@ -215,24 +215,19 @@ def _gaussian(rows: Sequence[Contributor]) -> bool:
 def _together(rows: Sequence[Contributor], name: str, gain: FloatArray) -> list[Contributor]:
     """An error of Gaussian axes, or of one axis alone, about the axes of the body."""
     mean = gain[:, [AXES.index(row.axis) for row in rows]] @ [row.mean_arcsec for row in rows]
-    figures = {}
+    figures: AnyDict = {}
     for key in _SIGMAS:
-        own = covariance([replace(row, sigma_arcsec=getattr(row, key)) for row in rows])
-        figures[key] = gain @ own @ gain.T
+        of_head = covariance([replace(row, sigma_arcsec=getattr(row, key)) for row in rows])
+        figures[key] = gain @ of_head @ gain.T
     correlations = axis_correlations(figures[_SIGMAS[0]], np.ones(3))
-    return [
-        replace(
-            rows[0],
-            name=name,
-            axis=axis,
-            mean_arcsec=float(mean[i]),
-            axis_correlation=correlations[i],
-            tail_997=max(row.tail_997 for row in rows),
-            applies=any(row.applies for row in rows),
-            **{key: math.sqrt(max(matrix[i, i], 0.0)) for key, matrix in figures.items()},
-        )
-        for i, axis in enumerate(AXES)
-    ]
+    made = []
+    for i, axis in enumerate(AXES):
+        own: AnyDict = {key: math.sqrt(max(matrix[i, i], 0.0)) for key, matrix in figures.items()}
+        own |= {"mean_arcsec": float(mean[i]), "axis_correlation": correlations[i]}
+        own |= {"tail_997": max(row.tail_997 for row in rows)}
+        own |= {"applies": any(row.applies for row in rows)}
+        made.append(replace(rows[0], name=name, axis=axis, **own))
+    return made
 
 
 def _alone(row: Contributor, name: str, head: str, gain: FloatArray) -> list[Contributor]:

@@ -17,7 +17,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.calibration.plausibility import find_reason
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, simpler_models
+from starcal_uq.camera.distortion import get_model, next_simpler, simpler_models
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.findings import clause
 from starcal_uq.core.status import Status
@@ -77,13 +77,17 @@ def fit_determined(
         if simpler is not None:
             used = simpler.camera.distortion
             if asked:
+                if get_model(camera.distortion).tilts and _converges(
+                    camera.replace(distortion=next_simpler(camera.distortion)), fit
+                ):
+                    used = next_simpler(camera.distortion)
                 raise CalibrationError(
                     f"the calibration failed ({status.name})",
                     status,
                     names,
                     found,
                     reason=(
-                        f"{remedy_of(status, names)}; {used!r} converges (--model {used}, or "
+                        f"{remedy_of(status, names, camera.distortion)}; {used!r} converges (--model {used}, or "
                         f"model={used!r} in Python)"
                     ),
                 ) from failure
@@ -163,6 +167,13 @@ def _simpler(
                 return replace(again, nominal=camera)
         return None if _wanted(obs, found, camera.distortion) else found
     return None
+
+
+def _converges(camera: Camera, fit: Callable[[Camera], Calibration]) -> bool:
+    try:
+        return fit(camera).status.ok
+    except CalibrationError:
+        return False
 
 
 def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:

@@ -83,6 +83,11 @@ class DistortionModel:
         return self.formula in (_radial, _none)
 
     @property
+    def tilts(self) -> bool:
+        """Whether the lens has all terms of the second order, which imitate a tilt of the camera."""
+        return self.formula is _cubic
+
+    @property
     def of_lens(self) -> slice:
         """Place of the lens's coefficients among the parameters."""
         return slice(3, 3 + len(self.lens))
@@ -325,7 +330,11 @@ def next_richer(name: str) -> str:
 
 
 def next_simpler(name: str) -> str:
-    """The richest of `simpler_models`; empty where there is none."""
+    """The richest of `simpler_models`, or a lens off its axis for one that imitates a tilt; empty
+    where there is none.
+    """
+    if get_model(name).tilts:
+        return like("brown_tangential", name)
     return max(simpler_models(name), key=lambda other: len(get_model(other).lens), default="")
 
 

@@ -33,7 +33,7 @@ def nearest_theta(
     def off(step: FloatArray) -> FloatArray:
         moved = theta + scale * step
         u, v = moved[2] * slopes.T
-        du, dv = model.displacement(u, v, moved[3:])
+        du, dv = model.displacement(u, v, moved[3:].tolist())
         seen = np.stack(model.stretched(u + du, v + dv, moved), axis=1)
         return np.asarray(seen + moved[:2] - pixels).ravel()
 

@@ -139,9 +139,8 @@ def failed(
         found.append(open_parameters(own.evaluate(at).matrix, noise, nominal, WEAK))
     names = min(filter(None, found), key=len, default=())
     status = Status.SINGULAR if names else status
-    return CalibrationError(
-        f"the calibration failed ({status.name})", status, names, reason=remedy_of(status, names)
-    )
+    reason = remedy_of(status, names, nominal.distortion)
+    return CalibrationError(f"the calibration failed ({status.name})", status, names, reason=reason)
 
 
 def noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:

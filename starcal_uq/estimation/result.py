@@ -262,7 +262,7 @@ class Calibration(Shown, Traced):
     @property
     def remedy(self) -> str:
         """Fault and remedy of a calibration that did not end well, in one clause."""
-        return remedy_of(self.status, self.undetermined, self.solver)
+        return remedy_of(self.status, self.undetermined, self.camera.distortion, self.solver)
 
     @property
     def sigmas(self) -> FloatArray:

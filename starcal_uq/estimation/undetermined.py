@@ -160,8 +160,9 @@ def coma_record(camera: Camera, factors: FloatArray) -> AnyDict:
 Open = Enum("Open", "PARAMETERS RICHER REMEDY")
 
 
-def remedy_of(status: Status, names: tuple[str, ...], solver: str = "") -> str:
-    """The remedy of a status, in terms of the parameters that the data leave open, where there are
-    some.
+def remedy_of(status: Status, names: tuple[str, ...], model: str, solver: str = "") -> str:
+    """The remedy of a status of a model, in terms of the parameters that the data leave open, where
+    there are some.
     """
-    return clause(Open.REMEDY, status=status, names=names, solver=solver)
+    tilts = get_model(model).tilts
+    return clause(Open.REMEDY, status=status, names=names, tilts=tilts, solver=solver)

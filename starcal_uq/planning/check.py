@@ -246,7 +246,7 @@ def _campaign(
     stars: StarCatalogue,
     n_frames: Sequence[int],
     n_campaigns: int,
-    options: TrackerOptions,
+    options: AnyDict,
     number: int,
     seeds: np.random.SeedSequence,
 ) -> _Calibrated:

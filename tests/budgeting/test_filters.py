@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from functools import lru_cache
 
@@ -215,9 +216,11 @@ def test_rows_are_states_by_what_they_state():
 
 
 def test_states_are_saved_and_shown(tmp_path):
+    from starcal_uq.presentation.pages.budgeting import sheet_html
     from starcal_uq.presentation.pages.write import write_page
     from starcal_uq.presentation.words.budgeting import filter_table
 
+    openpyxl = pytest.importorskip("openpyxl")
     found = budget()
     write_page(found, tmp_path / "b.csv")
     table = Budget.load(tmp_path / "b.csv").filter_dataframe()
@@ -227,3 +230,16 @@ def test_states_are_saved_and_shown(tmp_path):
     assert len(filter_table(found).rows) == len(table)
     write_page(found, tmp_path / "b.html")
     assert "States of a filter" in (tmp_path / "b.html").read_text("utf-8")
+    assert sheet_html(found).count('<td style="text-align:left">correlated</td>') == 3
+    write_page(found, tmp_path / "b.tex")
+    _, _, shown = (tmp_path / "b.tex").read_text("utf-8").partition("% --- table: filter")
+    assert shown.partition("% --- end of table")[0].count("& correlated &") == 3
+    write_page(found, tmp_path / "b.xlsx")
+    cells = openpyxl.load_workbook(tmp_path / "b.xlsx")["Filter"].values
+    head, *states = cells
+    assert head[:2] == ("Axis", "Kind") and len(states) == len(table)
+    sigma = head.index("Sigma [arcsec]")
+    assert [one[sigma] for one in states] == pytest.approx(table["sigma_arcsec"].tolist())
+    # Without behaviour in time there is nothing to show.
+    write_page(dataclasses.replace(found, filter=()), tmp_path / "none.xlsx")
+    assert "Filter" not in openpyxl.load_workbook(tmp_path / "none.xlsx").sheetnames

@@ -1,5 +1,6 @@
 """A model that the data do not determine."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -231,3 +232,22 @@ def test_intervals_of_noisy_stars_hold():
     assert 0.91 < np.mean(taken) < 0.999
     # Distortion that is left out moves f by several of its sigmas.
     assert np.mean(noisy("none", 10)) < 0.85
+
+
+def test_a_lens_that_imitates_a_tilt_is_refused_with_one_that_does_not():
+    stars = sc.load_catalogue(max_mag=7.0, epoch=2026.9)
+    truth = sc.Camera(2048, 2048, 15.0, 200.0, 1023.5, 1023.5, "brown_tangential", (0.0,) * 4)
+    obs = sc.simulate(stars, truth, n_frames=40, seed=1, min_stars=8)
+    start = truth.data_sheet()
+    with pytest.raises(CalibrationError, match=r"imitate a tilt .* any number of frames") as caught:
+        sc.calibrate(obs, start, model="cubic")
+    remedy = re.search(r"'(\w+)' converges \(--model \1", str(caught.value))
+    assert remedy is not None and "wider field" not in str(caught.value)
+    found = sc.calibrate(obs, start, model=remedy[1])
+    assert found.status.ok and found.camera.distortion == "brown_tangential"
+    errors = (found.theta - truth.theta) / np.sqrt(np.diag(found.covariance))
+    assert np.abs(errors).max() < 4.0
+    # Control: more frames, which other lenses are told to take, leave this one open.
+    more = sc.simulate(stars, truth, n_frames=100, seed=2, min_stars=8)
+    with pytest.raises(CalibrationError, match="imitate a tilt"):
+        sc.calibrate(more, start, model="cubic")

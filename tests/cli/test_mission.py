@@ -453,7 +453,6 @@ def test_a_plan_takes_its_noise_from_a_sensor(cli, inputs, tmp_path, small_plans
         text.replace("sun_exclusion_deg = 0.0", "sun_exclusion_deg = 60.0")
     )
     for options, words in (
-        (("--sensor", "sensor.toml", "--check", "10"), "leave out --sensor, or --check"),
         (("--time", "2026-11-26T12:00:00"), "add --sensor, or leave them out"),
         (("--sensor", "baffle.toml"), "baffle.toml: sun_exclusion_deg is 60 and needs --time"),
         (("--sensor", "sensor.toml", "--position-km", "1,2"), "not three numbers in km"),
@@ -461,6 +460,9 @@ def test_a_plan_takes_its_noise_from_a_sensor(cli, inputs, tmp_path, small_plans
         named = [tmp_path / word if word.endswith(".toml") else word for word in options]
         status, _, err = cli("plan", sheet, *named)
         assert status == 2 and words in err, err
+    checked = ("--sensor", tmp_path / "sensor.toml", "--frames", "20", "--check", "10")
+    status, out, err = cli("plan", sheet, *checked, "--json")
+    assert status == 0 and json.loads(out)["check"]["rows"], err
     options = ("--sensor", tmp_path / "baffle.toml", "--time", "2026-11-26T12:00:00")
     status, out, err = cli("plan", sheet, *options, "--json")
     # The cone of 60 degrees around the Sun is a quarter of the sky.

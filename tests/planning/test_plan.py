@@ -34,6 +34,7 @@ from starcal_uq.presentation.pages.planning import render_plan, write_plan
 from starcal_uq.presentation.words.numbers import frames as frames_words
 from starcal_uq.presentation.words.sentences import told
 from starcal_uq.simulation.frames import Tracker
+from starcal_uq.simulation.sensor import Sensor
 from tests.helpers.outside import attitude_errors, campaign
 from tests.helpers.scenes import camera, observations
 
@@ -202,6 +203,18 @@ def test_forecast_is_what_small_campaigns_state_and_do():
     assert not check.failures
     assert check.to_dataframe().shape == (2 * len(check.forecast.names), 9)
     assert "40 simulated campaigns" in check.text
+
+
+@pytest.mark.slow
+def test_campaigns_of_a_sensor_have_its_noise_and_its_brightest_stars():
+    options = {"n_campaigns": 40, "n_geometries": 1000, "workers": 0, "seed": 3}
+    noise = Sensor().noise(camera())
+    check = check_forecast(
+        camera(), sky(), sigma_px=noise, max_stars=12, n_frames=(10, 30), **options
+    )
+    assert check.ok, check.text
+    # Control: the forecast for the same noise of all stars is another one.
+    assert not replace(check, forecast=small_check().forecast).ok
 
 
 def test_a_forecast_that_forgets_the_attitudes_fails():

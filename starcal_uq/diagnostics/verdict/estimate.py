@@ -78,12 +78,13 @@ _OF_FRAMES_APART = {"frame", "zenith", "temperature", "time", "epoch"}
 
 def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
     """Did the optimiser reach an optimum in every stage?"""
-    simpler = next_simpler(cal.camera.distortion)
+    simpler, tilts = next_simpler(cal.camera.distortion), get_model(cal.camera.distortion).tilts
     known = {
-        Status.SINGULAR: with_model(simpler) + PLAN if simpler else PLAN,
+        Status.SINGULAR: (with_model(simpler) if simpler else ()) + (() if tilts else PLAN),
         **_REMEDIES,
     }
-    status = {"status": cal.status, "undetermined": cal.undetermined, "solver": cal.solver}
+    status: AnyDict = {"status": cal.status, "undetermined": cal.undetermined}
+    status |= {"solver": cal.solver, "tilts": tilts}
     # Sampling refuses priors that do not determine what the data leave open.
     by_priors = post is not None and bool(cal.undetermined)
     return Check(
