@@ -10,11 +10,14 @@ import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.calibration.calibrate import _enough
 from starcal_uq.core.errors import CalibrationError, ObservationError, RepeatedFramesError
 from starcal_uq.diagnostics.jackknife import jackknife_frames, jackknife_of_all
 from starcal_uq.likelihood.marginal import MarginalLikelihood
@@ -463,3 +466,23 @@ def test_effects_that_partitions_cannot_have_are_refused(moved, tmp_path: Path) 
     with pytest.raises(ObservationError, match=r"part3\.parquet: column temperature_c"):
         sc.calibrate(some, camera, effects="temperature")
     assert sc.calibrate(some, camera, effects="field").effects.names == ("field",)
+
+
+@pytest.mark.parametrize(
+    ("n_stars", "processors", "asked", "chosen"),
+    [
+        (1_560_000, 2, None, 0),  # 100,000 frames: two processes took longer
+        (1_560_000, 64, None, 0),
+        (15_600_000, 2, None, 2),
+        (15_600_000, 64, None, 10),  # No more than files
+        (15_600_000, 1, None, 0),
+        (1_560_000, 2, 2, 2),
+        (15_600_000, 2, 0, 0),
+    ],
+)
+def test_processes_are_started_where_they_save_time(
+    n_stars, processors, asked, chosen, monkeypatch
+) -> None:
+    monkeypatch.setattr("starcal_uq.calibration.calibrate.processors", lambda: processors)
+    files = SimpleNamespace(n_stars=n_stars, parts=range(10))
+    assert _enough(asked, cast(PartitionedObservations, files)) == chosen
