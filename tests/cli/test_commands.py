@@ -17,6 +17,7 @@ from typer.main import get_command
 import starcal_uq as sc
 from starcal_uq.cli.commands import app
 from starcal_uq.cli.schemas import document
+from starcal_uq.core.runfile import expanded
 from starcal_uq.core.settings import Starter
 from starcal_uq.studies.definition import StudyDefinition
 from tests.cli.conftest import check_document
@@ -98,7 +99,7 @@ def test_help_teaches(cli):
 def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_command_that_writes_it(
     cli, inputs
 ):
-    out = cli("run", "--help")[1]
+    out = cli("run", "--help-all")[1]
     panels = (
         "Options",
         "How a camera is estimated",
@@ -320,6 +321,7 @@ def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
     assert f"{what}.toml" in out
     assert "#" in (tmp_path / f"{what}.toml").read_text()
     load = {
+        "run": lambda path: expanded(path, [], ("out", "seed"), ()),
         "camera": sc.Camera.load,
         "sensor": sc.simulation.Sensor.load,
         "site": sc.sky.Site.load,

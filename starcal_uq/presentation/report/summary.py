@@ -108,6 +108,7 @@ def terminal_summary(results: Results) -> list[str]:
             results=results,
             parts=_PARTS,
             both=_both,
+            changed=lambda error: any("(" in _both(error, r, c) for r, _ in _PARTS for c in (3, 2)),
             shell=_shell,
         )
     )
