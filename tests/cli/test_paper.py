@@ -29,7 +29,7 @@ def test_reproduce_writes_a_report_and_tables(cli, tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_reproduce_field_writes_a_page_and_tables(cli, tmp_path, monkeypatch):
     monkeypatch.setattr("starcal_uq.paper.field.experiment.TOLERANCES_PX", (0.5, 2.0))
-    size = ("--replicates", 8, "--frames", 20, "--workers", 1)
+    size = ("--replicates", 20, "--frames", 20, "--workers", 1)
     status, out, _ = cli("reproduce-field", "-o", "field", *size, "--json")
     assert status == 0
     assert "are reproduced" in json.loads(out)["text"] and len(json.loads(out)["table_3"]) == 16
