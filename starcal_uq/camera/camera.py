@@ -214,6 +214,24 @@ class Camera(Shown):
         inside: BoolArray = np.all((points >= -0.5) & (points <= limit), axis=-1)
         return inside
 
+    def project(self, b_cam: ArrayLike) -> FloatArray:
+        """Pixels (..., 2) of directions (..., 3) in the camera frame; see
+        `starcal_uq.camera.project`.
+        """
+        from starcal_uq.camera.projection import project
+
+        directions = floats(b_cam)
+        return project(self, directions).reshape(*directions.shape[:-1], 2)
+
+    def unproject(self, xy_px: ArrayLike) -> FloatArray:
+        """Unit vectors (..., 3) in the camera frame of pixels (..., 2); see
+        `starcal_uq.camera.unproject`.
+        """
+        from starcal_uq.camera.projection import unproject
+
+        pixels = floats(xy_px)
+        return unproject(self, pixels).reshape(*pixels.shape[:-1], 3)
+
     def with_theta(self, theta: ArrayLike) -> Camera:
         """The same detector with other parameters.
 

@@ -16,11 +16,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.kernels import Kernel, build_kernel
 from starcal_uq.camera.planes import PINHOLE
@@ -434,7 +433,23 @@ def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> 
     return max_radius_px * folded
 
 
-def project(camera: Camera, b_cam: FloatArray) -> FloatArray:
+class Optics(Protocol):
+    """A camera, as far as these functions know it."""
+
+    @property
+    def distortion(self) -> str:
+        """Name of the model."""
+
+    @property
+    def theta(self) -> FloatArray:
+        """Parameters, px, shape (p,)."""
+
+    @property
+    def corner_radius_px(self) -> float:
+        """Distance of the farthest corner from the principal point, px."""
+
+
+def project(camera: Optics, b_cam: FloatArray) -> FloatArray:
     """Pixel positions of directions in the camera frame.
 
     Parameters
@@ -483,7 +498,7 @@ def project(camera: Camera, b_cam: FloatArray) -> FloatArray:
     return xy.T
 
 
-def unproject(camera: Camera, xy_px: FloatArray) -> FloatArray:
+def unproject(camera: Optics, xy_px: FloatArray) -> FloatArray:
     """Unit vectors in the camera frame of pixel positions.
 
     Parameters
@@ -513,7 +528,7 @@ def unproject(camera: Camera, xy_px: FloatArray) -> FloatArray:
     return b
 
 
-def _no_inverse(camera: Camera) -> DistortionError:
+def _no_inverse(camera: Optics) -> DistortionError:
     fold = fold_radius_px(camera.distortion, camera.theta, 4.0 * camera.corner_radius_px)
     if fold == float("inf"):
         limit_deg = np.degrees(get_model(camera.distortion).plane.limit_rad)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,13 +30,11 @@ from starcal_uq.cli.settings import (
     command_of,
     refuse_conflicts,
     refuse_others,
-    settings_of,
     typed_words,
 )
-from starcal_uq.core.conflicts import conflict, parsed
-from starcal_uq.core.errors import PriorError
+from starcal_uq.core.conflicts import asked, parsed, with_effects
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.toml import read_section
+from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     from starcal_uq.runs.run import Run
@@ -87,17 +84,15 @@ def run_command(
     """
     from starcal_uq.pipeline.images import are_images
     from starcal_uq.presentation.report.drawing import Ahead
-    from starcal_uq.runs.whole import calibrate_source, finish
+    from starcal_uq.runs.whole import calibrate_source, check_files, finish, kind_of
 
     run = sc.Run(out, tell=note)
-    if budget is not None:
-        # A mistake in it should not show after the work.
-        sc.budgeting.load_budget_file(budget)
+    typed: AnyDict = {"budget": budget}
+    for record in (estimation, sky, images, sampling, propagation):
+        typed |= vars(record)
+    check_files(typed)
     if propagation.temperature_profile is not None:
-        sc.propagation.load_temperature_profile(propagation.temperature_profile)
         _refuse_profile(estimation.effects)
-    if sampling.priors is not None:
-        read_section(sampling.priors, "priors", PriorError, alone=False)
     *given, last = inputs
     from starcal_uq.observations.files import READ
 
@@ -106,8 +101,7 @@ def run_command(
     inputs, camera = (given, last) if last.suffix.lower() == ".toml" or other else (inputs, None)
     if not inputs:
         raise typer.BadParameter(f"{last} is a camera: give images or a table of stars before it.")
-    folder = len(inputs) == 1 and inputs[0].is_dir() and any(inputs[0].glob("*.parquet"))
-    from_images = not folder and are_images(inputs)
+    from_images, folder = kind_of(inputs)
     refuse_others(from_images, sky, images)
     if cameras := [path for path in given if path.suffix.lower() == ".toml"]:
         raise typer.BadParameter(f"{cameras[0]} is a camera: give it last.")
@@ -119,23 +113,7 @@ def run_command(
         raise typer.BadParameter(
             "a table of stars needs the nominal camera (TOML) after it; only images do without."
         )
-    asked = settings_of(estimation, sky, sampling, propagation, partitioned=folder)
-    refuse_conflicts(asked)
-    if estimation.effects is None:
-        selecting = replace(estimation, effects="auto")
-        asked = settings_of(selecting, sky, sampling, propagation, partitioned=folder)
-        estimation = selecting if conflict(asked) is None else estimation
-    settings = {
-        "estimation": estimation,
-        "sky": sky,
-        "images": images,
-        "sampling": sampling,
-        "propagation": propagation,
-        "budget": budget,
-    }
-    files = {f"input {number}": path for number, path in enumerate(inputs)}
-    files |= {} if camera is None else {"camera": camera}
-    command = command_of("run", settings, files)
+    refuse_conflicts(asked({**typed, **estimation.options()}, folder))
     options = {
         **estimation.options(),
         **sky.options(),
@@ -144,6 +122,10 @@ def run_command(
         **vars(propagation),
         "budget": budget,
     }
+    options = with_effects(options, folder)
+    files = {f"input {number}": path for number, path in enumerate(inputs)}
+    files |= {} if camera is None else {"camera": camera}
+    command = command_of("run", typed, files)
     if from_images:
         # As many processes as there are processors.
         options["workers"] = None

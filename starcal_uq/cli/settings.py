@@ -26,7 +26,7 @@ from starcal_uq.cli.options import (
     parse_velocity,
 )
 from starcal_uq.core import settings
-from starcal_uq.core.conflicts import refusal, sampled_by_default
+from starcal_uq.core.conflicts import refusal
 from starcal_uq.core.errors import SensorError
 from starcal_uq.core.types import AnyDict
 
@@ -74,7 +74,6 @@ class EstimationSettings:
                 "out."
             )
         own = {name: value for name, value in vars(self).items() if name not in _OF_CAMERA}
-        own |= {name: None for name in ("effects", "mount") if own[name] == "none"}
         # No workers (0) are a choice, and no absence of one.
         return {
             name: value for name, value in own.items() if value is not None and value is not False
@@ -392,29 +391,6 @@ def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> N
             raise typer.BadParameter(f"--{name.replace('_', '-')} belongs to {kind}: leave it out.")
 
 
-def settings_of(
-    estimation: EstimationSettings,
-    sky: SkySettings,
-    sampling: SamplingSettings | None = None,
-    propagation: PropagationSettings | None = None,
-    *,
-    partitioned: bool = False,
-) -> AnyDict:
-    """Options of one call by the names that `starcal_uq.core.conflicts` has for them."""
-    settings = {
-        **vars(estimation),
-        **vars(sky),
-        **estimation.options(),
-        **({} if propagation is None else vars(propagation)),
-        "partitioned": partitioned,
-    }
-    if sampling is not None:
-        settings["sampled"] = sampling.likelihood or sampled_by_default(settings)
-        settings["sampled_dof"] = sampling.dof
-        settings["evaluation"] = sampling.evaluation
-    return settings
-
-
 def refuse_conflicts(settings: AnyDict) -> None:
     """Refuse options that cannot be given together, before anything is done, in the words of the
     command line.
@@ -450,11 +426,11 @@ def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]
     """
     from starcal_uq.core.manifest import identity
 
-    given: AnyDict = {}
-    for key, value in settings.items():
-        given |= vars(value) if is_dataclass(value) else {key: value}
-    paths = {key: value for key, value in given.items() if isinstance(value, Path)}
-    plain, files = given | {key: str(path) for key, path in paths.items()}, {**files, **paths}
+    paths = {key: value for key, value in settings.items() if isinstance(value, Path)}
+    plain, files = (
+        {**settings} | {key: str(path) for key, path in paths.items()},
+        {**files, **paths},
+    )
     aligned = Path(str(plain.get("alignment")))
     files = {**files, "alignment": aligned} if aligned.is_file() else files
     return {"command": name, "settings": plain, "inputs": identity(files)}

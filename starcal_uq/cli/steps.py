@@ -37,10 +37,10 @@ from starcal_uq.cli.settings import (
     SkySettings,
     TrackerSettings,
     refuse_conflicts,
-    settings_of,
     typed_words,
 )
 from starcal_uq.core import settings
+from starcal_uq.core.conflicts import asked
 from starcal_uq.core.files import check_new_folder, ensure_new, table_ending
 from starcal_uq.core.types import AnyDict
 
@@ -136,7 +136,7 @@ def calibrate_command(
 ) -> Answer:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
     run = sc.Run(out, tell=note)
-    refuse_conflicts(settings_of(estimation, sky, partitioned=observations.is_dir()))
+    refuse_conflicts(asked({**estimation.options(), **vars(sky)}, observations.is_dir()))
     check_new_folder(out, force)
     obs, nominal = load_table(observations, camera, sky)
     nominal = estimation.started(nominal)

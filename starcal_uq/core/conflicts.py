@@ -150,6 +150,25 @@ def sampled_by_default(settings: Mapping[str, object]) -> object:
     return "student_t" if tails else None
 
 
+def asked(options: Mapping[str, Any], partitioned: bool) -> dict[str, Any]:
+    """Settings of `starcal_uq.run` by the names that the rules have for them."""
+    return {
+        "observer_velocity": options.get("observer_velocity_km_s"),
+        **options,
+        "partitioned": partitioned,
+        "sampled": options.get("likelihood") or sampled_by_default(options),
+        "sampled_dof": options.get("dof"),
+    }
+
+
+def with_effects(options: dict[str, Any], partitioned: bool) -> dict[str, Any]:
+    """Settings of `starcal_uq.run`, which looks for effects where none are stated and nothing
+    excludes them.
+    """
+    selecting = {"effects": "auto", **options}
+    return options if conflict(asked(selecting, partitioned)) else selecting
+
+
 def arguments_of(options: Mapping[str, Sequence[str | None]]) -> dict[str, Any]:
     """Options as they are typed by the names that the rules have for them; a tuple where one is
     given several times.

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict, Unpack
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.conflicts import conflict, refuse_conflicts, sampled_by_default, words_of
+from starcal_uq.core.conflicts import asked, refuse_conflicts, with_effects, words_of
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError, SettingError
 from starcal_uq.core.manifest import identity
 from starcal_uq.core.settings import (
@@ -403,23 +403,20 @@ def run(
     """
     from starcal_uq.presentation.report.drawing import Ahead
 
-    options: AnyDict = dict(settings)
-    files, temporary = files_of(source), out is None
-    images, partitioned = _kind(source, files)
-    _check(options, images, camera)
-    given = _asked(options, partitioned)
+    files = files_of(source)
+    images, partitioned = kind_of(source)
+    _check(settings, images, camera)
+    given = asked(settings, partitioned)
     if images:
         given.pop("workers", None)
     refuse_conflicts(**given)
-    if "effects" not in options:
-        selecting = {**options, "effects": "auto"}
-        options = selecting if conflict(_asked(selecting, partitioned)) is None else options
+    options = with_effects({**settings}, partitioned)
     nominal = Camera.load(camera) if isinstance(camera, str | os.PathLike) else camera
-    record = {"command": "run", "seed": seed, "inputs": _identities(source, camera, options)}
     words = _words(files, camera, {**settings, "seed": seed}) if files else ()
     place = Path(tempfile.mkdtemp(prefix="starcal-"), "run") if out is None else Path(out)
+    record = {} if out is None else _record(source, camera, seed, settings)
     made = Run(place, tell=tell)
-    if temporary:
+    if out is None:
         weakref.finalize(made, shutil.rmtree, place.parent, ignore_errors=True)
     watch = Watch(made._tell)
     start = options.pop("start", {})
@@ -433,23 +430,24 @@ def run(
                 started=lambda sheet: sheet.replace(**start),
                 watch=watch,
                 images=images,
-                keep_failed=not temporary,
+                keep_failed=out is not None,
             )
         # Other processes would start the script of the user once more.
-        finish(made, Ahead(), options, seed=seed, watch=watch, report=not temporary)
+        finish(made, Ahead(), options, seed=seed, watch=watch, report=out is not None)
     return made
 
 
-def _kind(source: Any, files: list[Path]) -> tuple[bool, bool]:
+def kind_of(source: Any) -> tuple[bool, bool]:
     """Whether a source is images, and whether it is a folder of partitions."""
     from starcal_uq.pipeline.images import are_images
 
+    files = files_of(source)
     folder = len(files) == 1 and files[0].is_dir() and any(files[0].glob("*.parquet"))
     partitioned = folder or isinstance(source, PartitionedObservations)
     return not partitioned and are_images(files), partitioned
 
 
-def _check(options: AnyDict, images: bool, camera: Camera | PathLike | None) -> None:
+def _check(options: AnyMapping, images: bool, camera: Camera | PathLike | None) -> None:
     """Refuse, before anything is done, what would be ignored or found wrong after the work."""
     known = RunOptions.__annotations__
     others, kind = (TableOptions, "a table") if images else (ImageOptions, "images")
@@ -468,39 +466,30 @@ def _check(options: AnyDict, images: bool, camera: Camera | PathLike | None) -> 
             "temperature_profile needs the effect temperature: add it to effects, or leave the "
             "profile out."
         )
-    if isinstance(budget := options.get("budget"), str | os.PathLike):
-        from starcal_uq.budgeting.file import load_budget_file
-
-        load_budget_file(budget)
-    if isinstance(priors := options.get("priors"), str | os.PathLike):
-        read_section(priors, "priors", PriorError, alone=False)
+    check_files(options)
 
 
-def _asked(options: AnyMapping, partitioned: bool) -> AnyDict:
-    """Options by the names that `starcal_uq.core.conflicts` has for them."""
-    return {
-        **options,
-        "observer_velocity": options.get("observer_velocity_km_s"),
-        "partitioned": partitioned,
-        "sampled": options.get("likelihood") or sampled_by_default(options),
-        "sampled_dof": options.get("dof"),
-    }
+def check_files(options: AnyMapping) -> None:
+    """Read the files of which a mistake should not show after the work."""
+    from starcal_uq.budgeting.file import load_budget_file
+    from starcal_uq.propagation.thermal import load_temperature_profile
+
+    for name, read in (
+        ("budget", load_budget_file),
+        ("temperature_profile", load_temperature_profile),
+        ("priors", partial(read_section, name="priors", error=PriorError, alone=False)),
+    ):
+        if isinstance(path := options.get(name), str | os.PathLike):
+            read(path)
 
 
-def _identities(source: Any, camera: Any, options: AnyMapping) -> AnyDict:
-    """What tells the inputs of a call from those of another."""
-    files = files_of(source)
-    given = {f"input {number}": path for number, path in enumerate(files or [source])}
-    found: AnyDict = {}
-    for name, value in {**given, "camera": camera, **options}.items():
-        path = Path(value) if isinstance(value, str | os.PathLike) else None
-        if path is not None and path.exists():
-            found |= identity({name: path})
-        elif isinstance(value, bool | int | float | str | None):
-            found[name] = value
-        else:
-            found[name] = hashlib.sha256(pickle.dumps(value)).hexdigest()
-    return found
+def _record(source: Any, camera: Any, seed: int, settings: AnyMapping) -> AnyDict:
+    """What tells a call from others: an unfinished run of the same one is completed."""
+    inputs = {f"input {number}": path for number, path in enumerate(files_of(source))}
+    given = {**inputs, "camera": camera, **settings}
+    paths = {name: Path(one) for name, one in given.items() if isinstance(one, str | os.PathLike)}
+    told = hashlib.sha256(pickle.dumps((source, camera, seed, settings))).hexdigest()
+    return {"command": "run", "settings": told, "inputs": identity(paths)}
 
 
 # Settings that have another name on the command line.

@@ -157,3 +157,12 @@ def test_a_shift_of_pixels_is_one_of_the_principal_point(model: str) -> None:
     for axis, step in enumerate(0.5 * np.eye(2)):
         up, down = (projection.unproject_theta(model, theta, xy + s) for s in (step, -step))
         np.testing.assert_allclose(up - down, -jacobian[..., axis], rtol=1e-5, atol=1e-10)
+
+
+def test_methods_of_the_camera_take_any_shape_and_return_to_the_pixels():
+    cam = camera("brown")
+    grid = np.stack(np.meshgrid([0.0, 300.0, 900.0], [5.0, 700.0]), axis=-1)
+    seen = cam.unproject(grid)
+    assert seen.shape == (2, 3, 3) and np.allclose(np.linalg.norm(seen, axis=-1), 1.0)
+    assert cam.project(seen) == pytest.approx(grid, abs=1e-9)
+    assert cam.project(seen[1, 2]).shape == (2,)
