@@ -27,9 +27,10 @@ def program() -> NoReturn:
     sys.unraisablehook = _again
     if sys.argv[1:] == ["--version"]:
         # Before Typer and the commands, which take ten times as long to load.
-        from starcal_uq.core.provenance import version_line
+        # The installed metadata say the same, and take ten times as long to read.
+        from starcal_uq import __version__
 
-        print(version_line())
+        print(f"starcal-uq {__version__}")
         sys.exit(0)
     try:
         main()

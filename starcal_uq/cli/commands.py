@@ -44,9 +44,9 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from starcal_uq.core.provenance import version_line
+        from starcal_uq import __version__
 
-        print(version_line())
+        print(f"starcal-uq {__version__}")
         raise typer.Exit
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -151,15 +150,12 @@ def installed_version(distribution: str) -> str | None:
         return None
 
 
-def version_line() -> str:
-    """Name and version of the program."""
-    return f"{NAME} {installed_version(NAME)}"
-
-
 def installed_versions() -> dict[str, str | None]:
     """Versions of Python and of the packages that decide the numbers; None for one that is not
     installed.
     """
+    import platform
+
     # Read from the installed metadata: importing casadi or arviz to ask for its version would cost
     # a second.
     packages = {name.replace("-", "_"): installed_version(name) for name in _VERSIONED}

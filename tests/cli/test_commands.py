@@ -366,6 +366,15 @@ def test_python_runs_the_package_and_shells_complete_its_commands():
     command = [sys.executable, "-m", "starcal_uq"]
     told = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     assert told.stdout.startswith("starcal-uq ")
+    # What the version needs, and nothing else.
+    heavy = ("typer", "rich", "numpy", "importlib.metadata")
+    code = (
+        "import sys, starcal_uq.cli.app as app; sys.argv = ['starcal-uq', '--version']\n"
+        "try:\n    app.program()\nfinally:\n"
+        f"    print([name for name in {heavy} if name in sys.modules])"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout.splitlines()[1] == "[]"
     words = {
         "_STARCAL_UQ_COMPLETE": "complete_bash",
         "COMP_WORDS": "starcal-uq cal",
