@@ -164,7 +164,7 @@ def test_stars_that_do_not_determine_the_camera_are_shown_as_well(cli, tmp_path)
                 "sample RUN`."
             ),
         ),
-        (("export", __file__), "--to TO is missing (the camera for opencv"),
+        (("export", __file__), "--to WORD is missing (the camera for opencv"),
     ],
 )
 def test_a_call_that_lacks_an_argument_is_answered_with_a_sentence(cli, call, said):
