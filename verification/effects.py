@@ -33,7 +33,7 @@ KINDS = (
     *("axes", "field", "radial", "frame", "temperature"),
     *("time", "epoch", "star", "phase", "magnitude"),
 )
-# Scales that are standard deviations of what is drawn anew in every campaign.
+# Scales that are standard deviations of what is drawn again in every campaign.
 DRAWN = ("frame", "star")
 FRAMES, STARS, NIGHTS = 30, 20, 3
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "effects.md"

@@ -3,7 +3,7 @@
     python verification/ground.py TABLE CAMERA [--time UTC]
 
 Frame by frame: the camera and its effects are estimated from the other frames, and the stars of the
-one that is left out are predicted, without effects and with those that the data ask for. Chi-square
+one that is left out are predicted, without effects and with those that the data support. Chi-square
 per degree of freedom of what the attitude of that frame leaves counts noise, camera, effects of the
 run and the prior of effects of single frames; the log density compares the two. Then the attitudes
 of all frames by two quite different models, the common rotation taken off: their difference beside

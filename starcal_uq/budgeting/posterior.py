@@ -289,16 +289,16 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
         )
     if names := _effects(attitude):
         return (
-            f"The data ask for effects ({names}): {COMMON!r} and {REST!r} are errors of the calibrated camera "
+            f"The data support effects ({names}): {COMMON!r} and {REST!r} are errors of the calibrated camera "
             "if the one with these effects is right.",
         )
     return (
-        "The tests of the model ask for no further effects; what they cannot see is in no row.",
+        "The tests of the model support no further effects; what they cannot see is in no row.",
     )
 
 
 def _effects(attitude: AttitudeError) -> str:
-    """The effects that the calibration lacks and its data ask for; empty where there are none."""
+    """The effects that the calibration lacks and its data support; empty where there are none."""
     if attitude.misfit is None or attitude.variants:
         return ""
     return join_words([effect.name for effect in attitude.misfit.effects])

@@ -127,7 +127,7 @@ def calibrate(
         Limit for each stage.
     effects : {"none", "auto"} or sequence of str
         Effects beyond the camera, by name or joined by commas; ``auto`` takes up those that the
-        data ask for, beside any that are named (`Calibration.effects`). Scales of ``axes``,
+        data support, beside any that are named (`Calibration.effects`). Scales of ``axes``,
         ``field``, ``radial``, ``frame``, ``zenith``, ``temperature``, ``time``, ``epoch``,
         ``star``, ``phase`` and ``magnitude`` are estimated by restricted likelihood and
         marginalised in estimate, covariance and `compressed`. Two effects decide how much the stars
@@ -308,7 +308,7 @@ def _of_table(
 
 
 def _selected(obs: Observations, cal: Calibration, settings: EstimationSettings) -> Calibration:
-    """The calibration with the effects that the data ask for, noise and tails among them.
+    """The calibration with the effects that the data support, noise and tails among them.
 
     Where one of these gains more than each effect that shifts stars, or enough beside all of them,
     these are selected again with it, and then the other one is tried beside it. One of them that

@@ -81,10 +81,7 @@ def _main() -> None:
         # Libraries make other errors of a KeyboardInterrupt that they meet.
         number = caught_signal()
         if number is not None or isinstance(error, Abort | KeyboardInterrupt):
-            words = (
-                "interrupted; what was complete is kept: give the same command again, and it "
-                "goes on."
-            )
+            words = "interrupted; what was complete is kept: give the same command again to resume."
             _fail(words, 128 + (number or signal.SIGINT))
         if isinstance(error, Exit):
             sys.exit(error.exit_code)

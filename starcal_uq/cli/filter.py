@@ -23,7 +23,7 @@ def filter_command(
     force: bool = False,
 ) -> Answer:
     """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an
-    interrupted call goes on.
+    interrupted call resumes.
     """
     from starcal_uq.paper.recursive.folder import filter_run
     from starcal_uq.runs.folder import HISTORY

@@ -47,7 +47,7 @@ def centroid_command(
     """Find the stars in images, with a covariance for each; a frame that cannot be used is named
     and left out.
 
-    An interrupted command over a hundred images or more goes on.
+    An interrupted command over a hundred images or more resumes.
     """
     from starcal_uq.core.times import utc_text
     from starcal_uq.pipeline.images import counted, with_time

@@ -22,7 +22,7 @@ def validate_command(
     """Show that the intervals are right for this sensor and this volume of data, by
     simulation-based calibration.
 
-    With `-o`, replicates are kept as they are made: an interrupted command goes on, also with more
+    With `-o`, replicates are kept as they are made: an interrupted command resumes, also with more
     of them.
     """
     from starcal_uq.core.manifest import making

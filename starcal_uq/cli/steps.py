@@ -163,7 +163,7 @@ def calibrate_command(
 
 
 def sample_command(run: Path, sampling: SamplingSettings, force: bool = False) -> Answer:
-    """Sample the posterior with emcee from the calibration; an interrupted command goes on where it
+    """Sample the posterior with emcee from the calibration; an interrupted command resumes where it
     stopped.
     """
     from starcal_uq.runs.whole import sample_run

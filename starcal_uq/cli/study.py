@@ -20,7 +20,7 @@ def study_command(
     """Vary camera, sky, noise and observation: what couples, what decouples it, and what it does to
     attitudes.
 
-    Cells that are there already are not computed again; `--force` computes all anew, and then
+    Cells that are there already are not computed again; `--force` computes all again, and then
     replaces them. Status 1 when no cell has numbers.
     """
     pages: list[Path] = []

@@ -96,7 +96,7 @@ def compare(
     observations : pair of Observations, optional
         The frames of each; shared ones are then found even where the tables differ.
     fingerprints : pair of Fingerprints or None, optional
-        Those of the frames, by which images that were measured anew are found as well; a
+        Those of the frames, by which images that were measured again are found as well; a
         calibration brings its own.
     n : int
         Grid points along each side of the detector.

@@ -68,7 +68,7 @@ def difference_rule(
     """The rule for two calibrations or posteriors with their labels.
 
     `same_data` overrules what hashes and frames say. In the `observations`, the frames that each
-    rests on, shared ones are looked for; by `fingerprints` images that were measured anew are found
+    rests on, shared ones are looked for; by `fingerprints` images that were measured again are found
     as well.
     """
     data, seen = _relation(a, b, same_data, observations, fingerprints)
@@ -110,7 +110,7 @@ def _relation(
     if observations is not None:
         common, sizes = shared_frames(*observations), [obs.n_frames for obs in observations]
     if a_marks is not None and b_marks is not None and not common:
-        # The same pixels are the same data; the same image measured anew has another error, though
+        # The same pixels are the same data; the same image measured again has another error, though
         # nearly the same.
         pairs, sizes = shared(a_marks, b_marks), [len(a_marks.sizes), len(b_marks.sizes)]
         common = len(np.unique(pairs[:, 0]))

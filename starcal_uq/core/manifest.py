@@ -270,7 +270,7 @@ def making(
     """Yield a folder for all results of a command; they take their places at once, if the block
     succeeds.
 
-    Until then `folder`, in which no other process can make results, holds the results of before.
+    Until then `folder`, in which no other process can make results, holds the earlier results.
     What the command has kept there on its way (`core.store.Kept`) goes when the results are there.
     `main` is the result that versions without records always wrote; `also` are patterns of results
     that may be replaced without being recorded, because functions write them one by one.

@@ -159,7 +159,7 @@ def air_test(
 
 def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> StarNoise | None:
     """Direction errors that recurring stars show."""
-    # Effects hold what stars bring along, where the data ask for that.
+    # Effects hold what stars bring along, where the data support that.
     if not found.tau_px > 0.0 or has_effects(cal):
         return None
     own = float(np.sqrt(own_noise(obs, cal.sigma**2, found.tau_px**2)))

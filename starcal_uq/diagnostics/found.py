@@ -22,7 +22,7 @@ def with_misfit(
 
     Where they find structure and the data would take up effects, it is the error of the camera that
     was calibrated without them, if the camera with these effects is right: through the geometry of
-    the frames, with the posterior of the effects. Where the data ask for none, and where the
+    the frames, with the posterior of the effects. Where the data support none, and where the
     calibration holds effects already, it is the error if the model holds.
 
     Parameters

@@ -55,7 +55,7 @@ class Jackknife(Shown):
     n_frames : int
         K.
     residual_dof : int
-        Degrees of freedom of the noise in `formal_covariance`; 0 in files of before, which took it
+        Degrees of freedom of the noise in `formal_covariance`; 0 in earlier files, which took it
         as known.
     tail_dof : (p,) array or None
         Degrees of freedom of a chi-square as skew as `sandwich_covariance`; None in files of

@@ -1,4 +1,4 @@
-"""Which distortion model the data ask for: expected log predictive density, leaving one frame out
+"""Which distortion model the data support: expected log predictive density, leaving one frame out
 at a time.
 
 A frame is the unit, because its stars share an attitude. The log likelihood of a frame has its

@@ -164,7 +164,7 @@ def with_effects(
     obs, cal
         The table, with the weights of the calibration, and the estimate by its marginal likelihood.
     wanted : sequence of str
-        The effects; with ``auto`` also those that the data ask for beside them.
+        The effects; with ``auto`` also those that the data support beside them.
 
     Raises
     ------

@@ -73,7 +73,7 @@ def merge(
     names : sequence of str, optional
         Names of the runs in messages; ``run 1``... otherwise.
     noise : {"auto", "common", "own"}
-        ``common``: one noise for all runs, estimated anew. ``own``: each run keeps its own estimate
+        ``common``: one noise for all runs, estimated again. ``own``: each run keeps its own estimate
         as stated noise, and the result has a common factor on it (`sigma_scale`), which also allows
         runs with and without stated noises. ``auto``: ``own`` where the runs' noises differ
         (Bartlett's test at 0.1 %) or are of different kinds.

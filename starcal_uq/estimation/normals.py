@@ -196,7 +196,7 @@ class StarNormals:
     squares: float  # Sum of squared whitened residuals after the fit
     scores: FloatArray  # (S, p): share of the slope at the estimate; they sum to nothing
     # `matrices`, `slopes`, (S, p, p) and (S, p): what the normal equations lose without a star, the
-    # attitudes of its frames fitted anew.
+    # attitudes of its frames fitted again.
     matrices: FloatArray
     slopes: FloatArray
     # (S, 2, p): change of the slope by one px of offset of the star along each of its axes

@@ -247,7 +247,7 @@ def calibrate_partitions(
 
     `start`: calibration of the sample by the ``efficient`` method; its estimate from interstar
     angles stays. `cluster`: processes that read the partitions. `effects`: those that shift
-    stars; with ``auto`` also those that the data ask for.
+    stars; with ``auto`` also those that the data support.
     `duplicates`: what to do with frames that hold the same pixels as another. `progress`: called
     with (partitions done, partitions) in every pass. CalibrationError when there is no estimate.
     RepeatedFramesError when frames hold the same pixels and are refused. ObservationError for bad

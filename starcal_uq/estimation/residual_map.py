@@ -154,7 +154,7 @@ class PartitionSums:
     largest_frame: int  # Frame of the largest
     richer: tuple[RicherModel, ...] = ()  # Models of which the calibration's is a special case
     scatter: FrameScatter | None = (
-        None  # How all frames scatter about the estimate; None in a calibration of before
+        None  # How all frames scatter about the estimate; None in an earlier calibration
     )
 
     @classmethod

@@ -136,7 +136,7 @@ def selected(
     steps: list[Step],
     least: float,
 ) -> tuple[dict[str, float], list[Step], list[tuple[str, float]]]:
-    """Logs of the scales of the effects that the data ask for beside those of `logs`, how they were
+    """Logs of the scales of the effects that the data support beside those of `logs`, how they were
     taken up, and what the others would gain. `least`: gain that an effect has to exceed.
     """
     asked = tuple(logs)

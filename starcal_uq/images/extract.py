@@ -85,7 +85,7 @@ def extract_centroids(
         Called with (files done, files in all).
     keep
         Folder in which the stars of a hundred files and more are kept as they are measured; a later
-        call with the same files and options goes on from them (`starcal_uq.core.store.finished`
+        call with the same files and options resumes from them (`starcal_uq.core.store.finished`
         removes them).
     **options
         Those of `DetectionOptions`, such as ``threshold_sigma``.

@@ -272,7 +272,7 @@ class _Store:
                 )
                 np.random.RandomState(0).set_state(random_state)
         except SamplingError:
-            # What cannot be gone on with is made again.
+            # What cannot be resumed is made again.
             return
         self.state = emcee.State(
             content["coords"], log_prob=content["log_prob"], random_state=random_state

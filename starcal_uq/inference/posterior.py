@@ -167,7 +167,7 @@ class Diagnostics:
     checks : tuple of Check
         Every check of the draws, made once while sampling.
     derived : tuple of Derived
-        What follows from the parameters, with its convergence; empty in posteriors of before.
+        What follows from the parameters, with its convergence; empty in earlier posteriors.
     """
 
     rhat: FloatArray

@@ -123,7 +123,7 @@ class Priors(Shown, ABC):
         if unknown:
             raise PriorError(
                 f"no prior on {unknown[0]!r}: these priors were made for the distortion model "
-                f"{self.distortion!r}; make them anew with Priors.default."
+                f"{self.distortion!r}; make them again with Priors.default."
             )
         return np.array([moments[name][index] for name in names])
 

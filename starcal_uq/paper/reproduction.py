@@ -50,7 +50,7 @@ def reproduce(
         ``published.csv``, ``trials.csv``, ``checks.csv``, ``errors.csv``, ``replicates.csv``,
         ``replicates.npz``, ``interaction.csv``, and the figures as PNG in ``figures``. They are
         written when everything is computed; until then data sets that are done are kept in the
-        folder, and an interrupted call goes on from them.
+        folder, and an interrupted call resumes from them.
     n_replicates : int
         Data sets over which every method is repeated, at least 8; the filter that takes pairs as
         independent, a slow option, has a quarter of them.
@@ -67,7 +67,7 @@ def reproduce(
     study : bool
         Also vary the experiment along four axes (`interaction_study`).
     force : bool
-        Replace results of before, when those of this call are complete; other files in the folder
+        Replace earlier results, when those of this call are complete; other files in the folder
         stay.
 
     Raises
@@ -81,7 +81,7 @@ def reproduce(
     SamplingError
         If processes cannot be used.
     KeyboardInterrupt
-        After Ctrl-C; the same call then goes on.
+        After Ctrl-C; the same call then resumes.
     """
     if n_replicates < 8:
         raise CalibrationError(

@@ -2,7 +2,7 @@
 `starcal_uq.propagation.propagate.propagate`.
 
 Every error has two figures, under the same two names wherever it is shown: *if the model holds*, by
-the posterior alone, and *with the misfit found*, beside the effects that the data ask for where
+the posterior alone, and *with the misfit found*, beside the effects that the data support where
 tests of the model find structure. The second is the headline, and it is not assessed, never equal
 to the first, until the model has been tested.
 Both are computed here and nowhere else.
@@ -162,7 +162,7 @@ class AttitudeError(Shown):
     aligned : Observations or None
         Frames of the alignment; None when read from a file.
     misfit : OnboardError or None
-        The calibration's part beside the effects that its data ask for; what holds if the model
+        The calibration's part beside the effects that its data support; what holds if the model
         does where they ask for none. None where that is not assessed.
     seen : Observations or None
         The frames themselves; None when read from a file.

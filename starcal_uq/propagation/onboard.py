@@ -48,7 +48,7 @@ _ROUNDING = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Extended:
-    """A calibration with the effects that its data ask for, as far as attitudes need it.
+    """A calibration with the effects that its data support, as far as attitudes need it.
 
     Attributes
     ----------

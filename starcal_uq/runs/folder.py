@@ -340,12 +340,12 @@ class RunFolder:
 
         That is this folder. Where it holds another run, it is a hidden one inside, whose files take
         their places all at once when the run is complete; an error, a kill or a full disk leaves
-        the run of before.
+        the earlier run.
 
         Parameters
         ----------
         command : mapping
-            All that the run depends on; an unfinished one of something else is not gone on with.
+            All that the run depends on; an unfinished one of something else is not resumed.
         force : bool
             Whether to replace a run that is complete.
         words : sequence of str

@@ -364,7 +364,7 @@ class StoredRun:
         """All steps within the block make one run, which replaces that of before when it is
         complete, and not sooner.
 
-        An interrupted one goes on where it was: steps that are done, `did`, need not be done again.
+        An interrupted one resumes where it was: steps that are done, `did`, need not be done again.
 
         Parameters
         ----------

@@ -297,7 +297,7 @@ def finish(
     profile = propagation.get("temperature_profile")
     effects = run.calibration.effects
     if profile is not None and (effects is None or "temperature" not in effects.names):
-        run._tell(f"The data ask for no effect of the temperature: {profile} is left out.")
+        run._tell(f"The data support no effect of the temperature: {profile} is left out.")
         del propagation["temperature_profile"]
     apart = None
     # With fewer stars the other process would take longer to load what it needs than this one takes

@@ -50,7 +50,7 @@ def simulate_partitions(
     """Simulate identified stars, as `simulate` does, into a folder of Parquet files.
 
     A file depends on the seed and its number alone. The files take their places when all are made:
-    an interrupted call goes on, and until its end the folder holds what it held before. What the
+    an interrupted call resumes, and until its end the folder holds what it held before. What the
     same call has made stays.
 
     Parameters

@@ -120,7 +120,7 @@ class Trials(Generic[T]):
         number of processes, and a longer study begins with a shorter one. `workers`: processes; as
         many as there are processors by default, 0 for this one alone, where a BLAS with several
         threads can change the last digits. `progress` is called with (trials done, trials). `keep`
-        is a folder in which results are kept as they are made; a later call goes on from them.
+        is a folder in which results are kept as they are made; a later call resumes from them.
         """
         identity = [self.caller, seed, self.trial.args]
         kept = None if keep is None else Kept(keep, identity, self.kinds)

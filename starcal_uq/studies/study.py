@@ -45,7 +45,7 @@ _PAGES = ("report.html", "figures/*.png", "figures/*.svg")
 # once.
 _GEOMETRY_S, _CELL_S, _SIMULATED_S, _BATCH_S = 0.01, 0.0015, 0.1, 1.0
 _FEW_BATCHES = 5
-MISSING = "not computed yet: run the study again, and it goes on."
+MISSING = "not computed yet: run the study again to resume."
 
 
 @bounded
@@ -75,7 +75,7 @@ def study(
     stars : StarCatalogue, optional
         The sky; the embedded catalogue at the epoch of the definition by default.
     force : bool
-        Compute all cells anew. Those of before, and their results, stay until the new ones are
+        Compute all cells again. Those of before, and their results, stay until the new ones are
         complete.
     more : callable, optional
         Writes what belongs to the results, such as a page: called with the study and the folder in
@@ -130,7 +130,7 @@ def study(
         with making(
             folder, "study", NETCDF, force=force or _is_study(folder, given), also=_PAGES
         ) as stage:
-            # Cells that are made anew, by this call or by one that was stopped, stand apart until
+            # Cells that are made again, by this call or by one that was stopped, stand apart until
             # all are there.
             anew = bool(held(new / CELLS) or (force and held(folder / CELLS)))
             store = Store(new if anew else folder)

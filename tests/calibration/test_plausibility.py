@@ -23,7 +23,7 @@ BLAMES = (
     "look swapped",
     "mirrored",
     "frame number",
-    "ask for",
+    "fit a focal length",
     "principal point",
     "belong",
 )
@@ -83,7 +83,7 @@ CAMERAS = {
     "micrometres": (lambda f: {"focal_mm": 1000.0 * f}, "focal_mm looks like micrometres .*:"),
     "pixels": (lambda f: {"focal_mm": 100.0 * f}, "focal_mm looks like pixels .* by the pixel"),
     "pitch": (lambda f: {"pixel_um": 0.01}, "pixel_um looks like millimetres \\(0.01\\): multiply"),
-    "another": (lambda f: {"focal_mm": 2.2 * f}, "the stars ask for a focal length of about .*"),
+    "another": (lambda f: {"focal_mm": 2.2 * f}, "the stars fit a focal length of about .*"),
 }
 
 

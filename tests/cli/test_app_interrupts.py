@@ -25,9 +25,7 @@ from tests.conftest import ROOT
 from tests.helpers.scenes import observations
 
 PROGRAM = (sys.executable, "-c", "from starcal_uq.cli.app import program; program()")
-SENTENCE = (
-    "error: interrupted; what was complete is kept: give the same command again, and it goes on."
-)
+SENTENCE = "error: interrupted; what was complete is kept: give the same command again to resume."
 
 
 def start(folder: Path, *words: object) -> subprocess.Popen[str]:

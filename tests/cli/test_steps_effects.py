@@ -34,7 +34,7 @@ def test_the_terminal_shows_what_was_taken_up_and_what_was_not(cli, breathed) ->
     assert effects.names == ("frame",)
     row = next(line for line in out.splitlines() if line.startswith("│ frame "))
     assert f"{effects.fitted[0].gain_nat:.1f}" in row
-    assert "Effects that the data ask for: frame. Not taken up (an effect has to gain" in out
+    assert "Effects that the data support: frame. Not taken up (an effect has to gain" in out
     # The same words stand wherever a calibration or its effects are shown.
     shown = sc.Run("run").calibration
     assert effects.text in shown.text
@@ -61,7 +61,7 @@ def test_nothing_taken_up_is_one_sentence(cli, tmp_path) -> None:
     table(c).save(tmp_path / "obs.csv")
     sheet(c).save(tmp_path / "camera.toml")
     _, out, _ = cli("calibrate", "obs.csv", "camera.toml", "-o", "run", "--effects", "auto")
-    assert "The data ask for no effect beyond the camera. Not taken up (an effect has" in out
+    assert "The data support no effect beyond the camera. Not taken up (an effect has" in out
     assert "moved most" not in out
 
 

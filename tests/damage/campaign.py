@@ -6,7 +6,7 @@
 Every kind of file that the package reads (`tests/damage/samples.py`) is damaged, a seed each, and
 loaded: binary kinds that many times, and the kinds of text that one function reads that many times
 together. What was done is kept in `.bench/damage`, a file for every few thousand seeds: a campaign
-that is stopped goes on, and a larger one takes in a smaller one. A process may take 1 GB beyond
+that is stopped resumes, and a larger one takes in a smaller one. A process may take 1 GB beyond
 what it has before, and a file 20 s; one that dies is counted with its seed. ``--show`` prints what
 was wrong, ``--write`` puts the table into the documentation (`docs/explanation/reliability.md`).
 Without ``--text`` and ``--binary`` nothing new is tried.

@@ -6,7 +6,7 @@ A mutant is one small change of the source: a sign, a comparison, a constant, a 
 draws one of each function of a subject; a later seed leaves out what those before it draw, so its
 first result is of changes that no test was written against. Each is given to the fast tests that
 reach its line, in a process of its own; it is killed when one of them fails. What was drawn and
-tried is kept in `.bench/mutation`, so a run that is stopped goes on; without ``--seed`` nothing new
+tried is kept in `.bench/mutation`, so a run that is stopped resumes; without ``--seed`` nothing new
 is tried. ``--again`` tries those that survived, after tests were strengthened. ``--show`` prints
 survivors as differences, ``--write`` puts the table of all draws into
 `docs/explanation/reliability.md`.

@@ -58,7 +58,7 @@ def stars():
 
 
 def remembering(function):
-    """A function that gives the results of before for arguments of before."""
+    """A function that gives the earlier results for arguments of before."""
     known = {}
 
     def remembered(first, *arguments, **options):

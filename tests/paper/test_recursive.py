@@ -473,7 +473,7 @@ def test_steps_tell_estimate_and_covariance_after_every_frame():
         step = steps.update(obs.select_frames([k]))
         widths.append(step.sigmas)
         told.append(step.theta)
-    # Information only grows; the noise is estimated anew after each frame, which moves all sigmas
+    # Information only grows; the noise is estimated again after each frame, which moves all sigmas
     # together.
     covariances = np.array(widths)[5:]
     assert (covariances[-1] < 0.4 * covariances[0]).all()

@@ -85,7 +85,7 @@ def test_summary_counts_what_was_used_and_what_was_not() -> None:
 def test_report_says_what_changed(paper_calibration: sc.Calibration) -> None:
     shown = image_context(record(5), paper_calibration)
     rows = {row[0]: row for row in shown["round_table"].rows}
-    assert rows["Stars calibrated"][1:4] == ("80", "96", "16 identified anew, 0 given up")
+    assert rows["Stars calibrated"][1:4] == ("80", "96", "16 identified again, 0 given up")
     assert rows["f"][3] == "2.0 σ"
     assert shown["image_reasons"] == ["1 image: no star is bright enough."]
     assert len(shown["image_rows"]) == 5

@@ -146,7 +146,7 @@ def validate(
     progress : callable, optional
         Called as ``progress(done, total)``.
     keep : path, optional
-        Folder in which replicates are kept as they are made; a later call goes on from them, with
+        Folder in which replicates are kept as they are made; a later call resumes from them, with
         more replicates as well. Not for a likelihood of one's own.
     """
     from starcal_uq.sky.catalogue import load_catalogue

@@ -188,7 +188,7 @@ class Repetition:
 
     `campaign_px` (m, 2) is where the stars of the campaign truly are, `scale` its noise over what
     is stated, `tests` are the stars that each camera identified; those of the paper's methods are
-    calibrated anew from `nominal`.
+    calibrated again from `nominal`.
     """
 
     campaign: Observations

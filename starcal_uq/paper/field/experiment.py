@@ -93,7 +93,7 @@ def field_experiment(
     `out`: folder to write: ``field.html`` (self-contained), the tables of `FieldExperiment.tables`
     as CSV, and the
         figures as PNG in ``figures``, when everything is computed. Until then what is done is kept
-        in the folder, and an interrupted call goes on from it.
+        in the folder, and an interrupted call resumes from it.
     `n_frames`, `n_calibration_frames`, `n_replicates`: frames of the test, of which the paper has
     200, and of the
         calibration, of which it does not say; repetitions with other noise, from which the ranges

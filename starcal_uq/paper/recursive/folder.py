@@ -51,7 +51,7 @@ def filter_run(
     observations.
 
     `path` and `columns` are what `stream_frames` takes, `method` and `options` those of
-    `RecursiveCalibration`. After Ctrl-C the state is kept, and the same call goes on from it. A
+    `RecursiveCalibration`. After Ctrl-C the state is kept, and the same call resumes from it. A
     folder that holds results is refused unless `force`.
     """
     with RunFolder(out).writing(make=True):

@@ -71,7 +71,7 @@ def write_plan(
     """Write ``plan.html`` (self-contained), the tables as CSV, ``plan.json`` and the figures into a
     folder.
 
-    All files count at once, when they are complete, in place of those of a plan of before. `choice`
+    All files count at once, when they are complete, in place of those of an earlier plan. `choice`
     are the frames to take, for the page and ``frames.csv``, `check` is the forecast against
     simulation, for the page and ``check.csv``.
     """

@@ -281,7 +281,7 @@ def _round_table(record: ImageRecord, cal: Calibration) -> TextTable | None:
     ]
     old, new = ([np.array(r.parameters[spec.name]) / spec.scale for spec in specs] for r in both)
     found = table("rounds", it=specs, old=old, new=new)
-    anew = f"{count(last.new)} identified anew, {count(last.given_up)} given up"
+    anew = f"{count(last.new)} identified again, {count(last.given_up)} given up"
     unit = "times the stated noise" if last.sigma_name == "sigma_scale" else "px per axis"
     rows = (
         ("Images identified", *(count(r.n_frames) for r in both), "", ""),

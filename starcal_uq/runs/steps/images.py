@@ -91,7 +91,7 @@ def keep_frames(run: StoredRun, /, frames: Frames, *, force: bool = False) -> Pa
     frames : Frames
         What `inspect` gave.
     force : bool
-        Whether to replace the page of before.
+        Whether to replace the earlier page.
     """
     from starcal_uq.presentation.pages.gallery import write_frames
 

@@ -28,7 +28,7 @@ def diagnose(run: StoredRun, /, *, force: bool = False, **options: Any) -> Diagn
     Parameters
     ----------
     force : bool
-        Whether to replace the diagnosis of before.
+        Whether to replace the earlier diagnosis.
     **options
         Those of `starcal_uq.diagnose`.
     """

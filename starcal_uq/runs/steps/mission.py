@@ -128,7 +128,7 @@ def propagate(
     temperature_profile : TemperatureProfile or path, optional
         Temperatures of the optics over an orbit; the error over it is written as well.
     force : bool
-        Whether to replace the attitude error of before.
+        Whether to replace the earlier attitude error.
     """
     run._keep("attitude", force)
     posterior = run.posterior

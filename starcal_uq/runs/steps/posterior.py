@@ -23,7 +23,7 @@ def sample(
     Parameters
     ----------
     force : bool
-        Whether to replace the posterior of before.
+        Whether to replace the earlier posterior.
     progress, **options
         As for `starcal_uq.sample`.
     """
