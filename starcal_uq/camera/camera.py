@@ -232,6 +232,14 @@ class Camera(Shown):
         pixels = floats(xy_px)
         return unproject(self, pixels).reshape(*pixels.shape[:-1], 3)
 
+    def wcs(self, attitude: ArrayLike, tolerance_px: float = 0.01) -> Any:
+        """World coordinates (`astropy.wcs.WCS`, TAN-SIP) of a frame with this attitude, a
+        quaternion (4,) from ICRS to the camera frame; see `camera.exchange.camera_wcs`.
+        """
+        from starcal_uq.camera.exchange import camera_wcs
+
+        return camera_wcs(self, attitude, tolerance_px)
+
     def with_theta(self, theta: ArrayLike) -> Camera:
         """The same detector with other parameters.
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, get_model, powers, shared_names, with_axes
@@ -272,6 +273,56 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
         header.update(terms)
         worst = max(worst, error)
     return header, worst
+
+
+def camera_wcs(camera: Camera, attitude: ArrayLike, tolerance_px: float = 0.01) -> Any:
+    """World coordinates (TAN-SIP) of a frame.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera.
+    attitude : array_like (4,)
+        Quaternion of the rotation from ICRS to the camera frame, scalar last.
+    tolerance_px : float, default 0.01
+        Largest error of the polynomials over the detector, px.
+
+    Returns
+    -------
+    astropy.wcs.WCS
+        Its pixels count from 0, as those of the package do.
+
+    Raises
+    ------
+    CameraError
+        If the attitude is no quaternion, or the polynomials are not near enough.
+    """
+    quaternion = floats(attitude)
+    if quaternion.shape != (4,) or not 0.0 < np.linalg.norm(quaternion) < np.inf:
+        raise CameraError(f"camera: {attitude} is no attitude; give a quaternion (x, y, z, w).")
+    header, error = sip_header(camera)
+    if error > tolerance_px:
+        raise CameraError(
+            f"camera: TAN-SIP is up to {error:.2g} px off over the detector; give a tolerance_px "
+            "above that, or use project and unproject."
+        )
+    from astropy.wcs import WCS
+    from scipy.spatial.transform import Rotation
+
+    axes = Rotation.from_quat(quaternion).as_matrix()
+    x, y, z = axes[2]
+    right_ascension, declination = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+    sine, cosine = np.sin(right_ascension), np.cos(right_ascension)
+    east = np.array([-sine, cosine, 0.0])
+    north = np.cross(axes[2], east)
+    header["CRVAL1"], header["CRVAL2"] = np.degrees([right_ascension % (2.0 * np.pi), declination])
+    # Otherwise a frame at the pole would be turned by 180 degrees.
+    header["LONPOLE"] = 180.0
+    # The header's own camera has x and y against east and north.
+    step = [[header[f"CD{row}_{column}"] for column in (1, 2)] for row in (1, 2)]
+    turned = -np.stack([east, north]) @ axes[:2].T @ step
+    header.update({f"CD{i + 1}_{j + 1}": turned[i, j] for i in (0, 1) for j in (0, 1)})
+    return WCS(header)
 
 
 def _sip_terms(
