@@ -269,7 +269,7 @@ def _of_partitions(
     sample, plain = obs.sample(), settings.changed(effects="none")
     # What is compiled is compiled here, before other processes ask for it.
     with paths.using(paths.chosen(obs.n_stars)):
-        start = calibrate(sample, camera, plain, model=camera.distortion)
+        start = calibrate(sample, camera, plain, model=camera.model)
     with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
         return calibrate_partitions(
             obs,

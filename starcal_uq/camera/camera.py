@@ -13,7 +13,7 @@ import os
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,7 +34,7 @@ from starcal_uq.camera.spice import fitted_optics, read_kernel
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
 from starcal_uq.core.files import reading, shown, split_part
-from starcal_uq.core.settings import KEYS
+from starcal_uq.core.settings import KEYS, ModelName
 from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
 from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, PathLike, floats
 
@@ -196,6 +196,11 @@ class Camera(Shown):
         if self.pixel_um is None:
             return f"{length_px:.{digits}g} px"
         return f"{self.length_mm(length_px):.{digits}g} mm"
+
+    @property
+    def model(self) -> ModelName:
+        """The distortion model by its name, as `starcal_uq.calibrate` takes it."""
+        return cast("ModelName", self.distortion)
 
     def contains(self, xy: ArrayLike) -> BoolArray:
         """True for each point on the detector, edges included.

@@ -299,7 +299,9 @@ def camera_wcs(camera: Camera, attitude: ArrayLike, tolerance_px: float = 0.01) 
     """
     quaternion = floats(attitude)
     if quaternion.shape != (4,) or not 0.0 < np.linalg.norm(quaternion) < np.inf:
-        raise CameraError(f"camera: {attitude} is no attitude; give a quaternion (x, y, z, w).")
+        raise CameraError(
+            f"camera: {quaternion.tolist()} is no attitude; give a quaternion (x, y, z, w)."
+        )
     header, error = sip_header(camera)
     if error > tolerance_px:
         raise CameraError(

@@ -206,7 +206,7 @@ def compare_halves(
         When a half does not determine the camera.
     """
     first, second = (
-        calibrate(part, camera, model=camera.distortion, method=method, duplicates="keep")
+        calibrate(part, camera, model=camera.model, method=method, duplicates="keep")
         for part in split_frames(obs, how, seed=seed)
     )
     options = {"labels": split_labels(how), **options}

@@ -293,7 +293,7 @@ def diagnose(
     cal = whole = without_ties(obs, cal)
     if obs.n_frames < whole.n_frames and whole.partitions is not None:
         effects = whole.effects.names if whole.effects is not None else ()
-        model = whole.nominal.distortion
+        model = whole.nominal.model
         cal = calibrate(obs, whole.nominal, model=model, effects=effects, duplicates="keep")
     found = jackknife_of_all(whole) or _jackknife(obs, cal)
     step(1, 4)
@@ -389,7 +389,7 @@ def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatA
     if likelihood != "marginal" or method not in ("efficient", "three_stage"):
         effects = "none" if likelihood == "marginal" else "tails"
         other = calibrate(
-            obs, start, model=start.distortion, method=method, duplicates="keep", effects=effects
+            obs, start, model=start.model, method=method, duplicates="keep", effects=effects
         )
         return other.theta, other.chi2
     found = fit(obs, start, method=method)

@@ -14,6 +14,7 @@ from starcal_uq.core.settings import (
     WEIGHING,
     Duplicates,
     Method,
+    ModelName,
     MountKind,
     Solver,
     effect_names,
@@ -45,18 +46,18 @@ class MethodOptions(Protocol):
 class EstimationOptions(TypedDict, total=False):
     """Fields of `EstimationSettings`, as keywords."""
 
-    model: str | None
+    model: ModelName | None
     method: str
-    solver: str
+    solver: Solver
     max_iterations: int
     effects: str | Sequence[str] | None
     dof: float | str | None
     relative_attitudes: RelativeAttitudes | PathLike | None
     relative_alignment_arcsec: float | None
-    mount: str
+    mount: MountKind
     mount_sigma_arcsec: float | None
     recursion: MethodOptions | None
-    duplicates: str
+    duplicates: Duplicates
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -254,5 +254,5 @@ def _campaign(
     seed = int(seeds.generate_state(1, np.uint64)[0])
     size = n_frames[number // n_campaigns]
     obs = simulate(stars, camera, n_frames=size, seed=seed, **options)
-    cal = calibrate(obs, camera.data_sheet(), model=camera.distortion)
+    cal = calibrate(obs, camera.data_sheet(), model=camera.model)
     return _Calibrated(cal.theta - camera.theta, cal.covariance, float(cal.dof))

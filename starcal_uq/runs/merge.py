@@ -218,7 +218,7 @@ def _drop_shared(
             )
         rest = table.select_frames(np.delete(table.frame_ids, repeating))
         effects = "none" if cal.noise_model is None else "noise"
-        model = cal.nominal.distortion
+        model = cal.nominal.model
         again = calibrate(
             rest, cal.nominal, model=model, method=cal.method, effects=effects, duplicates="keep"
         )

@@ -114,7 +114,13 @@ class PropagationOptions(TypedDict, total=False):
 
 
 class RunOptions(
-    TableOptions, ImageOptions, PlaceOptions, EstimationOptions, SamplingOptions, PropagationOptions
+    TableOptions,
+    ImageOptions,
+    PlaceOptions,
+    EstimationOptions,
+    SamplingOptions,
+    PropagationOptions,
+    total=False,
 ):
     """Settings of `run`, by the names that its steps have for them."""
 

@@ -77,7 +77,7 @@ class SimulatedCells(Cells):
         cal = calibrate(
             obs,
             camera.data_sheet(),
-            model=camera.distortion,
+            model=camera.model,
             method=settings["method"],
             effects=[*tails, *stars],
         )

@@ -122,7 +122,7 @@ def run_replicate(
     truth = np.append(camera.theta, sigma_px)
     campaign = replace(study.campaign, sigma_px=sigma_px)
     obs = campaign.simulate(stars, camera, noise.generate_state(1, np.uint64)[0])
-    cal = calibrate(obs, study.nominal, model=study.nominal.distortion)
+    cal = calibrate(obs, study.nominal, model=study.nominal.model)
     draws, likelihood = _sample(study, obs, cal, sampler)
     return _compare(study, obs, cal, draws, likelihood, truth, index)
 
