@@ -239,9 +239,9 @@ class Camera(Shown):
 
     def wcs(self, attitude: ArrayLike, tolerance_px: float = 0.01) -> Any:
         """World coordinates (`astropy.wcs.WCS`, TAN-SIP) of a frame with this attitude, a
-        quaternion (4,) from ICRS to the camera frame; see `camera.exchange.camera_wcs`.
+        quaternion (4,) from ICRS to the camera frame; see `camera.sip.camera_wcs`.
         """
-        from starcal_uq.camera.exchange import camera_wcs
+        from starcal_uq.camera.sip import camera_wcs
 
         return camera_wcs(self, attitude, tolerance_px)
 

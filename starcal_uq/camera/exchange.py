@@ -14,32 +14,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import Parameter, get_model, powers, shared_names, with_axes
+from starcal_uq.camera.distortion import Parameter, get_model, shared_names, with_axes
 from starcal_uq.camera.formats import TEXT_FORMATS, Pinhole, write_pinhole
 from starcal_uq.camera.nearest import nearest_theta
 from starcal_uq.camera.planes import PINHOLE
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
+from starcal_uq.camera.sip import EXACT_PX, POINTS, in_front, pixel_grid, sip_header, sip_terms
 from starcal_uq.camera.spice import NO_INSTRUMENT, kernel_text
 from starcal_uq.core.errors import CameraError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, ensure_new
-from starcal_uq.core.types import AnyDict, FloatArray, PathLike, floats
-
-# Points along each side of the detector at which a fit is made, and checked between them.
-_POINTS = 33
-_MOST_ORDERS = 9
-# A polynomial this near needs no further order, px.
-_CLOSE_PX = 1e-4
-# Rounding, px: differences below it are none.
-_EXACT_PX = 1e-6
-# A field up to 80 degrees from the axis can be written as one of a pinhole.
-_LEAST_COSINE = np.cos(np.radians(80.0))
+from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
 
 @dataclass(frozen=True)
@@ -89,12 +78,6 @@ def export_camera(
 Writer = Callable[[Camera, Path], tuple[float, str]]
 
 
-def _grid(camera: Camera, points: int) -> FloatArray:
-    """Pixels (n^2, 2) over the whole detector, edges included."""
-    x, y = (np.linspace(-0.5, size - 0.5, points) for size in (camera.width_px, camera.height_px))
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-
 def nearest(camera: Camera, distortion: str, without: tuple[str, ...] = ()) -> tuple[Camera, float]:
     """The camera with this forward model of a pinhole that differs least over the detector, and by
     how much at most, px.
@@ -109,13 +92,13 @@ def nearest(camera: Camera, distortion: str, without: tuple[str, ...] = ()) -> t
         distortion=distortion,
         coefficients=tuple(known[name] if name in common else 0.0 for name in names),
     )
-    pixels = _grid(camera, _POINTS)
+    pixels = pixel_grid(camera, POINTS)
     seen = unproject(camera, pixels)
     theta, _ = nearest_theta(
         distortion, start.theta, seen[:, :2] / seen[:, 2:], pixels, fixed=without
     )
     found = start.with_theta(theta)
-    between = _grid(camera, 2 * _POINTS + 1)
+    between = pixel_grid(camera, 2 * POINTS + 1)
     return found, float(
         np.max(np.linalg.norm(project(found, unproject(camera, between)) - between, axis=1))
     )
@@ -134,7 +117,7 @@ def _held(camera: Camera, kept: tuple[str, ...], fisheye: bool = False) -> tuple
     own = model.direction == "forward" and model.plane is PINHOLE and used <= set(kept)
     if own or (not used and model.plane is PINHOLE):
         return camera, 0.0
-    _in_front(camera)
+    in_front(camera)
     wanted = "brown_tangential"
     if model.radial:
         wanted = "brown3" if "k3" in kept else "brown"
@@ -144,19 +127,8 @@ def _held(camera: Camera, kept: tuple[str, ...], fisheye: bool = False) -> tuple
     return nearest(camera, wanted)
 
 
-def _in_front(camera: Camera) -> FloatArray:
-    """Directions of a grid of pixels; CameraError where a pinhole does not reach one of them."""
-    seen = unproject(camera, _grid(camera, _POINTS))
-    if np.min(seen[:, 2]) < _LEAST_COSINE:
-        raise CameraError(
-            "the field of this camera is too wide for a pinhole, and so for this format: export "
-            "to opencv, ros or kalibr, which have a fisheye."
-        )
-    return seen
-
-
 def _said(error: float, what: str) -> str:
-    if error <= _EXACT_PX:
+    if error <= EXACT_PX:
         return f"{what}: the same camera, to rounding."
     return (
         f"{what}: fitted, because it lacks this camera's terms; up to {error:.2g} px off over "
@@ -179,7 +151,7 @@ def _pinhole_file(to: str, camera: Camera, path: Path) -> tuple[float, str]:
     if not skew or to == "giant":
         return error, _said(error, form.title)
     # The functions of OpenCV, which are also those of ROS, read fx, fy, cx and cy alone.
-    behind = (_grid(held, 2)[:, 1] - held.y0_px) / (1.0 + stretch)
+    behind = (pixel_grid(held, 2)[:, 1] - held.y0_px) / (1.0 + stretch)
     error = float(np.max(np.abs(skew * behind)))
     return error, (
         f"{form.title}: the same camera, with the skew in the camera matrix; functions of OpenCV leave "
@@ -212,7 +184,7 @@ def _tetra3(camera: Camera, path: Path) -> tuple[float, str]:
     """
     from scipy.optimize import least_squares
 
-    pixels, seen = _grid(camera, _POINTS), _in_front(camera)
+    pixels, seen = pixel_grid(camera, POINTS), in_front(camera)
     offsets = pixels - camera.centre_px
     half = camera.width_px / 2.0
     fraction = np.sum((offsets / half) ** 2, axis=1, keepdims=True)
@@ -236,127 +208,6 @@ def _tetra3(camera: Camera, path: Path) -> tuple[float, str]:
     return error, _said(error, "tetra3 and cedar-solve, arguments of solve_from_centroids")
 
 
-def sip_header(camera: Camera) -> tuple[Any, float]:
-    """FITS header (TAN-SIP) of a camera that looks at right ascension and declination 0, and its
-    largest error, px.
-
-    CRVAL and a rotation of CD make it that of a frame. A and B carry pixels to the tangent plane,
-    AP and BP back; their order is the least that is near enough. Pixels count from 1, as FITS does.
-    Source: Shupe et al. 2005, "The SIP convention for representing distortion in FITS image
-    headers".
-    """
-    with extra("images", "FITS headers"):
-        from astropy.io import fits
-
-    pixels, seen = _grid(camera, _POINTS), _in_front(camera)
-    measured = pixels - [camera.x0_px, camera.y0_px]
-    model, theta = get_model(camera.distortion), camera.theta
-    ideal = camera.focal_px * seen[:, :2] / seen[:, 2:]
-    # SIP has no linear terms: the axes of the detector are part of CD.
-    ideal = np.column_stack(model.stretched(ideal[:, 0], ideal[:, 1], theta))
-    along_x, along_y = np.eye(2)
-    axes = np.stack(model.unstretched(along_x, along_y, theta))
-    scale = camera.corner_radius_px
-    header = fits.Header()
-    header.update(WCSAXES=2, IMAGEW=camera.width_px, IMAGEH=camera.height_px)
-    sides = (("RA---TAN-SIP", camera.x0_px), ("DEC--TAN-SIP", camera.y0_px))
-    for axis, (kind, centre) in enumerate(sides, 1):
-        # x and y of a pixel run against right ascension and declination for who looks at the sky
-        # from within.
-        step = -np.degrees(1.0 / camera.focal_px) * axes[axis - 1]
-        own = {"CTYPE": kind, "CRPIX": centre + 1.0, "CRVAL": 0.0, "CUNIT": "deg"}
-        header.update({f"{name}{axis}": value for name, value in own.items()})
-        header.update({f"CD{axis}_{i}": float(value) for i, value in enumerate(step, 1)})
-    worst = 0.0
-    for names, start, end in ((("A", "B"), measured, ideal), (("AP", "BP"), ideal, measured)):
-        terms, error = _sip_terms(names, start, end, scale)
-        header.update(terms)
-        worst = max(worst, error)
-    return header, worst
-
-
-def camera_wcs(camera: Camera, attitude: ArrayLike, tolerance_px: float = 0.01) -> Any:
-    """World coordinates (TAN-SIP) of a frame.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera.
-    attitude : array_like (4,)
-        Quaternion of the rotation from ICRS to the camera frame, scalar last.
-    tolerance_px : float, default 0.01
-        Largest error of the polynomials over the detector, px.
-
-    Returns
-    -------
-    astropy.wcs.WCS
-        Its pixels count from 0, as those of the package do.
-
-    Raises
-    ------
-    CameraError
-        If the attitude is no quaternion, or the polynomials are not near enough.
-    """
-    quaternion = floats(attitude)
-    if quaternion.shape != (4,) or not 0.0 < np.linalg.norm(quaternion) < np.inf:
-        raise CameraError(
-            f"camera: {quaternion.tolist()} is no attitude; give a quaternion (x, y, z, w)."
-        )
-    header, error = sip_header(camera)
-    if error > tolerance_px:
-        raise CameraError(
-            f"camera: TAN-SIP is up to {error:.2g} px off over the detector; give a tolerance_px "
-            "above that, or use project and unproject."
-        )
-    from astropy.wcs import WCS
-    from scipy.spatial.transform import Rotation
-
-    axes = Rotation.from_quat(quaternion).as_matrix()
-    x, y, z = axes[2]
-    right_ascension, declination = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
-    sine, cosine = np.sin(right_ascension), np.cos(right_ascension)
-    east = np.array([-sine, cosine, 0.0])
-    north = np.cross(axes[2], east)
-    header["CRVAL1"], header["CRVAL2"] = np.degrees([right_ascension % (2.0 * np.pi), declination])
-    # Otherwise a frame at the pole would be turned by 180 degrees.
-    header["LONPOLE"] = 180.0
-    # The header's own camera has x and y against east and north.
-    step = [[header[f"CD{row}_{column}"] for column in (1, 2)] for row in (1, 2)]
-    turned = -np.stack([east, north]) @ axes[:2].T @ step
-    header.update({f"CD{i + 1}_{j + 1}": turned[i, j] for i in (0, 1) for j in (0, 1)})
-    return WCS(header)
-
-
-def _sip_terms(
-    names: Sequence[str],
-    start: FloatArray,
-    end: FloatArray,
-    scale: float,
-    least: int = 2,
-    close_px: float = _CLOSE_PX,
-) -> tuple[dict[str, float], float]:
-    """Coefficients and order of the polynomials that carry points (n, 2) to others, px, by the
-    names of a header or a kernel, with terms from the order `least` on, and their largest error,
-    px. Their order is the least that is near enough.
-    """
-    at, shift = start / scale, (end - start) / scale
-    for order in range(2, _MOST_ORDERS + 1):
-        places = powers(order, least)
-        terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in places], axis=1)
-        found = floats(np.linalg.lstsq(terms, shift, rcond=None)[0])
-        error = scale * float(np.max(np.linalg.norm(terms @ found - shift, axis=1)))
-        if error < close_px:
-            break
-    held: dict[str, float] = {}
-    for column, name in enumerate(names):
-        held[f"{name}_ORDER"] = order
-        for (p, q), value in zip(places, found[:, column].tolist(), strict=True):
-            # Below it no pixel of the detector moves by the millionth part of rounding.
-            if abs(value) * scale > _EXACT_PX / 1e6:
-                held[f"{name}_{p}_{q}"] = value * scale ** (1 - p - q)
-    return held, error
-
-
 def write_kernel(
     camera: Camera,
     path: Path,
@@ -374,12 +225,12 @@ def write_kernel(
         raise CameraError(
             "a kernel has its focal length in mm: state pixel_um in the camera's file first."
         )
-    pixels, seen = _grid(camera, _POINTS), _in_front(camera)
+    pixels, seen = pixel_grid(camera, POINTS), in_front(camera)
     centre = np.array([camera.x0_px, camera.y0_px])
     ideal, scale = camera.focal_px * seen[:, :2] / seen[:, 2:], camera.corner_radius_px
     names = ("SIP_AP", "SIP_BP")
-    terms, error = _sip_terms(names, ideal, pixels - centre, scale, 1, _EXACT_PX / 1e3)
-    corners = unproject(camera, _grid(camera, 2)[[0, 1, 3, 2]])
+    terms, error = sip_terms(names, ideal, pixels - centre, scale, 1, EXACT_PX / 1e3)
+    corners = unproject(camera, pixel_grid(camera, 2)[[0, 1, 3, 2]])
     values: dict[str, object] = {
         "FOCAL_LENGTH": camera.focal_mm,
         "PIXEL_SIZE": camera.pixel_um,
