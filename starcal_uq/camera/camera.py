@@ -220,27 +220,21 @@ class Camera(Shown):
         return inside
 
     def project(self, b_cam: ArrayLike) -> FloatArray:
-        """Pixels (..., 2) of directions (..., 3) in the camera frame; see
-        `starcal_uq.camera.project`.
-        """
+        """Pixels (..., 2) of directions (..., 3) in the camera frame (`camera.project`)."""
         from starcal_uq.camera.projection import project
 
         directions = floats(b_cam)
         return project(self, directions).reshape(*directions.shape[:-1], 2)
 
     def unproject(self, xy_px: ArrayLike) -> FloatArray:
-        """Unit vectors (..., 3) in the camera frame of pixels (..., 2); see
-        `starcal_uq.camera.unproject`.
-        """
+        """Unit vectors (..., 3) in the camera frame of pixels (..., 2) (`camera.unproject`)."""
         from starcal_uq.camera.projection import unproject
 
         pixels = floats(xy_px)
         return unproject(self, pixels).reshape(*pixels.shape[:-1], 3)
 
     def wcs(self, attitude: ArrayLike, tolerance_px: float = 0.01) -> Any:
-        """World coordinates (`astropy.wcs.WCS`, TAN-SIP) of a frame with this attitude, a
-        quaternion (4,) from ICRS to the camera frame; see `camera.sip.camera_wcs`.
-        """
+        """`astropy.wcs.WCS` (TAN-SIP) of a frame with a quaternion (4,); `camera.sip.camera_wcs`."""
         from starcal_uq.camera.sip import camera_wcs
 
         return camera_wcs(self, attitude, tolerance_px)
