@@ -10,6 +10,8 @@ import typer
 
 from starcal_uq.cli.options import PATHS
 
+# Parameters that no result depends on.
+_OF_THE_CALL = ("json", "edits", "quiet", "verbose", "help_all")
 # The words of a call that names a run file, as they were typed.
 _typed: list[str] = []
 
@@ -48,6 +50,6 @@ def run_keys(app: typer.Typer) -> Mapping[str, str]:
         (declared,) = parameter.annotation.__metadata__
         # Typer holds the first name as the default of an annotation.
         for option in (declared.default, *(declared.param_decls or ())):
-            if str(option).startswith("--") and parameter.name not in ("json", "edits"):
+            if str(option).startswith("--") and parameter.name not in _OF_THE_CALL:
                 keys[option[2:].replace("-", "_")] = parameter.name
     return keys
