@@ -99,7 +99,7 @@ def test_the_remedy_that_a_misfit_prints_first_leads_to_a_usable_answer(cli, tmp
     structure = next(c for c in verdict["checks"] if c["name"] == "Unexplained structure")
     assert "would take up the effect frame." in structure["sentence"]
     command = verdict["commands"][0]
-    assert "--effects auto" in command
+    assert "--set effects=auto" in command
     status, _, err = cli(*command.split()[1:])
     verdict = json.loads(Path("run/verdict.json").read_text("utf-8"))
     assert status == 0 and verdict["level"] != "fail", (err, verdict["headline"])
