@@ -17,6 +17,8 @@ import traceback
 from collections.abc import Callable
 from typing import Any, NoReturn
 
+from starcal_uq.cli import VERSION_LINE
+
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # An internal software error, as `sysexits.h` numbers it.
 FAULT = 70
@@ -27,10 +29,7 @@ def program() -> NoReturn:
     sys.unraisablehook = _again
     if sys.argv[1:] == ["--version"]:
         # Before Typer and the commands, which take ten times as long to load.
-        # The installed metadata say the same, and take ten times as long to read.
-        from starcal_uq import __version__
-
-        print(f"starcal-uq {__version__}")
+        print(VERSION_LINE)
         sys.exit(0)
     try:
         main()

@@ -8,6 +8,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 
+from starcal_uq.cli import VERSION_LINE
 from starcal_uq.cli import filter as cli_filter
 from starcal_uq.cli import images as cli_images
 from starcal_uq.cli import mission as cli_mission
@@ -44,9 +45,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from starcal_uq import __version__
-
-        print(f"starcal-uq {__version__}")
+        print(VERSION_LINE)
         raise typer.Exit
 
 
@@ -127,8 +126,10 @@ def usage_sentence(error: Exception) -> str:
 
 
 def _is_typed(parameter: Any) -> bool:
-    """Whether an option stands on the command line beside a run file."""
-    return any(word.partition("=")[0] in (*parameter.opts, "--set") for word in typed())
+    """Whether an option stands on the command line beside a run file, or a change of its key."""
+    keys = {option[2:].replace("-", "_") for option in parameter.opts}
+    words = [word.removeprefix("--set=") for word in typed()]
+    return any(word.partition("=")[0] in (*parameter.opts, *keys) for word in words[2:])
 
 
 def _missing(context: Any, parameter: Any) -> str:

@@ -85,6 +85,7 @@ def talking(*, tables: bool, notes: bool, steps: bool) -> Iterator[None]:
     finally:
         out.quiet, _notes = False, True
         log.removeHandler(handler)
+        log.setLevel(logging.NOTSET)
 
 
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:

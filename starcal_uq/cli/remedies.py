@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
 
 from starcal_uq.cli.runfiles import typed
-from starcal_uq.core.conflicts import arguments_of, parsed, words_of
+from starcal_uq.core.conflicts import arguments_of, parsed, without, words_of
 from starcal_uq.core.provenance import NAME
 from starcal_uq.core.remedy import CAMERA, OBS, RUN, Near, Remedy
 from starcal_uq.core.runfile import edited
@@ -36,26 +35,16 @@ def as_given(remedy: Remedy) -> str:
     if file := typed():
         here = arguments_of(parsed(words)[1])
         wanted = changed(here, arguments_of(parsed(words_of(remedy.options))[1]))
-        return shlex.join([NAME, *file, *words_of({"set": edited(here, wanted), "force": True})])
+        edits = edited(here, wanted)
+        keys = {edit.partition("=")[0] for edit in edits}
+        kept, earlier = without(without(file, "--force")[0], "--set")
+        edits = (*(edit for edit in earlier if edit and edit.partition("=")[0] not in keys), *edits)
+        return shlex.join([NAME, *kept, *words_of({"set": edits, "force": True})])
     if "effects" in asked:
         # An option that is given twice would hold the last list alone.
-        words, given = _without_effects(words)
+        words, given = without(words, "--effects")
         asked["effects"] = joined_effects(*given, asked["effects"])
     return shlex.join([NAME, *words, *words_of(asked)])
-
-
-def _without_effects(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """A command line without its lists of effects, and these."""
-    kept: list[str] = []
-    given: list[str] = []
-    rest = iter(words)
-    for word in rest:
-        name, equals, value = word.partition("=")
-        if name == "--effects":
-            given.append(value if equals else next(rest, "none"))
-        else:
-            kept.append(word)
-    return kept, given
 
 
 def _words(remedy: Remedy) -> list[str]:

@@ -21,8 +21,8 @@ def new_command(
     near: tuple[float, float] | None = None,
     force: bool = False,
 ) -> Answer:
-    """Write a starter file with comments (run, camera, sensor, site, budget, study), or real data to try
-    everything on.
+    """Write a starter file with comments (run, camera, sensor, site, budget, study), or real data
+    to try everything on.
     """
     if template is not None and what != "study":
         raise typer.BadParameter(f"--template belongs to a study, and this is a new {what}.")

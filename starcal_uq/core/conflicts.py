@@ -4,7 +4,7 @@ checks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -134,11 +134,31 @@ def parsed(words: Sequence[str]) -> tuple[list[str], Options]:
         if not word.startswith("--"):
             places.append(word)
             continue
-        name, equals, value = word.partition("=")
-        alone = name in _FLAGS or name in ("--robust", "--star-errors")
-        given = value if equals else None if alone else next(rest, None)
-        options[name] = (*options.get(name, ()), given)
+        name = word.partition("=")[0]
+        options[name] = (*options.get(name, ()), _value(word, rest))
     return places, options
+
+
+def without(words: Sequence[str], option: str) -> tuple[list[str], list[str | None]]:
+    """A command line without an option, and the values that this had."""
+    kept: list[str] = []
+    values: list[str | None] = []
+    rest = iter(words)
+    for word in rest:
+        if word.partition("=")[0] == option:
+            values.append(_value(word, rest))
+        else:
+            kept.append(word)
+    return kept, values
+
+
+def _value(word: str, rest: Iterator[str]) -> str | None:
+    """Value of an option: in its own word, or in the next of the rest; None where it stands
+    alone.
+    """
+    name, equals, value = word.partition("=")
+    alone = name in _FLAGS or name in ("--robust", "--star-errors")
+    return value if equals else None if alone else next(rest, None)
 
 
 def sampled_by_default(settings: Mapping[str, object]) -> object:

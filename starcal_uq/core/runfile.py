@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from starcal_uq.core.conflicts import parsed, words_of
+from starcal_uq.core.conflicts import parsed, without, words_of
 from starcal_uq.core.errors import RunFileError
 from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.toml import read_section, unknown_key
@@ -101,8 +101,8 @@ def expanded(
         If the file cannot be read, or has a key or a value that no option has.
     """
     table = _checked(path, read_section(path, "run", RunFileError), known)
-    edits: AnyDict = {}
     words: list[str] = []
+    changed: set[str] = set()
     left = iter(rest)
     for word in left:
         option, equals, value = word.partition("=")
@@ -110,19 +110,23 @@ def expanded(
             key, equals, value = (value if equals else next(left, "")).partition("=")
             if not equals:
                 raise RunFileError(f"--set {key} is not KEY=VALUE, such as seed=7.")
-            edits[key] = value
+            _checked(Path("--set"), {key: value}, known)
+            # What is changed last counts, be it an option or a key.
+            words, _ = without(words, _option(key))
+            table.pop(key, None)
+            if value and key in _FILES:
+                table[key], changed = value, changed | {key}
+            elif value:
+                words += _words({key: {"true": True, "false": False}.get(value, value)})
         else:
             words.append(word)
-            typed = "out" if option.startswith("-o") else option[2:].replace("-", "_")
-            table.pop(typed, None)
-    _checked(Path("--set"), edits, known)
-    for key, value in edits.items():
-        table.pop(key, None)
-        if value:
-            table[key] = {"true": True, "false": False}.get(value, value)
-    if "inputs" not in table:
+            if option.startswith("-o"):
+                table.pop("out", None)
+            elif option.startswith("--"):
+                table.pop(option[2:].replace("-", "_"), None)
+    if not table.get("inputs"):
         raise RunFileError(f'{path}: key inputs is missing; add inputs = ["stars.csv"].')
-    for key in {*paths, *_FILES, "out"} & set(table) - set(edits):
+    for key in {*paths, *_FILES} & set(table) - changed:
         table[key] = _beside(path.parent, key, table[key])
     return ["run", *_words(table), *words]
 
@@ -173,13 +177,17 @@ def _words(table: Mapping[str, Any]) -> list[str]:
     for key, value in table.items():
         if key in _FILES or value is False:
             continue
-        option = f"--{key.replace('_', '-')}"
+        option = _option(key)
         if isinstance(value, dict):
             pairs = [f"{name}={_word(one)}" for name, one in value.items()]
             value = pairs if key == "column" else ",".join(pairs)
         for one in value if isinstance(value, list) else [value]:
             words += [option] if one is True else [option, _word(one)]
     return words
+
+
+def _option(key: str) -> str:
+    return f"--{key.replace('_', '-')}"
 
 
 def _word(value: Any) -> str:

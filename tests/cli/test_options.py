@@ -284,3 +284,18 @@ def test_a_remedy_adds_its_effect_to_the_list_that_was_given(monkeypatch):
         words = ["starcal-uq", "calibrate", "obs.csv", "camera.toml", *given]
         monkeypatch.setattr("sys.argv", words)
         assert as_given(remedy) == f"starcal-uq calibrate obs.csv camera.toml {wanted}"
+
+
+def test_a_remedy_of_a_run_file_repeats_nothing_that_was_given(monkeypatch, tmp_path):
+    from starcal_uq.cli.remedies import as_given
+    from starcal_uq.cli.runfiles import expand
+    from starcal_uq.core.remedy import calibrated
+
+    file = tmp_path / "run.toml"
+    file.write_text('[run]\ninputs = "a.csv"\nout = "r"\n', encoding="utf-8")
+    words = ["run", str(file), "--force", "--set", "effects=field", "--set", "seed=3"]
+    monkeypatch.setattr("sys.argv", ["starcal-uq", *expand(words, declared.app)])
+    (remedy,) = calibrated(effects="tails")
+    wanted = f"starcal-uq run {file} --set seed=3 --set effects=field,tails --force"
+    assert as_given(remedy) == wanted
+    expand([], declared.app)

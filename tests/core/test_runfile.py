@@ -66,11 +66,19 @@ def test_what_is_typed_goes_before_the_file(tmp_path):
     text = '[run]\ninputs = "a.csv"\nseed = 3\nsite = "site.toml"\nin_space = true\n'
     words = expand(tmp_path, text, "--seed=4", "--set", "site=other.toml", "--set=in_space=", "-oX")
     # What is typed is a path from where one stands.
-    assert words == ["run", f"{tmp_path}/a.csv", "--site", "other.toml", "--seed=4", "-oX"]
+    assert words == ["run", f"{tmp_path}/a.csv", "--seed=4", "--site", "other.toml", "-oX"]
     assert expand(tmp_path, text, "--set", "in_space=false")[-2:] == [
         "--site",
         f"{tmp_path}/site.toml",
     ]
+
+
+def test_what_is_typed_last_counts_be_it_an_option_or_a_change_of_the_file(tmp_path):
+    text = '[run]\ninputs = "a.csv"\neffects = "field"\n'
+    given = ("--effects", "none", "--seed", "3", "--set", "effects=auto")
+    assert expand(tmp_path, text, *given)[2:] == ["--seed", "3", "--effects", "auto"]
+    given = ("--set", "effects=auto", "--set", "effects=", "--set", "inputs=b.csv")
+    assert expand(tmp_path, text, *given) == ["run", "b.csv"]
 
 
 def test_edits_make_other_options_of_those_of_a_file():

@@ -178,7 +178,8 @@ def screen(
         )
         states.append((use, calibration, tested))
         use = tested.in_use
-    # Rounds that go in circles have no natural end: the search continues from the state that fits best.
+    # Rounds that go in circles have no natural end: the search continues from the state that fits
+    # best.
     use, calibration, tested = (
         states[-1] if n_changed == 0 else min(states, key=lambda state: state[1].sigma)
     )

@@ -224,10 +224,11 @@ class Place:
             files, given = self.made
             out = self.run if self.words[0] == "run" else f"{self.run}-2"
             options = changed(given, asked, self.effects)
-            steps = (Remedy("run", files, options | {"out": out, "force": True}),)
-            if self.file:
-                edits = {"set": edited(given, options), "force": True}
-                steps = (Remedy("run", (self.file,), edits),)
+            steps = (
+                Remedy("run", (self.file,), {"set": edited(given, options), "force": True})
+                if self.file
+                else Remedy("run", files, options | {"out": out, "force": True}),
+            )
         elif OBS in remedy.files and self.observations:
             files = (f"{self.run}/observations.parquet", f"{self.run}/camera.toml")
             steps = (Remedy("run", files, {"out": f"{self.run}-2", **asked, "force": True}),)
