@@ -10,11 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from importlib.metadata import entry_points
 from typing import Any, Literal
 
 from starcal_uq.camera.planes import EQUIDISTANT, PINHOLE, Plane
 from starcal_uq.core.errors import DistortionError
 from starcal_uq.core.types import FloatArray, floats
+
+# Where other packages offer models.
+GROUP = "starcal_uq.distortion_models"
 
 Displacement = Callable[[Any, Any, Sequence[Any]], tuple[Any, Any]]
 
@@ -255,21 +259,43 @@ _SIGMA_SCALE = Parameter(
 
 
 def model_names(*, axes: bool = False) -> tuple[str, ...]:
-    """Names of all distortion models; with `axes` also those with free axes of the detector."""
+    """Names of the distortion models of this package; with `axes` also those with free axes of the
+    detector.
+    """
     names = tuple(_MODELS)
     return names + tuple(name + AXES_SUFFIX for name in names) if axes else names
 
 
 @lru_cache
 def get_model(name: str) -> DistortionModel:
-    """Look a distortion model up; DistortionError for a name that is not in the registry."""
+    """Look a distortion model up, of this package or offered by another in `GROUP`.
+
+    DistortionError for a name that nobody offers, and for an offered model that does not fit.
+    """
     base = name.removesuffix(AXES_SUFFIX)
-    if base not in _MODELS:
+    return replace(_MODELS.get(base) or _offered(base), name=name, axes=name != base)
+
+
+def _offered(name: str) -> DistortionModel:
+    """The model that another package offers; its coefficients become known by their names."""
+    found = next(iter(entry_points(group=GROUP, name=name)), None)
+    if found is None:
         raise DistortionError(
             f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}, each "
-            f"also as NAME{AXES_SUFFIX}."
+            f"also as NAME{AXES_SUFFIX}, or install the package that offers it."
         )
-    return replace(_MODELS[base], name=name, axes=name != base)
+    model: DistortionModel = found.load()
+    own = {spec.name: spec for spec in model.lens}
+    clash = [key for key, spec in own.items() if PARAMETERS.get(key, spec) != spec]
+    if clash:
+        problem = f"its coefficient {clash[0]} is another one here; rename it"
+    elif any(model.formula(3.0, 4.0, [0.0] * len(own))):
+        problem = "its displacement is not zero where its coefficients are; subtract what is left"
+    else:
+        COEFFICIENTS.update(own)
+        PARAMETERS.update(own)
+        return model
+    raise DistortionError(f"distortion model {name!r} of {found.value}: {problem}.")
 
 
 def with_axes(name: str) -> str:
@@ -360,10 +386,10 @@ def parameter_names(model_name: str) -> tuple[str, ...]:
     return tuple(p.name for p in parameters(model_name))
 
 
-# Coefficients and parameters of all models, by name.
-COEFFICIENTS = {spec.name: spec for model in _MODELS.values() for spec in model.lens} | {
-    spec.name: spec for spec in _AXES
-}
+# Coefficients and parameters of all models, by name; `_offered` adds those of other packages.
+COEFFICIENTS: dict[str, Coefficient] = {
+    spec.name: spec for model in _MODELS.values() for spec in model.lens
+} | {spec.name: spec for spec in _AXES}
 PARAMETERS: dict[str, Parameter] = {spec.name: spec for spec in _OPTICS} | COEFFICIENTS
 
 

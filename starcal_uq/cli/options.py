@@ -281,6 +281,7 @@ _CHECKS: Mapping[str, Callable[[Any], object]] = {
     "engine": _known_to("identification.proposers:offered_engine"),
     "frames": parse_frames,
     "labels": parse_labels,
+    "model": _known_to("camera.distortion:get_model"),
     "names": check_names,
     "position": parse_position,
     "planned effects": _known_to("planning.effects:PlannedEffects.parsed"),

@@ -45,7 +45,7 @@ _OF_CAMERA = ("start", "pixel_um")
 class EstimationSettings:
     """How a camera is estimated."""
 
-    model: settings.ModelName | None = None
+    model: str | None = None
     method: settings.Method = "efficient"
     solver: settings.Solver = "lm"
     screening: bool = False
