@@ -91,8 +91,6 @@ def run_command(
     for record in (estimation, sky, images, sampling, propagation):
         typed |= vars(record)
     check_files(typed)
-    if propagation.temperature_profile is not None:
-        _refuse_profile(estimation.effects)
     *given, last = inputs
     from starcal_uq.observations.files import READ
 
@@ -149,15 +147,6 @@ def run_command(
         warn_air(run.observations, run.calibration)
         finish(run, ahead, options, seed=sampling.seed, watch=watch)
     return _conclude(run)
-
-
-def _refuse_profile(effects: str | None) -> None:
-    """Refuse a temperature profile where the effects that are asked for follow no temperature."""
-    if effects is not None and not {"auto", "temperature"} & set(effects.split(",")):
-        raise typer.BadParameter(
-            f"--temperature-profile needs the effect temperature, which --effects {effects} leaves "
-            "out: add it, or leave the profile out."
-        )
 
 
 # Options that hold for the images of another camera as well.

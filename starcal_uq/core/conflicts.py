@@ -32,13 +32,18 @@ class Rule:
         The other option; "partitioned" stands for observations that are a folder of files.
     allowed : tuple
         Values of the other one with which it makes sense, of effects their kind
-        (`kind_of_effects`); None stands for its default.
+        (`kind_of_effects`) or, with ``auto`` among them, their names; None stands for its default.
     """
 
     name: str
     values: tuple[object, ...]
     other: str
     allowed: tuple[object, ...]
+
+    @property
+    def of_kinds(self) -> bool:
+        """Whether `allowed` are kinds of effects, and not their names."""
+        return self.other == "effects" and "auto" not in self.allowed
 
     def value(self, settings: Mapping[str, object]) -> object:
         """The option's value; of effects the first that the rule is about."""
@@ -54,8 +59,10 @@ class Rule:
         value = self.value(settings)
         concerned = value in self.values if self.values else is_given(value)
         other = settings.get(self.other)
-        if self.other == "effects":
+        if self.of_kinds:
             other = kind_of_effects(other)
+        elif self.other == "effects" and other is not None:
+            other = next((name for name in effect_names(other) if name in self.allowed), "others")
         return concerned and (other if is_given(other) else None) not in self.allowed
 
 
@@ -109,6 +116,7 @@ RULES = (
     Rule("site", (), "observer_velocity", (None,)),
     Rule("site", (), "directions", (None, "catalogue")),
     Rule("alignment_frames", (), "alignment", (None, "random")),
+    Rule("temperature_profile", (), "effects", (None, "auto", "temperature")),
 )
 
 
@@ -256,7 +264,7 @@ def refusal(
     if rule.other == "partitioned":
         kind = "a folder of partitions" if True in rule.allowed else "one table, and no folder"
         return f"{given} needs {kind}: leave {given} out."
-    wanted = [] if rule.other == "effects" else [v for v in rule.allowed if v is not None]
+    wanted = [] if rule.of_kinds else [v for v in rule.allowed if v is not None]
     if wanted:
         needed = " or ".join(spell(rule.other, value) for value in wanted)
         return f"{given} needs {needed}: give both, or leave {given} out."

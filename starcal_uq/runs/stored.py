@@ -99,7 +99,7 @@ class StoredRun:
 
     def __repr__(self) -> str:
         try:
-            return f"{self._name}: {self._as_it_is.text}"
+            return f"{self._as_it_is.text}\n{self._name}"
         except StarcalError:
             return self._name
 

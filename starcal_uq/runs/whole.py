@@ -29,7 +29,6 @@ from starcal_uq.core.settings import (
     Moves,
     OnboardModel,
     bounded,
-    effect_names,
     joined_effects,
 )
 from starcal_uq.core.store import finished
@@ -466,12 +465,6 @@ def _check(options: AnyMapping, images: bool, camera: Camera | PathLike | None) 
         raise SettingError(
             "a table of stars needs the nominal camera as well; only images do without."
         )
-    profile, effects = options.get("temperature_profile"), options.get("effects", "auto")
-    if profile is not None and not {"auto", "temperature"} & set(effect_names(effects)):
-        raise SettingError(
-            "temperature_profile needs the effect temperature: add it to effects, or leave the "
-            "profile out."
-        )
     check_files(options)
 
 
@@ -516,6 +509,9 @@ def _words(files: list[Path], camera: Any, options: AnyMapping) -> tuple[str, ..
     for name, value in given.items():
         if isinstance(value, os.PathLike) or (isinstance(value, str) and Path(value).is_file()):
             value = str(Path(value).resolve())
+        if name == "columns":
+            typed["column"] = tuple(f"{key}={in_file}" for key, in_file in (value or {}).items())
+            continue
         if not isinstance(value, bool | int | float | str | None):
             return ()
         if value not in (None, False, 0):

@@ -173,7 +173,7 @@ def test_a_profile_that_cannot_act_is_one_sentence(cli, warmed) -> None:
         ),
         (
             "run obs.csv camera.toml -o other --effects field --temperature-profile orbit.csv",
-            "--temperature-profile needs the effect temperature, which --effects field leaves out",
+            "--temperature-profile orbit.csv needs --effects auto or --effects temperature: give both",
         ),
         ("budget plain --temperature-profile orbit.csv", "holds no effect 'temperature', so that"),
     ):

@@ -59,6 +59,7 @@ def test_a_run_is_shown_by_its_verdict_and_kept_as_long_as_it_is_asked_for(few, 
     run = sc.run(few, sc.paper.paper_start(), effects="none", **FEW)
     for shown in (repr(run), run._repr_html_()):
         assert run.verdict.headline in shown and "Across the boresight" in shown
+    assert repr(run).startswith(run.verdict.headline)
     place = run.path
     assert run.has("budget") and not run.has("report")
     del run
@@ -69,8 +70,10 @@ def test_a_run_is_shown_by_its_verdict_and_kept_as_long_as_it_is_asked_for(few, 
 @pytest.mark.slow
 def test_a_run_in_a_folder_has_a_report_and_the_command_that_repeats_it(few, tmp_path, cli):
     files = (tmp_path / "obs.ecsv", tmp_path / "camera.toml")
-    run = sc.run(*files, out="run", effects=["tails"], seed=2, **FEW)
-    assert run.has("report") and run.place.words[:3] == ("run", *map(str, files))
+    files[0].write_text(files[0].read_text("utf-8").replace("x_px", "column"), "utf-8")
+    columns = {"x_px": "column"}
+    run = sc.run(*files, out="run", effects=["tails"], columns=columns, seed=2, **FEW)
+    assert run.has("report") and run.has("run_file") and run.place.words[:3] == ("run", *map(str, files))
     draws = run.posterior.draws
     assert cli(*run.place.words, "-o", "again") in (0, 1)
     assert np.array_equal(draws, sc.Run("again").posterior.draws)
@@ -84,7 +87,7 @@ def test_a_run_in_a_folder_has_a_report_and_the_command_that_repeats_it(few, tmp
         ({"n_stps": 20}, r"n_stps is unknown; did you mean n_steps\?"),
         ({"epoch": 2020.0}, "epoch belongs to images"),
         ({"n_steps": 0}, "n_steps is 0"),
-        ({"temperature_profile": "p.csv", "effects": "tails"}, "needs the effect temperature"),
+        ({"temperature_profile": "p.csv", "effects": "tails"}, "needs effects='auto' or effects="),
         ({"effects": "tails", "method": "samaan"}, "exclude|needs"),
         ({"camera": None}, "needs the nominal camera"),
     ],
