@@ -47,7 +47,7 @@ from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.findings import clause
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.settings import bounded, check_memory
+from starcal_uq.core.settings import Seed, bounded, check_memory, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, PathLike
 from starcal_uq.propagation.thermal import thermal_error
@@ -83,7 +83,7 @@ def budget(
     spectrum: ErrorSpectrum | None = None,
     indices: Sequence[Index] = (),
     n_samples: int = N_SAMPLES,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Budget:
     """Attitude error budget in the terms of ECSS-E-ST-60-20C, combined after ECSS-E-ST-60-10C and
     by sampling.
@@ -122,6 +122,7 @@ def budget(
     AttitudeProfileError, CalibrationError
         If the temperature profile is wrong, or the calibration holds no effect of the temperature.
     """
+    seed = seed_of(seed)
     if attitude is None:
         from starcal_uq.propagation.propagate import propagate
 

@@ -32,7 +32,7 @@ from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.core.findings import clause
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 
@@ -56,7 +56,7 @@ def array_budget(
     *,
     confidence: float | None = None,
     n_samples: int = N_SAMPLES,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Budget:
     """Attitude error budget of the body from those of its heads.
 
@@ -83,6 +83,7 @@ def array_budget(
     RunFolderError
         If a run folder holds no budget.
     """
+    seed = seed_of(seed)
     heads, stated = load_heads(file), load_budget_file(file, ("head",))
     if stated.sensor is not None:
         raise BudgetError(

@@ -21,7 +21,7 @@ from starcal_uq.budgeting.indices import Index, seen_by
 from starcal_uq.budgeting.rows import ALIGNMENT, COMMON, NEA, REST, SCOPES, Contributor
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, check_known, require
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray, PathLike
 from starcal_uq.propagation.geometry import FrameGeometry
 from starcal_uq.propagation.tolerance import sensitivities as turns
@@ -88,7 +88,7 @@ def sensitivities(
     spectrum: ErrorSpectrum | None = None,
     temperature_k: float = float("nan"),
     vary: Mapping[str, float] | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> BudgetSensitivities:
     """Sensitivities of every total of a budget.
 
@@ -111,7 +111,7 @@ def sensitivities(
         Half-widths, relative to the value, over which ``noise``, ``stars``, ``frames`` or
         ``temperature`` vary evenly, such as ``{"noise": 0.2, "stars": 0.3}``: Sobol shares are then
         found (`scipy.stats.sobol_indices`; Saltelli et al. 2010).
-    seed : int
+    seed : int or Generator
         Seed of the samples behind the shares.
 
     Raises
@@ -120,6 +120,7 @@ def sensitivities(
         For an unknown input, a half-width that is no share, or an index whose rows behave in time
         as `file` and `spectrum` do not say.
     """
+    seed = seed_of(seed)
     import pandas as pd
 
     vary = vary or {}

@@ -49,7 +49,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import ComparisonError
 from starcal_uq.core.findings import clause
 from starcal_uq.core.provenance import Provenance
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.splits import split_frames, split_labels
@@ -80,7 +80,7 @@ def compare(
     n: int = 25,
     level: float = 0.01,
     n_draws: int = 4000,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> CameraComparison:
     """Difference of the directions of two cameras, B minus A, and whether chance explains it.
 
@@ -104,7 +104,7 @@ def compare(
         Probability at most of a verdict "differ" when nothing does.
     n_draws : int
         Monte Carlo draws for the p-value of the worst pixel.
-    seed : int
+    seed : int or Generator
         Seed of the draws.
 
     Raises
@@ -115,6 +115,7 @@ def compare(
     DistortionError
         When the distortion of a camera folds over within the detector.
     """
+    seed = seed_of(seed)
     _check(a, b, labels, level)
     marks = fingerprints or (getattr(a, "fingerprints", None), getattr(b, "fingerprints", None))
     rule = difference_rule(a, b, labels, same_data, observations, marks)
@@ -177,7 +178,7 @@ def compare_halves(
     camera: Camera,
     how: str = "odd-even",
     *,
-    seed: int = 0,
+    seed: Seed = 0,
     method: str = "efficient",
     **options: Any,
 ) -> CameraComparison:
@@ -191,7 +192,7 @@ def compare_halves(
         Start of both calibrations.
     how : {"odd-even", "halves", "random"}
         Rule of `split_frames`.
-    seed : int
+    seed : int or Generator
         Seed of a random half, and of the comparison.
     method : str
         Method of `calibrate`.
@@ -205,6 +206,7 @@ def compare_halves(
     CalibrationError
         When a half does not determine the camera.
     """
+    seed = seed_of(seed)
     first, second = (
         calibrate(part, camera, model=camera.model, method=method, duplicates="keep")
         for part in split_frames(obs, how, seed=seed)

@@ -58,7 +58,7 @@ class Rule:
         """
         value = self.value(settings)
         concerned = value in self.values if self.values else is_given(value)
-        other = settings.get(self.other)
+        other: Any = settings.get(self.other)
         if self.of_kinds:
             other = kind_of_effects(other)
         elif self.other == "effects" and other is not None:

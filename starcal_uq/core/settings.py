@@ -15,14 +15,19 @@ from dataclasses import dataclass
 from functools import wraps
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, Literal, ParamSpec, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeAlias, TypeVar, get_args
 
 from starcal_uq.core.errors import CalibrationError, SettingError
 from starcal_uq.core.files import shown
 
+if TYPE_CHECKING:
+    import numpy as np
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
+# What `seed_of` makes a whole number of, which is recorded.
+Seed: TypeAlias = "int | np.random.Generator"
 Method = Literal["efficient", "three_stage", "least_squares", "samaan", "griffith"]
 RecursiveMethod = Literal["samaan", "griffith"]
 Solver = Literal["lm", "minpack", "ipopt"]
@@ -198,6 +203,18 @@ def bounded(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return checked
+
+
+def seed_of(seed: Seed) -> int:
+    """A whole number that repeats a result bit for bit: the seed, or one drawn from a Generator."""
+    if isinstance(seed, Integral):
+        return int(seed)
+    draw = getattr(seed, "integers", None)
+    if draw is None:
+        raise SettingError(
+            f"seed is {shown(seed)}: {LIMITS['seed'].wanted()}, or a numpy.random.Generator."
+        )
+    return int(draw(1 << 63))
 
 
 def check_memory(setting: str, n_bytes: float) -> None:

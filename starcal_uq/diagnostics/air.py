@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import (
@@ -112,7 +112,7 @@ class AirTest:
 @bounded
 @one_thread()
 def air_test(
-    obs: Observations, cal: Calibration, *, seed: int = 0, stars: StarTest | None = None
+    obs: Observations, cal: Calibration, *, seed: Seed = 0, stars: StarTest | None = None
 ) -> AirTest | None:
     """Look for refraction in the residuals of a calibration.
 
@@ -120,7 +120,7 @@ def air_test(
     ----------
     obs, cal
         The data and the estimate made from them.
-    seed : int
+    seed : int or Generator
         Seed of the draws of noise.
     stars : StarTest, optional
         Errors that stars bring along, where they are known already.
@@ -131,6 +131,7 @@ def air_test(
         None where the camera was in space, or where from no place all stars were above the horizon
         and frames by themselves hold no scale and shape.
     """
+    seed = seed_of(seed)
     if obs.origin.without_air:
         return None
     stars = star_test(obs, cal) if stars is None else stars

@@ -21,7 +21,7 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.status import Level
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, Progress
@@ -259,7 +259,7 @@ def diagnose(
     *,
     models: Sequence[str] | None = None,
     n_starts: int = 5,
-    seed: int = 0,
+    seed: Seed = 0,
     progress: Progress | None = None,
     apart: Callable[[], Apart | None] | None = None,
 ) -> Diagnosis:
@@ -278,7 +278,7 @@ def diagnose(
         leave the comparison out.
     n_starts : int
         Fits from other starts; 0 leaves them out.
-    seed : int
+    seed : int or Generator
         Seed of everything random.
     progress : callable, optional
         Called with the number of steps done and their total.
@@ -286,6 +286,7 @@ def diagnose(
         What waits for `diagnose_apart` of the same arguments, which runs elsewhere; None of it is
         asked for here again.
     """
+    seed = seed_of(seed)
     step = progress or (lambda done, total: None)
     models = rivals(cal.camera.distortion) if models is None else models
     obs, theta = weighed(obs, cal), cal.theta

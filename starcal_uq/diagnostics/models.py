@@ -24,7 +24,7 @@ from starcal_uq.camera.distortion import rivals
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import without_effects
 from starcal_uq.estimation.fit import refit
@@ -173,7 +173,7 @@ def compare_models(
     models: Sequence[str] | None = None,
     *,
     n_draws: int = _DRAWS,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> ModelComparison:
     """Compare distortion models by cross-validation over frames.
 
@@ -186,7 +186,7 @@ def compare_models(
         Names of the registry; by default `starcal_uq.camera.distortion.rivals`.
     n_draws : int
         Posterior draws of each model.
-    seed : int
+    seed : int or Generator
         Seed of the draws.
 
     Raises
@@ -194,6 +194,7 @@ def compare_models(
     StarcalError
         When no model can be calibrated.
     """
+    seed = seed_of(seed)
     obs = weighed(obs, cal)
     obs = without_effects(obs, cal)
     own = cal.camera.distortion

@@ -14,7 +14,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import has_effects, with_effects_of
@@ -104,7 +104,7 @@ def predictive_check(
     post: Posterior | None = None,
     *,
     n_draws: int = 500,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> PredictiveCheck:
     """Compare statistics of the residuals with those of data that the posterior predicts.
 
@@ -116,9 +116,10 @@ def predictive_check(
         The posterior; the normal approximation of the calibration otherwise.
     n_draws : int
         Draws, and replicates.
-    seed : int
+    seed : int or Generator
         Seed of the draws and the replicates.
     """
+    seed = seed_of(seed)
     rng = np.random.default_rng(seed)
     # The statistics settle long before: of very many stars, those of some frames do.
     limit = max(1, min(obs.n_frames, _MAX_STARS * obs.n_frames // obs.n_stars))

@@ -18,7 +18,7 @@ import numpy as np
 
 from starcal_uq.attitude.earth import LOWEST
 from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR
 from starcal_uq.core.types import FloatArray, StrArray
 from starcal_uq.diagnostics.beside import images_beside
@@ -119,7 +119,7 @@ def remainder(obs: Observations, cal: Calibration, seed: int) -> Images:
 
 @bounded
 def time_test(
-    obs: Observations, cal: Calibration, *, seed: int = 0, rest: Images | None = None
+    obs: Observations, cal: Calibration, *, seed: Seed = 0, rest: Images | None = None
 ) -> TimeTest | None:
     """Look for a wrong time in the residuals of a calibration.
 
@@ -127,7 +127,7 @@ def time_test(
     ----------
     obs, cal
         The data and the estimate made from them.
-    seed : int
+    seed : int or Generator
         Seed of the choice of frames, where there are many.
     rest : Images, optional
         What `remainder` gives for these, where it is known already.
@@ -137,6 +137,7 @@ def time_test(
     TimeTest or None
         The slip that explains most; None where none is seen.
     """
+    seed = seed_of(seed)
     rest = remainder(obs, cal, seed) if rest is None else rest
     best, most = None, 0.0
     for moved in _causes(rest):
@@ -171,7 +172,7 @@ def time_test(
 
 @bounded
 def unseen_aberration(
-    obs: Observations, cal: Calibration, *, seed: int = 0, rest: Images | None = None
+    obs: Observations, cal: Calibration, *, seed: Seed = 0, rest: Images | None = None
 ) -> UnseenAberration | None:
     """Ask how far annual aberration would move f without being seen in the residuals of a
     calibration.
@@ -180,7 +181,7 @@ def unseen_aberration(
     ----------
     obs, cal
         The data and the estimate made from them.
-    seed : int
+    seed : int or Generator
         Seed of the choice of frames, where there are many.
     rest : Images, optional
         What `remainder` gives for these, where it is known already.
@@ -190,6 +191,7 @@ def unseen_aberration(
     UnseenAberration or None
         None where `time_test` would see it, or it moves f by less than a standard deviation.
     """
+    seed = seed_of(seed)
     rest = remainder(obs, cal, seed) if rest is None else rest
     # The first cause is that aberration is missing.
     columns, absorbed = rest.left(next(_causes(rest)).shifts)

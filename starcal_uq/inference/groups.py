@@ -28,7 +28,7 @@ import numpy as np
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.files import write_netcdf
-from starcal_uq.core.settings import bounded, check_memory
+from starcal_uq.core.settings import Seed, bounded, check_memory, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
 from starcal_uq.estimation.weights import weighed
@@ -70,7 +70,7 @@ def arviz_data(
     groups: Sequence[Group] | None = None,
     n_draws: int = _DRAWS,
     n_frames: int = _FRAMES,
-    seed: int = 0,
+    seed: Seed = 0,
     progress: Progress | None = None,
 ) -> Any:
     """A posterior with all of ArviZ's groups, made on demand: ``InferenceData`` (0.23) or
@@ -95,7 +95,7 @@ def arviz_data(
         Draws over all chains, and of the prior.
     n_frames : int
         Frames, evenly spread, of the data and the drawn images; the log likelihood has all.
-    seed : int
+    seed : int or Generator
         Seed of the prior, the noise and the attitudes.
     progress : callable, optional
         Called as ``progress(draws_done, draws_total)`` for the log likelihood.
@@ -112,6 +112,7 @@ def arviz_data(
         For an unknown group, or one that there is not: the log likelihood needs the data of the
         posterior, and a likelihood of star positions in which frames are independent.
     """
+    seed = seed_of(seed)
     return to_arviz(_datasets(post, obs, groups, n_draws, n_frames, seed, progress))
 
 
@@ -123,12 +124,13 @@ def write_arviz(
     path: PathLike,
     *,
     n_draws: int = _DRAWS,
-    seed: int = 0,
+    seed: Seed = 0,
     progress: Progress | None = None,
 ) -> tuple[str, ...]:
     """Write what `arviz_data` gives as netCDF, all or nothing, for programs that read ArviZ's
     schema; its groups.
     """
+    seed = seed_of(seed)
     made = _datasets(post, obs, None, n_draws, _FRAMES, seed, progress)
 
     def fill(file: Any) -> None:

@@ -22,7 +22,7 @@ from starcal_uq.core.files import check_hdf5, ensure_new, reading, write_netcdf
 from starcal_uq.core.provenance import Provenance, Traced
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.remedy import RUN, Remedy, read_remedies
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.status import CODES, Check, Level, Words, worst
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, Shapes
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
@@ -447,7 +447,7 @@ class Posterior(Shown, Traced):
         return table
 
     @bounded
-    def thin(self, n: int, seed: int | np.random.SeedSequence | None = None) -> FloatArray:
+    def thin(self, n: int, seed: Seed | np.random.SeedSequence | None = None) -> FloatArray:
         """A random subset (n, p+1) of the draws without replacement; all of them if there are fewer
         than n.
         """

@@ -25,7 +25,7 @@ from starcal_uq.camera.projection import (
 )
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
-from starcal_uq.core.settings import bounded, check_memory
+from starcal_uq.core.settings import Seed, bounded, check_memory, seed_of
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
@@ -115,7 +115,7 @@ def prior_predictive(
     obs: Observations | None = None,
     *,
     n_draws: int = 200,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> PriorPredictive:
     """Draw cameras from a prior and look at what they would see.
 
@@ -135,7 +135,7 @@ def prior_predictive(
         The data; up to 30 frames are used, evenly spread.
     n_draws : int
         Number of cameras, at least 100 for the tail probabilities to mean something.
-    seed : int
+    seed : int or Generator
         Repeats bit for bit.
 
     Raises
@@ -143,6 +143,7 @@ def prior_predictive(
     PriorError
         For priors of another distortion model or kind of noise, or too few draws.
     """
+    seed = seed_of(seed)
     if priors.distortion != camera.distortion:
         raise PriorError(
             f"the priors are for {priors.distortion!r}, the camera has {camera.distortion!r}: "

@@ -23,6 +23,7 @@ from starcal_uq.camera.distortion import get_model, parameter_names, parameters,
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.findings import clause
+from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.toml import Key, Section, read_section
 from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray
 from starcal_uq.maths.linear import correlation_of
@@ -190,8 +191,10 @@ class Priors(Shown, ABC):
         """Mean and standard deviation of one parameter."""
         return float(self.mean([name])[0]), float(self.sd([name])[0])
 
-    def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
+    @bounded
+    def draw(self, n: int, seed: Seed) -> FloatArray:
         """Draw (n, p+1) parameters from the prior, the noise in the last column."""
+        rng = np.random.default_rng(seed)
         names = parameter_names(self.distortion)
         u = rng.standard_normal((n, len(names))) @ np.linalg.cholesky(self._correlation()).T
         theta = self.mean(names) + self.sd(names) * u

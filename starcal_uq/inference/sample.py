@@ -18,7 +18,15 @@ from starcal_uq.core.errors import SamplingError, check_known, require
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import Provenance, data_hashes, provenance
 from starcal_uq.core.records import to_plain
-from starcal_uq.core.settings import Evaluation, LikelihoodName, Moves, bounded, check_memory
+from starcal_uq.core.settings import (
+    Evaluation,
+    LikelihoodName,
+    Moves,
+    Seed,
+    bounded,
+    check_memory,
+    seed_of,
+)
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress, floats
@@ -78,7 +86,7 @@ def sample(
     n_steps: int = 200,
     n_burn: int | None = None,
     moves: Moves = "mixture",
-    seed: int | None = None,
+    seed: Seed | None = None,
     likelihood: LikelihoodName | Likelihood = "marginal",
     evaluation: Evaluation = "auto",
     dof: float | Literal["free"] | None = None,
@@ -110,7 +118,7 @@ def sample(
         ``mixture``: independence proposals (multivariate t at the Laplace approximation) with
         weight 0.7, differential evolution with 0.3. ``stretch``: emcee's own default, about twenty
         times slower here.
-    seed : int, optional
+    seed : int or Generator, optional
         The same seed gives the same draws; without one, a new one is taken and recorded in the
         provenance.
     likelihood : {"marginal", "pairs", "pairs_naive", "student_t"} or object
@@ -162,7 +170,7 @@ def sample(
         )
     _check_determined(cal, priors if stated else None)
     check_chain(priors, cal.nominal, data_hashes(cal.provenance))
-    seed = secrets.randbits(63) if seed is None else seed
+    seed = secrets.randbits(63) if seed is None else seed_of(seed)
     chosen: AnyDict = {
         "sigma": sigma,
         "n_ensembles": n_ensembles,

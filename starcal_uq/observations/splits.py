@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from starcal_uq.core.errors import ComparisonError, check_known
-from starcal_uq.core.settings import Split, bounded
+from starcal_uq.core.settings import Seed, Split, bounded, seed_of
 from starcal_uq.core.types import IntArray
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ _LABELS = {
 
 @bounded
 def split_frames(
-    obs: Observations, how: str = "odd-even", *, seed: int = 0
+    obs: Observations, how: str = "odd-even", *, seed: Seed = 0
 ) -> tuple[Observations, Observations]:
     """Two tables that share no frame and together are the whole.
 
@@ -34,7 +34,7 @@ def split_frames(
     how : {"odd-even", "halves", "random"}
         Every other frame in their order (the first, third... are the odd ones, whatever their
         numbers); the first and the second half; or a random half.
-    seed : int
+    seed : int or Generator
         Seed of the random half.
 
     Raises
@@ -42,6 +42,7 @@ def split_frames(
     ComparisonError
         For another `how`, or fewer than two frames.
     """
+    seed = seed_of(seed)
     labels = split_labels(how)
     if obs.n_frames < 2:
         raise ComparisonError(

@@ -34,7 +34,7 @@ from starcal_uq.core.errors import SamplingError, StarcalError
 from starcal_uq.core.files import cell_content, reading, write_csv
 from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
@@ -384,7 +384,7 @@ def interaction_study(
     max_mags: Sequence[float] = MAX_MAGS,
     n_replicates: int = 16,
     n_frames: int = 100,
-    seed: int = 2017,
+    seed: Seed = 2017,
     **options: Unpack[ReplicateOptions],
 ) -> InteractionStudy:
     """Bias and spread of x0, y0 and f for methods that ignore, decouple or couple optics and
@@ -423,6 +423,7 @@ def interaction_study(
     CatalogueError
         When a field is too narrow for the catalogue to show enough stars.
     """
+    seed = seed_of(seed)
     import pandas as pd
 
     truth = paper_camera() if truth is None else truth

@@ -29,7 +29,7 @@ from starcal_uq.core.errors import (
 from starcal_uq.core.provenance import Provenance, provenance
 from starcal_uq.core.records import Saved
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
@@ -317,7 +317,7 @@ def replicate(
     start: Camera | None = None,
     n_replicates: int = 200,
     n_frames: int = 1000,
-    seed: int = 2017,
+    seed: Seed = 2017,
     stars: StarCatalogue | None = None,
     share_slow: bool = False,
     **options: Unpack[ReplicateOptions],
@@ -355,6 +355,7 @@ def replicate(
     CalibrationError
         When a method never gave a result.
     """
+    seed = seed_of(seed)
     methods = tuple(methods)
     truth = paper_camera() if truth is None else truth
     start = paper_start() if start is None else start

@@ -8,7 +8,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.checks import paper_checks
@@ -34,7 +34,7 @@ def reproduce(
     *,
     n_replicates: int = 200,
     n_frames: int = 1000,
-    seed: int = 2017,
+    seed: Seed = 2017,
     convention: str = "eq14",
     workers: int | None = None,
     progress: Progress | None = None,
@@ -56,7 +56,7 @@ def reproduce(
         independent, a slow option, has a quarter of them.
     n_frames : int
         Frames in each; at least 20. The paper has 1000.
-    seed : int
+    seed : int or Generator
         The same seed gives the same numbers, for any number of processes.
     convention : {"eq14", "eq6"}
         The equation of the paper that the simulated distortion follows in the main reading.
@@ -83,6 +83,7 @@ def reproduce(
     KeyboardInterrupt
         After Ctrl-C; the same call then resumes.
     """
+    seed = seed_of(seed)
     if n_replicates < 8:
         raise CalibrationError(
             f"n_replicates is {n_replicates}: a comparison over seeds needs at least 8."

@@ -14,7 +14,7 @@ import numpy as np
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, PlanningError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.maths.intervals import chi_square_both_sides
 from starcal_uq.maths.linear import inverses
@@ -166,7 +166,7 @@ def check_forecast(
     n_frames: Sequence[int] = N_FRAMES,
     n_campaigns: int = 50,
     n_geometries: int = 3000,
-    seed: int = 0,
+    seed: Seed = 0,
     **options: Unpack[CheckOptions],
 ) -> ForecastCheck:
     """Simulate and calibrate campaigns, and compare what they state and how far they err with the
@@ -181,7 +181,7 @@ def check_forecast(
         Sheet, sky and settings as `plan` takes them.
     n_campaigns : int
         Campaigns of each number of frames.
-    seed : int
+    seed : int or Generator
         The same seed gives the same result for any number of processes.
     sigma_px, min_stars, max_stars, exclusion
         As `plan` takes them.
@@ -199,6 +199,7 @@ def check_forecast(
     KeyboardInterrupt
         After Ctrl-C before the last one.
     """
+    seed = seed_of(seed)
     if n_campaigns < 2 or not n_frames:
         raise PlanningError(
             f"n_campaigns is {n_campaigns}: give at least 2, and at least one number of frames."

@@ -25,7 +25,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError, require
 from starcal_uq.core.provenance import Provenance, provenance
-from starcal_uq.core.settings import Criterion, bounded
+from starcal_uq.core.settings import Criterion, Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import quantities, spreads
@@ -59,7 +59,7 @@ def choose_frames(
     scope: str = "common",
     after: HasInformation | None = None,
     n_geometries: int = 1000,
-    seed: int = 0,
+    seed: Seed = 0,
     **options: Unpack[TrackerOptions],
 ) -> FrameChoice:
     """Choose the frames that improve a calibration most.
@@ -85,7 +85,7 @@ def choose_frames(
         Data that are there already.
     n_geometries : int
         Random attitudes that stand for the mission.
-    seed : int
+    seed : int or Generator
         Repeats bit for bit.
 
     Raises
@@ -95,6 +95,7 @@ def choose_frames(
     CatalogueError
         When the field is too narrow for the catalogue to show `min_stars`.
     """
+    seed = seed_of(seed)
     tracker = Tracker.of(camera, **options)
     _check(tracker.min_stars, criterion, scope)
     mission = random_frames(stars, tracker, n_frames=n_geometries, seed=seed)

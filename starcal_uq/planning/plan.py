@@ -19,7 +19,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import PlanningError, require
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import to_plain
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, Progress, floats
 from starcal_uq.maths.linear import scaled_inverse
@@ -89,7 +89,7 @@ def plan(
     sweeps: bool = True,
     n_geometries: int = 3000,
     n_campaigns: int = N_CAMPAIGNS,
-    seed: int = 0,
+    seed: Seed = 0,
     progress: Progress | None = None,
     **options: Unpack[TrackerOptions],
 ) -> Plan:
@@ -135,7 +135,7 @@ def plan(
         over.
     n_campaigns : int
         Campaigns to average over.
-    seed : int
+    seed : int or Generator
         Repeats bit for bit.
     progress : callable, optional
         Called with the points of the sweeps that are done and all.
@@ -160,6 +160,7 @@ def plan(
     exclusion : Exclusion, optional
         Cones around Sun, Moon and Earth that the boresight keeps out of.
     """
+    seed = seed_of(seed)
     tracker = Tracker.of(camera, **options)
     sigma_px = tracker.noise
     _check(n_frames, tracker.min_stars, target_arcsec, n_geometries, n_campaigns)

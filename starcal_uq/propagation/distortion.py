@@ -26,7 +26,7 @@ from starcal_uq.camera.projection import unproject, unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import DistortionError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def distortion_curve(
     n_draws: int = 2000,
     level: float = 0.95,
     azimuths_deg: Sequence[float] | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> DistortionCurve:
     """Radial displacement against radius, with pointwise and simultaneous credible bands.
 
@@ -141,7 +141,7 @@ def distortion_curve(
     azimuths_deg : sequence of float, optional
         Directions for models with decentring terms; by default every 45 degrees. Others are the
         same in all.
-    seed : int
+    seed : int or Generator
         Chooses the draws.
 
     Raises
@@ -151,6 +151,7 @@ def distortion_curve(
     DistortionError
         For a camera without distortion, or when a draw folds the distortion within the detector.
     """
+    seed = seed_of(seed)
     if n < 2 or not 0.0 < level < 1.0:
         raise ValueError(
             f"a curve needs at least 2 radii and a level between 0 and 1, not {n} and {level:g}."

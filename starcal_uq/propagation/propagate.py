@@ -36,7 +36,7 @@ import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.settings import OnboardModel, bounded
+from starcal_uq.core.settings import OnboardModel, Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, PathLike
 from starcal_uq.maths.linear import mean_weights
@@ -68,7 +68,7 @@ def propagate(
     obs: Observations,
     *,
     n_draws: int = 300,
-    seed: int = 0,
+    seed: Seed = 0,
     alignment: Observations | str | None = None,
     alignment_frames: int | None = None,
     onboard: OnboardModel = "model",
@@ -89,7 +89,7 @@ def propagate(
         (`starcal_uq.simulation.mission_frames`, `starcal_uq.simulation.profile_frames`).
     n_draws : int
         Draws that go through QUEST; all if there are fewer.
-    seed : int
+    seed : int or Generator
         Chooses them, the noise, and a random sky.
     alignment : Observations or str, optional
         Frames on which alignment is calibrated in flight: ``random`` (by default) for a random sky
@@ -122,6 +122,7 @@ def propagate(
         When the temperature profile is wrong, or the calibration holds no effect of the
         temperature.
     """
+    seed = seed_of(seed)
     draws = post.thin(n_draws, seed)[:, :-1]
     count = len(draws)
     if count < 2:

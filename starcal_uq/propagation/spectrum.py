@@ -25,7 +25,7 @@ from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.core.records import Saved
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.geometry import FrameGeometry
@@ -53,7 +53,7 @@ def error_spectrum(
     times_s: FloatArray | None = None,
     *,
     n_draws: int = 100,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> ErrorSpectrum:
     """Spectrum of the frame-dependent part of the calibration error along a series of frames.
 
@@ -68,7 +68,7 @@ def error_spectrum(
         Time of each frame, s, in the order of frame numbers; those of `profile_frames` by default.
     n_draws : int
         Draws that go through QUEST; all if there are fewer.
-    seed : int
+    seed : int or Generator
         Chooses them.
 
     Raises
@@ -81,6 +81,7 @@ def error_spectrum(
     DistortionError, ObservationError, DegenerateFrameError
         For the reasons that `starcal_uq.propagate` has.
     """
+    seed = seed_of(seed)
     time, index = _series(obs, times_s)
     step, size = float((time[-1] - time[0]) / (len(time) - 1)), len(time)
     filled, weight = _neighbours(index, size)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.core.errors import ComparisonError, RunFolderError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import PathLike
 from starcal_uq.estimation.duplicates import fingerprints_of
 from starcal_uq.runs.run import Run
@@ -75,7 +75,7 @@ def compare_runs(
 
 @bounded
 def compare_split(
-    run: PathLike, how: str = "odd-even", *, seed: int = 0, **options: Any
+    run: PathLike, how: str = "odd-even", *, seed: Seed = 0, **options: Any
 ) -> CameraComparison:
     """Calibrate two halves of a run's frames by themselves and compare them.
 
@@ -85,7 +85,7 @@ def compare_split(
         Folder of a run. Its method and distortion model are used again.
     how : {"odd-even", "halves", "random"}
         As for `split_frames`.
-    seed : int
+    seed : int or Generator
         Seed of a random half.
     **options
         Further options of `compare`.
@@ -99,6 +99,7 @@ def compare_split(
     CalibrationError
         When a half does not determine the camera.
     """
+    seed = seed_of(seed)
     whole = Run(run)
     cal = whole.calibration
     obs = _table(whole)

@@ -28,8 +28,10 @@ from starcal_uq.core.settings import (
     LikelihoodName,
     Moves,
     OnboardModel,
+    Seed,
     bounded,
     joined_effects,
+    seed_of,
 )
 from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
@@ -341,7 +343,7 @@ def run(
     camera: Camera | PathLike | None = None,
     *,
     out: PathLike | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     force: bool = False,
     tell: Callable[[str], None] | None = None,
     **settings: Unpack[RunOptions],
@@ -359,7 +361,7 @@ def run(
     out : path, optional
         Folder of the run, where a report is written too. By default the run is kept in a temporary
         folder, which goes with the `Run`.
-    seed : int
+    seed : int or Generator
         Seed of everything that is random.
     force : bool
         Whether to replace a run in `out`.
@@ -406,6 +408,7 @@ def run(
     budget : BudgetFile or path, optional
         Of `Run.budget`.
     """
+    seed = seed_of(seed)
     from starcal_uq.presentation.report.drawing import Ahead
 
     files = files_of(source)
@@ -415,6 +418,7 @@ def run(
     if images:
         given.pop("workers", None)
     refuse_conflicts(**given)
+    check_files(settings)
     options = with_effects({**settings}, partitioned)
     nominal = Camera.load(camera) if isinstance(camera, str | os.PathLike) else camera
     words = _words(files, camera, {**settings, "seed": seed}) if files else ()
@@ -453,7 +457,7 @@ def kind_of(source: Any) -> tuple[bool, bool]:
 
 
 def _check(options: AnyMapping, images: bool, camera: Camera | PathLike | None) -> None:
-    """Refuse, before anything is done, what would be ignored or found wrong after the work."""
+    """Refuse, before anything is done, what would be ignored."""
     known = RunOptions.__annotations__
     others, kind = (TableOptions, "a table") if images else (ImageOptions, "images")
     for name in options:
@@ -465,7 +469,6 @@ def _check(options: AnyMapping, images: bool, camera: Camera | PathLike | None) 
         raise SettingError(
             "a table of stars needs the nominal camera as well; only images do without."
         )
-    check_files(options)
 
 
 def check_files(options: AnyMapping) -> None:

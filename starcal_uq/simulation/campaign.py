@@ -13,7 +13,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import RunFolderError, SensorError
 from starcal_uq.core.files import ensure_new
 from starcal_uq.core.manifest import alone
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray, PathLike, Progress, floats
 from starcal_uq.simulation.frames import Tracker, TrackerOptions
 from starcal_uq.simulation.rendering import Scene
@@ -34,7 +34,7 @@ def render_frames(
     *,
     n_frames: int = 100,
     sensor: Sensor | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     attitudes: FloatArray | None = None,
     rates_rad_s: ArrayLike | None = None,
     times_utc: Sequence[str] | None = None,
@@ -61,7 +61,7 @@ def render_frames(
         Number of frames.
     sensor : Sensor, optional
         Detector and PSF; ``Sensor()`` by default.
-    seed : int
+    seed : int or Generator
         Repeats bit for bit. The noise of a frame depends on the seed and the frame number only.
     attitudes : (n, 3, 3) array, optional
         R_cam_icrs at the middle of the exposures, instead of random ones; `n_frames` is then
@@ -94,6 +94,7 @@ def render_frames(
     SensorError
         For arguments that do not fit together.
     """
+    seed = seed_of(seed)
     given = None if attitudes is None else floats(attitudes).reshape(-1, 3, 3)
     rng = np.random.default_rng(seed)
     rotations, _ = Tracker.of(camera, **options).frames(stars, rng, n_frames, given)

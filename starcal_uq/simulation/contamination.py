@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import AnyDict, BoolArray, IntArray
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def contaminate(
     camera: Camera,
     fraction: float,
     kind: str = "random",
-    seed: int = 0,
+    seed: Seed = 0,
     *,
     radius_px: float = 60.0,
 ) -> Contaminated:
@@ -59,7 +59,7 @@ def contaminate(
     kind : {"random", "neighbour"}
         Any star of the catalogue, or one within `radius_px` of the right one. Stars that the frame
         has already are not used.
-    seed : int
+    seed : int or Generator
         Repeats bit for bit.
     radius_px : float
         Distance of neighbours.
@@ -71,6 +71,7 @@ def contaminate(
     ValueError
         For a kind or fraction that makes no sense.
     """
+    seed = seed_of(seed)
     if kind not in KINDS or not 0.0 <= fraction <= 1.0:
         raise ValueError(
             f"kind={kind!r}, fraction={fraction}: use {' or '.join(KINDS)}, and a number from 0 "

@@ -14,7 +14,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CatalogueError, SettingError, StarcalError, require
-from starcal_uq.core.settings import bounded, check_memory
+from starcal_uq.core.settings import Seed, bounded, check_memory, seed_of
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.origin import SIMULATED, Origin
 from starcal_uq.observations.table import Observations
@@ -225,7 +225,7 @@ def simulate(
     camera: Camera,
     *,
     n_frames: int = 1000,
-    seed: int = 0,
+    seed: Seed = 0,
     attitudes: FloatArray | None = None,
     **options: Unpack[TrackerOptions],
 ) -> Observations:
@@ -239,7 +239,7 @@ def simulate(
         The truth.
     n_frames : int
         Number of frames.
-    seed : int
+    seed : int or Generator
         Repeats bit for bit.
     attitudes : (n_frames, 3, 3) array, optional
         R_cam_icrs to use instead of random ones; `n_frames` is then ignored, and every frame must
@@ -270,6 +270,7 @@ def simulate(
     exclusion : Exclusion, optional
         Cones around Sun, Moon and Earth that the boresight keeps out of.
     """
+    seed = seed_of(seed)
     tracker = Tracker.of(camera, **options)
     min_stars = tracker.min_stars
     if min_stars < 3:

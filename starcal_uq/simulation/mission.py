@@ -16,7 +16,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.formatting import count, plural, significant
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.table import Observations
 from starcal_uq.simulation.frames import Tracker, simulate
@@ -41,7 +41,7 @@ def mission_frames(
     n_frames: int = 1000,
     min_stars: int = 5,
     max_stars: int | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     noise_like: Observations | None = None,
 ) -> Observations:
     """Noise-free frames at uniformly random attitudes, for `starcal_uq.propagate`.
@@ -59,7 +59,7 @@ def mission_frames(
         a valid frame.
     max_stars : int, optional
         Stars that the tracker uses of a frame, the brightest ones; all on the detector by default.
-    seed : int
+    seed : int or Generator
         Repeats bit for bit.
     noise_like : Observations, optional
         A table with stated noise, whose ``sigma_px`` is carried over by magnitude: the median of
@@ -74,6 +74,7 @@ def mission_frames(
     ObservationError
         When `noise_like` states no noise.
     """
+    seed = seed_of(seed)
     frames = simulate(
         *(stars, camera),
         n_frames=n_frames,

@@ -14,7 +14,7 @@ from starcal_uq.core.cluster import ClusterOptions, Scheduler, cluster
 from starcal_uq.core.errors import ObservationError, RunFolderError, SettingError
 from starcal_uq.core.files import UNFINISHED, new_folder
 from starcal_uq.core.manifest import alone, making, read_manifest
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import AnyDict, PathLike, Progress
 from starcal_uq.observations.files import parquet_summary
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
@@ -43,7 +43,7 @@ def simulate_partitions(
     *,
     n_frames: int,
     partition_frames: int = PARTITION_FRAMES,
-    seed: int = 0,
+    seed: Seed = 0,
     force: bool = False,
     **options: Unpack[PartitionOptions],
 ) -> PartitionedObservations:
@@ -63,7 +63,7 @@ def simulate_partitions(
         Number of frames in all.
     partition_frames : int
         Frames of one file.
-    seed : int
+    seed : int or Generator
         Seed; each file is drawn from it and its number.
     force : bool
         Whether to replace what another call has made there.
@@ -91,6 +91,7 @@ def simulate_partitions(
     progress : callable, optional
         Called with (files done, files).
     """
+    seed = seed_of(seed)
     tracker, run = _taker(camera, **options)
     least = tracker.min_stars
     if least < 3:

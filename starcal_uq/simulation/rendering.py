@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import SensorError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import FloatArray, IntArray, floats
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.simulation.psf import half_width_px, profiles
@@ -190,8 +190,7 @@ def render(
     rotation: ArrayLike,
     sensor: Sensor | None = None,
     *,
-    seed: int = 0,
-    rng: np.random.Generator | None = None,
+    seed: Seed = 0,
     rate_rad_s: ArrayLike | Sequence[float] | None = None,
     noise: bool = True,
     quantise: bool = True,
@@ -211,10 +210,8 @@ def render(
         R_cam_icrs at the middle of the exposure: b = R r.
     sensor : Sensor, optional
         Detector and PSF; ``Sensor()`` by default.
-    seed : int
+    seed : int or Generator
         Seed of the noise: the same seed and frame number repeat the frame bit for bit.
-    rng : numpy.random.Generator, optional
-        Source of the noise instead of `seed`.
     rate_rad_s : (3,) array, optional
         Angular rate of the camera in its own axes (x right, y down, z along the boresight),
         constant over the exposure, rad/s. A positive rate about y turns the boresight towards +x,
@@ -242,19 +239,19 @@ def render(
     is the same over the field. The smear is the exposure integral of the PSF along the star's path,
     by Gauss-Legendre quadrature.
     """
-    if rng is None and (seed < 0 or frame < 0):
+    seed = seed_of(seed)
+    if seed < 0 or frame < 0:
         raise SensorError(
             f"rendering: seed is {seed} and frame {frame}; give whole numbers of 0 or more."
         )
-    source = np.random.default_rng([seed, frame]) if rng is None else rng
     return Scene(stars, camera, Sensor() if sensor is None else sensor).render(
         rotation,
-        source,
+        np.random.default_rng([seed, frame]),
         rate_rad_s=rate_rad_s,
         noise=noise,
         quantise=quantise,
         frame=frame,
-        seed=int(seed) if rng is None else None,
+        seed=seed,
         time_utc=time_utc,
     )
 

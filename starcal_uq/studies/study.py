@@ -20,7 +20,7 @@ from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.manifest import NEW, alone, making, read_manifest
 from starcal_uq.core.provenance import NAME, installed_versions
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.store import held, take_over
 from starcal_uq.core.tasks import one_thread, processors
 from starcal_uq.core.types import AnyDict, PathLike, Progress, floats
@@ -54,7 +54,7 @@ def study(
     definition: StudyDefinition | PathLike,
     *,
     out: PathLike | None = None,
-    seed: int | None = None,
+    seed: Seed | None = None,
     stars: StarCatalogue | None = None,
     force: bool = False,
     more: Callable[[Study, Path], object] | None = None,
@@ -70,7 +70,7 @@ def study(
         Folder in which cells are kept as they are made, and at the end the results (``study.nc``,
         ``study.parquet``, ``study.toml`` where the definition is a file). Cells that are there
         already, by the hash of all that they depend on, are not computed again.
-    seed : int, optional
+    seed : int or Generator, optional
         Root seed, instead of that of the definition; it repeats bit for bit.
     stars : StarCatalogue, optional
         The sky; the embedded catalogue at the epoch of the definition by default.
@@ -108,7 +108,7 @@ def study(
     wanted = (
         definition if isinstance(definition, StudyDefinition) else StudyDefinition.load(definition)
     )
-    wanted = wanted if seed is None else replace(wanted, seed=seed)
+    wanted = wanted if seed is None else replace(wanted, seed=seed_of(seed))
     wanted.check()
     cells = wanted.cells()
     deepest = max(cell.settings["max_mag"] for cell in cells)

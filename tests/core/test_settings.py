@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import importlib
 import inspect
 import re
 from pathlib import Path
@@ -27,24 +26,9 @@ from starcal_uq.core.settings import LIMITS, Limit, bounded
 from starcal_uq.studies import StudyDefinition
 from starcal_uq.studies.axes import AXES, SENSOR_AXES
 from starcal_uq.studies.definition import _STUDY
+from tests.helpers.public import public_functions
 
 PACKAGE = Path(sc.__file__).parent
-
-
-def public_functions():
-    """Functions and methods of the stubs, by their full names."""
-    for stub in sorted(PACKAGE.rglob("__init__.pyi")):
-        wing = importlib.import_module(".".join(stub.parent.relative_to(PACKAGE.parent).parts))
-        for name in re.findall(r"import \w+ as (\w+)", stub.read_text()):
-            public = getattr(wing, name)
-            members = (
-                inspect.getmembers(public, inspect.isfunction)
-                if inspect.isclass(public)
-                else [("", public)]
-            )
-            for member, function in members:
-                if inspect.isfunction(function) and not member.startswith("_"):
-                    yield f"{name}.{member}".rstrip("."), function
 
 
 def test_every_public_function_refuses_settings_outside_their_limits():

@@ -73,7 +73,11 @@ def test_a_run_in_a_folder_has_a_report_and_the_command_that_repeats_it(few, tmp
     files[0].write_text(files[0].read_text("utf-8").replace("x_px", "column"), "utf-8")
     columns = {"x_px": "column"}
     run = sc.run(*files, out="run", effects=["tails"], columns=columns, seed=2, **FEW)
-    assert run.has("report") and run.has("run_file") and run.place.words[:3] == ("run", *map(str, files))
+    assert (
+        run.has("report")
+        and run.has("run_file")
+        and run.place.words[:3] == ("run", *map(str, files))
+    )
     draws = run.posterior.draws
     assert cli(*run.place.words, "-o", "again") in (0, 1)
     assert np.array_equal(draws, sc.Run("again").posterior.draws)

@@ -355,7 +355,7 @@ def test_a_seed_repeats_bit_for_bit() -> None:
     assert np.array_equal(one, again)
     assert not np.array_equal(one, other) and not np.array_equal(one, next_frame)
     rngs = [np.random.default_rng(4) for _ in range(2)]
-    assert np.array_equal(*(render(sky, SMALL, ATTITUDE, rng=rng).data for rng in rngs))
+    assert np.array_equal(*(render(sky, SMALL, ATTITUDE, seed=rng).data for rng in rngs))
 
 
 def test_rendering_is_quick_beyond_its_noise_arrays(stars: StarCatalogue) -> None:

@@ -25,7 +25,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import PriorError, SamplingError, check_known
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.settings import Truth, bounded
+from starcal_uq.core.settings import Seed, Truth, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.validation.replicates import (
@@ -80,7 +80,7 @@ def validate(
     *,
     n_replicates: int = 1000,
     n_frames: int = 50,
-    seed: int = 0,
+    seed: Seed = 0,
     truth: Truth = "fixed",
     priors: Priors | None = None,
     stars: StarCatalogue | None = None,
@@ -100,7 +100,7 @@ def validate(
         Data sets to simulate; 1000 know a coverage to 1.4 %.
     n_frames : int
         Frames of one calibration.
-    seed : int
+    seed : int or Generator
         The same seed gives the same result, bit for bit, for any number of processes; the first
         replicates of a longer validation are those of a shorter one.
     truth : {"fixed", "prior"}
@@ -149,6 +149,7 @@ def validate(
         Folder in which replicates are kept as they are made; a later call resumes from them, with
         more replicates as well. Not for a likelihood of one's own.
     """
+    seed = seed_of(seed)
     from starcal_uq.sky.catalogue import load_catalogue
 
     campaign, run = campaign_of(n_frames, **options)

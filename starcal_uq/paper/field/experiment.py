@@ -15,6 +15,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import Seed, seed_of
 from starcal_uq.core.store import Kept
 from starcal_uq.core.types import AnyDict, FloatArray, PathLike, Progress
 from starcal_uq.paper.commands import Bar, write_tables
@@ -78,7 +79,7 @@ def field_experiment(
     n_frames: int = 200,
     n_calibration_frames: int = 200,
     reading: str = "window",
-    seed: int = 2017,
+    seed: Seed = 2017,
     n_replicates: int = _N_REPLICATES,
     workers: int | None = None,
     progress: Progress | None = None,
@@ -100,6 +101,7 @@ def field_experiment(
         of the errors come. Each at least 20.
     `reading`: how the printed sensor is read (`READINGS`).
     """
+    seed = seed_of(seed)
     if reading not in READINGS:
         raise CalibrationError(
             f"reading {reading!r} of the field unit is unknown: use one of {', '.join(READINGS)}."

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.core.records import write_json
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import PathLike
 from starcal_uq.runs.steps.misfit import seen_by
 from starcal_uq.runs.stored import StoredRun, writing
@@ -30,7 +30,7 @@ def budget(
     file: BudgetFile | PathLike | None = None,
     confidence: float | None = None,
     temperature_profile: TemperatureProfile | PathLike | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     force: bool = False,
 ) -> Budget:
     """Make the attitude error budget and write it.
@@ -54,6 +54,7 @@ def budget(
     BudgetError
         If the file is wrong.
     """
+    seed = seed_of(seed)
     from starcal_uq.budgeting.budget import budget
     from starcal_uq.budgeting.file import stated_in
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.types import PathLike
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.runs.steps.misfit import with_misfit
@@ -61,10 +61,11 @@ class MissionSky:
     sense: Sense = "icrs_to_camera"
 
     @bounded
-    def frames(self, posterior: Posterior, obs: Observations, seed: int) -> Observations:
+    def frames(self, posterior: Posterior, obs: Observations, seed: Seed) -> Observations:
         """Noise-free frames, with the noise of the observed ones by magnitude where it is
         stated.
         """
+        seed = seed_of(seed)
         from starcal_uq.attitude.profile import load_attitude_profile
         from starcal_uq.simulation.mission import mission_frames, profile_frames
         from starcal_uq.sky.catalogue import load_catalogue
@@ -99,7 +100,7 @@ def propagate(
     /,
     *,
     n_draws: int = 300,
-    seed: int = 0,
+    seed: Seed = 0,
     sky: MissionSky | None = None,
     alignment: str | PathLike = "random",
     alignment_frames: int | None = None,
@@ -130,6 +131,7 @@ def propagate(
     force : bool
         Whether to replace the earlier attitude error.
     """
+    seed = seed_of(seed)
     run._keep("attitude", force)
     posterior = run.posterior
     if not run._keeps_observations and not run.has("observations"):
