@@ -23,8 +23,6 @@ from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers.profiles import slew
 from tests.helpers.scenes import camera, observations, with_sigmas
 
-Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
-
 
 def table(profile: AttitudeProfile) -> pd.DataFrame:
     return profile.to_dataframe()
@@ -198,28 +196,6 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path: Path, change: str, mess
     if change == "length":
         with pytest.raises(AttitudeProfileError, match=r"bad.parquet: row 5: the quaternion"):
             load_attitude_profile(write(broken(table(slew(8)), change), tmp_path / "bad.parquet"))
-
-
-def test_unreadable_files_are_named(tmp_path: Path) -> None:
-    for name, content, message in (
-        ("none.csv", None, "cannot be read"),
-        ("list.txt", b"", "ending .txt is unknown"),
-        ("bad.parquet", b"PAR1 no", "is not a readable table"),
-        ("latin.csv", "time_s,qx\n1,é\n".encode("latin-1"), "not UTF-8"),
-        (
-            "ragged.csv",
-            b"time_s,qx,qy,qz,qw\n1,0,0,0,1\n2,0,0,1\n",
-            "line 3: holds 4 values under a header of 5",
-        ),
-    ):
-        if content is not None:
-            (tmp_path / name).write_bytes(content)
-        with pytest.raises(AttitudeProfileError, match=message):
-            load_attitude_profile(tmp_path / name)
-    with pytest.raises(AttitudeProfileError, match=r"give \(K,\) and \(K, 4\)"):
-        AttitudeProfile(np.arange(3.0), np.ones((2, 4)))
-    with pytest.raises(AttitudeProfileError, match="row 2 holds a value that is not finite"):
-        AttitudeProfile(np.array([0.0, np.nan]), np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
 
 
 def test_frames_show_what_the_camera_sees() -> None:

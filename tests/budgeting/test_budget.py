@@ -225,23 +225,6 @@ def test_classes_hold_what_counts_in_a_scope(stated: Path) -> None:
     assert {*found.classes_dataframe("before alignment")["ecss_class"]} == counted
 
 
-def test_tables_say_what_rows_totals_and_requirements_are(stated: Path) -> None:
-    found = made(stated)
-    for table, entries in (
-        (found.to_dataframe(), found.rows),
-        (found.totals_dataframe(), found.totals),
-        (found.requirements_dataframe(), found.outcomes),
-    ):
-        assert len(table) == len(entries)
-        for line, entry in zip(table.to_dict("records"), entries, strict=True):
-            for name, value in line.items():
-                places = (entry, getattr(entry, "requirement", None), getattr(entry, "total", None))
-                (expected, *_) = [getattr(place, name) for place in places if hasattr(place, name)]
-                if name in ("not_assessed", "at_most"):
-                    expected = "; ".join(expected)
-                assert value == expected or (value != value and expected != expected), name
-
-
 def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path) -> None:
     """The attitude error brings it along."""
     held = attitude().if_model_holds_arcsec[:, :3]
@@ -533,52 +516,6 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
     assert control.verdict == "met" and control.total.sampled_se_arcsec > 0.0
 
 
-@pytest.mark.extra("excel")
-def test_a_budget_beyond_the_samples_is_whole(stated: Path, tmp_path: Path) -> None:
-    from openpyxl import load_workbook
-
-    found = made(stated, confidence=0.999999)
-    assert math.isnan(found.total("roll").larger_arcsec)
-    write_budget(found, tmp_path / "budget.xlsx")
-    sheet = load_workbook(tmp_path / "budget.xlsx")["Totals"]
-    first = {cell.value: sheet.cell(2, cell.column) for cell in sheet[1]}
-    assert first["Bound by sampling [arcsec]"].value == "not resolved"
-    assert first["Confidence"].number_format == "0.0000%"
-    json.dumps(found.to_dict(), allow_nan=False)
-    found.plot.contributors()
-    assert "not resolved" in found._repr_html_()
-
-
-def test_a_contributor_of_the_users_own_is_not_zero_on_axes_that_the_file_leaves_out(tmp_path):
-    own = FILE.split("[[contributor]]")[4].split("[[requirement]]")[0]
-    path = tmp_path / "own.toml"
-    path.write_text("[[contributor]]" + own, encoding="utf-8")
-    found = made(path)
-    rows = {row.axis: row for row in found.rows if row.name == "=my own"}
-    assert [rows[axis].assessed for axis in AXES] == [True, False, False]
-    assert "=my own" in found.not_assessed and "=my own" in found.total("Z").not_assessed
-    assert "=my own (about Y (yaw) and Z (roll))" in " ".join(found.notes)
-    path.write_text(
-        "[[contributor]]"
-        + own
-        + "[[contributor]]\nname = '=my own'\naxis = 'Z'\napplies = false\nprovenance = 'p'\n",
-        encoding="utf-8",
-    )
-    assert "=my own" not in made(path).total("Z").not_assessed
-
-
-def test_csv_is_lossless(stated: Path, tmp_path: Path) -> None:
-    found = made(stated, misfit=NOTHING_FOUND)
-    found.save(tmp_path / "budget.csv")
-    back = Budget.load(tmp_path / "budget.csv")
-    for name in ("rows", "totals", "outcomes", "confidence", "title", "notes", "provenance"):
-        assert repr(to_plain(getattr(back, name))) == repr(to_plain(getattr(found, name))), name
-    found.to_dataframe().to_csv(tmp_path / "frame.csv")
-    assert len(found.to_dataframe()) == len(found.rows) and len(found.totals_dataframe()) == len(
-        found.totals
-    )
-
-
 def test_correlations_of_axes_in_csv_are_lists_of_numbers_for_other_readers(stated, tmp_path):
     """None begins with an apostrophe, whatever the sign of its first number."""
     import pandas as pd
@@ -596,16 +533,6 @@ def test_correlations_of_axes_in_csv_are_lists_of_numbers_for_other_readers(stat
     before = " | ".join(map(repr, signed))
     path.write_text(path.read_text().replace(f'"{cell}"', f"'{before}"))
     assert f"'{before}" in path.read_text() and Budget.load(path).rows[0].axis_correlation == signed
-
-
-@pytest.mark.parametrize("text", ["", "a,b\n1,2\n", "record,name,value\nsetting,confidence,0.9\n"])
-def test_what_is_no_budget_is_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "budget.csv"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(RunFolderError, match="is not an error budget"):
-        Budget.load(path)
-    with pytest.raises(RunFolderError, match="cannot be read"):
-        Budget.load(tmp_path / "none.csv")
 
 
 @pytest.mark.extra("excel")

@@ -48,21 +48,6 @@ def test_a_contributor_takes_what_is_expected_of_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("axis", "expected"),
-    [
-        ("X", ("pitch",)),
-        ("yaw", ("yaw",)),
-        ("z", ("roll",)),
-        ("cross-boresight", ("pitch", "yaw")),
-        ("all", AXES),
-    ],
-)
-def test_axes(tmp_path: Path, axis: str, expected: tuple[str, ...]) -> None:
-    found = load_budget_file(written(tmp_path, ROW.replace('"all"', f'"{axis}"')))
-    assert tuple(row.axis for row in found.contributors) == expected
-
-
-@pytest.mark.parametrize(
     ("lines", "sigma", "mean"),
     [
         ('distribution = "uniform"\nhalf_width_arcsec = 3.0', 3.0 / math.sqrt(3.0), 0.0),
@@ -220,17 +205,6 @@ def test_what_is_wrong_is_said_in_one_sentence_with_file_and_key(tmp_path: Path,
         load_budget_file(path)
     assert sentence in str(caught.value) and str(path) in str(caught.value)
     assert "\n" not in str(caught.value).strip() and str(caught.value).endswith((".", "?"))
-
-
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(BudgetError, match="--template"):
-        load_budget_file(tmp_path / "none.toml")
-    with pytest.raises(BudgetError, match="is a directory; name the TOML file"):
-        load_budget_file(tmp_path)
-    path = tmp_path / "latin.toml"
-    path.write_bytes(b"# \xe9\n")
-    with pytest.raises(BudgetError, match="UTF-8"):
-        load_budget_file(path)
 
 
 def example(root: Path) -> str:

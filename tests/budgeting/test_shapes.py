@@ -18,31 +18,6 @@ from starcal_uq.budgeting.shapes import (
 )
 
 
-def test_two_axis_quantiles_are_not_those_of_one_axis() -> None:
-    assert one_axis_factor(0.9973) == pytest.approx(3.0, abs=1e-4)
-    for confidence, expected in ((0.95, 2.448), (0.997, 3.409), (0.9973, 3.439)):
-        assert two_axis_radius(confidence, 1.0, 1.0) == pytest.approx(expected, abs=5e-4)
-        assert two_axis_radius(confidence, 1.0, 1.0) == pytest.approx(
-            stats.rayleigh.ppf(confidence), rel=1e-10
-        )
-        # Negative control: the factor of one axis holds less.
-        held = stats.rayleigh.cdf(one_axis_factor(confidence))
-        assert held < confidence - 0.005
-
-
-def test_unequal_axes_are_exact() -> None:
-    assert two_axis_radius(0.997, 2.0, 0.0) == pytest.approx(2.0 * one_axis_factor(0.997), rel=1e-9)
-    assert two_axis_radius(0.997, 0.0, 0.0) == 0.0
-    rng = np.random.default_rng(1)
-    size = np.hypot(3.0 * rng.standard_normal(1_000_000), rng.standard_normal(1_000_000))
-    held = np.mean(size < two_axis_radius(0.95, 3.0, 1.0))
-    assert held == pytest.approx(0.95, abs=4.0 * math.sqrt(0.95 * 0.05 / 1e6))
-    # Negative control: the quantile of equal axes of the same mean square is off by many standard
-    # errors.
-    wrong = np.mean(size < two_axis_radius(0.95, math.sqrt(5.0), math.sqrt(5.0)))
-    assert abs(wrong - 0.95) > 20.0 * math.sqrt(0.95 * 0.05 / 1e6)
-
-
 @pytest.mark.parametrize("name", DISTRIBUTIONS)
 def test_deviates_have_unit_moments_and_the_stated_half_width(name: str) -> None:
     rng = np.random.default_rng(2)

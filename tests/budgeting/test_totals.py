@@ -7,11 +7,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from starcal_uq.budgeting.file import Requirement
 from starcal_uq.budgeting.result import Outcome
-from starcal_uq.budgeting.rows import GAUSSIAN_997, Contributor
+from starcal_uq.budgeting.rows import Contributor
 from starcal_uq.budgeting.sampling import draw
 from starcal_uq.budgeting.shapes import (
     half_width,
@@ -19,8 +18,6 @@ from starcal_uq.budgeting.shapes import (
 )
 from starcal_uq.budgeting.totals import (
     Total,
-    _heaviest,
-    covariance,
     total,
     totals,
 )
@@ -51,37 +48,6 @@ def combined(
 ) -> Total:
     options = {"scope": "before alignment", "interpretation": "mixed", **changes}
     return total(rows, draw(rows, 200_000, 3), axis=axis, confidence=confidence, **options)  # type: ignore[arg-type]
-
-
-def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
-    rows = [row(name, 6.6) for name in ("ground", "launch", "lens")]
-    found = combined(rows, confidence=0.9973, interpretation="temporal")
-    assert (
-        found.rule_arcsec
-        == pytest.approx(59.4, abs=0.1)
-        == pytest.approx(found.sampled_arcsec, abs=0.1)
-    )
-    assert found.rule_least_arcsec == pytest.approx(34.3, abs=0.1)
-    assert found.sampled_least_arcsec == pytest.approx(34.3, rel=0.02)
-    for limit, verdict in ((33.0, "violated"), (45.0, "open"), (60.0, "met")):
-        outcome = Outcome(
-            Requirement("R", "pitch", limit, 0.9973, "before alignment", "temporal"), found
-        )
-        assert outcome.verdict == verdict and outcome.between == (verdict == "open")
-        assert f"is {verdict}" in outcome.text
-    # Open for another reason: half an arcsecond is left, and a row is missing.
-    missing = dataclasses.replace(outcome, total=dataclasses.replace(found, not_assessed=("one",)))
-    missing = dataclasses.replace(
-        missing, requirement=dataclasses.replace(outcome.requirement, limit_arcsec=59.9)
-    )
-    assert missing.verdict == "open" and not missing.between
-    open_one = Outcome(
-        Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal", "rule"), found
-    )
-    assert (
-        "is open: at the least 34.3 and at most 59.4 arcsec against a limit of 45.0."
-        in open_one.text
-    )
 
 
 def test_what_is_absorbed_in_part_leaves_a_limit_open() -> None:
@@ -162,62 +128,6 @@ def test_signs_count_in_a_group_that_is_at_its_worst(axis: str) -> None:
     assert combined(plain, axis, interpretation="temporal").sampled_least_arcsec > limit
 
 
-def test_a_group_of_several_shapes_may_be_worst_on_its_way() -> None:
-    """A Gaussian against a uniform row: at its ends both cancel, in between they do not."""
-    rows = [row("bend", 1.0, correlation_group="heat"), row("slip", 1.7, distribution="uniform")]
-    rows[1] = dataclasses.replace(rows[1], correlation_group="-heat")
-    found = combined(rows, interpretation="temporal")
-    probability = np.linspace(0.0015, 0.9985, 100_001)
-    apart = stats.norm.ppf(probability) - 1.7 * math.sqrt(3.0) * (2.0 * probability - 1.0)
-    assert found.worst_arcsec == pytest.approx(np.abs(apart).max(), rel=1e-4)
-    # Control: at the ends.
-    assert abs(one_axis_factor(0.997) - 1.7 * math.sqrt(3.0)) < 0.1 * found.worst_arcsec
-
-
-def test_a_rule_above_what_is_sampled_violates_nothing() -> None:
-    """A dominant uniform error ends before a limit that the rule exceeds; whichever judges."""
-    found = combined([row("big", 10.0, distribution="uniform"), row("small", 0.1)])
-    limit = 1.2 * found.sampled_arcsec
-    assert found.rule_arcsec > limit
-    for judge, verdict in (("both", "open"), ("rule", "open"), ("sampling", "met")):
-        outcome = Outcome(
-            Requirement("R", "pitch", limit, 0.997, "before alignment", "mixed", judge), found
-        )
-        assert outcome.verdict == verdict and outcome.between == (verdict == "open")
-    # Control: a limit below the samples is violated by all.
-    for judge in ("both", "rule", "sampling"):
-        asked = Requirement(
-            "R", "pitch", 0.9 * found.sampled_arcsec, 0.997, "before alignment", "mixed", judge
-        )
-        assert Outcome(asked, found).verdict == "violated"
-
-
-def test_a_row_that_is_not_assessed_is_no_zero() -> None:
-    missing = Contributor("pixel", "pixel spatial", "pitch")
-    assert math.isnan(missing.sigma_arcsec) and not missing.assessed
-    found = combined([row("noise", 1.0), missing])
-    assert found.at_least and found.not_assessed == ("pixel",)
-    nothing = combined([missing])
-    assert (
-        math.isnan(nothing.rule_arcsec) and math.isnan(nothing.sampled_arcsec) and nothing.at_least
-    )
-    # A row that is absorbed is not missed after alignment.
-    absorbed = dataclasses.replace(missing, absorbed_by_alignment="yes")
-    assert not combined([row("noise", 1.0), absorbed], scope="after alignment").at_least
-    # What does not apply counts as assessed, and as nothing.
-    gone = row("pixel", 0.0, applies=False)
-    assert combined([row("noise", 1.0), gone]).rule_arcsec == pytest.approx(one_axis_factor(0.997))
-    assert not combined([row("noise", 1.0), gone]).at_least
-
-
-def test_the_seed_decides() -> None:
-    rows = [row("a", 1.0)]
-    first, again, other = (
-        draw(rows, 1000, seed).sums["before alignment", "ensemble"] for seed in (1, 1, 2)
-    )
-    assert np.array_equal(first, again) and not np.array_equal(first, other)
-
-
 def test_a_quantile_beyond_the_samples_is_not_known() -> None:
     rows = [row("noise", 6.6, tail_997=3.9)]
     found = combined(rows, confidence=0.9999999)
@@ -249,65 +159,6 @@ def test_the_combination_of_a_row_is_said() -> None:
     ):
         assert row("bend", 1.0, correlation_group=group).combination == words
     assert row("bend", 1.0, source="not assessed").combination == "not in the totals"
-
-
-def test_the_heaviest_tail_weighs_its_size() -> None:
-    large, long = row("large", 10.0, tail_997=3.2), row("long", 8.0, tail_997=4.5)
-    assert _heaviest([large, long]) is long
-    assert _heaviest([large, row("small", 0.1, tail_997=4.5)]) is large
-    assert _heaviest([row("noise", 10.0, tail_997=GAUSSIAN_997)]) is None
-
-
-def test_totals_scale_with_their_rows_and_their_sentences_stay() -> None:
-    rows = [
-        *both("noise", 1.0, tail_997=3.4, interpretation="temporal"),
-        *both(
-            "step",
-            2.0,
-            distribution="uniform",
-            interpretation="ensemble",
-            absorbed_by_alignment="in part",
-        ),
-        *both("ground", 0.7, distribution="rayleigh", mean_arcsec=1.4, interpretation="ensemble"),
-        row("wave", 0.8, distribution="arcsine", correlation_group="heat"),
-        row("bend", 0.5, "yaw", correlation_group="-heat", absorbed_by_alignment="yes"),
-        row("shift", 0.0, "roll", distribution="constant", mean_arcsec=3.0),
-        row("lens", 0.4, "roll", absorbed_by_alignment="caused by it"),
-    ]
-    small = [
-        dataclasses.replace(r, sigma_arcsec=1e-3 * r.sigma_arcsec, mean_arcsec=1e-3 * r.mean_arcsec)
-        for r in rows
-    ]
-    for one, other in zip(
-        *(totals(some, 0.95, n_samples=20_000)[0] for some in (rows, small)), strict=True
-    ):
-        assert one.explanation == other.explanation
-        for name, value in vars(one).items():
-            if name == "difference":
-                continue
-            expected = 1e-3 * value if name.endswith("_arcsec") else value
-            found = getattr(other, name)
-            assert found == (
-                pytest.approx(expected, nan_ok=True) if isinstance(value, float) else expected
-            ), name
-
-
-def test_the_case_of_many_is_of_one_sided_errors_about_their_mean() -> None:
-    """A ground error of one sign, next to no noise: its distribution, and not its mirror image."""
-    one = stats.rayleigh(scale=3.0)
-    rows = [
-        row(
-            "ground",
-            one.std(),
-            distribution="rayleigh",
-            mean_arcsec=one.mean(),
-            interpretation="ensemble",
-        ),
-        row("noise", 1e-3, interpretation="temporal"),
-    ]
-    found = combined(rows, confidence=0.95, interpretation="temporal")
-    assert found.sampled_least_arcsec == pytest.approx(one.ppf(0.95), rel=0.01)
-    assert 2.0 * one.mean() - one.ppf(0.05) < 0.9 * found.sampled_least_arcsec
 
 
 CORRELATION = np.array([[1.0, 0.3, -0.1], [0.3, 1.0, 0.8], [-0.1, 0.8, 1.0]])
@@ -354,34 +205,6 @@ def test_totals_of_correlated_axes_in_any_frame_against_monte_carlo(rotation, ax
     # Control: the axes of another frame.
     if rotation is PAYLOAD:
         assert abs(combined(rows, axis, 0.95).sampled_arcsec / found.sampled_arcsec - 1.0) > 0.05
-
-
-def test_groups_err_together_on_all_axes_with_their_signs() -> None:
-    bend = [
-        row("bend", 3.0, correlation_group="thermal"),
-        row("bend", 3.0, "yaw", correlation_group="-thermal"),
-        row("twist", 2.0, correlation_group="thermal"),
-    ]
-    np.testing.assert_allclose(
-        covariance(bend), [[25.0, -15.0, 0.0], [-15.0, 9.0, 0.0], [0.0, 0.0, 0.0]]
-    )
-    both_axes = combined(bend, "cross-boresight", 0.95)
-    # One cause: the angle is that of one deviate, 5.83 arcsec long.
-    assert both_axes.rule_arcsec == pytest.approx(
-        math.hypot(5.0, 3.0) * one_axis_factor(0.95), rel=1e-6
-    )
-    assert both_axes.sampled_arcsec == pytest.approx(both_axes.rule_arcsec, rel=0.01)
-    # About an axis between them the signs decide.
-    between = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, math.sqrt(2.0)]]) / math.sqrt(
-        2.0
-    )
-    there, across = (combined(bend, axis, 0.95, rotation=between) for axis in ("pitch", "yaw"))
-    assert there.sigma_arcsec == pytest.approx(2.0 / math.sqrt(2.0))
-    assert across.sigma_arcsec == pytest.approx(8.0 / math.sqrt(2.0))
-    assert across.sampled_arcsec == pytest.approx(across.rule_arcsec, rel=0.01)
-    # Control: without signs it is the other way round.
-    plain = [dataclasses.replace(entry, correlation_group="thermal") for entry in bend]
-    assert combined(plain, "pitch", 0.95, rotation=between).sigma_arcsec > 5.0
 
 
 def test_what_is_missing_on_an_axis_is_missing_wherever_it_is_seen() -> None:

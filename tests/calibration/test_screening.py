@@ -117,22 +117,6 @@ def test_every_rejected_row_is_listed_with_its_reason(dirty, found) -> None:
     assert found.observations.meta["screening"]["rejected"] == found.n_rejected
 
 
-def test_displays_and_file(found, tmp_path) -> None:
-    assert str(found.n_rejected) in found.text
-    assert "Limits: a star" in found.text
-    assert found.rejected["star_id"].iloc[0] in found._repr_html_()
-    assert repr(found).startswith(f"Screening({found.n_rejected} of ")
-    path = tmp_path / "rejected.csv"
-    found.save_rejected(path)
-    with path.open() as stream:
-        lines = list(csv.DictReader(stream))
-    assert [int(line["row"]) for line in lines] == found.rejected["row"].tolist()
-    assert {line["reason"] for line in lines} == set(found.counts)
-    with pytest.raises(sc.errors.RunFolderError, match="exists already"):
-        found.save_rejected(path)
-    found.save_rejected(path, force=True)
-
-
 def test_clean_data_are_left_alone(tmp_path) -> None:
     obs = scenes.observations()
     found = screen(obs, uncalibrated())
@@ -194,22 +178,6 @@ def test_nothing_right_is_said() -> None:
     with pytest.raises(sc.errors.CalibrationError, match="stars agree on attitudes") as caught:
         screen(dirty.observations, uncalibrated())
     assert caught.value.status is sc.core.Status.INCONSISTENT
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"significance": 0.0},
-        {"significance": 0.1, "control": "star"},
-        {"control": "row"},
-        {"max_rounds": 0},
-    ],
-)
-def test_options_that_make_no_sense(options) -> None:
-    with pytest.raises(
-        ValueError, match=next(iter(options)) if len(options) == 1 else "significance"
-    ):
-        screen(scenes.observations(), TRUTH, **options)
 
 
 def test_heavy_tails_are_not_called_wrong_stars() -> None:

@@ -214,16 +214,6 @@ def test_bad_file_is_named_with_key_and_remedy(tmp_path, text, message):
     assert "\n" not in str(caught.value)
 
 
-def test_unreadable_files(tmp_path):
-    with pytest.raises(CameraError, match="does not exist; check the path"):
-        Camera.load(tmp_path / "none.toml")
-    with pytest.raises(CameraError, match="is a directory"):
-        Camera.load(tmp_path)
-    (tmp_path / "latin.toml").write_bytes(b"[camera]\nname = '\xe9'\n")
-    with pytest.raises(CameraError, match="not UTF-8"):
-        Camera.load(tmp_path / "latin.toml")
-
-
 def matrix(fx=5000.0, fy=5000.0, skew=0.0):
     return np.array([[fx, skew, 500.0], [0.0, fy, 500.0], [0.0, 0.0, 1.0]])
 

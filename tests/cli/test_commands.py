@@ -260,24 +260,6 @@ def test_files_of_another_kind_are_named_before_any_work(cli, inputs, tmp_path, 
     assert not (inputs / "run").exists()
 
 
-def test_declared_directions_and_renamed_columns(cli, inputs):
-    text = (inputs / "obs.csv").read_text().replace("ra_deg", "alpha", 1)
-    (inputs / "obs.csv").write_text(text)
-    status, _, err = cli(
-        "calibrate",
-        inputs / "obs.csv",
-        inputs / "camera.toml",
-        "-o",
-        "run",
-        "--column",
-        "ra_deg=alpha",
-        "--directions",
-        "apparent",
-    )
-    assert status == 0
-    assert "warning" not in err
-
-
 def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
     made = (
         "simulate",

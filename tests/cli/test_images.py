@@ -262,31 +262,6 @@ def test_one_message_for_many_images():
     assert counted(["In all 7."]) == ["In all 7."]
 
 
-@pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
-def test_real_frames_from_images_to_observations(cli, tmp_path):
-    camera = ESA.parent / "esa_tetra3_camera.toml"
-    status, _, _ = cli("centroid", ESA, "-o", "c.parquet", "--camera", camera)
-    assert status == 0
-    arguments = ("c.parquet", camera, "-o", "o.csv", "--max-mag", 7.5, "--epoch", 2019.57, "--json")
-    status, out, _ = cli("identify", *arguments)
-    assert status == 0
-    assert [frame["status"] for frame in json.loads(out)["frames"]] == ["identified"] * 8
-    found = sc.load_observations(tmp_path / "o.csv")
-    table = pd.read_csv(ESA.parent / "esa_tetra3_observations.csv")
-    n = 0
-    for frame, x, y, ra, dec in table[["frame", "x_px", "y_px", "ra_deg", "dec_deg"]].to_numpy():
-        here = (found.frame == frame) & (np.hypot(found.x_px - x, found.y_px - y) < 1.0)
-        if here.any():
-            n += 1
-            off = np.hypot(
-                (found.ra_deg[here][0] - ra) * np.cos(np.radians(dec)), found.dec_deg[here][0] - dec
-            )
-            # Aberration, 20.5 arcsec at most, is in the one and not in the other.
-            assert off * 3600.0 < 25.0, "a wrong identification"
-    assert n > 400
-    assert found.n_stars / 8 >= 30
-
-
 @pytest.mark.slow
 def test_rendered_frames_through_the_whole_chain(tmp_path):
     truth = sc.paper.paper_camera()

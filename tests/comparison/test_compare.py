@@ -416,18 +416,6 @@ def test_an_untested_comparison_is_saved_too(tmp_path: Path) -> None:
     assert not CameraComparison.load(tmp_path / "comparison.json").tested
 
 
-def test_broken_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(RunFolderError, match=r"cannot be read .*; run `starcal-uq compare"):
-        CameraComparison.load(tmp_path)
-    for content in ("", "{}", '{"labels": 3}', "[1]"):
-        (tmp_path / "comparison.json").write_text(content)
-        with pytest.raises(RunFolderError, match="is not a comparison of cameras"):
-            CameraComparison.load(tmp_path)
-    (tmp_path / "file").write_text("")
-    with pytest.raises(RunFolderError, match="is a file, not a folder"):
-        write_comparison(halves(), tmp_path / "file")
-
-
 def write_run(path: Path, part: str) -> RunFolder:
     run = RunFolder(path).create()
     calibrated(part=part).save(run.calibration)

@@ -22,10 +22,8 @@ from hypothesis import strategies as st
 import starcal_uq as sc
 from starcal_uq.core import files
 from starcal_uq.core.errors import StarcalError
-from tests.damage.judging import Bench
+from tests.damage.judging import Bench, judge
 from tests.damage.samples import SAMPLES, Sample
-
-pytestmark = pytest.mark.slow
 
 BY_FILE = {sample.file: sample for sample in SAMPLES}
 # What reads files and is tested elsewhere: folders of runs, and what reads images by `read_image`.
@@ -46,6 +44,25 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     return Bench(tmp_path_factory.mktemp("mutants"))
 
 
+# Readable in part: rows that are missing at the end, and a budget file without a row.
+IN_PART = {"budget.toml", "kernel.ti", "profile.csv", "orbit.csv", "hip_main.dat"}
+
+
+@pytest.mark.parametrize("name", BY_FILE)
+def test_a_file_that_is_empty_cut_or_not_there_is_refused_in_one_sentence(
+    bench: Bench, name: str
+) -> None:
+    sample = BY_FILE[name]
+    data, valid, path = bench.valid(sample)
+    found = [bench.judged(sample, made, valid, path) for made in (b"", data[: len(data) // 2])]
+    whole = [outcome for outcome in found if outcome.kind != "refused"]
+    assert len(whole) == (name in IN_PART), found
+    path.unlink()
+    # Where there is no record of a run, there is no run yet.
+    assert judge(sample, path).kind == ("other" if name == "run.json" else "refused")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BY_FILE)
 def test_no_damage_escapes_a_loader(bench: Bench, name: str) -> None:
     sample = BY_FILE[name]

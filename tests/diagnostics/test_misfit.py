@@ -11,7 +11,6 @@ from scipy import stats
 
 import starcal_uq as sc
 from starcal_uq.camera.distortion import parameter_names, rivals
-from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
 from starcal_uq.diagnostics.shape_sums import ShapeSums
 from starcal_uq.diagnostics.verdict.estimate import misfit
@@ -291,16 +290,6 @@ def test_parts_of_the_table_give_the_same_sums(monkeypatch):
     assert len(StarFrames.from_observations(obs).parts(100)) > 5
     for a, b in zip(whole.tests, parts.tests, strict=True):
         assert a.p_value == pytest.approx(b.p_value, rel=1e-6), a.name
-
-
-def test_result_survives_json_and_shows_itself():
-    import json
-
-    found = refit(observations(n_frames=30))
-    again = from_plain(Misfit, json.loads(json.dumps(to_plain(found))))
-    assert repr(to_plain(again)) == repr(to_plain(found))
-    assert list(found.to_dataframe()["test"]) == [t.name for t in found.tests]
-    assert "overall p" in found._repr_html_()
 
 
 def test_power_table_has_a_row_for_every_error(capsys):

@@ -15,12 +15,10 @@ from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import (
     PriorError,
-    RunFolderError,
     SamplingError,
     SettingError,
 )
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD, Replication, run_replicate
-from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
 from starcal_uq.maths.ranks import (
     counts_below,
@@ -29,7 +27,6 @@ from starcal_uq.presentation.figures.diagnostics import plot_validation
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.simulation.frames import Campaign
 from tests.helpers import validation_controls as controls
-from tests.helpers.same import assert_same
 from tests.helpers.scenes import camera, nominal
 
 # Starts are draws of the Laplace approximation, which is nearly the posterior here: little has to
@@ -232,21 +229,6 @@ def test_failed_replicates_are_counted_and_explained(good):
     )
 
 
-def test_some_failures_leave_the_other_replicates(stars, monkeypatch):
-    calls = []
-
-    def fail_once(*arguments, **options):
-        calls.append(0)
-        if len(calls) == 2:
-            raise sc.errors.CalibrationError("the stars do not suffice: add some.")
-        return sc.calibrate(*arguments, **options)
-
-    monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail_once)
-    found = validate_study(study(), stars, 4, workers=0)
-    assert found.replicate.tolist() == [0, 2, 3]
-    assert found.failures == ("the stars do not suffice: add some.",)
-
-
 def _same(a, b):
     for name in (
         "replicate",
@@ -336,36 +318,6 @@ def test_priors_that_make_no_camera_say_so(stars):
         validate_study(
             dataclasses.replace(study(), truth="prior", priors=priors), stars, 1, workers=0
         )
-
-
-def test_save_and_load_lose_nothing(good, tmp_path):
-    path = tmp_path / "validation.npz"
-    found = dataclasses.replace(good, failures=("a reason.",))
-    found.save(path)
-    again = Validation.load(path)
-    assert_same(found, again)
-    assert again.text == found.text
-
-
-@pytest.mark.parametrize("content", [b"", b"no archive", None])
-def test_a_file_that_is_no_validation(tmp_path, content):
-    path = tmp_path / "validation.npz"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(RunFolderError, match="starcal-uq validate CAMERA"):
-        Validation.load(path)
-
-
-def test_table_and_html(good):
-    table = good.to_dataframe()
-    assert table["quantity"].tolist() == list(QUANTITIES)
-    assert table["unit"].tolist()[-3:] == ["arcsec"] * 3
-    assert (table["coverage_low"] <= table["coverage_95"]).all()
-    assert (table["coverage_95"] <= table["coverage_high"]).all()
-    assert table["posterior_sd"][0] == pytest.approx(np.median(good.sd[:, 0]))
-    html = good._repr_html_()
-    assert "are right as far as" in html
-    assert html.count("<tr") == len(QUANTITIES) + 1
 
 
 def test_figure_shows_curves_bands_and_coverage(good):

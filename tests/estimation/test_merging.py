@@ -18,7 +18,7 @@ from starcal_uq.core.provenance import data_hashes
 from starcal_uq.estimation.merging import consistency_of, merge, welch_james
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.inference.sample import sample
-from starcal_uq.likelihood.compressed import Optimum, moved, optimum, total
+from starcal_uq.likelihood.compressed import Optimum, optimum, total
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.runs.merge import join_observations, merge_runs
@@ -70,19 +70,6 @@ def write(folder: Path, obs: Observations, cal: Calibration) -> Path:
     cal.nominal.save(folder / "camera.toml")
     cal.save(folder / "calibration.json")
     return folder
-
-
-def test_optimum_of_a_compressed_likelihood_is_the_calibration() -> None:
-    cal = calibrated(1)
-    away = moved(cal.compressed, cal.theta + 3.0 * cal.sigmas, cal.compressed.whitening)
-    best = optimum(away)
-    assert np.all(np.abs(best.theta - cal.compressed.theta_hat) < 1e-4 * cal.sigmas)
-    assert np.allclose(
-        best.covariance / np.outer(cal.sigmas, cal.sigmas), cal.correlation, atol=1e-4
-    )
-    product = best.information @ best.covariance * np.outer(cal.sigmas, 1.0 / cal.sigmas)
-    assert np.allclose(product, np.eye(5), atol=1e-6)
-    assert best.sigma == pytest.approx(cal.sigma, rel=1e-6)
 
 
 @pytest.mark.parametrize("stated", [False, True])
@@ -363,18 +350,3 @@ def test_runs_that_hold_effects_are_not_merged() -> None:
     merge([one, two])
     with pytest.raises(CalibrationError, match=r"run 1: holds effects \(field\).*join_obs"):
         merge([held, two])
-
-
-def test_runs_with_effects_are_calibrated_together_instead() -> None:
-    """What the refusal names gives the joint fit; effects of either run alone do not."""
-    tables = [simulated(1), simulated(2)]
-    joined = join_observations(tables, ["one", "two"])
-    assert joined.n_frames == sum(table.n_frames for table in tables)
-    both = calibrate(joined, NOMINAL, effects="field,frame")
-    halves = [calibrate(table, NOMINAL, effects="field,frame") for table in tables]
-    assert both.effects is not None
-    assert all(np.all(both.sigmas < half.sigmas) for half in halves)
-    # Without effects it is what merging gives.
-    alone = merge([calibrate(table, NOMINAL) for table in tables], joined)
-    plain = calibrate(joined, NOMINAL)
-    assert np.max(np.abs(alone.theta - plain.theta) / plain.sigmas) < 1e-3

@@ -37,7 +37,7 @@ from starcal_uq.identification.pyramid import (
 from starcal_uq.identification.sheet import calibrated_tolerance
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.simulation.frames import Sky
-from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
+from starcal_uq.sky.positions import ra_dec_deg
 
 SIGMA = 0.3
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -175,17 +175,6 @@ def test_stops_at_the_first_good_match_and_looks_before_it_matches(
     )
     # Four fits each where every one is matched; most are seen to be wrong before the first.
     assert calls["match_frame"] > 100 and calls["_fit"] < calls["match_frame"]
-
-
-def test_no_stars_at_all(stars: Any, folder: Path) -> None:
-    table = centroid_table([(np.empty((0, 2)), np.empty(0))] * 2)
-    found = identify(table, square_camera(12.0), stars, cache_dir=folder)
-    assert [frame.status for frame in found.frames] == ["too few stars"] * 2
-    for name in ("frame_ids", "image", "time_utc"):
-        setattr(table, name, getattr(table, name)[:0])
-    assert (
-        identify(table, square_camera(12.0), stars, cache_dir=folder).text == "There are no frames."
-    )
 
 
 def test_false_and_missing_stars(stars: Any, folder: Path) -> None:
@@ -530,44 +519,6 @@ def test_bad_input(stars: Any, folder: Path) -> None:
     table.sigma_px = np.full(len(table.frame), np.nan)
     with pytest.raises(IdentificationError, match="no finite number"):
         identify(table, square_camera(12.0), stars)
-
-
-def test_real_frames(folder: Path) -> None:
-    """All eight, from the data sheet's camera, and no star elsewhere than an independent match put
-    it.
-    """
-    source = DATA / "esa_tetra3_observations.csv"
-    if not source.is_file():
-        pytest.skip("the real frames' table is not there (../shared/data)")
-    with source.open() as file:
-        rows = list(csv.DictReader(file))
-    values = {
-        c: np.array([float(row[c]) for row in rows])
-        for c in ("x_px", "y_px", "mag", "ra_deg", "dec_deg")
-    }
-    frame = np.array([int(row["frame"]) for row in rows])
-    groups = [
-        (np.column_stack([values["x_px"], values["y_px"]])[frame == k], values["mag"][frame == k])
-        for k in range(8)
-    ]
-    table = centroid_table([(xy, 10.0 ** (-0.4 * mag)) for xy, mag in groups], 0.1)
-    nominal = sc.Camera.load(DATA / "esa_tetra3_camera.toml")
-    found = identify(table, nominal, sc.load_catalogue(8.0, epoch=2019.57), cache_dir=folder)
-    o = found.observations
-    assert found.n_identified == 8
-    assert len(o) >= 8 * 30
-    truth = {
-        key: i
-        for i, key in enumerate(zip(frame.tolist(), values["x_px"], values["y_px"], strict=True))
-    }
-    at = [truth[key] for key in zip(o.frame.tolist(), o.x_px, o.y_px, strict=True)]
-    apart = angle_between(
-        o.directions_icrs, unit_vectors(values["ra_deg"][at], values["dec_deg"][at])
-    )
-    assert np.degrees(apart.max()) * 3600.0 < 10.0
-    # Refraction is in the focal length here, and an independent fit without it has 5114.3 px.
-    assert abs(found.camera.focal_px - 5114.3) < 2.0
-    assert all(f.noise_scale < 1.5 for f in found.frames)
 
 
 def test_brightness_of_real_frames(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.special import erf
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.errors import ImageError, ObservationError, RunFolderError, SettingError
+from starcal_uq.core.errors import ImageError, ObservationError, RunFolderError
 from starcal_uq.identification.result import FrameIdentification, Identification
 from starcal_uq.images import detection
 from starcal_uq.images import fits as star_fits
@@ -467,20 +467,6 @@ def test_frames_that_cannot_be_used_are_left_out_and_the_others_go_on(stars, tmp
     np.testing.assert_array_equal(alone.xy, found.select_frames([0]).xy)
 
 
-def test_options_out_of_range_are_named():
-    image = Image(np.zeros((8, 8)), "a")
-    for name, value in (
-        ("threshold_sigma", 0.5),
-        ("gain_e_per_count", 0.0),
-        ("max_stars", 0),
-        ("psf_sigma_px", 99.0),
-    ):
-        with pytest.raises(SettingError, match=f"{name} is {value}: give a"):
-            extract_centroids(image, **{name: value})
-    with pytest.raises(ImageError, match="there is none"):
-        extract_centroids([])
-
-
 # --- reading images
 
 
@@ -573,19 +559,6 @@ def test_files_lose_nothing(table, tmp_path, ending):
         assert again.messages == wanted.messages and again.meta == wanted.meta
         with pytest.raises(RunFolderError, match="exists already"):
             wanted.save(path)
-
-
-def test_files_that_are_no_centroids(tmp_path):
-    (tmp_path / "a.csv").write_text("frame,x_px\n0,1\n")
-    with pytest.raises(ObservationError, match="list of frames is missing"):
-        Centroids.load(tmp_path / "a.csv")
-    (tmp_path / "b.parquet").write_text("nothing")
-    with pytest.raises(ObservationError, match="not a readable table"):
-        Centroids.load(tmp_path / "b.parquet")
-    with pytest.raises(ObservationError, match="does not exist"):
-        Centroids.load(tmp_path / "c.csv")
-    with pytest.raises(ObservationError, match="ending"):
-        Centroids.load(tmp_path / "c.txt")
 
 
 def test_the_table_and_its_frames(table):

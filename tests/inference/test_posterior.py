@@ -97,22 +97,6 @@ def test_every_place_of_the_draws_states_its_unit(post: Posterior, tmp_path: Pat
         assert not np.allclose(file["k1"].values.ravel(), plain[:, 3])
 
 
-def test_bad_files_are_named(tmp_path: Path) -> None:
-    import h5netcdf
-
-    with pytest.raises(RunFolderError, match="no such file"):
-        Posterior.load(tmp_path / "none.nc")
-    text = tmp_path / "text.nc"
-    text.write_text("x", encoding="utf-8")
-    with pytest.raises(RunFolderError, match=r"text\.nc: is not a posterior of this version"):
-        Posterior.load(text)
-    other = tmp_path / "other.nc"
-    with h5netcdf.File(other, "w") as file:
-        file.dimensions = {"n": 2}
-    with pytest.raises(RunFolderError, match="not a posterior of this version"):
-        Posterior.load(other)
-
-
 def test_arviz_data_has_scaled_coefficients_units_and_provenance(post: Posterior) -> None:
     data = post.data
     assert data.posterior["k1"].shape == (4, 1600)
@@ -135,13 +119,6 @@ def test_scaling_saves_the_monte_carlo_error(post: Posterior) -> None:
 def test_given_noise_is_an_attribute_not_a_variable(given: Posterior) -> None:
     assert "sigma" not in given.data.posterior
     assert given.data.posterior.attrs["sigma_given"] == 0.05
-
-
-def test_moments(post: Posterior) -> None:
-    assert np.allclose(post.mean, post.draws[:, :5].mean(axis=0), rtol=1e-12)
-    sd = np.sqrt(np.diag(post.covariance))
-    assert np.allclose(sd, post.draws[:, :5].std(axis=0, ddof=1), rtol=1e-9)
-    assert np.allclose(sd, post.sd[:5], rtol=1e-9)
 
 
 def test_summary_has_plain_and_scaled_numbers(post: Posterior) -> None:

@@ -16,9 +16,7 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import SamplingError, SettingError
 from starcal_uq.core.status import Level, Status
-from starcal_uq.inference import named
 from starcal_uq.inference.checks import _DEFAULTS, check_compression
-from starcal_uq.inference.exact import FrameSample
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
@@ -138,16 +136,6 @@ def test_same_seed_same_bits_and_ensembles_differ() -> None:
     assert not np.any(first.draws[:, 0] == other.draws[:, 0])
     ensembles = first.draws[:, 0].reshape(2, -1)
     assert not np.array_equal(ensembles[0], ensembles[1])
-
-
-def test_a_seed_is_taken_and_recorded() -> None:
-    cal = gaussian_calibration()
-    options = {**QUICK, "seed": None}
-    post = sample(None, cal, **options, evaluation="compressed")
-    again = sample(
-        None, cal, **{**options, "seed": post.provenance["seed"]}, evaluation="compressed"
-    )
-    assert np.array_equal(post.draws, again.draws)
 
 
 @pytest.mark.parametrize("stop", [40, 90])
@@ -546,26 +534,3 @@ def test_a_wider_calibration_widens_no_prior(accepted: Any) -> None:
     both = symmetric_inverse(information + tight.precision(cal.parameter_names))
     assert post.sd[:-1] == pytest.approx(np.sqrt(np.diag(both)), rel=0.1)
     assert both[2, 2] < 0.2 * cal.covariance[2, 2]
-
-
-def test_a_sample_of_frames_checks_the_wider_likelihood(accepted: Any) -> None:
-    obs, (cal, _) = observations(n_frames=20), accepted
-    plain = dataclasses.replace(
-        named.find_source("marginal", obs, accepted[1], None), sample=FrameSample(obs, cal)
-    )
-    source = named._widened(plain, FACTORS)
-    steps = np.random.default_rng(1).standard_normal((4, 5)) * cal.sigmas
-    sigma = np.full(4, cal.sigma)
-    assert (
-        source.sample is not None
-        and plain.sample is not None
-        and source.fast is not None
-        and plain.fast is not None
-    )
-    far, near = cal.theta + steps * FACTORS, cal.theta + steps
-    for wide, narrow in (
-        (source.sample.left_out, plain.sample.left_out),
-        (source.fast, plain.fast),
-    ):
-        np.testing.assert_allclose(wide(far, sigma), narrow(near, sigma), rtol=1e-6, atol=1e-6)
-    assert np.abs(plain.fast(far, sigma) - plain.fast(near, sigma)).max() > 1.0

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.likelihood.compressed import (
     CompressedLikelihood,
     _derivatives,
     combined,
-    compress,
     gram_sums,
     moved,
     optimum,
@@ -156,53 +154,6 @@ def test_combined_estimates_have_the_sum_of_the_precisions():
         p @ (theta - thetas[0]) for p, theta in zip(precisions, thetas, strict=True)
     )
     assert np.allclose((mean - thetas[0]) * scale, shift * scale, atol=1e-4)
-
-
-def test_compressed_adds_over_frames_and_survives_a_round_trip():
-    obs = observations(n_frames=60)
-    cal = _estimate(obs, "brown")
-    whole = cal.compressed
-    parts = [
-        compress(
-            MarginalLikelihood(obs.select_frames(ids), "brown"),
-            whole.theta_hat,
-            whole.whitening @ whole.whitening.T,
-        )
-        for ids in (obs.frame_ids[:25], obs.frame_ids[25:])
-    ]
-    assert np.allclose(
-        sum(part.gram for part in parts), whole.gram, rtol=1e-6, atol=1e-7 * whole.gram.max() * 1e-3
-    )
-    assert sum(part.log_determinant for part in parts) == pytest.approx(
-        whole.log_determinant, rel=1e-12
-    )
-    again = from_plain(CompressedLikelihood, to_plain(whole))
-    assert np.array_equal(again.gram, whole.gram)
-    assert np.array_equal(
-        again.log_likelihood(cal.theta[None], 0.05), whole.log_likelihood(cal.theta[None], 0.05)
-    )
-
-
-def test_derivatives_of_the_compressed_sum_of_squares():
-    """Of any expansion: that of an estimate has next to no slope."""
-    rng = np.random.default_rng(4)
-    root = rng.standard_normal((30, 21))
-    compressed = CompressedLikelihood(
-        np.zeros(5), np.eye(5), root.T @ root, 0.0, np.zeros(5), 100, 50, 5
-    )
-    slope, hessian = _derivatives(compressed)
-    unit = 1e-3 * np.eye(5)
-
-    def value(z):
-        return compressed.sum_of_squares(np.atleast_2d(z))[0]
-
-    steps = [(value(e) - value(-e)) / 2e-3 for e in unit]
-    bends = [
-        [(value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / 4e-6 for a in unit]
-        for b in unit
-    ]
-    np.testing.assert_allclose(slope, steps, rtol=1e-4, atol=1e-3)
-    np.testing.assert_allclose(hessian, bends, rtol=1e-3, atol=1e-2)
 
 
 def test_the_optimum_of_an_expansion_from_where_it_curves_the_wrong_way():

@@ -110,23 +110,3 @@ def test_information_is_the_schur_complement_of_the_attitudes():
     scale = _information_scale(schur)
     difference = (likelihood.evaluate(theta).matrix - schur) * np.outer(scale, scale)
     assert np.max(np.abs(difference)) < 1e-8
-
-
-def _estimate(obs, model):
-    from starcal_uq.calibration.calibrate import calibrate
-    from tests.helpers.scenes import nominal
-
-    return calibrate(obs, nominal(camera(model)))
-
-
-def test_scaling_the_stated_noise_only_rescales_sigma():
-    import dataclasses
-
-    obs = with_sigmas(observations(n_frames=30, sigma_px=0.0))
-    doubled = dataclasses.replace(obs, sigma_px=2.0 * obs.sigma_px)
-    a, b = _estimate(obs, "brown"), _estimate(doubled, "brown")
-    assert a.sigma_name == "sigma_scale"
-    assert a.sigma == pytest.approx(2.0 * b.sigma, rel=1e-9)
-    assert np.allclose(a.theta, b.theta, rtol=1e-9)
-    assert np.allclose(a.covariance, b.covariance, rtol=1e-6)
-    assert 0.8 < a.sigma < 1.2

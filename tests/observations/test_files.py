@@ -16,7 +16,6 @@ from starcal_uq.observations.table import Observations, load_observations
 from tests.helpers.outside import campaign
 from tests.helpers.speed import sort_a_million, times_as_long
 
-APPARENT = {"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
 CAMERA = Camera(1024, 768, 6.9, 35.0, 511.5, 383.5)
 TIME = "2026-11-21T01:02:03"
 ENDINGS = (".csv", pytest.param(".ecsv", marks=pytest.mark.extra("images")), ".parquet")
@@ -307,21 +306,6 @@ def test_other_directions_are_undeclared(tmp_path):
     assert "bad.ecsv: its metadata say directions = 'nice'" in str(caught(tmp_path / "bad.ecsv"))
 
 
-def test_real_star_camera_table(real_data):
-    camera = Camera.load(real_data / "esa_tetra3_camera.toml")
-    path = real_data / "esa_tetra3_observations.csv"
-    obs = load_observations(path, camera)
-    assert (obs.n_stars, obs.n_frames) == (567, 8)
-    np.testing.assert_array_equal(obs.stars_per_frame, [42, 31, 79, 102, 44, 47, 119, 103])
-    assert obs.meta["ignored_columns"] == ["snr", "ra_apparent_deg", "dec_apparent_deg", "image"]
-    assert not obs.directions_declared
-    assert (obs.x_px[0], obs.ra_deg[0], obs.star_id[0]) == (255.5938, 233.7002039, "HIP76276")
-    apparent = load_observations(path, camera, columns=APPARENT)
-    assert apparent.ra_deg[0] == 233.7098184
-    assert apparent.meta["ignored_columns"] == ["ra_deg", "dec_deg", "snr", "image"]
-    assert apparent.data_hash != obs.data_hash
-
-
 @pytest.mark.parametrize(
     ("cells", "line", "column", "reason"),
     [
@@ -504,14 +488,6 @@ def test_bad_file_is_named(tmp_path, name, content, message):
     assert path.read_bytes() == content
 
 
-def test_missing_file_and_directory(tmp_path):
-    assert (
-        str(caught(tmp_path / "none.csv"))
-        == f"{tmp_path / 'none.csv'}: the file does not exist; check the path."
-    )
-    assert "is a directory; name a file of observations, or open a folder" in str(caught(tmp_path))
-
-
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_save_asks_before_it_overwrites(tmp_path, ending):
     path = tmp_path / f"obs{ending}"
@@ -521,12 +497,6 @@ def test_save_asks_before_it_overwrites(tmp_path, ending):
     assert path.read_bytes() == b"mine"
     random_table().save(path, force=True)
     assert_same(load_observations(path), random_table())
-
-
-def test_save_needs_a_known_ending(tmp_path):
-    with pytest.raises(ObservationError, match=r"the ending \.txt is unknown; use .*\.fits,"):
-        random_table().save(tmp_path / "obs.txt")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

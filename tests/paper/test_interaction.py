@@ -5,15 +5,13 @@ nobody else is.
 from __future__ import annotations
 
 import dataclasses
-import signal
 
 import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.errors import RunFolderError, SamplingError, SettingError
+from starcal_uq.core.errors import SamplingError, SettingError
 from starcal_uq.paper.interaction import (
-    AXES,
     HANDLING,
     OPTICS,
     Condition,
@@ -155,35 +153,6 @@ def test_small_distortion_biases_in_proportion(study):
 # --- workers, interrupts ---
 
 
-def test_interrupt_keeps_what_is_done():
-    def press(done, total):
-        if done >= 7:
-            signal.raise_signal(signal.SIGINT)
-
-    found = interaction_study(workers=0, progress=press, **(SMALL | {"n_replicates": 50}))
-    assert found.interrupted
-    assert set(found.table["n"]) == {1, 2}
-    assert "was interrupted" in found.text
-    assert set(found.table["axis"]) == set(AXES)
-
-
-def test_a_method_that_fails_is_counted(monkeypatch):
-    def fail(obs, start, *, method, **options):
-        if method == "samaan":
-            raise sc.errors.CalibrationError("the stars do not suffice: add some.")
-        return sc.calibrate(obs, start, method=method, **options)
-
-    monkeypatch.setattr("starcal_uq.paper.interaction.calibrate", fail)
-    settings = SMALL | {"frames": (), "max_mags": (), "fields_deg": (), "n_replicates": 2}
-    found = interaction_study(workers=0, **settings)
-    rows = found.table.set_index("method")
-    assert (rows.loc["samaan", "failed"] == 2).all() and (rows.loc["samaan", "n"] == 0).all()
-    assert (rows.loc["efficient", "failed"] == 0).all()
-    assert not any(t.method == "samaan" for t in found.thresholds)
-    assert "samaan" not in found.text
-    found.plot.bias()
-
-
 # --- surface ---
 
 
@@ -197,24 +166,6 @@ def test_a_method_that_fails_is_counted(monkeypatch):
 def test_bad_settings_are_one_sentence(options, words):
     with pytest.raises((SamplingError, SettingError), match=words):
         interaction_study(**options)
-
-
-def test_table(study):
-    table = study.table
-    assert len(table) == 9 * 4 * 3
-    wanted = (
-        "axis value corner_px corner_size_px field_deg n_frames stars_per_frame max_mag method "
-        "handling parameter "
-    )
-    wanted += (
-        "unit n failed bias bias_se design_spread noise noise_se spread spread_se noise_shift "
-        "noise_shift_se rmse "
-    )
-    wanted += "crlb bias_over_noise bias_over_noise_low bias_over_noise_high"
-    assert set(wanted.split()) <= set(table.columns)
-    numbers = table.select_dtypes("number")
-    assert np.isfinite(numbers.to_numpy()).all()
-    assert (table["bias_over_noise_low"] <= table["bias_over_noise"]).all()
 
 
 def test_text_and_html(study):
@@ -239,18 +190,6 @@ def test_save_and_load_lose_nothing(study, tmp_path):
     assert again.text == dataclasses.replace(study, provenance={}).text
     study.save_csv(path)
     assert [p.name for p in tmp_path.iterdir()] == ["interaction.csv"]
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"a,b\n1,2\n", b"axis,method,handling,parameter,unit,bias,spread\n,,,,,x,1\n", None],
-)
-def test_a_file_that_is_no_study(tmp_path, content):
-    path = tmp_path / "interaction.csv"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(RunFolderError, match="starcal-uq reproduce"):
-        InteractionStudy.load_csv(path)
 
 
 # --- statistics of the methods ---

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.pairs import PairObjective
-from starcal_uq.likelihood.solvers import levenberg_marquardt
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.recursive import filter as recursion_module
 from starcal_uq.paper.recursive import filter as recursion_sums
@@ -91,46 +89,6 @@ def test_innovations_are_generalised_least_squares_over_explicit_pairs(model, st
         differs.append(relative(independent, gls))
     # Control: taking pairs as independent is something else.
     assert min(differs) > 0.3
-
-
-@pytest.mark.parametrize("covariance", ["full", "diagonal"])
-def test_numbers_of_a_frame_do_not_depend_on_its_company(covariance):
-    frames = StarFrames.from_observations(observations(max_mag=6.5))
-    theta, scale = camera().theta, scale_of("brown")
-    together = frame_normals(frames, "brown", theta, scale, covariance)
-    for first, last in [(k, k + 1) for k in range(12)] + [(3, 9), (20, 57)]:
-        alone = frame_normals(frames.part(first, last), "brown", theta, scale, covariance)
-        for name in ("grams", "weighted", "pairs", "response", "noise"):
-            assert np.array_equal(getattr(alone, name), getattr(together, name)[first:last]), name
-
-
-def test_innovations_say_what_the_likelihood_of_positions_says():
-    """To first order the pairs with their full covariance are the positions with the attitudes
-    eliminated.
-    """
-    obs = observations()
-    frames, theta, scale = StarFrames.from_observations(obs), camera().theta, scale_of("brown")
-    normals = frame_normals(frames, "brown", theta, scale)
-    likelihood = MarginalLikelihood(frames, "brown")
-    exact = likelihood.evaluate(theta)
-    total = np.sum(normals.grams, axis=0)
-    assert total[0, 0] == pytest.approx(exact.cost, rel=1e-4)
-    assert relative(total[1:, 1:], exact.matrix * np.outer(scale, scale)) < 1e-3
-    error = (total[1:, 0] + exact.gradient * scale) / np.sqrt(np.diag(total[1:, 1:]) * 0.05**2)
-    assert np.max(np.abs(error)) < 0.02
-    state, _ = likelihood.profile(theta)
-    response = (
-        -np.mean(
-            likelihood.attitude_response(state, likelihood.derivatives(theta, state)), axis=2
-        ).T
-        * scale
-    )
-    assert np.max(np.abs(np.mean(normals.response, axis=0) - response)) < 2e-3 * np.max(
-        np.abs(response)
-    )
-    assert np.allclose(
-        np.mean(normals.noise, axis=0), np.mean(state.inverse, axis=2), rtol=0, atol=1e-3 * 3e-6
-    )
 
 
 def test_three_stars_in_line_do_no_harm():
@@ -267,58 +225,10 @@ def plain_start():
     return nominal(camera("none")).replace(focal_mm=72.0)
 
 
-def batch_optimum(obs, model, start):
-    """Maximum of the likelihood with its sigmas: what a filter with the full covariance should
-    find.
-    """
-    likelihood = MarginalLikelihood(obs, model)
-    best = levenberg_marquardt(likelihood.evaluate, start, tolerance=1e-18)
-    unit = np.sqrt(np.diag(best.normal.matrix))
-    variance = np.diag(np.linalg.inv(best.normal.matrix / np.outer(unit, unit))) / unit**2
-    return best.theta, np.sqrt(variance * best.normal.cost / (likelihood.dof - len(start)))
-
-
 def filtered_theta(obs, start, **options):
     steps = RecursiveCalibration(start, "griffith", RecursionOptions(**options))
     step = steps.update(obs)
     return step.theta, step
-
-
-def test_frozen_frames_give_the_batch_step():
-    """Linearised at one point for good, the frames are a linear problem, and the filter its
-    solution.
-    """
-    obs = observations("none")
-    frames = StarFrames.from_observations(obs)
-    theta = camera("none").theta
-    filtered = blank(3, origin=theta, reference_px=0.05)
-    filtered.advance(frames)
-    total = np.sum(frame_normals(frames, "none", theta, np.ones(3)).grams, axis=0)
-    information = total[1:, 1:] + np.eye(3) / 2500.0
-    step = np.linalg.solve(information, total[1:, 0])
-    assert np.max(np.abs(filtered.offset - step) * np.sqrt(np.diag(information))) < 1e-9
-    assert filtered.chi2 == pytest.approx(total[0, 0] - step @ total[1:, 0], rel=1e-9)
-
-
-def test_from_72_mm_it_lands_on_the_batch_answer():
-    obs = observations("none", 300, 3)
-    best, sigmas = batch_optimum(obs, "none", camera("none").theta)
-    theta, step = filtered_theta(obs, plain_start())
-    assert np.max(np.abs(theta - best) / sigmas) < 0.04
-    assert np.allclose(step.sigmas, sigmas, rtol=3e-3)
-    assert step.sigma == pytest.approx(0.05, rel=0.03)
-    # Control: the plain filter, which linearises each frame once, keeps the error of the first
-    # ones.
-    plain, _ = filtered_theta(obs, plain_start(), iterations=1)
-    assert np.max(np.abs(plain - best) / sigmas) > 0.1
-
-
-def test_all_parameters_land_on_the_batch_answer():
-    obs = observations("brown", 300)
-    best, sigmas = batch_optimum(obs, "brown", camera().theta)
-    theta, step = filtered_theta(obs, sc.paper.paper_start(), parameters="all")
-    assert np.max(np.abs(theta - best) / sigmas) < 0.03
-    assert np.allclose(step.sigmas, sigmas, rtol=5e-3)
 
 
 def test_the_order_of_frames_does_not_matter():
@@ -429,38 +339,6 @@ def test_grouping_of_frames_does_not_matter(method, options):
     assert backwards._digest != states[0]._digest
 
 
-def test_a_broken_or_foreign_file_is_named(tmp_path):
-    steps = RecursiveCalibration(sc.paper.paper_start())
-    steps.update(observations())
-    path = tmp_path / "state.npz"
-    steps.save(path)
-    data = path.read_bytes()
-    for length in (0, 10, 1000, len(data) // 2, len(data) - 1):
-        path.write_bytes(data[:length])
-        with pytest.raises(
-            RunFolderError,
-            match=r"state\.npz: is not a saved recursive calibration, or is incomplete",
-        ):
-            RecursiveCalibration.load(path)
-    np.savez(path, a=np.zeros(3))
-    with pytest.raises(RunFolderError, match=r"give a file written by RecursiveCalibration\.save"):
-        RecursiveCalibration.load(path)
-    np.savez(path, header=np.array('{"kind": "something else", "version": 1}'))
-    with pytest.raises(RunFolderError, match=r"incomplete \(another kind or version\); give"):
-        RecursiveCalibration.load(path)
-    (tmp_path / "note.npz").write_text("hello")
-    with pytest.raises(RunFolderError, match=r"note\.npz"):
-        RecursiveCalibration.load(tmp_path / "note.npz")
-    with pytest.raises(
-        RunFolderError,
-        match=r"nowhere\.npz: cannot be read \(No such file or directory\); give a file",
-    ):
-        RecursiveCalibration.load(tmp_path / "nowhere.npz")
-    with pytest.raises(RunFolderError, match="does not exist"):
-        steps.save(tmp_path / "no" / "state.npz")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["note.npz", "state.npz"]
-
-
 def test_steps_tell_estimate_and_covariance_after_every_frame():
     obs = observations("none", n_frames=60)
     steps = RecursiveCalibration(plain_start())
@@ -493,17 +371,6 @@ def test_history_of_a_long_stream_is_thinned(monkeypatch):
     assert len(stage.trajectory) <= 17
     assert np.array_equal(stage.trajectory[-1], step.theta)
     assert np.array_equal(stage.trajectory[0], plain_start().theta)
-
-
-def test_data_without_noise_give_the_truth():
-    obs = observations("brown", sigma_px=0.0)
-    step = RecursiveCalibration(
-        sc.paper.paper_start(), options=RecursionOptions(parameters="all")
-    ).update(obs)
-    # The start is believed a little: one part in a million of its error stays.
-    assert np.allclose(step.theta[:3], camera().theta[:3], rtol=0, atol=5e-5)
-    assert np.allclose(step.theta[3:], camera().theta[3:], rtol=1e-4)
-    assert step.sigma < 1e-3
 
 
 @pytest.mark.parametrize("method", ["griffith", "samaan"])

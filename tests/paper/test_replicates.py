@@ -5,7 +5,6 @@ chance neither.
 from __future__ import annotations
 
 import dataclasses
-import signal
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import (
     CalibrationError,
-    RunFolderError,
     SamplingError,
     SettingError,
 )
@@ -23,7 +21,6 @@ from starcal_uq.likelihood.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.replicates import METHODS, Method, Replicates, replicate, solve_all
 from starcal_uq.paper.statistics import HONEST, TOO_FEW, chi_interval, chi_p_value, summarise
-from tests.helpers.same import assert_same
 from tests.helpers.scenes import camera, observations
 
 ALL = ("x0", "y0", "f", "k1", "k2")
@@ -253,32 +250,7 @@ def test_a_method_that_fails_is_counted(monkeypatch):
     assert "No result from efficient in 1." in found.text
 
 
-def test_a_method_that_never_works_is_an_error(monkeypatch):
-    def fail(*_):
-        raise CalibrationError("the stars do not suffice: add some.")
-
-    monkeypatch.setattr(Method, "calibrate", fail)
-    with pytest.raises(
-        CalibrationError,
-        match="'least squares' never gave a result; first reason: the stars do not",
-    ):
-        replicate(n_replicates=3, workers=0, **SMALL)
-
-
 # --- workers, interrupts ---
-
-
-def test_interrupt_keeps_what_is_done():
-    def press(done, total):
-        if done >= 4:
-            signal.raise_signal(signal.SIGINT)
-
-    found = replicate(n_replicates=500, workers=0, progress=press, **SMALL)
-    assert found.interrupted
-    assert 4 <= found.n_replicates < 500
-    assert f"interrupted after {found.n_replicates} of 500" in found.text
-    first = replicate(n_replicates=2, workers=0, **SMALL)
-    np.testing.assert_array_equal(found.estimates[:, found.replicate < 2], first.estimates)
 
 
 # --- surface ---
@@ -334,23 +306,6 @@ def test_accuracy_over_the_field(found):
     assert rms["least squares"] > 10 * rms["efficient"]
     # A pixel is 35 arcsec.
     np.testing.assert_allclose(found.map_arcsec / found.map_px, 35.1, rtol=0.02)
-
-
-def test_save_and_load_lose_nothing(found, tmp_path):
-    path = tmp_path / "replicates.npz"
-    found.save(path)
-    again = Replicates.load(path)
-    assert_same(found, again)
-    assert again.table().equals(found.table())
-
-
-@pytest.mark.parametrize("content", [b"", b"no archive", None])
-def test_a_file_that_holds_no_replicates(tmp_path, content):
-    path = tmp_path / "replicates.npz"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(RunFolderError, match="starcal-uq reproduce"):
-        Replicates.load(path)
 
 
 # --- statistics of the methods ---

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -50,24 +49,6 @@ def record(n: int, left_out: int = 1) -> ImageRecord:
         for k in range(n - left_out, n)
     ]
     return ImageRecord(rounds, (*used, *dark), 3, "mirrored")
-
-
-def test_file_is_lossless(tmp_path: Path) -> None:
-    found = record(5)
-    found.save(tmp_path / "images.json")
-    assert ImageRecord.load(tmp_path / "images.json") == found
-
-
-@pytest.mark.parametrize(
-    "text", ["", "{}", "[1]", '{"rounds": [{"a": 1}], "rows": [], "n_disturbed": 0, "parity": ""}']
-)
-def test_broken_files_are_named(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "images.json"
-    path.write_text(text)
-    with pytest.raises(sc.errors.RunFolderError, match=r"images\.json: is not a record of images"):
-        ImageRecord.load(path)
-    with pytest.raises(sc.errors.RunFolderError, match="cannot be read"):
-        ImageRecord.load(tmp_path / "none.json")
 
 
 def test_summary_counts_what_was_used_and_what_was_not() -> None:

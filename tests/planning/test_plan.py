@@ -326,20 +326,6 @@ def test_frames_needed_keep_the_target_and_fewer_do_not():
         assert forecaster.frames_needed(target, share=0.95) > needed
 
 
-def test_first_order_law_of_the_target():
-    """Half the error takes four times the frames, and so does twice the noise."""
-
-    def needed(target_arcsec: float, sigma_px: float = 0.05) -> int | None:
-        frames = random_frames(sky(), Tracker(camera(), sigma_px), n_frames=500, seed=0)
-        return Forecaster(frames, Outlook(n_campaigns=100)).frames_needed(target_arcsec)
-
-    needs = [needed(10.0), needed(5.0)]
-    assert needs[1] == pytest.approx(4 * needs[0], rel=0.02)
-    assert needed(10.0, sigma_px=0.1) == pytest.approx(4 * needs[0], rel=0.03)
-    # The plan says the same.
-    assert made(target_arcsec=5.0).frames_needed == needs[1]
-
-
 def test_radius_is_the_rayleigh_quantile_of_the_common_rotation():
     forecast = made(sweeps=False).forecast
     sigma = np.sqrt(
@@ -642,25 +628,6 @@ def test_a_page_with_choice_and_check(tmp_path):
     assert "Frames to take" in text
     assert "Forecast against simulation" in text
     assert {"frames.csv", "check.csv"} < {path.name for path in page.parent.iterdir()}
-
-
-def test_a_plan_without_target_or_sweeps_is_drawn(tmp_path):
-    found = made(sweeps=False)
-    assert found.frames_needed is None
-    page = write_plan(found, tmp_path / "plan").read_text(encoding="utf-8")
-    assert "Frames needed" not in page
-    with pytest.raises(ValueError, match="without sweeps"):
-        found.plot.sweeps()
-
-
-def test_one_distortion_less_one_column_less():
-    found = plan(camera("none"), sky(), n_geometries=100, n_campaigns=20, sweeps=False)
-    assert "distortion_corner_px" not in found.forecast.names
-    found.plot.forecast()
-    tangential = plan(
-        camera("brown_tangential"), sky(), n_geometries=100, n_campaigns=20, sweeps=False
-    )
-    assert {"p1_per_px", "p2_per_px", "k2_per_px4"} < set(tangential.forecast.names)
 
 
 def test_coupling_of_a_plan_is_that_of_a_calibration() -> None:

@@ -24,9 +24,6 @@ from starcal_uq.presentation.figures.coupling import (
 )
 from starcal_uq.presentation.figures.estimation import (
     plot_convergence,
-    plot_residual_histogram,
-    plot_residual_map,
-    plot_residual_radius,
     plot_residuals,
 )
 from starcal_uq.presentation.figures.inference import (
@@ -220,33 +217,6 @@ def test_residuals(run):
     few = run.obs.select_frames(run.obs.frame_ids[:3])
     cal = sc.calibrate(few, run.cal.camera)
     drawn(plot_residuals(cal, few))
-
-
-def test_panels_draw_on_the_axes_they_are_given(run, errors):
-    from matplotlib.figure import Figure
-
-    figure = Figure()
-    axes = figure.subplots(2, 3).ravel()
-    assert plot_residual_map(run.cal, run.obs, axes[0]) is axes[0]
-    assert plot_residual_radius(run.cal, run.obs, axes[1]) is axes[1]
-    assert plot_residual_histogram(run.cal, run.obs, axes[2]) is axes[2]
-    assert plot_correlation(run.coupling, axes[3]) is axes[3]
-    assert plot_couplings(run.coupling, axes[4]) is axes[4]
-    assert plot_attitude(errors[0], axes[5]) is axes[5]
-    for panel in (plot_residual_map, plot_residual_radius, plot_residual_histogram):
-        drawn(panel(run.cal, run.obs))
-
-
-def test_attitude_bars(errors):
-    attitude, _ = errors
-    ax = plot_attitude(attitude)
-    heights = [bar.get_height() for bar in ax.patches]
-    wanted = np.concatenate([attitude.nea_arcsec, attitude.common_arcsec, attitude.rest_arcsec])
-    assert heights == pytest.approx(wanted)
-    assert ax.get_yscale() == "log"
-    drawn(ax)
-    drawn(plot_attitude(dataclasses.replace(attitude, rest_arcsec=np.zeros(3))))
-    assert "with the misfit found: not assessed" in ax.get_xlabel()
 
 
 def test_attitude_bars_are_with_the_misfit_found_and_lines_if_the_model_holds(errors):

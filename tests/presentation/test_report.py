@@ -361,19 +361,6 @@ def test_names_from_outside_are_text_and_not_markup(full):
     assert str(symbol("<b>")) == "&lt;b&gt;"
 
 
-def test_mixed_runs_are_refused_and_nothing_is_touched(run):
-    before = run.report.read_bytes()
-    observations(n_frames=60, seed=4).save(run.observations, force=True)
-    with pytest.raises(
-        sc.errors.RunFolderError, match="parquet: is not the file that this run has written"
-    ):
-        sc.Run(run.path).report(force=True)
-    (run.path / "run.json").unlink()
-    with pytest.raises(sc.errors.RunFolderError, match="other observations"):
-        sc.Run(run.path).report(force=True)
-    assert run.report.read_bytes() == before
-
-
 def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}

@@ -21,7 +21,6 @@ from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import DistortionError, ObservationError, RunFolderError, SamplingError
 from starcal_uq.estimation.result import Calibration
-from starcal_uq.maths.linear import mean_weights
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_start
 from starcal_uq.propagation.attitude_error import AttitudeError
@@ -58,36 +57,10 @@ def propagate(post: Any, obs: Observations, **options: Any) -> AttitudeError:
     return propagate_aligned(post, obs, **{"alignment": "observed", **options})
 
 
-def aligned(post: Any, obs: Observations, phi: np.ndarray) -> np.ndarray:
-    """What an alignment on these frames finds of rotations (d, K, 3)."""
-    weights, _ = mean_weights(FrameGeometry.of(post, obs).noise_covariance)
-    return np.einsum("kij,dkj->di", weights, phi)
-
-
 @lru_cache
 def error(n_draws: int = 300) -> AttitudeError:
     obs, cal = scene()
     return propagate(gaussian_posterior(cal), obs, n_draws=n_draws, seed=1)
-
-
-def test_with_all_draws_sigmas_are_plain_standard_deviations() -> None:
-    obs, cal = scene()
-    post = gaussian_posterior(cal, n=60)
-    found = propagate(post, obs, n_draws=60)
-    reference = quest(
-        unproject_theta("brown", post.mean, obs.xy), obs.directions_icrs, obs.frame_starts
-    )
-    b = np.stack([unproject_theta("brown", theta, obs.xy) for theta in post.theta_draws])
-    phi = ARCSEC * left_error(
-        quest(b, obs.directions_icrs, obs.frame_starts).quaternions, reference.quaternions
-    )
-    common = aligned(post, obs, phi)[:, None]
-    np.testing.assert_allclose(found.common_arcsec, common[:, 0].std(axis=0, ddof=1), rtol=1e-8)
-    rest = (phi - common).std(axis=0, ddof=1)
-    np.testing.assert_allclose(found.rest_rms_per_frame_arcsec, rest, rtol=1e-4)
-    np.testing.assert_allclose(found.rest_arcsec, np.sqrt(np.mean(rest**2, axis=0)), rtol=1e-4)
-    total = np.sqrt(np.mean(phi.var(axis=0, ddof=1), axis=0))
-    np.testing.assert_allclose(found.calibration_total_arcsec, total, rtol=1e-6)
 
 
 def test_few_draws_tell_nearly_as_much_as_all() -> None:
@@ -210,23 +183,6 @@ def test_stated_noise_is_carried_over_by_magnitude() -> None:
     np.testing.assert_allclose(values[1:4], 0.01 * 10 ** (0.2 * (asked[1:4] - 2.0)), rtol=0.02)
     assert values[0] == pytest.approx(0.01, rel=0.1)
     assert values[4] == np.median(like.sigma_px)
-
-
-def test_principal_point_is_a_rotation_of_the_camera() -> None:
-    obs, cal = scene()
-    post = gaussian_posterior(cal, n=3)
-    f = cal.theta[2]
-    theta = cal.theta + np.array([[-1.0, 0, 0, 0, 0], [1.0, 0, 0, 0, 0], [0, 0, 0, 0, 0]])
-    post.theta_draws = theta
-    post.draws = np.column_stack((theta, np.full(3, 0.05)))
-    post.thin = lambda n, seed: post.draws
-    post.mean, post.covariance = theta.mean(axis=0), np.cov(theta, rowvar=False)
-    found = propagate(post, obs)
-    # x0 larger: every direction moves to -x, which is a negative yaw (rotation about +Y) of the
-    # camera-frame vectors.
-    expected = np.array([[0, 1, 0], [0, -1, 0], [0, 0, 0]]) * ARCSEC / f
-    np.testing.assert_allclose(found.common_draws_arcsec, expected, atol=0.02 * ARCSEC / f)
-    assert found.rest_arcsec[1] < 0.01 * found.common_arcsec[1]
 
 
 def test_seed_repeats_and_changes_the_draws() -> None:
@@ -352,28 +308,6 @@ def test_one_number_is_taken_apart() -> None:
     assert "no alignment absorbs it" in swapped.text
     none = dataclasses.replace(found, rest_arcsec=np.zeros(3))
     assert "is a common rotation of" in none.text
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "contributor,axis\n",
-        "contributor,axis,sigma_arcsec\na,b,c\n",
-        "\x00\x01",
-        "a,b\n1,2,3\n4\n",
-    ],
-)
-def test_broken_files_are_named(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "attitude.csv"
-    path.write_text(text)
-    with pytest.raises(RunFolderError, match=r"attitude\.csv: is not a table of attitude errors"):
-        AttitudeError.load(path)
-    with pytest.raises(
-        RunFolderError,
-        match=r"none\.csv: cannot be read .*; run `starcal-uq propagate RUN --force`",
-    ):
-        AttitudeError.load(tmp_path / "none.csv")
 
 
 def test_what_cannot_be_propagated_is_said() -> None:

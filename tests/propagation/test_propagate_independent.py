@@ -5,7 +5,6 @@ responses by differences.
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +20,6 @@ from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.records import to_plain
 from starcal_uq.observations.splits import frame_sample
 from starcal_uq.observations.table import Observations
-from starcal_uq.presentation.words.numbers import two_figures
 from starcal_uq.propagation import propagate as propagating
 from starcal_uq.propagation import sampled as through
 from starcal_uq.propagation.alignment import random_sky
@@ -34,7 +32,6 @@ from starcal_uq.propagation.distortion import distortion_curve
 from starcal_uq.propagation.field import field_map
 from starcal_uq.propagation.onboard_error import EffectError, OnboardError
 from starcal_uq.propagation.propagate import propagate
-from starcal_uq.propagation.spectrum import error_spectrum
 from tests.propagation.test_alignment import ARCSEC, POST, THETA, directions, skies, table
 
 SEED, SAMPLES = 5, 4000
@@ -333,85 +330,6 @@ def test_a_random_sky_is_drawn_by_solid_angle() -> None:
     post.thin = lambda n, seed: asked.append(n) or draws
     random_sky(post, like, 7, SEED)
     assert asked == [60]
-
-
-def test_what_is_taken_where_nothing_is_said() -> None:
-    for function, defaults in (
-        (
-            propagate,
-            {
-                "n_draws": 300,
-                "seed": 0,
-                "alignment": None,
-                "alignment_frames": None,
-                "onboard": "model",
-                "calibrated": None,
-                "temperature_profile": None,
-            },
-        ),
-        (error_spectrum, {"times_s": None, "n_draws": 100, "seed": 0}),
-        (
-            distortion_curve,
-            {
-                "obs": None,
-                "n": 101,
-                "n_draws": 2000,
-                "level": 0.95,
-                "azimuths_deg": None,
-                "seed": 0,
-            },
-        ),
-        (field_map, {"n": 25}),
-    ):
-        options = inspect.signature(function).parameters.values()
-        assert {
-            o.name: o.default for o in options if o.default is not inspect.Parameter.empty
-        } == defaults
-    sigma = np.ones(3)
-    bare = AttitudeError(
-        sigma, sigma, 2.0 * sigma, *(np.ones((5, 4)),) * 2, sigma, sigma, sigma, 10, 20
-    )
-    unknown = {
-        "interaction_arcsec": (3,),
-        "covariance_arcsec2": (5, 3, 3),
-        "alignment_covariance_arcsec2": (3, 3),
-    }
-    for name, shape in unknown.items():
-        assert getattr(bare, name).shape == shape and np.isnan(getattr(bare, name)).all()
-    assert bare.rest_constant_arcsec.tolist() == [0.0] * 3 and np.isnan(bare.alignment_arcsec).all()
-    assert (bare.frames, bare.alignment, bare.n_sampled_frames) == (
-        "observed frames",
-        "the frames themselves",
-        0,
-    )
-    np.testing.assert_allclose(bare.calibration_total_arcsec, np.sqrt(5.0) * sigma)
-    nothing = (
-        "misfit",
-        "seen",
-        "aligned",
-        "total_arcsec",
-        "analytic_total_arcsec",
-        "common_draws_arcsec",
-    )
-    assert all(getattr(bare, name) is None for name in nothing) and bare.axes == AXES
-    for n_sampled, told in ((0, "20"), (20, "20"), (7, "7 of 20")):
-        assert (
-            dataclasses.replace(bare, n_sampled_frames=n_sampled).told_frames
-            == f"{told} frames (observed frames)"
-        )
-    # More than half of the variance of the rest.
-    constant = np.sqrt([0.49, 0.51, 1.0]) * bare.rest_arcsec
-    assert dataclasses.replace(bare, rest_constant_arcsec=constant).stays.tolist() == [
-        False,
-        True,
-        True,
-    ]
-    assert two_figures((2.0, 1.0)) == "2.0 arcsec with the misfit found (1.0 if the model holds)"
-    assert two_figures((1.001, 1.0)) == "1.0 arcsec"
-    assert (
-        two_figures((np.nan, 1.0))
-        == "1.0 arcsec if the model holds (with the misfit found: not assessed)"
-    )
 
 
 def test_ratios_of_next_to_nothing_are_none() -> None:

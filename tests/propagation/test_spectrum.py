@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +14,10 @@ from starcal_uq.attitude.rotations import left_error
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.calibration.calibrate import calibrate
 from starcal_uq.camera.projection import unproject_theta
-from starcal_uq.core.errors import AttitudeProfileError, RunFolderError, SamplingError
+from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.observations.table import Observations
 from starcal_uq.propagation.propagate import propagate
-from starcal_uq.propagation.spectrum import ErrorSpectrum, _neighbours, error_spectrum
+from starcal_uq.propagation.spectrum import ErrorSpectrum, error_spectrum
 from starcal_uq.simulation.mission import profile_frames
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers.gaussian_camera import gaussian_posterior
@@ -108,40 +107,6 @@ def test_correlation_is_that_of_the_draws() -> None:
         np.testing.assert_allclose(found.autocorrelation[lag], expected, atol=0.03)
 
 
-def test_averages_are_those_of_the_series() -> None:
-    post, obs = posterior(40), frames()
-    found = error_spectrum(post, obs, n_draws=40)
-    rest = rest_of_draws(post, obs)
-    for window in (1, 10, 60):
-        kernel = np.ones(window) / window
-        runs = np.apply_along_axis(np.convolve, 1, rest, kernel, "valid")
-        averaged, noise = found.averaged_arcsec(float(window))
-        np.testing.assert_allclose(averaged, np.sqrt(np.mean(runs**2, axis=(0, 1))), rtol=0.06)
-        np.testing.assert_allclose(noise, found.nea_arcsec / np.sqrt(window))
-    assert np.isnan(found.dominates_after_s).all()
-    assert "leaves it below centroid noise" in found.text
-    # With noise a hundred times smaller it matters soon.
-    quiet = dataclasses.replace(found, nea_arcsec=0.01 * found.nea_arcsec)
-    after = quiet.dominates_after_s
-    assert np.isfinite(after).all()
-    for axis, time in enumerate(after):
-        assert np.greater(*quiet.averaged_arcsec(time))[axis]
-    assert "it comes to exceed centroid noise: pitch after" in quiet.text
-    # Noise that equals it after 20 s: from there on, to the next of the averages tried, and not
-    # before.
-    level = dataclasses.replace(found, nea_arcsec=np.sqrt(20.0) * found.averaged_arcsec(20.0)[0])
-    assert np.all((level.dominates_after_s >= 20.0) & (level.dominates_after_s < 21.5))
-    for seconds in (0.5, 200.0):
-        with pytest.raises(ValueError, match=r"choose 1 s to 150\.25 s"):
-            found.averaged_arcsec(seconds)
-
-
-def test_gaps_are_filled_in_proportion() -> None:
-    before, weight = _neighbours(np.array([0, 4, 5]), 6)
-    assert before.tolist() == [0, 0, 0, 0, 1, 1]
-    assert weight.tolist() == [0.0, 0.25, 0.5, 0.75, 0.0, 1.0]
-
-
 def test_gaps_are_bridged_and_said() -> None:
     obs, whole = frames(), spectrum()
     kept = np.random.default_rng(4).random(obs.n_frames) > 0.05
@@ -204,42 +169,6 @@ def test_slower_frames_have_the_same_errors_at_lower_frequencies() -> None:
     np.testing.assert_allclose(four.lag_s, 4.0 * one.lag_s, rtol=1e-12)
     np.testing.assert_allclose(four.autocorrelation, one.autocorrelation, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(four.variance_arcsec2, one.variance_arcsec2)
-
-
-def test_file_is_lossless(tmp_path: Path) -> None:
-    found = spectrum()
-    found.save(tmp_path / "spectrum.npz")
-    loaded = ErrorSpectrum.load(tmp_path / "spectrum.npz")
-    for field in dataclasses.fields(ErrorSpectrum):
-        np.testing.assert_array_equal(
-            getattr(loaded, field.name), getattr(found, field.name), err_msg=field.name
-        )
-    (tmp_path / "bad.npz").write_bytes(b"no")
-    for name, message in (("bad.npz", "is not an error spectrum"), ("none.npz", "cannot be read")):
-        with pytest.raises(RunFolderError, match=message):
-            ErrorSpectrum.load(tmp_path / name)
-
-
-def test_shows_itself() -> None:
-    from matplotlib.axes import Axes
-
-    found = spectrum()
-    assert list(found.to_dataframe().columns) == [
-        "frequency_hz",
-        "axis",
-        "rest_arcsec2_hz",
-        "nea_arcsec2_hz",
-    ]
-    assert len(found.to_dataframe()) == 3 * len(found.frequency_hz)
-    ax = found.plot.spectrum()
-    assert isinstance(ax, Axes)
-    assert ax.get_legend().get_texts()[0].get_text().startswith("calibration, pitch")
-    assert isinstance(found.plot.time_series(), Axes)
-    other = found.plot.time_series()
-    assert found.plot.time_series(ax=other) is other
-    html = found._repr_html_()
-    assert "correlation time [s]" in html
-    assert "arcsec (pitch, yaw, roll)" in html
 
 
 def test_a_camera_without_error_has_no_spectrum() -> None:

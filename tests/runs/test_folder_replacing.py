@@ -20,7 +20,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.manifest import read_manifest
-from tests.helpers.crashes import small_files, snapshots
+from tests.helpers.crashes import snapshots
 from tests.helpers.scenes import observations
 
 SAMPLING = {"n_ensembles": 2, "n_walkers": 14, "n_steps": 30, "n_burn": 10}
@@ -247,33 +247,6 @@ def test_an_unfinished_run_of_other_settings_starts_again_and_the_first_one_stay
         make(tmp_path / "run", FIRST)
 
 
-@pytest.mark.parametrize(
-    "largest", [8000, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 60_000))]
-)
-def test_a_full_disk_leaves_the_old_run(largest: int, whole: dict[int, Path], run: Path) -> None:
-    with (
-        small_files(largest),
-        pytest.raises(RunFolderError, match=r"cannot be written .*free space"),
-    ):
-        make(run, SECOND, force=True)
-    assert content(run) == content(whole[FIRST])
-    assert notes(run)
-    make(run, SECOND, force=True)
-    assert content(run) == content(whole[SECOND])
-
-
-def test_what_the_run_has_not_written_is_never_overwritten(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / "camera.toml").write_text(NOTES)
-    with pytest.raises(
-        RunFolderError, match=r"camera\.toml: is in the way .* not of this run: move it elsewhere"
-    ):
-        make(folder, FIRST, force=True)
-    assert [path.name for path in folder.iterdir()] == ["camera.toml"]
-    assert (folder / "camera.toml").read_text() == NOTES
-
-
 @pytest.mark.parametrize("hidden", [".new", ".step"])
 def test_a_hidden_folder_that_is_a_link_is_refused_and_what_it_names_survives(
     hidden: str, whole: dict[int, Path], run: Path, tmp_path: Path
@@ -412,12 +385,3 @@ def test_one_process_at_a_time_writes_into_a_folder(
     finally:
         os.close(other)
     writers["report"]()
-
-
-def test_a_damaged_record_is_named(run: Path) -> None:
-    (run / "run.json").write_text("{")
-    with pytest.raises(
-        RunFolderError,
-        match=r"run\.json: is not the record of a run .*; delete it, and the folder is",
-    ):
-        sc.Run(run).report(force=True)

@@ -260,41 +260,6 @@ def test_shot_noise_is_poisson(mean: float) -> None:
     assert stats.chi2.sf(wrong_chi2, max(1, kept.sum() - 1)) < 1e-4
 
 
-def test_the_stated_accuracy_is_reached_by_a_matched_fit() -> None:
-    # One Newton step of the weighted least squares fit from the truth is the efficient estimate.
-    sensor = Sensor()
-    _, wanted = sensor.star_accuracy(5.0)
-    rng = np.random.default_rng(8)
-    error = []
-    for place in 28.0 + (np.arange(4) - 1.5) / 4.0:
-        sky = sky_of([[place, 26.1]], SMALL_DETECTOR, mag=5.0)
-        scene = Scene(sky, SMALL_DETECTOR, sensor)
-        flux = sensor.electrons(5.0)
-        (_, low), (_, ex), (_, high) = (
-            profiles(np.array([place + d]), sensor.psf_sigma_px, sensor.psf)
-            for d in (-1e-4, 0.0, 1e-4)
-        )
-        _, ey = profiles(np.array([26.1]), sensor.psf_sigma_px, sensor.psf)
-        first = (
-            profiles(np.array([place]), 1.0, "gaussian")[0][0],
-            profiles(np.array([26.1]), 1.0, "gaussian")[0][0],
-        )
-        window = slice(first[1], first[1] + ey.size), slice(first[0], first[0] + ex.size)
-        expected = (
-            scene.render(ATTITUDE, None, noise=False, quantise=False).data[window]
-            * sensor.gain_e_per_count
-        )
-        slope = flux * np.outer(ey[0], (high - low)[0] / 2e-4)
-        weight = 1.0 / (flux * np.outer(ey[0], ex[0]) + sensor.pixel_variance_e2)
-        for _ in range(500):
-            drawn = scene.render(ATTITUDE, rng).data[window] * sensor.gain_e_per_count
-            error.append(np.sum(weight * slope * (drawn - expected)) / np.sum(weight * slope**2))
-    # 2000 fits determine the standard deviation to 1.6 %; the bound is that of the position given
-    # the flux as well.
-    assert np.std(error) == pytest.approx(wanted, rel=0.06)
-    assert np.std(error) != pytest.approx(1.2 * wanted, rel=0.06)
-
-
 def test_the_default_star_of_magnitude_six_is_located_to_a_twentieth_of_a_pixel() -> None:
     snr, sigma_px = Sensor().star_accuracy(6.0)
     assert sigma_px == pytest.approx(0.05, rel=0.02)
@@ -381,19 +346,6 @@ def test_a_psf_radius_becomes_a_sigma() -> None:
     assert half.exposure_s == 0.2
     with pytest.raises(SensorError, match="fraction between 0 and 1"):
         Sensor.from_psf_radius(2.0, fraction=1.0)
-
-
-def test_a_sensor_goes_through_its_file(tmp_path: Path) -> None:
-    sensor = Sensor(psf_sigma_px=0.1 + 0.2 + 0.7, bits=14, psf="sampled")
-    sensor.save(tmp_path / "sensor.toml")
-    assert Sensor.load(tmp_path / "sensor.toml") == sensor
-    assert (
-        Sensor.from_dict({})
-        == Sensor()
-        == Sensor(bits=np.int64(12), exposure_s=np.float32(0.5)).replace(exposure_s=0.1)
-    )
-    with pytest.raises(RunFolderError, match="--force"):
-        sensor.save(tmp_path / "sensor.toml")
 
 
 @pytest.mark.parametrize(

@@ -230,12 +230,6 @@ def test_a_doctored_noise_is_found_below_the_limit() -> None:
 # --- the file
 
 
-def test_the_aperture_goes_through_the_file(tmp_path: Path) -> None:
-    WORN.save(tmp_path / "sensor.toml")
-    assert Sensor.load(tmp_path / "sensor.toml") == WORN
-    assert WORN.replace(aperture_mm=40.0).zero_point_e_s == pytest.approx(4 * WORN.zero_point_e_s)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 
-import erfa
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -131,47 +130,6 @@ def test_apparent_directions_against_astropy(site):
     # The control: without refraction, seconds of arc are left.
     control = aberrate(directions, earth_velocity_km_s(time))
     assert np.linalg.norm(rotated_onto(control, astropy) - astropy, axis=1).max() * ARCSEC > 20.0
-
-
-def test_refraction_is_the_formula_and_erfas():
-    zenith = np.array([0.0, 0.0, 1.0])
-    z_seen = np.radians(np.array([0.0, 10.0, 45.0, 60.0, 75.0, 80.0]))
-    # The conditions of the table in the documentation of erfa's refco: 58.18 arcsec at 45 degrees.
-    site = Site(
-        50.0,
-        0.0,
-        pressure_hpa=1005.0,
-        temperature_c=7.0,
-        relative_humidity=0.8,
-        wavelength_um=0.574,
-    )
-    a, b = refraction_constants(site)
-    expected = a * np.tan(z_seen) + b * np.tan(z_seen) ** 3
-    z_vacuum = z_seen + expected
-    directions = np.column_stack([np.sin(z_vacuum), np.zeros(6), np.cos(z_vacuum)])
-    seen = refract(directions, zenith, (a, b))
-    assert np.arctan2(seen[:, 0], seen[:, 2]) == pytest.approx(z_seen, abs=1e-12)
-    assert expected[2] * ARCSEC == pytest.approx(58.18, abs=0.01)
-    # All over the sky, below the horizon too, lengths stay one.
-    sky = np.random.default_rng(2).normal(size=(1000, 3))
-    sky /= np.linalg.norm(sky, axis=1, keepdims=True)
-    assert np.linalg.norm(refract(sky, zenith, (a, b)), axis=1) == pytest.approx(1.0, abs=1e-14)
-    assert np.isfinite(refract(np.array([zenith, -zenith]), zenith, (a, b))).all()
-    # erfa's whole chain, which takes one step of Newton's method where this takes four.
-    astrom = erfa.apio(0.0, 0.0, 0.0, np.radians(50.0), 0.0, 0.0, 0.0, a, b)
-    _, zenith_distance, *_ = erfa.atioq(*_cirs(directions[1:5], np.radians(50.0)), astrom)
-    assert zenith_distance == pytest.approx(z_seen[1:5], abs=0.01 / ARCSEC)
-
-
-def _cirs(up: np.ndarray, latitude: float) -> tuple[np.ndarray, np.ndarray]:
-    """Right ascension and declination, at hour angle zero of Greenwich, of directions given by x
-    south, z up.
-    """
-    south, z = up[:, 0], up[:, 2]
-    x = np.cos(latitude) * z + np.sin(latitude) * south
-    y = up[:, 1]
-    w = np.sin(latitude) * z - np.cos(latitude) * south
-    return np.arctan2(y, x), np.arctan2(w, np.hypot(x, y))
 
 
 @pytest.mark.parametrize("altitude", [90.0, 60.0, 45.0, 25.0])

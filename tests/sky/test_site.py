@@ -342,26 +342,6 @@ def test_times_as_tables_hold_them(text, expected):
     assert utc_text(text) == expected
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "2019-07-29",
-        "2019-02-30",
-        "noon",
-        "",
-        "2019-07-29T25:00",
-        "1858-11-17T00:00:00",
-        "2019-07-29T20:47:61",
-    ],
-)
-def test_other_times_are_refused_in_one_sentence(text):
-    with pytest.raises(
-        sc.errors.CatalogueError, match=f"^The time '{text}' is .*; write it as"
-    ) as caught:
-        utc_text(text)
-    assert "number 1" not in str(caught.value)
-
-
 def test_a_missing_image_is_left_out_once(stars, tmp_path):
     """With the centroids, not as a frame without them; the control is an image without stars."""
     dark = sc.images.Image(np.random.default_rng(0).normal(100.0, 3.0, (768, 1024)), "dark")
