@@ -21,7 +21,7 @@ def test_the_template_states_nothing_and_lists_everything(tmp_path: Path) -> Non
     text = path.read_text(encoding="utf-8")
     assert all(f'# name = "{entry.name}"' in text for entry in FROM_FILE)
     assert max(len(line) for line in text.splitlines()) <= 120
-    with pytest.raises(RunFolderError, match="exists already"):
+    with pytest.raises(RunFolderError):
         write_budget_template(path)
     write_budget_template(path, force=True)
 

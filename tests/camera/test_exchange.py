@@ -263,7 +263,7 @@ def test_a_format_without_fisheye_refuses_a_field_that_no_pinhole_has(to, tmp_pa
 def test_no_camera_is_lost_or_made_up(tmp_path):
     camera = CAMERAS["brown"]
     path = export_camera(camera, "ros", tmp_path / "c.yaml").path
-    with pytest.raises(RunFolderError, match="exists"):
+    with pytest.raises(RunFolderError):
         export_camera(camera, "ros", path)
     with pytest.raises(CameraError, match="no format for a camera"):
         export_camera(camera, "word", path, force=True)

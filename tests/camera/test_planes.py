@@ -91,7 +91,7 @@ def test_all_derivatives_are_smooth_at_the_axis():
 
 
 def test_what_a_model_does_not_reach_is_refused():
-    with pytest.raises(DistortionError, match="folds over"):
+    with pytest.raises(DistortionError):
         projection.project(
             WIDE.replace(distortion="equidistant", coefficients=(-0.3 / F**2, 0.0)), [[1.0, 0, 0]]
         )

@@ -455,7 +455,7 @@ def test_what_cannot_be_compared_is_refused() -> None:
         compare(a, result(truth, status=Status.MAX_ITERATIONS), labels=("cold", "warm"))
     with pytest.raises(ComparisonError, match="level 2 is not a probability"):
         compare(a, a, level=2.0)
-    with pytest.raises(DistortionError, match="folds over"):
+    with pytest.raises(DistortionError):
         compare(a, result(truth * np.array([1, 1, 1, -1e4, 1])))
     pitch = compare(
         a, result(truth, camera=camera("brown", pixel_um=10.0), provenance=other()), **SMALL

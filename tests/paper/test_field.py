@@ -163,7 +163,7 @@ def test_refuses_what_makes_no_sense(tmp_path, wrong, words) -> None:
 
 def test_refuses_a_used_folder(tmp_path) -> None:
     (tmp_path / "mine.txt").write_text("x")
-    with pytest.raises(RunFolderError, match="not empty"):
+    with pytest.raises(RunFolderError):
         field_experiment(tmp_path)
 
 

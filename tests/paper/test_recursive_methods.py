@@ -173,11 +173,11 @@ def test_a_stream_calibration_saves_itself(tmp_path):
 def test_a_mirror_is_seen(method):
     obs = observations(n_frames=30)
     mirrored = dataclasses.replace(obs, y_px=1023.0 - obs.y_px)
-    with pytest.raises(CalibrationError, match="the image is mirrored") as caught:
+    with pytest.raises(CalibrationError) as caught:
         run(mirrored, sc.paper.paper_start(), method)
     assert caught.value.status is Status.INCONSISTENT
     # Of a list of frames the first ones are looked at.
-    with pytest.raises(CalibrationError, match="the image is mirrored"):
+    with pytest.raises(CalibrationError):
         run(one_by_one(mirrored), sc.paper.paper_start(), method)
     assert (
         run(one_by_one(mirrored), sc.paper.paper_start(), method, throw=False).status

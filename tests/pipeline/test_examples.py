@@ -36,7 +36,7 @@ def test_it_is_saved_as_it_is_shipped(tmp_path: Path) -> None:
     ]
     again = sc.load_observations(tmp_path / "new" / "stars.ecsv")
     assert np.array_equal(again.x_px, esa.observations.x_px)
-    with pytest.raises(RunFolderError, match="exists already"):
+    with pytest.raises(RunFolderError):
         esa.save(tmp_path / "new")
     esa.save(tmp_path / "new", force=True)
 

@@ -117,22 +117,6 @@ def test_table_points_where_the_frames_are():
     assert len(set(table["candidate"])) == 30
 
 
-def test_files_words_and_figure(tmp_path):
-    import pandas as pd
-
-    found = chosen()
-    found.to_dataframe().to_csv(tmp_path / "frames.csv", index=False)
-    assert pd.read_csv(tmp_path / "frames.csv")["qx"].to_numpy() == pytest.approx(
-        found.quaternions[:, 0], abs=1e-15
-    )
-    assert found.text.startswith("30 frames of")
-    assert "parameters as a whole" in chosen(criterion="D").text
-    assert list(found.worth()["quantity"]) == list(found.names)
-    assert found._repr_html_().startswith("<p><b>Frames to take</b>")
-    for choice in (found, chosen(criterion="D"), chosen(n_frames=1)):
-        choice.plot.choice()
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -248,7 +248,7 @@ def test_a_random_sky_is_uniform_on_the_sphere_and_off_folded_places() -> None:
     within = random_sky(wide, like, 100, seed=1)  # type: ignore[arg-type]
     assert 250.0 < np.sqrt(np.max(np.sum((within.xy - 511.5) ** 2, axis=1))) < 267.0
     wide.draws[7, 3] = np.nan
-    with pytest.raises(DistortionError, match="folds over everywhere"):
+    with pytest.raises(DistortionError):
         random_sky(wide, like, 100, seed=1)  # type: ignore[arg-type]
 
 

