@@ -82,6 +82,7 @@ from starcal_uq.presentation.figures.studies import (
 )
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.pages.budgeting import section_html
+from starcal_uq.presentation.pages.explorer import framed
 from starcal_uq.presentation.pages.gallery import frames_html
 from starcal_uq.presentation.report.results import Results
 from starcal_uq.presentation.report.words import run_html
@@ -114,17 +115,18 @@ def _view(
     text: str | Callable[[Any], str],
     table: Callable[[Any], TextTable | Sequence[TextTable | None] | None],
     notes: Callable[[Any], Iterable[str]] = lambda result: (),
+    frame: Callable[[Any], str] = lambda result: "",
     **figures: Callable[..., Any],
 ) -> View:
     """A result with its sentences (the name of a text, or what makes them), its table, what is worth
-    noting, and its figures.
+    noting, its interactive figure, and its figures.
     """
     said = partial(told, text) if isinstance(text, str) else text
 
     def html(result: Any) -> str:
         found = table(result)
         tables = filter(None, [found] if isinstance(found, TextTable | None) else found)
-        return card(title, said(result), *tables) + listed(notes(result))
+        return card(title, said(result), *tables) + listed(notes(result)) + frame(result)
 
     return View(said, html, figures)
 
@@ -238,6 +240,7 @@ VIEWS: Mapping[type, View] = {
         "Coupling",
         "coupling",
         propagation.coupling_table,
+        frame=framed,
         correlation=plot_correlation,
         correlations=plot_correlations,
         couplings=plot_couplings,
@@ -275,6 +278,7 @@ VIEWS: Mapping[type, View] = {
         studies.study_text,
         studies.study_tables,
         studies.study_notes,
+        framed,
         correlation=plot_study_correlation,
         map=plot_study_map,
         maps=plot_study_maps,

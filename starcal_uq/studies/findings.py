@@ -258,8 +258,10 @@ class Sweep:
         }
         return xr.Dataset(found, attrs={"held": held})
 
-    def held(self, along: str, by: str | None = None, at: AnyMapping | None = None) -> AnyDict:
-        """Where the other axes are held."""
+    def held(
+        self, along: str | None = None, by: str | None = None, at: AnyMapping | None = None
+    ) -> AnyDict:
+        """Where the axes beside `along` and `by` are held."""
         import xarray as xr
 
         for axis in filter(None, (along, by)):

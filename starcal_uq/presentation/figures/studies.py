@@ -119,7 +119,7 @@ def plot_study_correlation(
         pairs = [pair.names for pair in main[:_MOST_PANELS]]
     panels, posterior = {}, {}
     for first, second in pairs:
-        r = _correlation(study, first, second)
+        r = correlation_of(study, first, second)
         title = f"{symbol(first)} and {symbol(second)}{_sign_words(r[sweep.ok])}"
         panels[title] = np.abs(r)
         if "posterior_correlation" in study.data and second not in AXES:
@@ -133,7 +133,7 @@ def plot_study_correlation(
     return figure
 
 
-def _correlation(study: Study, first: str, second: str) -> FloatArray:
+def correlation_of(study: Study, first: str, second: str) -> FloatArray:
     """Correlation of two parameters, or of a parameter and an axis of the common rotation, of every
     cell.
     """

@@ -15,6 +15,7 @@ from starcal_uq.core.provenance import Provenance
 from starcal_uq.core.types import PathLike
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page
+from starcal_uq.presentation.pages.explorer import explorer
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import studies as words
 from starcal_uq.presentation.words.axes import axis_label, value_words
@@ -66,6 +67,7 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
         cells=cells_table(study, _CELLS_SHOWN),
         provenance=_provenance(study),
         images=images,
+        explorer=explorer(study),
     )
 
 

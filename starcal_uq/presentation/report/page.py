@@ -13,6 +13,7 @@ from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.presentation.html import page
+from starcal_uq.presentation.pages.explorer import explorer
 from starcal_uq.presentation.report import summary, tables, words
 from starcal_uq.presentation.report.results import Results
 from starcal_uq.presentation.words import budgeting, diagnostics, effects, propagation
@@ -63,7 +64,7 @@ def context(results: Results) -> AnyDict:
 _KNOWN: AnyDict = {
     one.__name__.rpartition(".")[2]: one
     for one in (
-        *(Code, Level, Question, Remedy, worst, limits, p_words),
+        *(Code, Level, Question, Remedy, explorer, worst, limits, p_words),
         *(diagnostics, effects, propagation, summary, tables, words),
     )
 } | {"RUN": RUN, "MISFIT_P": MISFIT_P}
