@@ -359,7 +359,7 @@ def _missing(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
             some = (
                 ""
                 if len(absent) == len(axes)
-                else f" (about {join_words([AXIS_LABELS[axis] for axis in absent])})"
+                else f" (in {join_words([AXIS_LABELS[axis] for axis in absent])})"
             )
             names.append(name + some)
     return tuple(names)

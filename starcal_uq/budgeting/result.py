@@ -33,11 +33,13 @@ from starcal_uq.core.types import AnyDict, AnyMapping, FloatArray, PathLike
 if TYPE_CHECKING:
     import pandas as pd
 
-# All that people may call an axis: its name, its letter, its label in the tables.
+# All that people may call an axis: its name, its letter, its label in the tables of any version.
 _AXIS_NAMES = {
     **{name: name for name in AXIS_LABELS},
-    **{label.lower(): name for name, label in AXIS_LABELS.items()},
+    **{label: name for name, label in AXIS_LABELS.items()},
     **dict(zip("xyz", AXES, strict=True)),
+    **{f"{letter} ({name})": name for letter, name in zip("xyz", AXES, strict=True)},
+    "x and y together": CROSS_BORESIGHT,
 }
 
 
@@ -226,8 +228,8 @@ class Budget(Shown):
         Parameters
         ----------
         axis : str
-            ``pitch``, ``yaw``, ``roll``, ``cross-boresight``, or as tables show it: ``X``, ``X
-            (pitch)``, ``X and Y together``.
+            ``pitch``, ``yaw``, ``roll``, ``cross-boresight``, ``across the boresight``, ``X``,
+            ``Y`` or ``Z``.
         scope : str
             ``before alignment`` or ``after alignment``.
         interpretation : str
@@ -247,7 +249,7 @@ class Budget(Shown):
                 return found
         raise ValueError(
             f"this budget has no total for {axis!r}, {scope!r}, {interpretation!r}, {index!r}; "
-            f"the axis is one of X, Y, Z (pitch, yaw, roll) or {CROSS_BORESIGHT}, the scope "
+            f"the axis is one of pitch, yaw, roll (or X, Y, Z) or {CROSS_BORESIGHT}, the scope "
             f"{' or '.join(SCOPES)}, the interpretation mixed, ensemble or temporal, the index "
             f"one of {', '.join(self.indices)}"
         )

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import ClassVar
 
-from starcal_uq.core.constants import CROSS_BORESIGHT, INTERACTION
+from starcal_uq.core.constants import AXES, CROSS_BORESIGHT, INTERACTION
 from starcal_uq.maths.intervals import HALF_WIDTH_997
 
 AXIS_LABELS = {
-    "pitch": "X (pitch)",
-    "yaw": "Y (yaw)",
-    "roll": "Z (roll)",
-    CROSS_BORESIGHT: "X and Y together",
+    **{name: name for name in AXES},
+    CROSS_BORESIGHT: "across the boresight",
 }
 
 DISTRIBUTIONS = ("gaussian", "uniform", "arcsine", "rayleigh", "constant")

@@ -31,7 +31,7 @@ _HEADER = f"""\
 # absorbed_by_alignment too. On an axis that it leaves out it is not assessed, unless applies = false is stated there.
 #
 # Keys of a contributor (values that are left out are those shown here for it):
-#   axis                   X (pitch), Y (yaw), Z (roll, about the boresight), cross-boresight (X and Y, each), all
+#   axis                   X (pitch), Y (yaw), Z (roll), cross-boresight (pitch and yaw, each), all
 #   sigma_arcsec           standard deviation; or half_width_arcsec for uniform (half its width) and arcsine (amplitude)
 #   mean_arcsec            known mean, with its sign; 0 if left out
 #   distribution           {", ".join(DISTRIBUTIONS)}

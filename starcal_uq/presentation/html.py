@@ -24,14 +24,18 @@ if TYPE_CHECKING:
 WIDTH = 80
 
 
-def wrapped(text: str, indent: str = "") -> str:
-    """Text in lines of at most 80 columns, which begin with an indent; the others with more."""
+def wrapped(text: str, indent: str = "", lines: int | None = None) -> str:
+    """Text in lines of at most 80 columns, which begin with an indent, the others with more; an
+    ellipsis stands for what is beyond so many lines.
+    """
     return textwrap.fill(
         re.sub("[ \n]+", " ", text),
         WIDTH,
         initial_indent=indent,
         subsequent_indent=f"{indent}  ",
         break_on_hyphens=False,
+        max_lines=lines,
+        placeholder=" …",
     )
 
 

@@ -183,7 +183,7 @@ def test_rows_of_the_file_replace_what_is_not_assessed(stated: Path) -> None:
         1.5 / math.sqrt(2.0)
     )
     assert not rows["thermo-elastic distortion", "roll"].assessed
-    assert "thermo-elastic distortion (about Z (roll))" in found.notes[-1]
+    assert "thermo-elastic distortion (in roll)" in found.notes[-1]
     assert "measurement date error" not in found.not_assessed
     assert rows["=my own", "pitch"].ecss_class == "other" and not rows["=my own", "yaw"].assessed
 
@@ -277,7 +277,7 @@ def test_reasons_that_differ_in_numbers_alone_are_told_once() -> None:
         *(one.sentence for one in found[3:]),
     ]
     assert told[0].startswith(
-        "X (pitch), before alignment; Y (yaw), before alignment; Z (roll), before alignment: "
+        "pitch, before alignment; yaw, before alignment; roll, before alignment: "
     )
 
 
@@ -861,8 +861,8 @@ def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.Monke
         "Attitude error budget",
     )
     partly = {
-        FROM_FILE[1].name: " (about Y (yaw) and Z (roll))",
-        FROM_FILE[3].name: " (about Z (roll))",
+        FROM_FILE[1].name: " (in yaw and roll)",
+        FROM_FILE[3].name: " (in roll)",
     }
     missing = [entry.name + partly.get(entry.name, "") for entry in (UNTESTED, *FROM_FILE[1:])]
     assert found.notes == (
@@ -1011,7 +1011,7 @@ def test_names_of_axes_and_limits_of_this_confidence(tmp_path: Path) -> None:
             == found.totals[4 * 3]
             == found.total(axis, "after alignment", "mixed")
         )
-    with pytest.raises(ValueError, match=r"one of X, Y, Z .*cross-boresight"):
+    with pytest.raises(ValueError, match=r"one of pitch, yaw, roll .*cross-boresight"):
         found.total("W")
     assert found.total("X and Y together") is found.total("cross-boresight")
     assert found.total("Z", "before alignment", "temporal") is found.totals[3 * 2 + 2]

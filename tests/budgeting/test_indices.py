@@ -114,7 +114,7 @@ def test_what_is_taken_at_most_leaves_a_requirement_open(tmp_path: Path) -> None
     )
     (outcome,) = made(written(tmp_path, stated, asked("limit_arcsec = 2.0"))).outcomes
     assert outcome.verdict == "violated"
-    assert "RKE 9 s, X (pitch)" in outcome.text
+    assert "RKE 9 s, pitch" in outcome.text
 
 
 def test_a_rate_moves_spatial_rows_between_classes(tmp_path: Path) -> None:

@@ -455,18 +455,15 @@ def test_limits_name_the_largest_term_and_the_coupling(run):
     nothing = np.full((5, 4), np.nan)
     error = AttitudeError(*sizes, nothing, nothing, *sizes, n_draws=300, n_frames=100)
     sentences = limits(run.obs, run.cal, sc.coupling(run.post), error)
-    assert (
-        "common rotation, one constant, exceeds centroid noise: 5.5 arcsec if the model holds"
-        in sentences[0]
-    )
-    assert (
-        "what remains is 0.020 arcsec if the model holds (with the misfit found: not assessed)"
-        in sentences[0]
-    )
+    assert "common rotation, one constant, exceeds centroid noise. Alignment" in sentences[0]
+    line = told("attitude_line", error)
+    assert line.startswith("0.020 arcsec per axis across the boresight and 0.20 in roll after")
+    assert "a common rotation of 5.5 and 0.10 (1 sigma, if the model holds; with the" in line
     parts = error.common_arcsec, np.array([0.5, 0.5, 7.0]), np.array([5.5, 5.5, 7.0])
     found = OnboardError("model", *parts, ())
-    tested = limits(run.obs, run.cal, attitude=dataclasses.replace(error, misfit=found))[0]
-    assert "what remains is 0.50 arcsec with the misfit found (0.020 if the model holds)" in tested
+    tested = told("attitude_line", dataclasses.replace(error, misfit=found))
+    assert tested.startswith("0.50 (0.020) arcsec per axis across the boresight and 7.0 (0.20) in")
+    assert "(1 sigma, with the misfit found; in brackets if the model holds)" in tested
     assert "k1 trades against k2" in sentences[1] or "f trades against" in sentences[1]
     small = dataclasses.replace(error, common_arcsec=np.full(3, 0.1))
     assert (

@@ -23,7 +23,12 @@ def _empty(_canvas: FigureCanvasSVG, file: IO[str], **_options: object) -> None:
 
 # Whose absence leaves out a figure of the report; the others need the calibration alone.
 NEEDED = {"misfit": "diagnosis", "corner": "posterior", "prior_posterior": "posterior"}
-NEEDED |= {"correlation": "coupling", "price_of_coupling": "coupling", "glance": "attitude"}
+NEEDED |= {
+    "correlation": "coupling",
+    "price_of_coupling": "coupling",
+    "glance_attitude": "attitude",
+    "glance_field": "field_map",
+}
 NEEDED |= {name: name for name in ("attitude", "field_map", "distortion_curve", "budget")}
 
 

@@ -202,8 +202,13 @@ def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
         # tell.
         assert bool(said) == (bool(doubts[0]) and not commands), (options, out[-1500:])
         assert not said or all(
-            words in said for words in ("usable: ", "not: ", "Not usable, because ", "would tell: ")
+            words in said for words in ("Not usable, because ", "would tell: ")
         ), said
+        summary = out.splitlines()
+        begin = next(
+            i for i, line in enumerate(summary) if re.match(r"\S+: [\d\W]+ stars? in", line)
+        )
+        assert len(summary[begin:]) <= 24, out[-2500:]
         steps.append(Step(options, status, doubts, commands, said))
         for command in set(commands) - set(runs):
             status, _, err = call(shlex.split(command)[1:])

@@ -76,14 +76,8 @@ def _attitude(error: AttitudeError) -> Finding:
     """Compare the terms across the boresight, where missions state their requirement."""
     names = ("noise", "common", "rest")
     values = error.headline_arcsec[:3, 3]
-    pairs = zip(
-        error.with_misfit_found_arcsec[:3, 3].tolist(),
-        error.if_model_holds_arcsec[:3, 3].tolist(),
-        strict=True,
-    )
     largest = "common" if values[1] == max(values) else names[int(np.argmax(values))]
-    sizes = {f"{name}_arcsec": pair for name, pair in zip(names, pairs, strict=True)}
-    return Finding(Limit.ATTITUDE, {"largest": largest, "alignment": error.alignment, **sizes})
+    return Finding(Limit.ATTITUDE, {"largest": largest, "alignment": error.alignment})
 
 
 def _coupled(coupling: Coupling) -> Finding:

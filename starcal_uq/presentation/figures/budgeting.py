@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
 
 _PANELS = (
-    (CROSS_BORESIGHT, "Across the boresight, X and Y together"),
-    ("roll", "About the boresight, Z"),
+    (CROSS_BORESIGHT, "Across the boresight, two axes together"),
+    ("roll", "Roll"),
 )
 _COLOURS = {"posterior": style.SKY, "file": style.ORANGE}
 _TALL = 0.31

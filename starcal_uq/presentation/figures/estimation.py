@@ -176,12 +176,12 @@ def plot_residual_map(cal: Calibration, obs: Observations, ax: Axes | None = Non
             )
     ax.quiverkey(
         arrows,
-        0.66,
+        0.93,
         1.045,
         key,
         f"{significant(key)} px (noise)",
         coordinates="axes",
-        labelpos="E",
+        labelpos="W",
         labelcolor=style.INK,
         fontproperties={"size": style.TICK_SIZE},
     )

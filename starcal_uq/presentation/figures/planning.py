@@ -58,7 +58,7 @@ _CHECKED = {
 
 
 def plot_forecast(plan: Plan) -> Figure:
-    """Attitude errors across and about the boresight, the two-axis error with the target, and the
+    """Attitude errors across the boresight and in roll, the two-axis error with the target, and the
     parameters.
 
     All against number of frames, on logarithmic axes. The band of the two-axis error holds 90 % of
@@ -76,7 +76,7 @@ def plot_forecast(plan: Plan) -> Figure:
     }
     for ax, axes, title in (
         (panels[0, 0], AXES[:2], "Across the boresight, per axis"),
-        (panels[0, 1], AXES[2:], "About the boresight"),
+        (panels[0, 1], AXES[2:], "Roll"),
     ):
         squares = {
             words: table[[f"{part}_{axis}_arcsec" for axis in axes]] ** 2

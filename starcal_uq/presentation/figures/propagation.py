@@ -108,25 +108,29 @@ def plot_field_map(field: FieldMap) -> Figure:
     return figure
 
 
-def plot_glance(
-    error: AttitudeError, cal: Calibration, obs: Observations, field: FieldMap
-) -> Figure:
-    """A run at a glance: attitude error, mean residuals, and what of a direction no rotation takes
-    away.
-    """
-    figure = style.new_figure(11.0, 3.3)
-    grid = style.panels(
-        figure, 1, 3, (0.66, 0.55, 0.75, 0.4), (0.75, 0.0), width_ratios=(4.0, 2.15, 2.33)
-    )
-    bars, stars, rest = (figure.add_subplot(grid[i]) for i in range(3))
-    plot_attitude(error, bars)
-    style.legend_on_top(bars, columnspacing=0.8, handlelength=1.2)
-    plot_residual_map(cal, obs, stars)
-    _panel(rest, field, field.sigma_compensated_arcsec, None, "Rest of directions [arcsec]", "")
-    # The page says what else there is to say.
-    bars.set_xlabel(bars.get_xlabel().partition("\n")[0])
-    style.label(stars, "Residuals", "x [px]")
-    return figure
+def glance_attitude(error: AttitudeError) -> Axes:
+    """The bars of `plot_attitude` for a first page, which says what else there is to say."""
+    ax = plot_attitude(error, style.new_axes(4.9, 3.1))
+    style.legend_on_top(ax, columnspacing=0.8, handlelength=1.2)
+    ax.set_xlabel("")
+    return ax
+
+
+def glance_residuals(cal: Calibration, obs: Observations) -> Axes | None:
+    """Mean residuals over the detector for a first page; None of residuals that are summed."""
+    if not len(cal.residuals_px):
+        return None
+    ax = plot_residual_map(cal, obs, style.new_axes(3.1, 3.1))
+    style.label(ax, "", "x [px]")
+    ax.set_title("", loc="left")
+    return ax
+
+
+def glance_field(field: FieldMap) -> Axes:
+    """What of a direction no rotation takes away, for a first page."""
+    ax = style.new_axes(3.5, 3.1)
+    _panel(ax, field, field.sigma_compensated_arcsec, None, "", "")
+    return ax
 
 
 def _panel(
@@ -235,7 +239,7 @@ def plot_spectrum(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
         rest = significant(spectrum.rest_arcsec[i])
         ax.plot(x, y, _DASHES[i], color=_COLOURS[i], lw=1.5, label=f"calibration, {axis}: {rest}″")
         top, bottom = max(top, float(y.max())), min(bottom, y[y > 0.0].min(initial=np.inf))
-    for names, members in (("pitch and yaw", [0, 1]), ("roll", [2])):
+    for names, members in (("across the boresight", [0, 1]), ("roll", [2])):
         level = float(np.mean(spectrum.nea_psd_arcsec2_hz[members]))
         nea = significant(np.sqrt(np.mean(spectrum.nea_arcsec[members] ** 2)))
         ax.plot(f[[0, -1]], [level, level], ":", color=style.INK, lw=1.3)
@@ -253,7 +257,7 @@ def plot_spectrum(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
 
 def plot_thermal(error: ThermalError) -> Figure:
     """Temperature of the optics over time, and the attitude error that it causes: across the
-    boresight and about it, with one camera for all temperatures and with effects aboard.
+    boresight and in roll, with one camera for all temperatures and with effects aboard.
     """
     figure = style.new_figure(7.2, 4.4)
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 2.0))

@@ -20,10 +20,12 @@ from starcal_uq.presentation.figures.effects import plot_effects
 from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
 from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
 from starcal_uq.presentation.figures.propagation import (
+    glance_attitude,
+    glance_field,
+    glance_residuals,
     plot_attitude,
     plot_distortion_curve,
     plot_field_map,
-    plot_glance,
     plot_thermal,
 )
 from starcal_uq.presentation.figures.style import figure_of, label, new_axes, svg_bytes
@@ -32,7 +34,7 @@ from starcal_uq.presentation.report.results import Results
 T = TypeVar("T")
 
 # Figures by the step after which they can be drawn.
-AFTER_CALIBRATION = ("residuals", "residual_profiles", "effects", "convergence")
+AFTER_CALIBRATION = ("glance_residuals", "residuals", "residual_profiles", "effects", "convergence")
 AFTER_SAMPLING = (
     "corner",
     "prior_posterior",
@@ -40,8 +42,8 @@ AFTER_SAMPLING = (
     "price_of_coupling",
     "distortion_curve",
 )
-AFTER_PROPAGATION = ("field_map", "thermal")
-AFTER_DIAGNOSIS = ("glance", "misfit", "attitude")
+AFTER_PROPAGATION = ("glance_field", "field_map", "thermal")
+AFTER_DIAGNOSIS = ("glance_attitude", "misfit", "attitude")
 AFTER_BUDGET = ("budget",)
 # The frames of a run from images stand among the figures by this name: a piece of a page, not a
 # picture.
@@ -82,10 +84,9 @@ def _figure(results: Results, name: str) -> Any:
 
 # What draws each figure, and what of the results it takes; the truth may be missing.
 _PLOTS: dict[str, tuple[Callable[..., Any], str]] = {
-    "glance": (
-        lambda error, cal, *of: plot_glance(error, cal, *of) if len(cal.residuals_px) else None,
-        "attitude calibration observations field_map",
-    ),
+    "glance_attitude": (glance_attitude, "attitude"),
+    "glance_residuals": (glance_residuals, "calibration observations"),
+    "glance_field": (glance_field, "field_map"),
     "residuals": (plot_residuals, "calibration observations"),
     "residual_profiles": (plot_residual_profiles, "calibration observations"),
     "effects": (

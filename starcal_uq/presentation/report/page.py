@@ -8,7 +8,7 @@ from functools import partial
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.formatting import p_words
 from starcal_uq.core.remedy import RUN, Remedy
-from starcal_uq.core.status import Code, Level, Question, worst
+from starcal_uq.core.status import Code, Level, Question
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.limits import limits
@@ -64,7 +64,7 @@ def context(results: Results) -> AnyDict:
 _KNOWN: AnyDict = {
     one.__name__.rpartition(".")[2]: one
     for one in (
-        *(Code, Level, Question, Remedy, explorer, worst, limits, p_words),
+        *(Code, Level, Question, Remedy, explorer, limits, p_words),
         *(diagnostics, effects, propagation, summary, tables, words),
     )
 } | {"RUN": RUN, "MISFIT_P": MISFIT_P}

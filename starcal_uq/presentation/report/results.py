@@ -10,6 +10,7 @@ from starcal_uq.budgeting.result import requirement_checks
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
 from starcal_uq.core.remedy import Remedy
+from starcal_uq.core.status import Note
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.observations.table import Observations
 
@@ -66,6 +67,11 @@ class Results(Shown):
         known = (self.observations, self.calibration, self.posterior, self.truth, self.attitude)
         required = requirement_checks(self.budget)
         return judge(*known, diagnosis=self.diagnosis, place=self.place, requirements=required)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the numbers must not be used, whatever is required of them."""
+        return self.verdict.summary.code is Note.NOT_USABLE
 
     def command(self, remedy: Remedy) -> str:
         """A command with the files of this run in place of its words in capitals."""

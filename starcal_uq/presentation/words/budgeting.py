@@ -290,7 +290,7 @@ def contributors_table(budget: Budget) -> TextTable:
             (row["name"], row["ecss_class"], *shown, row["interpretation"], row["absorbed"])
         )
         rows += [(f"  {name}", "", *values, "", "") for name, values in row["figures"]]
-    heads = ("contributor", "class", "X", "Y", "Z", "random over", "absorbed")
+    heads = ("contributor", "class", *AXES, "random over", "absorbed")
     return TextTable(
         heads, tuple(rows), f"{budget.title}: contributors, 1 sigma, arcsec", "lllllll"
     )

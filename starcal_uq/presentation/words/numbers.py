@@ -24,6 +24,7 @@ from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, 
 if TYPE_CHECKING:
     from starcal_uq.planning.open_distortion import DistortionRange
     from starcal_uq.planning.planned import Need
+    from starcal_uq.propagation.attitude_error import AttitudeError
 
 # A number, or the least and the most of several.
 Number: TypeAlias = float | tuple[float, float]
@@ -41,6 +42,17 @@ def two_figures(pair: Sequence[float]) -> str:
         return f"{held} arcsec {IF_MODEL_HOLDS} ({WITH_MISFIT_FOUND}: {NOT_ASSESSED})"
     more = f" {WITH_MISFIT_FOUND} ({held} {IF_MODEL_HOLDS})" if found != held else ""
     return f"{found} arcsec{more}"
+
+
+def both(error: AttitudeError, part: int, axis: int) -> str:
+    """A term of the attitude error on an axis, arcsec, with the misfit found; in brackets if the
+    model holds, where that prints otherwise.
+    """
+    held = significant(error.if_model_holds_arcsec[part, axis])
+    if error.misfit is None:
+        return held
+    found = significant(error.with_misfit_found_arcsec[part, axis])
+    return held if found == held else f"{found} ({held})"
 
 
 def with_error(value: float, sigma: float) -> str:
@@ -90,7 +102,7 @@ def axis_label(asked: Requirement) -> str:
     """Axis of a requirement, with its index and frame where these are not the usual ones."""
     label = AXIS_LABELS[asked.axis]
     if asked.frame != SENSOR:
-        label = f"{label.split(' (')[0]} of {asked.frame}"
+        label = f"{label} of {asked.frame}"
     return label if asked.index == "AKE" else f"{asked.limited.label}, {label}"
 
 
@@ -142,7 +154,7 @@ def pair(values: Sequence[float], decimals: int) -> str:
     return " ± ".join(fixed(value, decimals) for value in values)
 
 
-def across_and_about(angles: Sequence[float]) -> str:
-    """Angles about the three axes: across the boresight, and about it."""
+def across_and_roll(angles: Sequence[float]) -> str:
+    """Angles about the three axes: across the boresight, and in roll."""
     pitch, yaw, roll = angles
     return f"{significant(np.hypot(pitch, yaw))} / {significant(abs(roll))}"

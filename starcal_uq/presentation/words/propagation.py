@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from starcal_uq.camera.distortion import Parameter, scales_of
-from starcal_uq.core.constants import AXES, TOTAL_AXES
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import (
     fixed,
     significant,
@@ -76,7 +76,7 @@ def attitude_table(error: AttitudeError) -> TextTable:
         once = error.misfit is None or figures[0][1:] == figures[1][1:]
         rows.append((str(contributor), *(figures[1][1:-1] if once else [""] * 5), str(words)))
         rows += [] if once else figures
-    heads = ("contributor", *TOTAL_AXES, "two-axis 95 %", "absorbed by alignment")
+    heads = ("contributor", *AXES, "across", "two-axis 95 %", "absorbed by alignment")
     which = f", {IF_MODEL_HOLDS}" if error.misfit is None else ""
     return TextTable(heads, tuple(rows), f"Attitude error, arcsec, 1 sigma{which}", "lrrrrrl")
 
@@ -92,7 +92,7 @@ def onboard_table(error: AttitudeError) -> TextTable:
         for values in [with_cross(own.parts[part]).tolist()]
     ]
     return TextTable(
-        ("part", "aboard", *TOTAL_AXES),
+        ("part", "aboard", *AXES, "across"),
         tuple(rows),
         f"Calibration's part with effects, arcsec, 1 sigma, {IF_MODEL_HOLDS}",
         "llrrrr",
@@ -111,7 +111,7 @@ def thermal_table(error: ThermalError) -> TextTable:
         for own, values in zip(("model", "effects"), both, strict=True)
     )
     title = f"Temperature of the optics over {error.profile.name}, arcsec, 1 sigma"
-    return TextTable(("part", "aboard", *TOTAL_AXES), rows, title, "llrrrr")
+    return TextTable(("part", "aboard", *AXES, "across"), rows, title, "llrrrr")
 
 
 def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextTable:

@@ -53,7 +53,7 @@ SCOPE_NAMES = {
 _NUMBERS = (
     *("capital", "two_figures", "with_error", "change", "numbers", "digits", "percents", "least"),
     *("bound", "axis_label", "frames", "need_words", "range_words", "corner", "span"),
-    *("across_and_about", "mean_to_mcse", "pair"),
+    *("across_and_roll", "mean_to_mcse", "pair", "both"),
 )
 _FORMATTING = (
     *("count", "fixed", "join_words", "p_words", "percent", "plural", "plus_minus", "significant"),
