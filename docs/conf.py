@@ -129,25 +129,16 @@ def copy_notebooks(_app: object) -> None:
         shutil.copyfile(notebook, HERE / "notebooks" / notebook.name)
 
 
-def command_names() -> list[str]:
-    """The commands of the command line, in the order of its help."""
-    from starcal_uq.cli.commands import app
-
-    return [
-        str(command.name or command.callback.__name__)
-        for command in app.registered_commands
-        if command.callback
-    ]
-
-
 def write_command_help(_app: object) -> None:
     """Write the help texts as the installed command prints them, so that the page cannot go
     stale.
     """
+    from starcal_uq.cli.overview import COMMANDS
+
     command = str(Path(sys.executable).with_name("starcal-uq"))
     environment = {**os.environ, "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     texts = []
-    for name in ("", *command_names()):
+    for name in ("", *COMMANDS):
         arguments = [name, "--help"] if name else ["--help"]
         run = subprocess.run(
             [command, *arguments], env=environment, capture_output=True, text=True, check=True

@@ -8,7 +8,6 @@ import importlib.util
 from pathlib import Path
 
 import pytest
-import typer
 
 from starcal_uq.cli.commands import app
 
@@ -29,7 +28,7 @@ def test_every_command_has_an_example(example):
     ]
     lines = [line for _, lines in found for line in lines]
     named = {line.split()[1] for line in lines if line.startswith("starcal-uq ")}
-    assert named == set(typer.main.get_command(app).commands)
+    assert named == set(app.commands)
     # Recordings are of these lines, fit a page, and none is left over.
     names = {name: lines for name, lines in found if name}
     assert {path.stem for path in example.RECORDED.glob("*")} == set(names)

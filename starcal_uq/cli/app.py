@@ -27,10 +27,16 @@ FAULT = 70
 def program() -> NoReturn:
     """The program: `main`, after which no signal is of interest any more."""
     sys.unraisablehook = _again
-    if sys.argv[1:] == ["--version"]:
-        # Before Typer and the commands, which take ten times as long to load.
+    words = sys.argv[1:]
+    # Typer takes longer to load than these to answer.
+    if words == ["--version"]:
         print(VERSION_LINE)
         sys.exit(0)
+    if words == ["--help"] or not (words or "_STARCAL_UQ_COMPLETE" in os.environ):
+        from starcal_uq.cli.overview import overview
+
+        print(overview())
+        sys.exit(0 if words else 2)
     try:
         main()
     finally:
@@ -69,7 +75,7 @@ def _main() -> None:
     # them every 700 new ones for what could be thrown away takes a twentieth of the time.
     gc.set_threshold(50_000, 20, 50)
     try:
-        sys.argv[1:] = expand(sys.argv[1:], app)
+        sys.argv[1:] = expand(sys.argv[1:], app.commands)
         with spoken(as_given):
             code = app(standalone_mode=False)
         if code == 128 + signal.SIGINT:

@@ -1,46 +1,72 @@
-"""All commands of the command line, and what is said of a wrong call."""
+"""All commands of the command line, each loaded when it is called, and what is said of a wrong
+call.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
 from typing import Annotated, Any, get_args
 
 import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
 from starcal_uq.cli import VERSION_LINE
-from starcal_uq.cli import filter as cli_filter
-from starcal_uq.cli import images as cli_images
-from starcal_uq.cli import mission as cli_mission
-from starcal_uq.cli import paper as cli_paper
-from starcal_uq.cli import run as cli_run
-from starcal_uq.cli import schema as cli_schema
-from starcal_uq.cli import starters as cli_starters
-from starcal_uq.cli import statistics as cli_statistics
-from starcal_uq.cli import steps as cli_steps
-from starcal_uq.cli import study as cli_study
-from starcal_uq.cli.answers import Answer
+from starcal_uq.cli.overview import COMMANDS, overview
 from starcal_uq.cli.runfiles import typed
-from starcal_uq.cli.settings import unfolded
 from starcal_uq.core.conflicts import EARLIER
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import wanted
 from starcal_uq.core.types import AnyDict
 
-app = typer.Typer(
-    name="starcal-uq",
-    help=(
-        "Probabilistic calibration of star sensors: from identified stars to a posterior and its "
-        "attitude error."
-    ),
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-    epilog=(
-        "Start with `starcal-uq demo`: the experiment of Ye & Yang 2017, from a star catalogue "
-        "to a report."
-    ),
-)
+
+class _Command(TyperCommand):
+    """A command whose help lists options under what they are for."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            kind = f"{parameter.param_type_name.capitalize()}s"
+            row = parameter.get_help_record(ctx)
+            if row is not None:
+                sections.setdefault(parameter.rich_help_panel or kind, []).append(row)
+        for section, rows in sections.items():
+            with formatter.section(section):
+                formatter.write_dl(rows)
+
+
+class _Program(TyperGroup):
+    """The program, whose help loads no command."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        formatter.write(overview())
+
+
+class _Commands(Mapping[str, Any]):
+    """The commands by their names."""
+
+    def __getitem__(self, name: str) -> Any:
+        return _command(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+
+@cache
+def _command(name: str) -> Any:
+    from starcal_uq.cli.settings import unfolded
+
+    module = import_module(f"starcal_uq.cli.{COMMANDS[name][0]}")
+    function = getattr(module, f"{name.replace('-', '_')}_command")
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
+    alone.command(name, cls=_Command)(unfolded(name, function))
+    return get_command(alone)
 
 
 def _print_version(wanted: bool) -> None:
@@ -49,8 +75,7 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
-def common(
+def _common(
     version: Annotated[
         bool,
         typer.Option(
@@ -58,45 +83,13 @@ def common(
         ),
     ] = False,
 ) -> None:
-    """Probabilistic calibration of star sensors: from identified stars to a posterior and its
-    attitude error.
-    """
+    """What the program does without a command."""
 
 
-# What one wants -> the commands, in the order of the help.
-GROUPS: Mapping[str, list[Callable[..., Answer]]] = {
-    "All at once": [cli_run.demo, cli_run.run_command],
-    "Before there are data": [
-        cli_starters.new_command,
-        cli_mission.plan_command,
-        cli_steps.simulate_command,
-        cli_study.study_command,
-        cli_statistics.validate_command,
-    ],
-    "From images to stars": [cli_images.centroid_command, cli_images.identify_command],
-    "A run, step by step": [
-        cli_steps.calibrate_command,
-        cli_steps.sample_command,
-        cli_steps.coupling_command,
-        cli_steps.propagate_command,
-        cli_statistics.diagnose_command,
-        cli_mission.budget_command,
-        cli_steps.report_command,
-        cli_images.inspect_command,
-        cli_steps.export_command,
-    ],
-    "Several runs, and streams": [
-        cli_mission.compare_command,
-        cli_statistics.merge_command,
-        cli_filter.filter_command,
-    ],
-    "The paper": [cli_paper.reproduce_command, cli_paper.reproduce_field_command],
-    "For programs": [cli_schema.schema_command],
-}
-for group, commands in GROUPS.items():
-    for command in commands:
-        name = command.__name__.removesuffix("_command").replace("_", "-")
-        app.command(name, rich_help_panel=group)(unfolded(name, command))
+app: Any = get_command(
+    typer.Typer(name="starcal-uq", cls=_Program, callback=_common, rich_markup_mode=None)
+)
+app.commands = _Commands()
 
 
 def usage_sentence(error: Exception) -> str:

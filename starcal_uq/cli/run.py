@@ -13,6 +13,7 @@ import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import (
     note,
+    progress_bar,
     show_calibration,
     show_screening,
     show_summary,
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from starcal_uq.runs.run import Run
 
 
-def demo(
+def demo_command(
     out: Path = Path("starcal-demo"),
     frames: int = 1000,
     seed: int = 2017,
@@ -82,9 +83,11 @@ def run_command(
     """Calibrate, sample, couple, propagate, budget and report: all from stars or images to
     RUN/report.html.
     """
-    from starcal_uq.pipeline.images import are_images
-    from starcal_uq.presentation.report.drawing import Ahead
-    from starcal_uq.runs.whole import calibrate_source, check_files, finish, kind_of
+    # Loading what calibrates takes longer than a user should see nothing.
+    with progress_bar("loading"):
+        from starcal_uq.pipeline.images import are_images
+        from starcal_uq.presentation.report.drawing import Ahead
+        from starcal_uq.runs.whole import calibrate_source, check_files, finish, kind_of
 
     run = sc.Run(out, tell=note)
     typed: AnyDict = {"budget": budget}

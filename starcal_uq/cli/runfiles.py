@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-
-import typer
-
-from starcal_uq.cli.options import PATHS
+from typing import Any
 
 # Parameters that no result depends on.
 _OF_THE_CALL = ("json", "edits", "quiet", "verbose", "help_all")
@@ -21,14 +17,15 @@ def typed() -> Sequence[str]:
     return _typed
 
 
-def expand(words: Sequence[str], app: typer.Typer) -> list[str]:
+def expand(words: Sequence[str], commands: Mapping[str, Any]) -> list[str]:
     """A command line in which a run file is replaced by what it holds."""
     _typed.clear()
     if not _names_a_file(words):
         return list(words)
+    from starcal_uq.cli.options import PATHS
     from starcal_uq.core.runfile import expanded
 
-    keys = run_keys(app)
+    keys = run_keys(commands)
     paths = {key for key, name in keys.items() if name in PATHS}
     found = expanded(Path(words[1]), words[2:], keys, paths)
     _typed[:] = words
@@ -42,14 +39,11 @@ def _names_a_file(words: Sequence[str]) -> bool:
     return path.is_file() and b"[run" in path.read_bytes()
 
 
-def run_keys(app: typer.Typer) -> Mapping[str, str]:
+def run_keys(commands: Mapping[str, Any]) -> Mapping[str, str]:
     """Key of a run file -> parameter of the command `run`."""
-    (command,) = (one for one in app.registered_commands if one.name == "run")
-    keys = {}
-    for parameter in inspect.signature(command.callback or run_keys).parameters.values():
-        (declared,) = parameter.annotation.__metadata__
-        # Typer holds the first name as the default of an annotation.
-        for option in (declared.default, *(declared.param_decls or ())):
-            if str(option).startswith("--") and parameter.name not in _OF_THE_CALL:
-                keys[option[2:].replace("-", "_")] = parameter.name
-    return keys
+    return {
+        option[2:].replace("-", "_"): parameter.name
+        for parameter in commands["run"].params
+        for option in parameter.opts
+        if option.startswith("--") and parameter.name not in _OF_THE_CALL
+    }

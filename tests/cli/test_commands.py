@@ -4,6 +4,7 @@ mistake.
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import subprocess
@@ -12,10 +13,10 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from typer.main import get_command
 
 import starcal_uq as sc
 from starcal_uq.cli.commands import app
+from starcal_uq.cli.overview import COMMANDS, LISTED, overview
 from starcal_uq.cli.schemas import document
 from starcal_uq.core.runfile import expanded
 from starcal_uq.core.settings import Starter
@@ -91,7 +92,13 @@ def test_demo_ends_with_the_table_of_truth_and_the_report(cli, tmp_path):
 
 
 def test_help_teaches(cli):
-    for command in ((), *((name,) for name in get_command(app).commands)):
+    # The help of the program holds the first sentence of each command, which it does not load.
+    for name, (_, words) in COMMANDS.items():
+        said = inspect.unwrap(app.commands[name].callback).__doc__
+        assert " ".join(said.partition("\n\n")[0].split()) == words.strip(), name
+    options = [name for name in LISTED["Options"] if name != "--help"]
+    assert options == [option for one in app.params for option in one.opts]
+    for command in ((), *((name,) for name in app.commands)):
         status, out, _ = cli(*command, "--help")
         assert status == 0 and "Usage" in out and len(out.splitlines()) > 8, command
 
@@ -106,7 +113,7 @@ def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_comm
         "What belongs to images alone",
         "How a posterior is sampled",
     )
-    places = [out.index(f" {words} ") for words in panels]
+    places = [out.index(f"\n{words}:") for words in panels]
     assert (
         places == sorted(places)
         and places[1] < out.index("--effects") < places[2] < out.index("--gain") < places[3]
@@ -348,27 +355,35 @@ def test_python_runs_the_package_and_shells_complete_its_commands():
     command = [sys.executable, "-m", "starcal_uq"]
     told = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
     assert told.stdout.startswith("starcal-uq ")
-    # What the version needs, and nothing else.
-    heavy = ("typer", "rich", "numpy", "importlib.metadata")
+    # What the version and the help need, and nothing else; the help of a command, and completion.
+    heavy, parsing = {"matplotlib", "numpy", "rich", "typer"}, {"rich", "typer"}
     code = (
-        "import sys, starcal_uq.cli.app as app; sys.argv = ['starcal-uq', '--version']\n"
+        "import sys, starcal_uq.cli.app as app; sys.argv[0] = 'starcal-uq'\n"
         "try:\n    app.program()\nfinally:\n"
-        f"    print([name for name in {heavy} if name in sys.modules])"
+        f"    print(*{heavy} & sys.modules.keys(), file=sys.stderr)"
     )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.splitlines()[1] == "[]"
-    words = {
-        "_STARCAL_UQ_COMPLETE": "complete_bash",
-        "COMP_WORDS": "starcal-uq cal",
-        "COMP_CWORD": "1",
-    }
-    code = (
-        "import sys; sys.argv = ['starcal-uq']; from starcal_uq.cli.app import program; program()"
-    )
-    told = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, **words}, capture_output=True, text=True
-    )
-    assert told.stdout.split() == ["calibrate"]
+
+    def run(words, loaded, **environment):
+        told = subprocess.run(
+            [sys.executable, "-c", code, *words],
+            env=os.environ | environment,
+            capture_output=True,
+            text=True,
+        )
+        assert set(told.stderr.split()) <= loaded
+        return told.stdout
+
+    assert run(["--version"], set()) == told.stdout
+    assert run(["--help"], set()) == run([], set()) == overview() + "\n"
+    assert "--effects" in run(["run", "--help"], parsing)
+    for words, found in (
+        ("starcal-uq cal", ["calibrate"]),
+        ("starcal-uq run --eff", ["--effects"]),
+        ("starcal-uq run --model thin", ["thin_prism", "thin_prism+axes"]),
+    ):
+        asked = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
+        told = run([], parsing, _STARCAL_UQ_COMPLETE="complete_bash", **asked)
+        assert told.split() == found, words
 
 
 @pytest.mark.slow

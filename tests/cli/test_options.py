@@ -61,7 +61,7 @@ class BeginsError(BaseException):
 
 @pytest.fixture(scope="module")
 def commands():
-    return typer.main.get_command(declared.app).commands
+    return declared.app.commands
 
 
 @pytest.fixture
@@ -70,7 +70,6 @@ def parse(commands, monkeypatch, capsys, tmp_path):
     otherwise.
     """
     monkeypatch.chdir(tmp_path)
-    group = typer.main.get_command(declared.app)
     for folder in ("folder", "RUN", "IMAGES"):
         Path(folder).mkdir()
     for file in ("OBS", "CAMERA"):
@@ -79,9 +78,8 @@ def parse(commands, monkeypatch, capsys, tmp_path):
     def begin(**_):
         raise BeginsError
 
-    for command in group.commands.values():
+    for command in commands.values():
         monkeypatch.setattr(command, "callback", begin)
-    monkeypatch.setattr(declared, "app", group)
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["starcal-uq", *arguments])
@@ -180,11 +178,11 @@ def test_every_option_refuses_odd_values_in_one_sentence(commands, parse):
     assert refused > 1000 and accepted < 0.2 * refused
 
 
-def test_memory_that_is_not_there_is_a_sentence(parse, monkeypatch):
+def test_memory_that_is_not_there_is_a_sentence(parse, commands, monkeypatch):
     def begin(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr(declared, "app", begin)
+    monkeypatch.setattr(commands["demo"], "callback", begin)
     assert (
         parse("demo")
         == "error: there is not enough memory for this: ask for fewer draws, frames or samples.\n"
@@ -294,8 +292,8 @@ def test_a_remedy_of_a_run_file_repeats_nothing_that_was_given(monkeypatch, tmp_
     file = tmp_path / "run.toml"
     file.write_text('[run]\ninputs = "a.csv"\nout = "r"\n', encoding="utf-8")
     words = ["run", str(file), "--force", "--set", "effects=field", "--set", "seed=3"]
-    monkeypatch.setattr("sys.argv", ["starcal-uq", *expand(words, declared.app)])
+    monkeypatch.setattr("sys.argv", ["starcal-uq", *expand(words, declared.app.commands)])
     (remedy,) = calibrated(effects="tails")
     wanted = f"starcal-uq run {file} --set seed=3 --set effects=field,tails --force"
     assert as_given(remedy) == wanted
-    expand([], declared.app)
+    expand([], declared.app.commands)

@@ -9,7 +9,6 @@ import re
 
 import numpy as np
 import pytest
-import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.app import FAULT
@@ -148,7 +147,7 @@ def check_ending(words, status, err):
 def test_every_option_has_values():
     options = {
         max(parameter.opts, key=len)
-        for parameter in typer.main.get_command(app).commands["run"].params
+        for parameter in app.commands["run"].params
         if parameter.opts[0].startswith("-")
     }
     of_the_call = {"--help", "--help-all", "--set", "--quiet", "--verbose"}

@@ -490,7 +490,7 @@ def execute(small, cli, tmp_path):
             for word in words
         ]
         if parse:
-            typer.main.get_command(app).commands[words[0]].make_context(words[0], words[1:])
+            app.commands[words[0]].make_context(words[0], words[1:])
             return
         status, out, err = cli(*words)
         # 1 is the verdict on so short a run; 2 is a command that cannot be.

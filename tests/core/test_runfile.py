@@ -124,4 +124,4 @@ def test_the_starter_has_keys_of_the_command_alone(tmp_path):
         for line in text.splitlines()
     )
     keys = tomllib.loads(whole)["run"].keys()
-    assert len(keys) > 8 and keys - {"inputs", "camera"} <= run_keys(app).keys()
+    assert len(keys) > 8 and keys - {"inputs", "camera"} <= run_keys(app.commands).keys()

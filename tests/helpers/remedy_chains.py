@@ -155,7 +155,7 @@ def printed(out: str) -> tuple[str, ...]:
 
 def options_of(words: Sequence[str]) -> dict[str, tuple[str | None, ...]]:
     """Options of a command line; those of a run file, with its edits, are those that it holds."""
-    options = parsed(expand(words, app))[1]
+    options = parsed(expand(words, app.commands))[1]
     return {name: values for name, values in options.items() if name != "--out"}
 
 
