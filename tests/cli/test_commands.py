@@ -379,7 +379,7 @@ def test_python_runs_the_package_and_shells_complete_its_commands():
     for words, found in (
         ("starcal-uq cal", ["calibrate"]),
         ("starcal-uq run --eff", ["--effects"]),
-        ("starcal-uq run --model thin", ["thin_prism", "thin_prism+axes"]),
+        ("starcal-uq run --solver mi", ["minpack"]),
     ):
         asked = {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)}
         told = run([], parsing, _STARCAL_UQ_COMPLETE="complete_bash", **asked)
