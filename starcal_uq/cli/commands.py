@@ -30,9 +30,10 @@ class _Command(TyperCommand):
         sections: dict[str, list[tuple[str, str]]] = {}
         for parameter in self.get_params(ctx):
             kind = f"{parameter.param_type_name.capitalize()}s"
+            section = getattr(parameter, "rich_help_panel", None) or kind
             row = parameter.get_help_record(ctx)
             if row is not None:
-                sections.setdefault(parameter.rich_help_panel or kind, []).append(row)
+                sections.setdefault(section, []).append(row)
         for section, rows in sections.items():
             with formatter.section(section):
                 formatter.write_dl(rows)
