@@ -103,6 +103,7 @@ class AttitudeProfile(Shown):
         rate: FloatArray = np.degrees(angle) / np.diff(self.time_s)
         return rate
 
+    @bounded
     def at(self, time_s: FloatArray) -> FloatArray:
         """Attitudes (n, 4) at some times (n,), s, on the shortest arc between neighbouring samples
         (slerp).

@@ -37,6 +37,7 @@ from starcal_uq.core.files import reading, shown, split_part
 from starcal_uq.core.settings import KEYS, ModelName
 from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
 from starcal_uq.core.types import AnyDict, AnyMapping, BoolArray, FloatArray, PathLike, floats
+from starcal_uq.core.units import plain
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class Camera(Shown):
         if self.pixel_um is not None:
             lengths.append("pixel_um")
         for key in (*lengths, "x0_px", "y0_px"):
-            self._set(key, _finite(key, getattr(self, key)))
+            self._set(key, _finite(key, plain(key, getattr(self, key))))
         for key in ("width_px", "height_px", *lengths):
             if getattr(self, key) <= 0:
                 raise CameraError(f"camera: {key} is {getattr(self, key)!r}; it must be above 0.")

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeAlias, TypeVar, g
 
 from starcal_uq.core.errors import CalibrationError, SettingError
 from starcal_uq.core.files import shown
+from starcal_uq.core.units import plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -188,7 +189,9 @@ LIMITS, KEYS = _limits("parameters"), _limits("keys")
 
 
 def bounded(function: Callable[P, R]) -> Callable[P, R]:
-    """A function that refuses, with `SettingError`, settings outside the limits of their names."""
+    """A function that refuses, with `SettingError`, settings outside the limits of their names, and
+    takes quantities and times of astropy in place of numbers and text.
+    """
     parameters = inspect.signature(function).parameters
     names = tuple(parameters)
     takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
@@ -196,11 +199,13 @@ def bounded(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-        given: Iterable[tuple[str, Any]] = (*zip(names, args, strict=False), *kwargs.items())
+        placed: Any = [*map(plain, names, args), *args[len(names) :]]
+        others: Any = {name: plain(name, value) for name, value in kwargs.items()}
+        given: Iterable[tuple[str, Any]] = (*zip(names, placed, strict=False), *others.items())
         for name, value in given:
             if name in limits and not limits[name].holds(value):
                 raise SettingError(f"{name} is {shown(value)}: {limits[name].wanted()}.")
-        return function(*args, **kwargs)
+        return function(*placed, **others)
 
     return checked
 

@@ -12,6 +12,7 @@ import numpy as np
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.files import shown
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.units import plain
 
 FIRST_YEAR, LAST_YEAR = 1960, 2100
 _EXAMPLE = "2026-11-21T03:04:05.6"
@@ -44,10 +45,10 @@ def julian_days(
     each time is (n,).
 
     A time is ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as "+02:00"
-    is understood), `datetime.datetime` or `numpy.datetime64`, UTC without an offset. CatalogueError
+    is understood), `datetime.datetime` or `numpy.datetime64`, UTC without an offset, or of astropy. CatalogueError
     quotes one that is not readable, with its place among several, from 1.
     """
-    times = np.atleast_1d(np.asarray(time_utc)).astype(str)
+    times = np.atleast_1d(np.asarray(plain("time_utc", time_utc))).astype(str)
     unique, inverse = np.unique(times, return_inverse=True)
     days = np.array(
         [_days(str(text), times, ut1_minus_utc_s) for text in unique], dtype=np.float64
@@ -67,7 +68,7 @@ def utc_text(time: Any) -> str:
 
     CatalogueError quotes one that is not readable, or a date alone.
     """
-    time = str(time.utc.isot if hasattr(time, "isot") else time)
+    time = str(plain("time", time))
     match = _ISO.fullmatch(time.strip())
     if match is not None and match[4] is None and match[7] is None:
         # Dates that do not exist are named as such.

@@ -18,6 +18,7 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.settings import Limit
 from starcal_uq.core.types import AnyDict, PathLike
+from starcal_uq.core.units import plain
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -204,10 +205,8 @@ class Stated:
     SECTION: ClassVar[Section]
 
     def __post_init__(self) -> None:
-        given = {
-            name: value.item() if hasattr(value, "item") else value
-            for name, value in self.to_dict().items()
-        }
+        given = {name: plain(name, value) for name, value in self.to_dict().items()}
+        given = {n: value.item() if hasattr(value, "item") else value for n, value in given.items()}
         for name, value in self.SECTION.check(given, self.SECTION.name).items():
             object.__setattr__(self, name, value)
 

@@ -22,6 +22,7 @@ from starcal_uq.core.manifest import digest
 from starcal_uq.core.provenance import Provenance, Traced, in_order, provenance
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
 from starcal_uq.core.remedy import Remedy
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.estimation.kept import KeptFrames
@@ -352,6 +353,7 @@ class Calibration(Shown, Traced):
         """
         return "marginal" if self.provenance.tail_weights else self.provenance.likelihood
 
+    @bounded
     def at(
         self,
         *,

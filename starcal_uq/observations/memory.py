@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.tables import RawTable, arrow_columns
+from starcal_uq.core.units import plain
 
 
 def raw_table(table: Any) -> RawTable:
@@ -40,7 +41,7 @@ def _has_unit(column: Any) -> bool:
 def _values(column: Any) -> Any:
     """A column of astropy: an array of numbers without gaps, or texts."""
     if hasattr(column, "isot"):
-        return np.atleast_1d(column.utc.isot).tolist()
+        return np.atleast_1d(plain("time_utc", column)).tolist()
     gaps = np.ma.getmaskarray(getattr(column, "value", column))
     values = np.asarray(np.ma.getdata(getattr(column, "value", column)))
     if values.dtype.kind in "iuf" and not gaps.any():

@@ -23,6 +23,7 @@ from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.settings import Directions
 from starcal_uq.core.times import utc_text
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, PathLike, StrArray
+from starcal_uq.core.units import plain
 from starcal_uq.observations.checks import check_columns, raise_problems
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import checked_table, read_table
@@ -103,7 +104,7 @@ class Observations(FrameRows, Sourced, Shown):
     noise_axes: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        columns = {name: _array(name, values) for name, values in self.columns.items()}
+        columns = {name: _array(name, plain(name, values)) for name, values in self.columns.items()}
         n = len(columns["frame"])
         check_lengths("observations", columns, "frame")
         frame = columns["frame"]

@@ -85,7 +85,7 @@ class PlaceOptions(TypedDict, total=False):
     """What the directions are, and where and when the camera saw them."""
 
     directions: Directions | None
-    site: Site | PathLike | None
+    site: Any
     in_space: bool
     time: Any
 
@@ -176,7 +176,7 @@ def read_stars(
     *,
     frames: Sequence[tuple[int, int]] | None = None,
     time: Any = None,
-    site: Site | PathLike | None = None,
+    site: Any = None,
     **known: Any,
 ) -> Stars:
     """Stars of a table, several, a folder of partitions, or of what is in memory, with directions
@@ -184,17 +184,13 @@ def read_stars(
     """
     from starcal_uq.pipeline.tables import observations_from_table, partitions_from_folder
 
-    known |= {"time_utc": time, "site": _site(site)}
+    known |= {"time_utc": time, "site": Site.of(site)}
     files = files_of(source)
     what = files[0] if len(files) == 1 else files or source
     if isinstance(what, PartitionedObservations) or (isinstance(what, Path) and what.is_dir()):
         return partitions_from_folder(what, camera, **known)
     obs = observations_from_table(what, camera, **known)
     return obs if frames is None else obs.in_ranges(frames)
-
-
-def _site(site: Site | PathLike | None) -> Site | None:
-    return site if site is None or isinstance(site, Site) else Site.load(site)
 
 
 def calibrate_source(
@@ -225,7 +221,7 @@ def calibrate_source(
         if images:
             from starcal_uq.pipeline.images import observations_from_images
 
-            place |= {"time_utc": place.pop("time", None), "site": _site(place.get("site"))}
+            place |= {"time_utc": place.pop("time", None), "site": Site.of(place.get("site"))}
             with watch.bar("images") as progress:
                 obs, centroids, found = observations_from_images(
                     files_of(source),
@@ -390,7 +386,7 @@ def run(
         Of images; see `starcal_uq.pipeline.observations_from_images`.
     directions : {"undeclared", "catalogue", "apparent"}, optional
         What the directions are; by default what the table says.
-    site : Site or path, optional
+    site : Site, path or astropy EarthLocation, optional
         Where on the ground the camera stood.
     in_space : bool
         Whether the camera was above the air.
@@ -411,6 +407,8 @@ def run(
     seed = seed_of(seed)
     from starcal_uq.presentation.report.drawing import Ahead
 
+    if hasattr(settings.get("site"), "geodetic"):
+        settings["site"] = Site.of(settings["site"])
     files = files_of(source)
     images, partitioned = kind_of(source)
     _check(settings, images, camera)

@@ -26,6 +26,7 @@ from starcal_uq.core.constants import ARCSEC, AU_KM, LIGHT_SPEED_KM_S
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.findings import clause
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import AnyDict, FloatArray, floats
 from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
@@ -85,6 +86,7 @@ def earth_velocity_km_s(time_utc: Any) -> FloatArray:
     return velocity[0] if np.ndim(time_utc) == 0 else velocity
 
 
+@bounded
 def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]) -> FloatArray:
     """Apparent directions for a moving observer: special-relativistic aberration.
 
@@ -118,6 +120,7 @@ def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]
     return floats(erfa.ab(directions, velocity, SUN_DISTANCE_AU, inverse_gamma))
 
 
+@bounded
 def apparent_directions(
     directions: FloatArray,
     time_utc: Any,
@@ -152,6 +155,7 @@ def apparent_directions(
     return refract(aberrate(directions, velocity + moving), zenith, refraction_constants(site))
 
 
+@bounded
 def catalogue_directions(
     apparent: FloatArray,
     time_utc: Any,
@@ -183,6 +187,7 @@ def catalogue_directions(
     return directions
 
 
+@bounded
 def make_apparent(
     obs: Observations,
     observer_velocity_km_s: FloatArray | Sequence[float] | None = None,
@@ -272,6 +277,7 @@ def make_apparent(
     return replace(obs, ra_deg=ra, dec_deg=dec).with_origin(**facts)
 
 
+@bounded
 def without_low_stars(
     obs: Observations, site: Site, least_altitude_deg: float = LEAST_ALTITUDE_DEG
 ) -> Observations:

@@ -14,7 +14,7 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.settings import KEYS
+from starcal_uq.core.settings import KEYS, bounded
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.sky.apparent import aberrate, check_velocity
 from starcal_uq.sky.gaia import (
@@ -112,6 +112,7 @@ class StarCatalogue(Shown):
         names = ("ra_deg", "dec_deg", "star_id", "mag")
         return {name: getattr(self, name)[index] for name in names}
 
+    @bounded
     def at_epoch(self, epoch: float) -> StarCatalogue:
         """The same stars, moved by their proper motion to another Julian year.
 
@@ -136,6 +137,7 @@ class StarCatalogue(Shown):
             self, ra_deg=ra, dec_deg=dec, pm_ra_mas_yr=pm_ra, pm_dec_mas_yr=pm_dec, epoch=epoch
         )
 
+    @bounded
     def seen_from(self, observer_velocity_km_s: FloatArray | Sequence[float]) -> StarCatalogue:
         """The same stars with apparent directions for an observer of one barycentric velocity (3,),
         km/s, ICRS axes.
@@ -161,6 +163,7 @@ class StarCatalogue(Shown):
         return pd.DataFrame({name: getattr(self, name) for name in COLUMNS})
 
 
+@bounded
 def load_catalogue(
     max_mag: float = 6.0,
     epoch: float = CATALOGUE_EPOCH,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from starcal_uq.core.errors import SiteError
 from starcal_uq.core.toml import Section, Stated
@@ -37,6 +38,8 @@ class Site(Stated):
     ------
     SiteError
         If a value is no number or out of range.
+    SettingError
+        If a quantity of astropy is of another kind.
     """
 
     SECTION = Section.of_data(__package__, "site", SiteError)
@@ -49,6 +52,15 @@ class Site(Stated):
     relative_humidity: float = 0.5
     wavelength_um: float = 0.6
     name: str = ""
+
+    @classmethod
+    def of(cls, place: Any) -> Site | None:
+        """A site from one, from the path of its file, or from astropy's `EarthLocation`; None for
+        none.
+        """
+        if hasattr(place, "geodetic"):
+            return cls(place.lat, place.lon, place.height)
+        return place if place is None or isinstance(place, Site) else cls.load(place)
 
     @property
     def air_pressure_hpa(self) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import check_fits, listed, read_bytes, reading, unpack
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tables import RawTable, in_unit, read_cells
 from starcal_uq.core.types import BoolArray, FloatArray, StrArray, floats
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
@@ -52,6 +53,7 @@ _NAMES = {name: kind for kind, layout in LAYOUTS.items() for name in layout["fil
 _ENDINGS = {".csv": "csv", ".ecsv": "ecsv", ".fits": "fits", ".fit": "fits"}
 
 
+@bounded
 def read_catalogue(
     path: str | Path,
     columns: Mapping[str, str] | None = None,

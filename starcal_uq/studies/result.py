@@ -19,6 +19,7 @@ from starcal_uq.core.errors import StudyError
 from starcal_uq.core.files import atomic_path, check_hdf5, new_folder, reading, write_netcdf
 from starcal_uq.core.manifest import read_manifest
 from starcal_uq.core.remedy import Remedy
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyMapping, BoolArray, FloatArray, PathLike, floats
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
@@ -146,6 +147,7 @@ class Study(Shown):
             )
         return numbers
 
+    @bounded
     def frames_for(self, target_arcsec: float) -> FloatArray:
         """Frames (C,) that bring the frame-dependent error, 1 sigma per axis across the boresight,
         to a target.
@@ -209,6 +211,7 @@ class Study(Shown):
             raise StudyError(str(error)) from None
         return xr.Dataset(found).to_dataframe().rename_axis("value").reset_index()
 
+    @bounded
     def needed(
         self, along: str, target_arcsec: float | None = None, *, at: AnyMapping | None = None
     ) -> pd.DataFrame:
@@ -228,6 +231,7 @@ class Study(Shown):
             raise StudyError("no target is set: give target_arcsec above zero, here or in [study].")
         return target
 
+    @bounded
     def met(
         self, along: str, target_arcsec: float | None = None, *, at: AnyMapping | None = None
     ) -> list[float]:
