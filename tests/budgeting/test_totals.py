@@ -10,7 +10,7 @@ import pytest
 
 from starcal_uq.budgeting.file import Requirement
 from starcal_uq.budgeting.result import Outcome
-from starcal_uq.budgeting.rows import Contributor
+from starcal_uq.budgeting.rows import GAUSSIAN_997, Contributor
 from starcal_uq.budgeting.sampling import draw
 from starcal_uq.budgeting.shapes import (
     half_width,
@@ -18,6 +18,7 @@ from starcal_uq.budgeting.shapes import (
 )
 from starcal_uq.budgeting.totals import (
     Total,
+    _heaviest,
     total,
     totals,
 )
@@ -240,3 +241,10 @@ def test_sampled_totals_do_not_follow_the_rounding_of_a_correlation(coupled):
         np.testing.assert_allclose(sampled(exact + sign * rounding), reference, rtol=1e-9)
     # Control: what a correlation changes is seen.
     assert np.abs(sampled(exact + 1e11 * rounding) / reference - 1.0).max() > 1e-4
+
+
+def test_the_heaviest_tail_weighs_its_size() -> None:
+    large, long = row("large", 10.0, tail_997=3.2), row("long", 8.0, tail_997=4.5)
+    assert _heaviest([large, long]) is long
+    assert _heaviest([large, row("small", 0.1, tail_997=4.5)]) is large
+    assert _heaviest([row("noise", 10.0, tail_997=GAUSSIAN_997)]) is None

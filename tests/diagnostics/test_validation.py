@@ -211,12 +211,6 @@ def test_noise_understated_by_a_fifth_is_found(stars, same_data):
     assert "too narrow" in found.text
 
 
-def test_few_replicates_are_no_verdict(stars, same_data):
-    found = validate_study(study(), stars, 8, workers=0)
-    assert not found.ok
-    assert "Too few replicates" in found.text
-
-
 def test_failed_replicates_are_counted_and_explained(good):
     reasons = ("the calibration did not end well (SINGULAR): add frames.",) * 2 + (
         "another reason.",
@@ -229,7 +223,7 @@ def test_failed_replicates_are_counted_and_explained(good):
     )
 
 
-def _same(a, b):
+def _same(a, b, n=None):
     for name in (
         "replicate",
         "truth",
@@ -240,25 +234,21 @@ def _same(a, b):
         "nees",
         "compression_error",
     ):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name)[:n])
 
 
-def test_workers_do_not_change_a_bit_and_progress_is_told(stars):
-    settings, calls = study(seed=11), []
-    alone = validate_study(settings, stars, 6, workers=0)
-    both = validate_study(
-        settings, stars, 6, workers=2, progress=lambda done, total: calls.append((done, total))
+def test_workers_do_not_change_a_bit_and_a_few_replicates_are_the_first_of_many(stars, good):
+    calls = []
+    few = validate_study(
+        study(), stars, 6, workers=2, progress=lambda done, total: calls.append((done, total))
     )
-    _same(alone, both)
+    _same(few, good, 6)
     assert calls[-1] == (6, 6)
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
-    # A longer run begins with the shorter one.
-    np.testing.assert_array_equal(
-        validate_study(settings, stars, 2, workers=0).ranks, alone.ranks[:2]
-    )
-    assert not np.array_equal(
-        validate_study(study(seed=12), stars, 2, workers=0).ranks, alone.ranks[:2]
-    )
+    assert not few.ok and "Too few replicates" in few.text
+    # Another seed gives others.
+    other = validate_study(study(seed=12), stars, 2, workers=0)
+    assert not np.array_equal(other.ranks, few.ranks[:2])
 
 
 def test_an_interrupted_validation_goes_on_with_what_it_kept(tmp_path):

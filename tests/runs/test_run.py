@@ -4,6 +4,7 @@ refused.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -56,13 +57,24 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 
 def test_a_demo_reads_each_file_once_at_most_and_is_judged_once(
-    calls: Counter[str], unpainted: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    calls: Counter[str],
+    unpainted: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
-    monkeypatch.setattr(
-        sys, "argv", ["starcal-uq", "demo", "--frames", "60", "--out", str(tmp_path / "demo")]
-    )
-    with pytest.raises(SystemExit):
+    out = tmp_path / "demo"
+    argv = ["starcal-uq", "demo", "--frames", "60", "--out", str(out), "--json"]
+    monkeypatch.setattr(sys, "argv", argv)
+    with pytest.raises(SystemExit) as stop:
         main()
+    # It ends with the table of truth and the report.
+    assert not stop.value.code
+    found = json.loads(capsys.readouterr().out)
+    assert found["calibration"]["parameters"][2]["truth"] == sc.paper.paper_camera().focal_px
+    assert found["verdict"]["level"] != "fail" and Path(found["report"]).samefile(
+        out / "report.html"
+    )
     assert max(calls.values()) == 1
     # What a step gave is not read again, but for what a file keeps in part.
     assert set(calls) == {"AttitudeError", "Diagnosis", "judge", "coupling"}
