@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -23,7 +24,7 @@ from starcal_uq.camera.projection import project
 from starcal_uq.images.centroids import COLUMNS, Centroids
 from starcal_uq.pipeline.inspection import IDENTIFIED, LEFT_OUT, NOT_MATCHED, Frames
 from starcal_uq.pipeline.record import ImageRecord, ImageRow, RoundRecord
-from starcal_uq.presentation.pages.gallery import gallery, picture, write_frames
+from starcal_uq.presentation.pages.gallery import gallery, labelled, picture, write_frames
 from starcal_uq.sky.names import proper_name, short_name
 from starcal_uq.sky.positions import unit_vectors
 
@@ -237,4 +238,38 @@ def test_bright_stars_have_names() -> None:
     assert named["Sirius"] == pytest.approx(101.3, abs=0.1)
     assert "" not in named
     assert short_name("HIP 39953", 1.7) == "HIP 39953"
-    assert short_name("Gaia DR3 5", 4.26) == "4.3"
+    assert short_name("Gaia DR3 5", 4.26) == "G 4.3"
+    # Stars of Gaia have names, too: right ascensions of the Nautical Almanac.
+    stars = sc.load_catalogue(max_mag=4.0)
+    named = dict(zip(map(proper_name, stars.star_id.tolist()), stars.ra_deg.tolist(), strict=True))
+    assert named["Merak"] == pytest.approx(165.5, abs=0.1)
+    assert named["Alderamin"] == pytest.approx(319.6, abs=0.1)
+
+
+def test_labels_do_not_collide_and_zoom_shows_more(frames: Frames) -> None:
+    """In a frame of 400 stars, by the boxes of the text of nine letters."""
+    frame = frames[0]
+    width, height = frame.width_px, frame.height_px
+    rng = np.random.default_rng(1)
+    stars = pd.DataFrame({"x_px": width * rng.random(400), "y_px": height * rng.random(400)})
+    numbers = []
+    for (zoom, kept), size in zip(labelled(stars, frame).items(), (2.5, 1.3, 0.65), strict=True):
+        letters, tall = 9 * 0.62 * size * width / 100.0, size * width / 100.0
+        lefts = [row.x_px - letters if x < row.x_px else row.x_px for (x, _), row in kept.items()]
+        boxes = [(left, row.y_px) for left, row in zip(lefts, kept.values(), strict=True)]
+        assert all(left >= 0.0 and left + letters <= width for left, _ in boxes)
+        for k, (left, y) in enumerate(boxes):
+            assert all(abs(left - a) > letters or abs(y - b) > tall for a, b in boxes[:k]), zoom
+        numbers.append(len(kept))
+    assert numbers == [12, 30, 80]
+    # The brightest has a label always, unless the compass is there.
+    assert stars["x_px"][0] == next(iter(labelled(stars, frame)[1].values())).x_px
+
+
+def test_a_frame_that_is_not_identified_shows_what_was_found(frames: Frames) -> None:
+    page = gallery(frames.select(0, STRANGE))
+    first, strange = (part.partition("</svg>")[0] for part in page.split('<div class="view"')[1:])
+    assert strange.count("<title>detection at x ") == len(frames[STRANGE].detections)
+    assert ">SNR " in strange and ">G " not in strange
+    assert ">G " in first and ">SNR " not in first
+    assert "Vega" not in gallery(frames.select(STRANGE))

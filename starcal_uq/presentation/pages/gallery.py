@@ -9,7 +9,7 @@ import io
 import re
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,9 +31,11 @@ from starcal_uq.presentation.figures.scales import round_below
 from starcal_uq.presentation.html import page, template_environment
 from starcal_uq.presentation.words.images import next_step
 from starcal_uq.presentation.words.sentences import told
-from starcal_uq.sky.names import short_name
+from starcal_uq.sky.names import proper_name, short_name
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from starcal_uq.camera.camera import Camera
 
 # Width of a picture: sharp on a telephone and half a desk, or on the whole of one.
@@ -44,7 +46,8 @@ _BLACK, _SPAN, _BEND = 0.2, 4.0, 0.06
 _BLUR_PX = 0.7
 # Widths of the image that a typical residual's arrow is long.
 _ARROW = 0.02
-_NAMED = 4
+# Stars with a label at most, and the room of a label over the width of the image, at each zoom.
+_NAMED, _ROOM = {1: 12, 2: 30, 4: 80}, (0.15, 0.035)
 # A notebook shows at most so many frames.
 _NOTEBOOK = 24
 # Outlines of marks of unit radius, in relative commands: a circle, a cross, a triangle, a cross
@@ -86,6 +89,7 @@ def gallery(frames: Frames) -> str:
         # Of a circle, px of the image.
         "radius": frames.camera.width_px / (150.0 if frames.large else 90.0),
         "outline": _outline,
+        "proper_name": proper_name,
         "short_name": short_name,
         "isfinite": np.isfinite,
         "FAINTER": FAINTER,
@@ -162,7 +166,7 @@ def _card(frame: InspectedFrame, frames: Frames) -> AnyDict:
         "frame": frame,
         "outcome": told("outcome_of_frame", frame),
         "marks": {"e": stars, **kinds, "m": stars[stars["missed"]]},
-        "named": kinds["i"].nsmallest(_NAMED, "mag"),
+        "named": labelled(kinds["i"].sort_values("mag") if frame.solved else detections, frame),
         "reasons": [(reason, n) for (_, reason), n in reasons.items()],
         "step": next_step(frame, frames),
     }
@@ -174,6 +178,23 @@ def _card(frame: InspectedFrame, frames: Frames) -> AnyDict:
         except (ImageError, MissingExtraError) as error:
             card["error"] = str(error)
     return card
+
+
+def labelled(stars: pd.DataFrame, frame: InspectedFrame) -> dict[int, dict[tuple[Any, ...], Any]]:
+    """The first stars whose labels do not touch those of others, nor the compass, by zoom and by
+    the middle of the label.
+    """
+    width, shown = frame.width_px, {}
+    for zoom, most in _NAMED.items():
+        kept = shown[zoom] = dict[tuple[Any, ...], Any]()
+        wide, high = width * _ROOM[0] / zoom, width * _ROOM[1] / zoom
+        for star in stars.itertuples():
+            x, y = star.x_px + (-0.5 if star.x_px > 0.85 * width else 0.5) * wide, star.y_px
+            corner = x > 0.75 * width and y > 0.75 * frame.height_px
+            near = (abs(x - a) < wide and abs(y - b) < high for a, b in kept)
+            if len(kept) < most and not corner and not any(near):
+                kept[x, y] = star
+    return shown
 
 
 @cache
