@@ -126,8 +126,7 @@ def by_frame(frames: StarFrames, columns: FloatArray) -> tuple[FloatArray, IntAr
     kept = values > _ABSORBED
     root = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :]
     spread = frames.spread(np.ascontiguousarray(np.moveaxis(root, 0, 2)))
-    found = np.einsum("axn,abn->bxn", columns, spread, optimize=True)
-    return np.ascontiguousarray(found), np.count_nonzero(kept, axis=1)
+    return np.einsum("axn,abn->bxn", columns, spread), np.count_nonzero(kept, axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -211,7 +211,7 @@ class _Likeness:
 
 def _recurring(obs: Observations, numbers: IntArray) -> BoolArray:
     """Images (N,) of stars that recur, in frames with two such images or more."""
-    frame = np.searchsorted(obs.frame_ids, obs.frame)
+    frame = np.repeat(np.arange(obs.n_frames), np.diff(obs.frame_starts))
     used = np.ones(len(numbers), dtype=bool)
     while True:
         often = np.bincount(numbers[used], minlength=int(numbers.max()) + 1) >= 2
@@ -229,12 +229,9 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     used = _recurring(obs, numbers)
     if not used.any():
         return _Likeness(0, 0)
-    obs = obs.select(used)
-    frames, stars = (
-        StarFrames.from_observations(obs),
-        np.unique(numbers[used], return_inverse=True)[1],
-    )
-    rotations = quaternion_to_rotation(cal.quaternions[np.isin(cal.frame_ids, obs.frame_ids)])
+    frames, numbers = StarFrames.from_observations(obs).select(used), numbers[used]
+    rotations = quaternion_to_rotation(cal.quaternions[np.isin(cal.frame_ids, obs.frame[used])])
+    stars = (np.cumsum(np.bincount(numbers) > 0) - 1)[numbers]
     sums = TermSums(star_term(stars, frames.r, float(cal.theta[2]), rigid=True))
     p, likelihood = len(cal.theta), MarginalLikelihood(frames, cal.camera.distortion)
     gram = np.zeros((p + 1, p + 1))
@@ -276,7 +273,7 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
         )
 
     sd = spread(size2)
-    unit = float(1.0 / np.sqrt(np.mean(obs.sigma_or_one**-2.0)))
+    unit = float(1.0 / np.sqrt(np.mean(obs.sigma_or_one[used] ** -2.0)))
     low, high = np.sqrt(max(tau2 - sd, 0.0)), np.sqrt(size2 + sd)
     return _Likeness(
         n_stars=sums.n_groups,

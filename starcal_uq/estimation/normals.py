@@ -19,7 +19,7 @@ from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
 from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import star_term
-from starcal_uq.likelihood.terms import TermSums, add_by_group
+from starcal_uq.likelihood.terms import add_by_group
 from starcal_uq.maths.linear import without_first
 from starcal_uq.observations.frames import StarFrames
 
@@ -77,9 +77,8 @@ class FrameNormals:
         3, 3) or QUEST's.
         """
         likelihood = MarginalLikelihood(obs, model, axes=True)
-        gram, attitudes = likelihood.frame_normals(theta, start)
-        dof = 2 * likelihood.frames.sizes - 3
-        return cls.of(theta, gram, attitudes.log_determinant, attitudes.rotations, dof, scale)
+        found = likelihood.frame_normals(theta, start)
+        return cls.of(theta, *found, 2 * likelihood.frames.sizes - 3, scale)
 
     @classmethod
     def beside(
@@ -208,25 +207,28 @@ class StarNormals:
         """Sums over the stars that `numbers` (N,) tells apart, at the estimate of a calibration."""
         likelihood = MarginalLikelihood(obs, cal.camera.distortion)
         frames, p = likelihood.frames, len(cal.theta)
-        sums = TermSums(star_term(numbers, frames.r, float(cal.theta[2])))
+        term = star_term(numbers, frames.r, float(cal.theta[2]))
         start, gram = quaternion_to_rotation(cal.quaternions), np.zeros((p + 1, p + 1))
-        s = sums.n_groups
-        scores, slopes, matrices = np.zeros((s, p)), np.zeros((s, p)), np.zeros((s, p, p))
+        s, (i, j) = term.n_groups, np.triu_indices(p)
+        scores, slopes, packed = np.zeros((s, p)), np.zeros((s, p)), np.zeros((s, len(i)))
+        cross = np.zeros((s, 2, p))
         for part, state, columns, rows in likelihood.linearised(
             cal.theta, cal.sigmas, start, _STARS_AT_ONCE
         ):
-            h, flat = columns[:p], columns.reshape(p + 1, -1)
+            h, flat, stars = columns[:p], columns.reshape(p + 1, -1), numbers[rows]
             gram += flat @ flat.T
-            sums.add(part, state, h, rows)
+            for total, seen in ((scores[:, None], state.e[None]), (cross, term.columns(part, state, rows))):
+                add_by_group(total, np.einsum("axn,pxn->apn", seen, h), stars)
             # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has
             # hidden.
-            a, stars = part.attitudes(state).orthonormal, numbers[rows]
-            free = np.linalg.inv(np.eye(2) - np.einsum("axn,ayn->nxy", a, a, optimize=True))
-            raised = np.einsum("nxy,pyn->pxn", free, h, optimize=True)
-            add_by_group(scores, np.sum(h * state.e, axis=1), stars)
+            a = part.attitudes(state).orthonormal
+            (xx, xy), (yx, yy) = np.eye(2)[:, :, None] - np.einsum("axn,ayn->xyn", a, a)
+            raised = np.stack([yy * h[:, 0] - xy * h[:, 1], xx * h[:, 1] - yx * h[:, 0]], axis=1)
+            raised /= xx * yy - xy * yx
             add_by_group(slopes, np.sum(raised * state.e, axis=1), stars)
-            add_by_group(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
-        matrix = gram[:p, :p]
+            add_by_group(packed, np.sum(raised[i] * h[j], axis=1), stars)
+        matrix, matrices = gram[:p, :p], np.empty((s, p, p))
+        matrices[:, i, j] = matrices[:, j, i] = packed
         unit = 1.0 / np.sqrt(np.diag(matrix))
         return cls(
             scale=cal.sigmas * unit,
@@ -235,7 +237,7 @@ class StarNormals:
             scores=scores * unit,
             matrices=matrices * np.outer(unit, unit),
             slopes=slopes * unit,
-            response=sums.cross.reshape(s, 2, p) * unit,
+            response=cross * unit,
             dof=likelihood.dof - p,
         )
 

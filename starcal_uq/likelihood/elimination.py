@@ -47,8 +47,8 @@ class ByFrame:
         """Columns (c, 2, N) that span the same, orthonormal in every frame."""
         root: FloatArray = np.asarray(np.linalg.cholesky(np.moveaxis(self.inverse, 2, 0)))
         spread = self.frames.spread(np.moveaxis(root, 0, 2))
-        # Stars last in memory as well: what takes products of these is ten times faster then.
-        return np.ascontiguousarray(np.einsum("axn,abn->bxn", self.columns, spread, optimize=True))
+        # Not optimised: a product of matrices for each star would take ten times as long.
+        return np.asarray(np.einsum("axn,abn->bxn", self.columns, spread))
 
 
 def products_by_frame(frames: StarFrames, one: FloatArray, other: FloatArray) -> FloatArray:

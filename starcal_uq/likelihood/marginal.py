@@ -326,43 +326,55 @@ class MarginalLikelihood:
         Attitudes are searched from `rotations` (K, 3, 3), or as those of `sums`.
         """
         if rotations is None:
-            best = self.sums(theta)[1].at(theta)
-        else:
-            best = settled_sums(self.frames, self.model_name, theta, rotations)[1].at(theta)
+            rotations = self.sums(theta)[1].at(theta)
         for first, last in self.frames.parts(max_stars):
-            yield self.piece(theta, best, first, last)
+            yield self.piece(theta, rotations, first, last)
 
     def piece(
-        self, theta: FloatArray, best: FloatArray, first: int, last: int
+        self, theta: FloatArray, rotations: FloatArray, first: int, last: int
     ) -> tuple[MarginalLikelihood, Profile, slice]:
-        """Frames from `first` up to `last`, as `pieces` gives them; `best` are the best attitudes (K,
-        3, 3) of all.
+        """Frames from `first` up to `last`, as `pieces` gives them; attitudes are searched from
+        `rotations` (K, 3, 3) of all.
         """
         part = MarginalLikelihood(self.frames.part(first, last), self.model_name)
-        frames, rotations = part.frames, best[first:last]
-        b = frames.rotated(rotations)
-        xy, h, a = part.first(theta, b)
+        start = rotations[first:last]
+        state, turn = part._at(theta, start)
+        if turn >= ATTITUDE_TOLERANCE_RAD:
+            _, found = settled_sums(part.frames, self.model_name, theta, start)
+            state, _ = part._at(theta, found.at(theta))
+        return part, state, slice(int(self.frames.starts[first]), int(self.frames.starts[last]))
+
+    def _at(self, theta: FloatArray, rotations: FloatArray) -> tuple[Profile, float]:
+        """The model at these attitudes (K, 3, 3), with the residuals of the best ones to first
+        order, and the largest turn to these, rad.
+        """
+        frames, b = self.frames, self.frames.rotated(rotations)
+        xy, h, a = self.first(theta, b)
         e = frames.pixel - xy
         frames.whiten(e)
         inverse, determinant = _inverse(frames, a)
+        turn = np.einsum("ijk,jk->ik", inverse, frames.sum(np.einsum("ixn,xn->in", a, e)))
+        e -= np.einsum("ixn,in->xn", a, frames.spread(turn))
         state = Profile(rotations, b, e, a, inverse, np.log(determinant), h)
-        return part, state, slice(int(self.frames.starts[first]), int(self.frames.starts[last]))
+        return state, float(np.max(np.abs(turn), initial=0.0))
 
     def frame_normals(
         self, theta: FloatArray, rotations: FloatArray | None = None
-    ) -> tuple[FloatArray, Attitudes]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal equations of every single frame at its best attitude, searched from `rotations` (K,
         3, 3) or as those of `sums`.
 
-        Returns products (K, p + 1, p + 1) of H and e without what the frame's attitude can reproduce.
+        Returns products (K, p + 1, p + 1) of H and e without what the frame's attitude can
+        reproduce, log |A^T A| (K,) and the attitudes (K, 3, 3).
         """
-        if rotations is not None:
-            self.use_rotations(rotations)
-        sums, known = self.sums(theta)
-        self.use_sums(sums, known)
-        pieces = self.linearised(theta, np.ones(len(theta)), None, BLOCK_STARS)
-        grams = [products_by_frame(part.frames, own, own) for part, _, own, _ in pieces]
-        return np.concatenate(grams), known
+        found = [
+            (products_by_frame(part.frames, own, own), state.log_determinant, state.rotations)
+            for part, state, own, _ in self.linearised(
+                theta, np.ones(len(theta)), rotations, BLOCK_STARS
+            )
+        ]
+        gram, volume, rotations = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return gram, volume, rotations
 
     def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
         """Turn columns (q, 2, N) into (q, m) with products by the covariance of the data, attitudes

@@ -25,6 +25,7 @@ _SAME_PX = 0.3
 # Stars of one name are one star within this: aberration and proper motion move a direction from
 # frame to frame.
 _SAME_NAME_PX, _SAME_NAME_RAD = 5.0, 6e-4
+_NAMES_AT_ONCE = 100_000
 
 
 def star_numbers(obs: Observations, focal_px: float) -> IntArray:
@@ -35,12 +36,25 @@ def star_numbers(obs: Observations, focal_px: float) -> IntArray:
     named = names is not None and bool(np.all(names != ""))
     tolerance = max(_SAME_NAME_PX / focal_px, _SAME_NAME_RAD) if named else _SAME_PX / focal_px
     place = _linked(obs.directions_icrs, tolerance)
-    if named and names is not None:
-        # A name alone is not trusted: numbers that start again with every frame are no names of
-        # stars.
-        code = np.unique(names, return_inverse=True)[1]
-        place = np.unique(code * (int(place.max()) + 1) + place, return_inverse=True)[1]
-    return np.asarray(place, dtype=np.int64)
+    if not named or names is None:
+        return place
+    # A name alone is not trusted: numbers that start again with every frame are no names of stars.
+    first = names[first_of_each(place)]
+    blocks = np.array_split(np.arange(len(place)), len(place) // _NAMES_AT_ONCE + 1)
+    if all(np.array_equal(first[place[rows]], names[rows]) for rows in blocks):
+        # Sorting the names of all images would take longer than all else.
+        rank = np.argsort(np.argsort(first, kind="stable"), kind="stable")
+        return np.asarray(rank[place], dtype=np.int64)
+    code = np.unique(names, return_inverse=True)[1]
+    code = code * (int(place.max()) + 1) + place
+    return np.asarray(np.unique(code, return_inverse=True)[1], dtype=np.int64)
+
+
+def first_of_each(numbers: IntArray) -> IntArray:
+    """First image (S,) of every star of images (N,) that are numbered from 0, none left out."""
+    first = np.empty(int(numbers.max(initial=-1)) + 1, dtype=np.int64)
+    first[numbers[::-1]] = np.arange(len(numbers))[::-1]
+    return first
 
 
 def _linked(directions: FloatArray, tolerance: float) -> IntArray:
@@ -75,15 +89,12 @@ def _linked(directions: FloatArray, tolerance: float) -> IntArray:
 
 
 def sky_axes(directions: FloatArray, numbers: IntArray) -> FloatArray:
-    """Two axes across each star's direction, the same for all of its images: (2, 3, N) for
-    directions (3, N).
-    """
-    first = np.unique(numbers, return_index=True)[1]
-    r = directions[:, first]
+    """Two axes across each of S stars, (2, 3, S), for directions (3, N) of their images."""
+    r = directions[:, first_of_each(numbers)]
     helper = np.eye(3)[np.argmin(np.abs(r), axis=0)].T
     u = np.cross(helper, r, axis=0)
     u /= np.linalg.norm(u, axis=0)
-    return np.stack([u, np.cross(r, u, axis=0)])[:, :, numbers]
+    return np.stack([u, np.cross(r, u, axis=0)])
 
 
 def offset_columns(
@@ -93,7 +104,7 @@ def offset_columns(
     along `axes`.
     """
     rotations = part.frames.spread(state.rotations.T)
-    moves = np.einsum("kin,jkn->jin", rotations, axes, optimize=True)
+    moves = np.einsum("kin,jkn->jin", rotations, axes)
     return state.shifts(moves) / focal_px
 
 
@@ -120,7 +131,7 @@ def star_term(
     axes, n_stars = sky_axes(directions, numbers), int(numbers.max()) + 1
 
     def columns(part: MarginalLikelihood, state: Profile, rows: slice) -> FloatArray:
-        z = offset_columns(part, state, axes[:, :, rows], focal_px)
+        z = offset_columns(part, state, axes[:, :, numbers[rows]], focal_px)
         return _turn(z) if rigid else z
 
     return Term(numbers, n_stars, columns)

@@ -97,30 +97,32 @@ class TermSums:
         own = part.attitudes(state).orthonormal
         if of_frames is not None:
             own = np.concatenate([own, of_frames])
-        block = np.einsum("ixn,bxn->nib", z, own, optimize=True)
-        frame = self._frames + np.repeat(np.arange(part.frames.n_frames), part.frames.sizes)
+        block = np.einsum("ixn,bxn->nbi", z, own)
+        frame = part.frames.spread(self._frames + np.arange(part.frames.n_frames))
         self._blocks.append((block, groups, frame))
         self._frames += part.frames.n_frames
 
     @cached_property
     def coupling(self) -> Any:
         """``Z^T A (A^T A)^(-1/2)`` (G c, 3 K), sparse."""
-        return self._by_frame(lambda block, frames: block[:, :, :3])
+        return self._by_frame(lambda block, frames: block[:, :3])
 
     def coupling_of(self, turn: FloatArray) -> Any:
         """Products (G c, d K) with the columns of frames turned by (K, c, d), sparse."""
-        return self._by_frame(lambda block, frames: block[:, :, 3:] @ turn[frames])
+        return self._by_frame(lambda block, frames: np.swapaxes(turn, 1, 2)[frames] @ block[:, 3:])
 
     def _by_frame(self, columns: Callable[[FloatArray, IntArray], FloatArray]) -> Any:
-        from scipy.sparse import csr_array
+        from scipy.sparse import bsr_array, csr_array
 
         block, groups, frames = (np.concatenate(parts) for parts in zip(*self._blocks, strict=True))
         block = columns(block, frames)
-        width = block.shape[2]
-        rows = _SIZE * groups[:, None, None] + np.arange(_SIZE)[:, None]
-        place = np.broadcast_arrays(rows, width * frames[:, None, None] + np.arange(width))
-        shape = (self.n_groups * _SIZE, width * self._frames)
-        return csr_array((block.ravel(), tuple(index.ravel() for index in place)), shape=shape)
+        width = block.shape[1]
+        shape = (width * self._frames, self.n_groups * _SIZE)
+        if not width:
+            return csr_array(shape[::-1])
+        starts = np.searchsorted(frames, np.arange(self._frames + 1))
+        # A product of whole blocks takes a tenth of the time of one of their entries.
+        return bsr_array((block, groups, starts), shape=shape).T
 
     @cached_property
     def matrix(self) -> Any:

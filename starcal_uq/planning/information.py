@@ -182,7 +182,9 @@ def frame_matrices(
     frames.
     """
     likelihood = MarginalLikelihood(frames, camera.distortion)
-    gram, attitudes = likelihood.frame_normals(camera.theta, rotations)
+    likelihood.use_rotations(rotations)
+    _, attitudes = likelihood.sums(camera.theta)
+    gram, *_ = likelihood.frame_normals(camera.theta, attitudes.rotations)
     return (
         gram[:, :-1, :-1],
         attitudes.response.transpose(2, 0, 1),

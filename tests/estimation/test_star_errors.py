@@ -43,7 +43,7 @@ def dense(obs, cal, model, ratio):
     frame = np.searchsorted(obs.frame_ids, obs.frame)
     # Derivatives by finite turns of the directions and of the camera, without the columns under
     # test.
-    axes = sky_axes(model.directions, model.numbers)
+    axes = sky_axes(model.directions, model.numbers)[:, :, model.numbers]
     for i in range(2):
         step = 1e-7
         turned = np.einsum("nij,jn->in", state.rotations[frame], axes[i])
