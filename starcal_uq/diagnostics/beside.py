@@ -8,6 +8,7 @@ of effects have no prior, so that what is left is noise alone, however large the
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -24,6 +25,7 @@ from starcal_uq.likelihood.effects import Effect, effects_of, star_effect
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.likelihood.star_errors import StarModel
+from starcal_uq.maths.linear import principal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import one_of_each
 
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 FRAMES, _STARS = 200, 4000
 # Directions of which what is fitted already takes all but this share of the square are not there.
 _ABSORBED = 1e-8
+_STARS_AT_ONCE = 10_000
 
 
 def has_effects(cal: Calibration) -> bool:
@@ -137,11 +140,39 @@ class Freed:
     h: FloatArray  # (r, 2, N): parameters and effects of the run beside these, orthonormal
     e: FloatArray  # (2, N): whitened residuals
     frame_dof: FloatArray  # (K,): degrees of freedom of every frame, `h` not fitted
+    rows: slice  # Rows of the stars in the table
 
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom of the residuals."""
-        return int(self.frame_dof.sum()) - len(self.h)
+    @classmethod
+    def pieces(
+        cls, obs: Observations, cal: Calibration, gram: FloatArray, raw: FloatArray
+    ) -> Iterator[Freed]:
+        """Those of a calibration, some frames at a time where it has no effects.
+
+        `gram` (p + 1, p + 1): products of parameters and residuals, attitudes removed. `raw` (p,):
+        squares of the parameters' columns, attitudes in them.
+        """
+        if has_effects(cal):
+            yield cls.of(obs, cal, axes=True)
+            return
+        unit, p = 1.0 / np.sqrt(raw), len(raw)
+        values, vectors = principal(gram[:p, :p] * np.outer(unit, unit), _ABSORBED)
+        turn = (unit[:, None] * vectors / np.sqrt(values)).T
+        along = turn @ gram[:p, p]
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
+        start = quaternion_to_rotation(cal.quaternions)
+        for part, state, columns, rows in likelihood.linearised(
+            cal.theta, np.ones(p), start, _STARS_AT_ONCE
+        ):
+            basis = part.attitudes(state).orthonormal
+            unit_of_all = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, part.frames.n_frames))
+            h = np.tensordot(turn, columns[:p], axes=1)
+            yield cls(
+                ByFrame(part.frames, basis, unit_of_all),
+                h,
+                columns[p] - np.tensordot(along, h, axes=1),
+                2.0 * part.frames.sizes - 3.0,
+                rows,
+            )
 
     @classmethod
     def of(cls, obs: Observations, cal: Calibration, axes: bool) -> Freed:
@@ -169,4 +200,5 @@ class Freed:
         h = orthonormal(h.reshape(len(h), -1), _ABSORBED).reshape(-1, *e.shape)
         e = own.removed_from(e[None])[0]
         e = e - np.tensordot(np.tensordot(h, e, axes=2), h, axes=1)
-        return cls(own, h, np.asarray(e), floats(2.0 * frames.sizes - 3.0 - rank))
+        dof = floats(2.0 * frames.sizes - 3.0 - rank)
+        return cls(own, h, np.asarray(e), dof, slice(0, frames.n_stars))

@@ -25,14 +25,10 @@ from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import Freed, has_effects, without_effects
 from starcal_uq.diagnostics.misfit_test import LEAST_DOF, MisfitTest
-from starcal_uq.diagnostics.noise_tests import noise_by_frame, noise_tests, noise_weights
+from starcal_uq.diagnostics.noise_tests import NoiseSums, noise_weights
 from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.shape_sums import ShapeSums
-from starcal_uq.estimation.noise_model import (
-    axis_noise_beside,
-    fit_noise,
-    sigma_ratios,
-)
+from starcal_uq.estimation.noise_model import AxisSums, fit_noise, sigma_ratios
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.noise_model import NoiseModel, noise_model_of
 from starcal_uq.likelihood.shapes import (
@@ -149,23 +145,24 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     tests = [test for test in (sums.family(family) for family in families) if test is not None]
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
-    freed, of_noise = Freed.of(obs, cal, axes=True), []
-    if freed.dof >= LEAST_DOF:
-        of_noise = [
-            (f"noise that changes with {name}", name, z, p)
-            for name, z, p in noise_tests(freed, noise_weights(obs, cal.camera))
-        ]
-    if (frames := noise_by_frame(freed, has_effects(cal))) is not None:
+    gram, weights = sums.gram[: sums.p + 1, : sums.p + 1], noise_weights(obs, cal.camera)
+    pieces = Freed.pieces(obs, cal, gram, sums.parameters_raw)
+    noise, of_noise = NoiseSums(pieces, weights, has_effects(cal)), []
+    if noise.dof >= LEAST_DOF:
+        of_noise = [(f"noise that changes with {name}", name, z, p) for name, z, p in noise.tests()]
+    if (frames := noise.by_frame()) is not None:
         of_noise.append(("noise that differs from frame to frame", "frame", *frames))
-    alike = freed if obs.noise_axes is None else Freed.of(obs, cal, axes=False)
-    own = alike.own
-    axes = axis_noise_beside(own.frames, own.columns, alike.h, alike.e, alike.dof)
+    axes = noise.axes
+    if obs.noise_axes is not None:
+        alike, axes = Freed.of(obs, cal, axes=False), AxisSums()
+        axes.add(alike.own.frames, alike.own.columns, alike.h, alike.e)
     names = "noise that differs between the axes", "noise whose axes correlate"
-    for name, z in zip(names, axes.z(noise_model_of(cal)), strict=True):
+    known = noise_model_of(cal)
+    for name, z in zip(names, axes.noise(noise.dof).z(known), strict=True):
         of_noise.append((name, "axis", z, float(2.0 * ndtr(-abs(z)))))
     nothing = float("nan")
     tests += [
-        MisfitTest(name, against, z, 0, freed.dof, p, 1.0, nothing, nothing)
+        MisfitTest(name, against, z, 0, noise.dof, p, 1.0, nothing, nothing)
         for name, against, z, p in of_noise
     ]
     corrected = holm([test.p_value for test in tests])

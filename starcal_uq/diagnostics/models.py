@@ -331,27 +331,25 @@ def closed_form(normals: FrameNormals, *, left_out: bool = True) -> FloatArray:
     """
     from scipy.special import gammaln
 
-    matrices, slopes, dof = normals.matrices, normals.slopes, normals.dof
+    matrix, matrices, slopes, dof = (
+        normals.matrix,
+        normals.matrices,
+        normals.slopes,
+        normals.dof,
+    )
     squares, total = normals.squares.sum(), slopes.sum(axis=0)
     if left_out:
         z, rest = normals.left_out()
-        squares, total = squares - normals.squares, total - slopes
+        squares, total, together = squares - normals.squares, total - slopes, matrix
         nu = dof.sum() - dof - len(normals.theta)
     else:
-        rest = np.broadcast_to(normals.matrix, matrices.shape)
-        z = np.broadcast_to(np.linalg.solve(normals.matrix, total), slopes.shape)
-        nu = np.broadcast_to(dof.sum() - len(normals.theta), dof.shape)
-    together = rest + matrices
-
-    def square(step: FloatArray, c: FloatArray, g: FloatArray, h: FloatArray) -> FloatArray:
-        quadratic = np.einsum("ka,kab,kb->k", step, h, step)
-        return np.asarray(c - 2.0 * np.sum(g * step, axis=1) + quadratic)
-
-    own = square(z, normals.squares, slopes, matrices)
-    variance = square(z, squares, total, rest) / nu
+        rest, together, nu = matrix, matrix + matrices, dof.sum() - len(normals.theta)
+        z = np.broadcast_to(np.linalg.solve(matrix, total), slopes.shape)
+    variance = (squares - np.sum(total * z, axis=1)) / nu
     # What the frame's residuals and its own pull on the parameters leave, by the Woodbury identity.
     pull = slopes - np.einsum("kab,kb->ka", matrices, z)
-    own = own - np.sum(pull * np.linalg.solve(together, pull[..., None])[..., 0], axis=1)
+    own = normals.squares - np.sum((slopes + pull) * z, axis=1)
+    own -= np.sum(pull * np.linalg.solve(together, pull[..., None])[..., 0], axis=1)
     growth = np.linalg.slogdet(together)[1] - np.linalg.slogdet(rest)[1]
     density: FloatArray = (
         gammaln(0.5 * (nu + dof))

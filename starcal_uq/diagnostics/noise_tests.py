@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.misfit_test import LEAST_DOF
+from starcal_uq.estimation.noise_model import AxisSums
 from starcal_uq.likelihood.elimination import products_by_frame
 from starcal_uq.likelihood.shapes import Covariates
 
@@ -29,67 +31,89 @@ def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:
     return {name: values for name, values in found.items() if values is not None}
 
 
-def noise_tests(freed: Freed, weights: dict[str, FloatArray]) -> list[tuple[str, float, float]]:
-    """Name, z and two-sided p-value of every weight (N,)."""
-    from scipy.special import erfc
+class NoiseSums:
+    """Sums over residuals of which all that is fitted is free, from which the tests follow.
 
-    found: list[tuple[str, float, float]] = []
-    frames, a, h, e = freed.own.frames, freed.own.columns, freed.h, freed.e
-    dof, squares = freed.dof, e**2
-    # Effects with as many coefficients as there are pixels leave nothing to compare.
-    if dof < 1 or not squares.any():
-        return found
-    flat = h.reshape(len(h), -1)
-    for name, w in weights.items():
-        aw, hw = a * w, h * w
-        awa, awh = products_by_frame(frames, aw, a), products_by_frame(frames, aw, h)
-        hwh = hw.reshape(len(h), -1) @ flat.T
-        trace = 2.0 * np.sum(w) - np.einsum("kaa->", awa) - np.trace(hwh)
-        # tr(W W) - 2 tr(P W W) + tr(P W P W), P being of frames and of what they share.
-        trace2 = 2.0 * np.sum(w**2) - 2.0 * np.sum(aw**2) - 2.0 * np.sum(hw**2)
-        trace2 += np.sum(awa**2) + 2.0 * np.sum(awh**2) + np.sum(hwh**2)
-        variance = 2.0 * (trace2 - trace**2 / dof) / (dof * (dof + 2.0))
-        if not variance > 0.0:
-            continue
-        z = float((np.sum(w * squares) / np.sum(squares) - trace / dof) / np.sqrt(variance))
-        found.append((name, z, float(erfc(abs(z) / np.sqrt(2.0)))))
-    return found
-
-
-def noise_by_frame(freed: Freed, shared: bool) -> tuple[float, float] | None:
-    """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few
-    frames.
-
-    With d_k degrees of freedom of the frames' sums of squares S_k, nu in all, the statistic is
-    T = nu log(S / nu) - sum d_k log(S_k / d_k). Shares of S are independent of S, so that mean
-    and variance of T follow exactly from those of logarithms of chi-squares; T is then taken as
-    gamma-distributed. Effects whose coefficients frames have in common (`shared`) couple their sums:
-    mean and variance are then those of independent sums times the change to first order.
+    `pieces`: of all frames. `weights`: what the noise could change with (N,), by name. `shared`:
+    whether frames have coefficients of effects in common.
     """
-    from scipy.special import digamma, gammaincc, ndtri, polygamma
 
-    frames, h = freed.own.frames, freed.h
-    matrices = products_by_frame(frames, h, h)
-    squares = frames.sum(np.sum(freed.e**2, axis=0))
-    dof = freed.frame_dof - np.einsum("kaa->k", matrices)
-    nu = float(dof.sum())
-    if (
-        len(dof) < _LEAST_FRAMES
-        or nu < LEAST_DOF
-        or dof.min() < _LEAST_FRAME_DOF
-        or squares.min() <= 0.0
-    ):
-        return None
-    found = nu * np.log(squares.sum() / nu) - np.sum(dof * np.log(squares / dof))
-    mean = nu * (digamma(nu / 2) - np.log(nu / 2)) - np.sum(
-        dof * (digamma(dof / 2) - np.log(dof / 2))
-    )
-    variance = np.sum(dof**2 * polygamma(1, dof / 2)) - nu**2 * float(polygamma(1, nu / 2))
-    if shared:
-        by_mean, by_variance = _coupled(matrices, dof)
-        mean, variance = mean * by_mean, variance * by_variance
-    p = float(gammaincc(mean**2 / variance, found * mean / variance))
-    return float(-ndtri(np.clip(p, 1e-300, 1.0 - 1e-16))), p
+    def __init__(
+        self, pieces: Iterable[Freed], weights: dict[str, FloatArray], shared: bool
+    ) -> None:
+        self.axes = AxisSums()
+        self._numbers = {name: np.zeros(6) for name in weights}
+        self._held: dict[str, FloatArray | float] = dict.fromkeys(weights, 0.0)
+        by_frame, matrices, rank = [], [], 0
+        for piece in pieces:
+            frames, a, h = piece.own.frames, piece.own.columns, piece.h
+            self.axes.add(frames, a, h, piece.e)
+            square, of_all = np.sum(piece.e**2, axis=0), np.sum(h**2, axis=(0, 1))
+            taken, columns, rank = of_all + np.sum(a**2, axis=(0, 1)), [*a, *h], len(h)
+            own = np.einsum("ixn,bxn->ibn", a, np.reshape(columns, (-1, *piece.e.shape)))
+            for name, every in weights.items():
+                w = every[piece.rows]
+                left = frames.sum(own * w) ** 2
+                size = np.sum(left[:, : len(a)]) + 2.0 * np.sum(left[:, len(a) :])
+                self._numbers[name] += [w.sum(), w @ w, w @ taken, w**2 @ taken, w @ square, size]
+                self._held[name] += np.einsum("pxn,qxn->pq", h * w, h)
+            by_frame.append([piece.frame_dof, frames.sum(square), frames.sum(of_all)])
+            if shared:
+                matrices.append(products_by_frame(frames, h, h))
+        dof, self._squares, taken = np.concatenate(by_frame, axis=1)
+        self._frame_dof, self.dof = dof - taken, int(dof.sum()) - rank
+        self._matrices = np.concatenate(matrices) if shared else None
+
+    def tests(self) -> list[tuple[str, float, float]]:
+        """Name, z and two-sided p-value of every weight."""
+        from scipy.special import erfc
+
+        found: list[tuple[str, float, float]] = []
+        dof, total = self.dof, float(self._squares.sum())
+        # Effects with as many coefficients as there are pixels leave nothing to compare.
+        if dof < 1 or total <= 0.0:
+            return found
+        for name, (w, w2, taken, taken2, weighted, size) in self._numbers.items():
+            trace = 2.0 * w - taken
+            # tr(W W) - 2 tr(P W W) + tr(P W P W), P being of frames and of what they share.
+            trace2 = 2.0 * w2 - 2.0 * taken2 + size + np.sum(self._held[name] ** 2)
+            variance = 2.0 * (trace2 - trace**2 / dof) / (dof * (dof + 2.0))
+            if variance > 0.0:
+                z = float((weighted / total - trace / dof) / np.sqrt(variance))
+                found.append((name, z, float(erfc(abs(z) / np.sqrt(2.0)))))
+        return found
+
+    def by_frame(self) -> tuple[float, float] | None:
+        """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few
+        frames.
+
+        With d_k degrees of freedom of the frames' sums of squares S_k, nu in all, the statistic is
+        T = nu log(S / nu) - sum d_k log(S_k / d_k). Shares of S are independent of S, so that mean
+        and variance of T follow exactly from those of logarithms of chi-squares; T is then taken as
+        gamma-distributed. Effects whose coefficients frames have in common couple their sums: mean
+        and variance are then those of independent sums times the change to first order.
+        """
+        from scipy.special import digamma, gammaincc, ndtri, polygamma
+
+        squares, dof = self._squares, self._frame_dof
+        nu = float(dof.sum())
+        if (
+            len(dof) < _LEAST_FRAMES
+            or nu < LEAST_DOF
+            or dof.min() < _LEAST_FRAME_DOF
+            or squares.min() <= 0.0
+        ):
+            return None
+        found = nu * np.log(squares.sum() / nu) - np.sum(dof * np.log(squares / dof))
+        mean = nu * (digamma(nu / 2) - np.log(nu / 2)) - np.sum(
+            dof * (digamma(dof / 2) - np.log(dof / 2))
+        )
+        variance = np.sum(dof**2 * polygamma(1, dof / 2)) - nu**2 * float(polygamma(1, nu / 2))
+        if self._matrices is not None:
+            by_mean, by_variance = _coupled(self._matrices, dof)
+            mean, variance = mean * by_mean, variance * by_variance
+        p = float(gammaincc(mean**2 / variance, found * mean / variance))
+        return float(-ndtri(np.clip(p, 1e-300, 1.0 - 1e-16))), p
 
 
 def _coupled(matrices: FloatArray, dof: FloatArray) -> tuple[float, float]:

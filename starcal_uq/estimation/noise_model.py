@@ -27,6 +27,7 @@ import numpy as np
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.stages import REFINEMENT_TOLERANCE, Search, refinement_stage
+from starcal_uq.likelihood.arrays import BLOCK_STARS
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -109,61 +110,77 @@ def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
     `theta` (p,): estimate, px units.
     """
     state, attitude, camera = _held(likelihood, theta)
-    return axis_noise_beside(likelihood.frames, attitude, camera, state.e, likelihood.dof)
+    sums = AxisSums()
+    sums.add(likelihood.frames, attitude, camera, state.e)
+    return sums.noise(likelihood.dof)
 
 
-def axis_noise_beside(
-    frames: StarFrames, attitude: FloatArray, camera: FloatArray, e: FloatArray, left: int
-) -> AxisNoise:
-    """The same of residuals e (2, N), where these are the orthonormal columns of every frame (a, 2,
-    N) and of all stars (p, 2, N).
+class AxisSums:
+    """Sums over the stars of any frames from which the same follows; frames are added to them."""
 
-    `left`: degrees of freedom that these leave; where those of all stars are few, with or without.
-    """
-    n = frames.n_stars
+    def __init__(self) -> None:
+        self._n, self._traces, self._products = 0, np.zeros(4), np.zeros((4, 4))
+        self._camera: FloatArray | None = None
+        self._sums, self._squares = np.zeros(3), np.zeros((3, 3))
 
-    def products(one: int, other: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """U^T U over the stars of the axes: attitudes of each frame, both ways of attitudes with
-        camera, camera.
+    def add(
+        self, frames: StarFrames, attitude: FloatArray, camera: FloatArray, e: FloatArray
+    ) -> None:
+        """Add residuals e (2, N) beside orthonormal columns of every frame (a, 2, N) and of all
+        stars (p, 2, N).
         """
-        a, b, c, d = attitude[:, one], attitude[:, other], camera[:, one], camera[:, other]
-        inner = frames.sum(np.einsum("in,jn->ijn", a, b))
-        mixed = frames.sum(np.einsum("in,jn->ijn", a, d))
-        turned = frames.sum(np.einsum("in,jn->ijn", b, c))
-        return inner, mixed, turned, c @ d.T
+        a, p = len(attitude), len(camera)
+        if self._camera is None:
+            self._camera = np.zeros((4, p, p))
+        self._n += frames.n_stars
+        for first, last in frames.parts(BLOCK_STARS):
+            rows = slice(int(frames.starts[first]), int(frames.starts[last]))
+            held = np.concatenate([attitude[..., rows], camera[..., rows]])
+            x, y = e[:, rows]
+            # U^T U over the stars, for x with x, x with y, y with x and y with y: of attitudes,
+            # frame by frame, of these with the camera, and of the camera.
+            own = np.einsum("isn,btn->stibn", held[:a], held).reshape(4, a, a + p, -1)
+            by_frame = frames.part(first, last).sum(own)
+            inner, mixed = by_frame[:, :, :a], by_frame[:, :, a:]
+            self._traces += np.einsum("siik->s", inner)
+            for part in (inner, mixed, mixed[[0, 2, 1, 3]]):
+                flat = part.reshape(4, -1)
+                self._products += flat @ flat.T
+            self._camera += np.einsum("isn,jtn->stij", held[a:], held[a:]).reshape(4, p, p)
+            values = np.stack([x**2, y**2, x * y])
+            self._sums += values.sum(axis=1)
+            self._squares += values @ values.T
 
-    xx, yy, xy, yx = products(0, 0), products(1, 1), products(0, 1), products(1, 0)
-    taken = [float(np.einsum("iik->", part[0]) + np.trace(part[3])) for part in (xx, yy, xy)]
-
-    def squared(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> float:
-        return float(sum(np.sum(a * b) for a, b in zip(one, other, strict=True)))
-
-    across = squared(xx, yy)
-    free = np.array(
-        [
-            [n - 2.0 * taken[0] + squared(xx, xx), across],
-            [across, n - 2.0 * taken[1] + squared(yy, yy)],
-        ]
-    )
-    variances = np.linalg.solve(free, np.sum(e**2, axis=1))
-    dof = n - taken[0] - taken[1] + squared(xy, xy) + squared(xy, yx)
-    if not (np.all(variances > 0.0) and dof > 0.0):
-        return AxisNoise(0.0, np.inf, 0.0, np.inf)
-    sigma = np.sqrt(variances)
-    covariance = (float(e[0] @ e[1]) + float(np.mean(variances)) * taken[2]) / dof
-    correlation = covariance / float(sigma[0] * sigma[1])
-    by_star = np.linalg.solve(free, e**2) / variances[:, None]
-    scatter = by_star[0] - by_star[1]
-    scatter = scatter - np.mean(scatter)
-    # Residuals are smaller than errors: the scatter of their products grows by the square of the
-    # share that is left.
-    grown = 2.0 * n / left
-    log_ratio_std = 0.5 * float(np.sqrt(grown * np.sum(scatter**2)))
-    mixed = e[0] * e[1] / (sigma[0] * sigma[1])
-    correlation_std = float(np.sqrt(grown * np.sum((mixed - np.mean(mixed)) ** 2))) / dof
-    return AxisNoise(
-        float(np.log(sigma[0] / sigma[1])), log_ratio_std, float(correlation), correlation_std
-    )
+    def noise(self, left: int) -> AxisNoise:
+        """Noise of the axes; `left` are the degrees of freedom of the residuals, where those of all
+        stars are few with or without.
+        """
+        n, camera = self._n, np.zeros((4, 0, 0)) if self._camera is None else self._camera
+        taken, flat = self._traces + np.einsum("sii->s", camera), camera.reshape(4, -1)
+        products = self._products + flat @ flat.T
+        free = np.array(
+            [
+                [n - 2.0 * taken[0] + products[0, 0], products[0, 3]],
+                [products[0, 3], n - 2.0 * taken[3] + products[3, 3]],
+            ]
+        )
+        variances = np.linalg.solve(free, self._sums[:2])
+        dof = n - taken[0] - taken[3] + products[1, 1] + products[1, 2]
+        if not (np.all(variances > 0.0) and dof > 0.0):
+            return AxisNoise(0.0, np.inf, 0.0, np.inf)
+        sigma = np.sqrt(variances)
+        covariance = (self._sums[2] + float(np.mean(variances)) * taken[1]) / dof
+        correlation = covariance / (sigma[0] * sigma[1])
+        by_star = np.linalg.inv(free) / variances[:, None]
+        scatter = by_star[0] - by_star[1]
+        about_mean = self._squares - np.outer(self._sums, self._sums) / n
+        # Residuals are smaller than errors: the scatter of their products grows by the square of
+        # the share that is left.
+        grown = 2.0 * n / left
+        log_ratio_std = 0.5 * float(np.sqrt(grown * (scatter @ about_mean[:2, :2] @ scatter)))
+        correlation_std = float(np.sqrt(grown * about_mean[2, 2]) / (sigma[0] * sigma[1])) / dof
+        log_ratio = float(np.log(sigma[0] / sigma[1]))
+        return AxisNoise(log_ratio, log_ratio_std, float(correlation), float(correlation_std))
 
 
 def fit_noise(

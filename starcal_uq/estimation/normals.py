@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 _STARS_AT_ONCE = 20_000
+# Condition of normal equations that determine nothing any more.
+_WORST = 1e14
 
 
 @dataclass(frozen=True)
@@ -180,8 +182,7 @@ class FrameNormals:
 
         A frame without which the parameters are not determined gives rows that are not finite.
         """
-        rest = self.matrix - self.matrices
-        return _steps(rest, self.slopes.sum(axis=0) - self.slopes), rest
+        return _steps(self.matrix, self.matrices, self.slopes.sum(axis=0) - self.slopes)
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,10 @@ class StarNormals:
         ):
             h, flat, stars = columns[:p], columns.reshape(p + 1, -1), numbers[rows]
             gram += flat @ flat.T
-            for total, seen in ((scores[:, None], state.e[None]), (cross, term.columns(part, state, rows))):
+            for total, seen in (
+                (scores[:, None], state.e[None]),
+                (cross, term.columns(part, state, rows)),
+            ):
                 add_by_group(total, np.einsum("axn,pxn->apn", seen, h), stars)
             # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has
             # hidden.
@@ -245,12 +249,20 @@ class StarNormals:
         """Changes z (S, p) of the estimate without each star, not finite where the parameters hang
         on it.
         """
-        return _steps(self.matrix - self.matrices, -self.slopes)
+        return _steps(self.matrix, self.matrices, -self.slopes)[0]
 
 
-def _steps(matrices: FloatArray, slopes: FloatArray) -> FloatArray:
-    """Solutions (n, p) of normal equations, NaN where these determine none."""
-    determined = np.linalg.cond(matrices) < 1e14
+def _steps(
+    matrix: FloatArray, parts: FloatArray, slopes: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Solutions (n, p) of normal equations less one of the parts (n, p, p) of their matrix (p, p),
+    NaN where these determine none, and the matrices (n, p, p).
+    """
+    rest = matrix - parts
+    # Whitened by the matrix, a part has no eigenvalue above its trace.
+    share = np.einsum("kab,ba->k", parts, np.linalg.inv(matrix))
+    determined = np.linalg.cond(matrix) < _WORST * (1.0 - share)
+    determined[~determined] = np.linalg.cond(rest[~determined]) < _WORST
     steps = np.full(slopes.shape, np.nan)
-    steps[determined] = np.linalg.solve(matrices[determined], slopes[determined, :, None])[..., 0]
-    return steps
+    steps[determined] = np.linalg.solve(rest[determined], slopes[determined, :, None])[..., 0]
+    return steps, rest

@@ -28,18 +28,13 @@ class ByFrame:
 
     def coefficients(self, values: FloatArray) -> FloatArray:
         """Least-squares coefficients (q, c, K) of values (q, 2, N)."""
-        products = [self.frames.sum(np.sum(own * values, axis=1))[:, None] for own in self.columns]
-        found: FloatArray = sum(
-            product * row for product, row in zip(products, self.inverse, strict=True)
-        )
-        return found
+        products = self.frames.sum(np.einsum("ixn,qxn->qin", self.columns, values))
+        return np.asarray(np.einsum("ijk,qik->qjk", self.inverse, products))
 
     def removed_from(self, values: FloatArray) -> FloatArray:
         """What is left of values (q, 2, N)."""
         spread = self.frames.spread(self.coefficients(values))
-        left: FloatArray = values - sum(
-            spread[:, i, None, :] * own for i, own in enumerate(self.columns)
-        )
+        left: FloatArray = values - np.einsum("qin,ixn->qxn", spread, self.columns)
         return left
 
     @cached_property

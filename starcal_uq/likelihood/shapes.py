@@ -93,6 +93,8 @@ class Shape:
     # Name and unit of each column's amplitude, where amplitudes mean something by themselves.
     labels: tuple[tuple[str, str], ...] = ()
     per_amplitude: tuple[float, ...] = ()  # Amplitude in that unit of a column as it stands
+    # Cell (n,) of every star, where columns are the shifts of a cell in x and in y.
+    cells: Callable[[View], IntArray] | None = None
 
 
 def shapes(
@@ -525,14 +527,18 @@ def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
     cell = longer / int(np.clip(np.sqrt(per_area), 2, max_cells))
     nx, ny = (int(np.ceil(side / cell - 1e-9)) for side in (camera.width_px, camera.height_px))
 
-    def columns(view: View) -> FloatArray:
+    def cells(view: View) -> IntArray:
         x, y = view.predicted
         column = np.clip(((x + 0.5) / cell).astype(np.int64), 0, nx - 1)
         row = np.clip(((y + 0.5) / cell).astype(np.int64), 0, ny - 1)
-        own, star = row * nx + column, np.arange(len(x))
-        found = np.zeros((nx * ny, 2, 2, len(x)))
+        return np.asarray(row * nx + column)
+
+    def columns(view: View) -> FloatArray:
+        own = cells(view)
+        star = np.arange(len(own))
+        found = np.zeros((nx * ny, 2, 2, len(own)))
         found[own, 0, 0, star] = found[own, 1, 1, star] = 1.0
-        return found.reshape(-1, 2, len(x))
+        return found.reshape(-1, 2, len(own))
 
     name = f"mean shift in {nx} × {ny} cells of the field"
-    return Shape(name, "field cells", 2 * nx * ny, columns)
+    return Shape(name, "field cells", 2 * nx * ny, columns, cells=cells)

@@ -71,13 +71,11 @@ def _linked(directions: FloatArray, tolerance: float) -> IntArray:
     # arcsec and more.
     side = 2 * int(np.abs(grid).max(initial=0)) + 1
     if side < 2**21:
-        key = (
-            ((grid[:, 0] + side // 2) * side + grid[:, 1] + side // 2) * side
-            + grid[:, 2]
-            + side // 2
-        )
-        first, member = np.unique(key, return_index=True, return_inverse=True)[1:]
-        cells = grid[first]
+        key = np.ravel_multi_index(tuple((grid + side // 2).T), (side,) * 3)
+        # Places among the few cells are found sooner than all images are sorted.
+        unique = np.unique(key)
+        member = np.searchsorted(unique, key)
+        cells = np.stack(np.unravel_index(unique, (side,) * 3), axis=1) - side // 2
     else:
         cells, member = np.unique(grid, axis=0, return_inverse=True)
     pairs = cKDTree(cells).query_pairs(1.0 / 0.3, output_type="ndarray")

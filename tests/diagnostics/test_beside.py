@@ -52,8 +52,9 @@ def test_noise_is_looked_at_where_effects_are_free() -> None:
     shifted = replace(obs, x_px=obs.x_px + 1e-4 * (obs.x_px / 1024.0) ** 2)
     again = Freed.of(shifted, cal, axes=True)
     np.testing.assert_allclose(again.e, free.e, atol=1e-6)
-    scatter = float(np.sqrt(np.sum(free.e**2) / free.dof))
-    assert scatter == pytest.approx(0.05, rel=4.0 / np.sqrt(2.0 * free.dof))
+    dof = free.frame_dof.sum() - len(free.h)
+    scatter = float(np.sqrt(np.sum(free.e**2) / dof))
+    assert scatter == pytest.approx(0.05, rel=4.0 / np.sqrt(2.0 * dof))
     # Control: a shift of as much that no effect holds shows in full.
     rough = replace(obs, x_px=obs.x_px + 1e-4 * np.sin(7.0 * obs.x_px))
     assert np.abs(Freed.of(rough, cal, axes=True).e - free.e).max() > 5e-5

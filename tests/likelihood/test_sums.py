@@ -110,9 +110,7 @@ def test_sums_of_single_frames_keep_their_digits_in_a_narrow_field(field_deg):
         q, r = np.linalg.qr(rows[0])
         left = np.hstack(rows[1:]) - q @ (q.T @ np.hstack(rows[1:]))
         own[k] = left.T @ left
-        assert volume[k] == pytest.approx(
-            2.0 * np.sum(np.log(np.abs(np.diag(r)))), rel=1e-9
-        )
+        assert volume[k] == pytest.approx(2.0 * np.sum(np.log(np.abs(np.diag(r)))), rel=1e-9)
     size = np.sqrt(np.einsum("kii->ki", own))
     assert np.max(np.abs(gram - own) / (size[:, :, None] * size[:, None])) < 1e-7
     assert np.max(np.abs(found - attitudes.rotations)) < 1e-9
