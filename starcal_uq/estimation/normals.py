@@ -210,19 +210,17 @@ class StarNormals:
         frames, p = likelihood.frames, len(cal.theta)
         term = star_term(numbers, frames.r, float(cal.theta[2]))
         start, gram = quaternion_to_rotation(cal.quaternions), np.zeros((p + 1, p + 1))
-        s, (i, j) = term.n_groups, np.triu_indices(p)
-        scores, slopes, packed = np.zeros((s, p)), np.zeros((s, p)), np.zeros((s, len(i)))
-        cross = np.zeros((s, 2, p))
+        s = term.n_groups
+        scores, slopes, matrices = np.zeros((s, p)), np.zeros((s, p)), np.zeros((s, p, p))
+        response = np.zeros((s, 2, p))
         for part, state, columns, rows in likelihood.linearised(
             cal.theta, cal.sigmas, start, _STARS_AT_ONCE
         ):
             h, flat, stars = columns[:p], columns.reshape(p + 1, -1), numbers[rows]
             gram += flat @ flat.T
-            for total, seen in (
-                (scores[:, None], state.e[None]),
-                (cross, term.columns(part, state, rows)),
-            ):
-                add_by_group(total, np.einsum("axn,pxn->apn", seen, h), stars)
+            z = term.columns(part, state, rows)
+            add_by_group(scores, np.sum(h * state.e, axis=1), stars)
+            add_by_group(response, np.einsum("ixn,pxn->ipn", z, h), stars)
             # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has
             # hidden.
             a = part.attitudes(state).orthonormal
@@ -230,9 +228,8 @@ class StarNormals:
             raised = np.stack([yy * h[:, 0] - xy * h[:, 1], xx * h[:, 1] - yx * h[:, 0]], axis=1)
             raised /= xx * yy - xy * yx
             add_by_group(slopes, np.sum(raised * state.e, axis=1), stars)
-            add_by_group(packed, np.sum(raised[i] * h[j], axis=1), stars)
-        matrix, matrices = gram[:p, :p], np.empty((s, p, p))
-        matrices[:, i, j] = matrices[:, j, i] = packed
+            add_by_group(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
+        matrix = gram[:p, :p]
         unit = 1.0 / np.sqrt(np.diag(matrix))
         return cls(
             scale=cal.sigmas * unit,
@@ -241,7 +238,7 @@ class StarNormals:
             scores=scores * unit,
             matrices=matrices * np.outer(unit, unit),
             slopes=slopes * unit,
-            response=cross * unit,
+            response=response * unit,
             dof=likelihood.dof - p,
         )
 

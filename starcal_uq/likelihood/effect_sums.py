@@ -22,7 +22,7 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.likelihood.effects import Effect
-from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
+from starcal_uq.likelihood.elimination import ByFrame, frame_blocks, products_by_frame
 from starcal_uq.likelihood.frame_products import FrameProducts
 from starcal_uq.likelihood.marginal import MarginalLikelihood, Profile
 from starcal_uq.likelihood.shapes import View
@@ -79,11 +79,20 @@ class Columns:
     def _shifts(self, effects: Sequence[Effect]) -> FloatArray:
         return _whitened(self.frames, *(e.columns.columns(self.view) for e in effects))
 
-    def _cells(self, effect: Effect) -> _Cells | None:
-        of_stars = effect.columns.cells
-        if of_stars is None:
+    @property
+    def _cells(self) -> Any | None:
+        """Columns (2 n, m) of the run's last effect, sparse, where each star is in one cell of it."""
+        from scipy.sparse import csr_array
+
+        own, n = self.of_run[-1].columns if self.of_run else None, self.frames.n_stars
+        if own is None or own.cells is None or self.n_stars:
             return None
-        return _Cells(self.frames, of_stars(self.view), effect.columns.size // 2)
+        shifts = np.repeat(np.eye(2)[:, :, None], n, axis=2)
+        self.frames.whiten(shifts)
+        stars, axes = np.arange(n), np.arange(2)[:, None]
+        place = np.broadcast_arrays(stars + n * axes, 2 * own.cells(self.view) + axes[:, None])
+        entries = shifts.ravel(), tuple(index.ravel() for index in place)
+        return csr_array(entries, shape=(2 * n, own.size))
 
     @cached_property
     def run(self) -> FloatArray:
@@ -122,33 +131,26 @@ class Columns:
 
     def products(self, added: FloatArray) -> Products:
         """Products with added columns (q, 2, n) and among themselves, attitudes projected out."""
-        cells = self._cells(self.of_run[-1]) if self.of_run and not self.n_stars else None
+        cells = self._cells
         dense = self.raw if cells is None else self._shifts(self.of_run[:-1])
         others = np.concatenate([dense, self.frame, added])
-        local = np.concatenate([self.attitudes.columns, self.frame])
-        by_frame = products_by_frame(self.frames, local, others)
-        flat, d = others.reshape(len(others), 2 * self.frames.n_stars), len(dense)
-        every = flat @ flat.T
+        blocks = frame_blocks(self.frames, np.concatenate([self.attitudes.columns, self.frame]))
+        flat = others.reshape(len(others), 2 * self.frames.n_stars)
+        every, by_frame, m = flat @ flat.T, blocks @ flat.T, len(dense)
         if cells is not None:
-            # Each star is in one cell: sums over cells, and no columns full of zeros.
-            along, own = cells.cross(others), cells.products()
-            every = np.block(
-                [
-                    [every[:d, :d], along[:, :d].T, every[:d, d:]],
-                    [along[:, :d], own, along[:, d:]],
-                    [every[d:, :d], along[:, d:].T, every[d:, d:]],
-                ]
-            )
-            by_frame = np.concatenate(
-                [by_frame[:, :, :d], cells.by_frame(local), by_frame[:, :, d:]], axis=2
-            )
-            d += len(own)
+            along = cells.T @ flat.T
+            every = np.block([[every, along.T], [along, (cells.T @ cells).toarray()]])
+            by_frame = np.concatenate([by_frame, (blocks @ cells).toarray()], axis=1)
+            order = np.r_[:m, len(others) : len(every), m : len(others)]
+            every, by_frame = every[np.ix_(order, order)], by_frame[:, order]
+            m += len(along)
+        by_frame = by_frame.reshape(self.frames.n_frames, -1, len(every))
         root = np.linalg.cholesky(np.moveaxis(self.attitudes.inverse, 2, 0))
         turned = np.swapaxes(root, 1, 2) @ by_frame[:, :3]
         turned = turned.reshape(3 * self.frames.n_frames, len(every))
         # A view of few columns would keep all of them.
         frame, gram = by_frame[:, 3:].copy(), every - turned.T @ turned
-        m, end, star = d, len(every) - len(added), np.zeros((0, len(every)))
+        end, star = len(every) - len(added), np.zeros((0, len(every)))
         if self.n_stars:
             left = self.attitudes.removed_from(added)
             star = self.cross(np.concatenate([self.run, self.frame, left])).star
@@ -166,45 +168,6 @@ def _whitened(frames: StarFrames, *columns: FloatArray) -> FloatArray:
     found = np.concatenate([np.zeros((0, 2, frames.n_stars)), *columns])
     frames.whiten(found)
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Whitened columns (2 G, 2, n) of shifts in x and in y of each of G cells."""
-
-    frames: StarFrames
-    cell: IntArray  # (n,): cell of every star
-    size: int
-
-    @cached_property
-    def _units(self) -> FloatArray:
-        """Whitened shifts (2, 2, n) of a star by one px in x and in y."""
-        units = np.repeat(np.eye(2)[:, :, None], self.frames.n_stars, axis=2)
-        self.frames.whiten(units)
-        return units
-
-    def cross(self, x: FloatArray) -> FloatArray:
-        """Products (2 G, q) with columns (q, 2, n)."""
-        return self._by_group(x, self.cell, self.size)
-
-    def by_frame(self, x: FloatArray) -> FloatArray:
-        """The same over the stars of each frame, (K, q, 2 G)."""
-        k = self.frames.n_frames
-        frame = self.frames.spread(np.arange(k))
-        found = self._by_group(x, frame * self.size + self.cell, k * self.size)
-        return np.swapaxes(found.reshape(k, 2 * self.size, len(x)), 1, 2)
-
-    def products(self) -> FloatArray:
-        """Products (2 G, 2 G) among themselves."""
-        own = self.cross(self._units).reshape(self.size, 2, 2)
-        found = np.zeros((self.size, 2, self.size, 2))
-        found[np.arange(self.size), :, np.arange(self.size)] = own
-        return found.reshape(2 * self.size, 2 * self.size)
-
-    def _by_group(self, x: FloatArray, groups: IntArray, n_groups: int) -> FloatArray:
-        total = np.zeros((n_groups, 2, len(x)))
-        add_by_group(total, np.einsum("ixn,qxn->iqn", self._units, x), groups)
-        return total.reshape(2 * n_groups, len(x))
 
 
 @dataclass(frozen=True, eq=False)

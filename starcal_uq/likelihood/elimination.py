@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -50,12 +51,16 @@ def products_by_frame(frames: StarFrames, one: FloatArray, other: FloatArray) ->
     """Products (K, a, b) of columns (a, x, N) and (b, x, N) over the stars of each frame, along x
     axes.
     """
+    found = frame_blocks(frames, one) @ other.reshape(len(other), one[0].size).T
+    return np.asarray(found.reshape(frames.n_frames, len(one), len(other)))
+
+
+def frame_blocks(frames: StarFrames, one: FloatArray) -> Any:
+    """Columns (a, x, N) as a sparse matrix (a K, x N), each frame with rows of its own."""
     from scipy.sparse import csc_array
 
     a, axes, n = one.shape
     n *= axes
     place = a * np.repeat(np.arange(frames.n_frames), frames.sizes)[:, None] + np.arange(a)
     entries = one.reshape(a, n).T.ravel(), np.tile(place.ravel(), axes)
-    blocks = csc_array((*entries, a * np.arange(n + 1)), shape=(a * frames.n_frames, n))
-    found = blocks @ other.reshape(len(other), n).T
-    return np.asarray(found.reshape(frames.n_frames, a, len(other)))
+    return csc_array((*entries, a * np.arange(n + 1)), shape=(a * frames.n_frames, n))

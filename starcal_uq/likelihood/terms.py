@@ -98,7 +98,7 @@ class TermSums:
         if of_frames is not None:
             own = np.concatenate([own, of_frames])
         block = np.einsum("ixn,bxn->nbi", z, own)
-        frame = part.frames.spread(self._frames + np.arange(part.frames.n_frames))
+        frame = self._frames + np.repeat(np.arange(part.frames.n_frames), part.frames.sizes)
         self._blocks.append((block, groups, frame))
         self._frames += part.frames.n_frames
 
