@@ -143,36 +143,28 @@ class Freed:
     rows: slice  # Rows of the stars in the table
 
     @classmethod
-    def pieces(
-        cls, obs: Observations, cal: Calibration, gram: FloatArray, raw: FloatArray
-    ) -> Iterator[Freed]:
+    def pieces(cls, obs: Observations, cal: Calibration, gram: FloatArray) -> Iterator[Freed]:
         """Those of a calibration, some frames at a time where it has no effects.
 
-        `gram` (p + 1, p + 1): products of parameters and residuals, attitudes removed. `raw` (p,):
-        squares of the parameters' columns, attitudes in them.
+        `gram` (p + 1, p + 1): products of parameters and residuals, attitudes removed.
         """
         if has_effects(cal):
             yield cls.of(obs, cal, axes=True)
             return
-        unit, p = 1.0 / np.sqrt(raw), len(raw)
-        values, vectors = principal(gram[:p, :p] * np.outer(unit, unit), _ABSORBED)
+        inner, unit = gram[:-1, :-1], 1.0 / np.sqrt(np.diag(gram)[:-1])
+        values, vectors = principal(inner * np.outer(unit, unit), _ABSORBED)
         turn = (unit[:, None] * vectors / np.sqrt(values)).T
-        along = turn @ gram[:p, p]
+        along = turn @ gram[:-1, -1]
         likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
         start = quaternion_to_rotation(cal.quaternions)
         for part, state, columns, rows in likelihood.linearised(
-            cal.theta, np.ones(p), start, _STARS_AT_ONCE
+            cal.theta, np.ones(len(unit)), start, _STARS_AT_ONCE
         ):
-            basis = part.attitudes(state).orthonormal
-            unit_of_all = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, part.frames.n_frames))
-            h = np.tensordot(turn, columns[:p], axes=1)
-            yield cls(
-                ByFrame(part.frames, basis, unit_of_all),
-                h,
-                columns[p] - np.tensordot(along, h, axes=1),
-                2.0 * part.frames.sizes - 3.0,
-                rows,
-            )
+            frames, basis = part.frames, part.attitudes(state).orthonormal
+            apart = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, frames.n_frames))
+            h = np.tensordot(turn, columns[:-1], axes=1)
+            e = columns[-1] - np.tensordot(along, h, axes=1)
+            yield cls(ByFrame(frames, basis, apart), h, e, floats(2.0 * frames.sizes - 3.0), rows)
 
     @classmethod
     def of(cls, obs: Observations, cal: Calibration, axes: bool) -> Freed:

@@ -146,8 +146,7 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
     gram, weights = sums.gram[: sums.p + 1, : sums.p + 1], noise_weights(obs, cal.camera)
-    pieces = Freed.pieces(obs, cal, gram, sums.parameters_raw)
-    noise, of_noise = NoiseSums(pieces, weights, has_effects(cal)), []
+    noise, of_noise = NoiseSums(Freed.pieces(obs, cal, gram), weights, has_effects(cal)), []
     if noise.dof >= LEAST_DOF:
         of_noise = [(f"noise that changes with {name}", name, z, p) for name, z, p in noise.tests()]
     if (frames := noise.by_frame()) is not None:

@@ -61,18 +61,16 @@ class ShapeSums:
         of_frames = None if held else EffectSums([*effects, frame], theta, cal.sigma, apart=False)
         # Degrees of freedom that scale and shape of every frame by itself take.
         self.places, self.block_rank, square = sums.places, 0, 0.0
-        # Squares of columns before attitudes are removed: of the parameters and of the families
-        self.parameters_raw = np.zeros(p)
         rotations = quaternion_to_rotation(cal.quaternions)
         for part, state, rows in likelihood.pieces(theta, rotations, _STARS_AT_ONCE):
             h = part.derivatives(theta, state)
-            self.parameters_raw += np.einsum("pxn,pxn->p", h, h)
             fitted = part.project_out(state, np.concatenate([h, state.e[None]]))
             sums.add(part, state, fitted, rows)
             if of_frames is not None:
                 own = of_frames.add(part, state, fitted, rows).frame
                 self.block_rank += int(by_frame(part.frames, own)[1].sum())
                 square += float(np.sum(own**2))
+        # Squares of the columns before attitudes are removed
         self.raw = sums.total.squares
         ratio = {} if cal.effects is None else cal.effects.ratio(cal.sigma)
         # Products of parameters, residuals and columns of effects and of all families, attitudes

@@ -134,7 +134,8 @@ class Columns:
         cells = self._cells
         dense = self.raw if cells is None else self._shifts(self.of_run[:-1])
         others = np.concatenate([dense, self.frame, added])
-        blocks = frame_blocks(self.frames, np.concatenate([self.attitudes.columns, self.frame]))
+        local = np.concatenate([self.attitudes.columns, self.frame])
+        blocks = frame_blocks(self.frames, local)
         flat = others.reshape(len(others), 2 * self.frames.n_stars)
         every, by_frame, m = flat @ flat.T, blocks @ flat.T, len(dense)
         if cells is not None:
@@ -144,7 +145,7 @@ class Columns:
             order = np.r_[:m, len(others) : len(every), m : len(others)]
             every, by_frame = every[np.ix_(order, order)], by_frame[:, order]
             m += len(along)
-        by_frame = by_frame.reshape(self.frames.n_frames, -1, len(every))
+        by_frame = by_frame.reshape(self.frames.n_frames, len(local), len(every))
         root = np.linalg.cholesky(np.moveaxis(self.attitudes.inverse, 2, 0))
         turned = np.swapaxes(root, 1, 2) @ by_frame[:, :3]
         turned = turned.reshape(3 * self.frames.n_frames, len(every))

@@ -51,7 +51,8 @@ def products_by_frame(frames: StarFrames, one: FloatArray, other: FloatArray) ->
     """Products (K, a, b) of columns (a, x, N) and (b, x, N) over the stars of each frame, along x
     axes.
     """
-    found = frame_blocks(frames, one) @ other.reshape(len(other), one[0].size).T
+    blocks = frame_blocks(frames, one)
+    found = blocks @ other.reshape(len(other), blocks.shape[1]).T
     return np.asarray(found.reshape(frames.n_frames, len(one), len(other)))
 
 
