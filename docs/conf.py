@@ -133,12 +133,12 @@ def write_command_help(_app: object) -> None:
     """Write the help texts as the installed command prints them, so that the page cannot go
     stale.
     """
-    from starcal_uq.cli.overview import COMMANDS
+    from starcal_uq.cli.commands import app
 
     command = str(Path(sys.executable).with_name("starcal-uq"))
     environment = {**os.environ, "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     texts = []
-    for name in ("", *COMMANDS):
+    for name in ("", *app.commands):
         arguments = [name, "--help"] if name else ["--help"]
         run = subprocess.run(
             [command, *arguments], env=environment, capture_output=True, text=True, check=True

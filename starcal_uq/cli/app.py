@@ -17,7 +17,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from starcal_uq.cli import VERSION_LINE
+from starcal_uq.cli import HELP, VERSION_LINE
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # An internal software error, as `sysexits.h` numbers it.
@@ -33,9 +33,7 @@ def program() -> NoReturn:
         print(VERSION_LINE)
         sys.exit(0)
     if words == ["--help"] or not (words or "_STARCAL_UQ_COMPLETE" in os.environ):
-        from starcal_uq.cli.overview import overview
-
-        print(overview())
+        print(HELP.read_text("utf-8"), end="")
         sys.exit(0 if words else 2)
     try:
         main()

@@ -5,22 +5,26 @@ call.
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from starcal_uq.cli import VERSION_LINE
-from starcal_uq.cli.overview import COMMANDS, overview
+from starcal_uq.cli import HELP, VERSION_LINE
 from starcal_uq.cli.runfiles import typed
 from starcal_uq.core.conflicts import EARLIER
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import wanted
 from starcal_uq.core.types import AnyDict
+
+
+_MODULES = tomllib.loads(Path(__file__).with_name("commands.toml").read_text("utf-8"))
 
 
 class _Command(TyperCommand):
@@ -43,7 +47,7 @@ class _Program(TyperGroup):
     """The program, whose help loads no command."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        formatter.write(overview())
+        formatter.write(HELP.read_text("utf-8"))
 
 
 class _Commands(Mapping[str, Any]):
@@ -53,17 +57,17 @@ class _Commands(Mapping[str, Any]):
         return _command(name)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(COMMANDS)
+        return iter(_MODULES)
 
     def __len__(self) -> int:
-        return len(COMMANDS)
+        return len(_MODULES)
 
 
 @cache
 def _command(name: str) -> Any:
     from starcal_uq.cli.settings import unfolded
 
-    module = import_module(f"starcal_uq.cli.{COMMANDS[name][0]}")
+    module = import_module(f"starcal_uq.cli.{_MODULES[name]}")
     function = getattr(module, f"{name.replace('-', '_')}_command")
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
     alone.command(name, cls=_Command)(unfolded(name, function))

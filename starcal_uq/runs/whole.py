@@ -56,8 +56,6 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.thermal import TemperatureProfile
 
 Stars: TypeAlias = Observations | PartitionedObservations
-# From so many stars on, half of the diagnosis is worth another process.
-_APART_STARS = 50_000
 # Frames on the page of a run that has failed.
 _FAILED_FRAMES = 24
 
@@ -303,10 +301,7 @@ def finish(
         run._tell(f"The data support no effect of the temperature: {profile} is left out.")
         del propagation["temperature_profile"]
     apart = None
-    # With fewer stars the other process would take longer to load what it needs than this one takes
-    # for all of it.
-    many = run.calibration.partitions is None and len(run.observations) >= _APART_STARS
-    if many and not run.did("diagnose"):
+    if run.calibration.partitions is None and not run.did("diagnose"):
         apart = ahead.begin(partial(diagnose_apart, seed=seed), run.observations, run.calibration)
     watch.tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
     ahead.draw(run.calibrated, AFTER_CALIBRATION)

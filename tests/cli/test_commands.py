@@ -4,8 +4,10 @@ mistake.
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
+import re
 import subprocess
 import sys
 from typing import get_args
@@ -14,8 +16,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.cli import HELP
 from starcal_uq.cli.commands import app
-from starcal_uq.cli.overview import overview
 from starcal_uq.cli.schemas import document
 from starcal_uq.core.runfile import expanded
 from starcal_uq.core.settings import Starter
@@ -74,6 +76,18 @@ def test_simulate_writes_a_table_that_calibrates(cli, inputs, tmp_path):
     assert status == 0
     assert "truth" in out
     assert "warning" not in err
+
+
+def test_help_of_the_program_is_that_of_its_commands_which_it_does_not_load(cli):
+    text = cli("--help")[1]
+    assert text == HELP.read_text("utf-8") and max(map(len, text.splitlines())) <= 80
+    rows = re.findall(r"^  (\S+) +(\S.*(?:\n {3,}.*)*)", text, re.MULTILINE)
+    listed = {name: " ".join(words.split()) for name, words in rows}
+    options = [option for one in app.params for option in one.opts]
+    assert list(listed) == [*options, "--help", *app.commands]
+    for name, command in app.commands.items():
+        said = inspect.getdoc(inspect.unwrap(command.callback)).partition("\n\n")[0]
+        assert listed[name] == " ".join(said.split()), name
 
 
 def test_help_teaches(cli):
@@ -320,7 +334,7 @@ def test_python_runs_the_package_and_shells_complete_its_commands():
         return told.stdout
 
     assert run(["--version"], set()) == told.stdout
-    assert run(["--help"], set()) == run([], set()) == overview() + "\n"
+    assert run(["--help"], set()) == run([], set()) == HELP.read_text("utf-8")
     assert "--effects" in run(["run", "--help"], parsing)
     for words, found in (
         ("starcal-uq cal", ["calibrate"]),
