@@ -23,7 +23,6 @@ from starcal_uq.core.files import shown
 from starcal_uq.core.settings import wanted
 from starcal_uq.core.types import AnyDict
 
-
 _MODULES = tomllib.loads(Path(__file__).with_name("commands.toml").read_text("utf-8"))
 
 
