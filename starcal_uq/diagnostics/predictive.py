@@ -146,7 +146,7 @@ def predictive_check(
     measured, replicated = [], []
     for shift, noise in zip(theta - cal.theta, sigma, strict=True):
         measured.append(summary(np.tensordot(np.append(-shift, 1.0), columns, 1) / noise))
-        fresh = rng.standard_normal((1, *e.shape))
+        fresh = _noise(cal, e.shape, rng)
         if exact is not None:
             fresh += exact.random_shifts(state, rng)
         replicated.append(summary(left(fresh)[0]))
@@ -161,6 +161,19 @@ def predictive_check(
         # Every frame's sum of squares went into the factor of its own noise.
         statistics = tuple(s for s in statistics if not s.name.startswith("worst frame"))
     return PredictiveCheck(statistics, len(sigma), some.n_frames, obs.n_frames)
+
+
+def _noise(cal: Calibration, shape: tuple[int, ...], rng: np.random.Generator) -> FloatArray:
+    """Noise (1, 2, N) of stars in units of sigma, with the tails and the weights of an estimate."""
+    noise = rng.standard_normal((1, *shape))
+    if cal.provenance.likelihood != "student_t":
+        return noise
+    # The bivariate t of `likelihood.student`: r^2 / (nu + r^2) is Beta(1, nu / 2), in any direction.
+    nu = float(cal.provenance.student_t["dof"])
+    share = rng.beta(1.0, nu / 2.0, shape[-1])
+    # Weights (nu + 2) / (nu + r^2) bound what is left.
+    square = nu * share / (1.0 - share) if cal.star_weights is None else (nu + 2.0) * share
+    return noise * np.sqrt(square / np.sum(noise[0] ** 2, axis=0))
 
 
 def _draws(

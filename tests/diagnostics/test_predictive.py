@@ -30,6 +30,24 @@ def test_replicates_look_like_data_of_the_model_and_unlike_others(obs, cal):
     )
 
 
+@pytest.mark.parametrize("effects", ["tails", "tails,time"])
+def test_replicates_have_the_tails_of_the_model(obs, effects):
+    """Noise with four degrees of freedom looks like itself, beside effects, which keep the weights
+    of the stars, and without; wrong stars do not.
+    """
+    some = obs.select(obs.frame < 60)
+    rng = np.random.default_rng(3)
+    noise = 0.05 * rng.standard_normal((2, len(some))) / np.sqrt(rng.chisquare(4, len(some)) / 4)
+    wrong = (rng.random((2, len(some))) < 0.05) * rng.uniform(3.0, 30.0, (2, len(some)))
+    extreme = []
+    for x, y in (noise, wrong):
+        data = dataclasses.replace(some, x_px=some.x_px + x, y_px=some.y_px + y)
+        cal = sc.calibrate(data, sc.paper.paper_start(), effects=effects)
+        found = predictive_check(data, cal, n_draws=200)
+        extreme.append([s.name for s in found.statistics if s.extreme])
+    assert not extreme[0] and extreme[1]
+
+
 def test_replicates_on_some_frames_say_so(obs, cal, monkeypatch):
     monkeypatch.setattr("starcal_uq.diagnostics.predictive._MAX_STARS", 500)
     some = predictive_check(obs, cal, n_draws=100)

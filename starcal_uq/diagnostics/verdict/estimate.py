@@ -403,7 +403,8 @@ def predictive(found: PredictiveCheck) -> Check:
         Code.POSTERIOR_PREDICTIVE_CHECK,
         {"p_value": low.p_value, "n_draws": found.n_draws, "extreme": extreme},
         dict(zip(("p_value_least", "p_value_most"), EXTREME_P, strict=True)),
-        ROBUST,
+        # What tails do not describe either is no noise of these stars.
+        (*ROBUST, *SCREEN),
         good=not extreme,
     )
 
