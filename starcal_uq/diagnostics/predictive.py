@@ -16,7 +16,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import Seed, bounded, seed_of
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, floats
 from starcal_uq.diagnostics.beside import has_effects, with_effects_of
 from starcal_uq.estimation.weights import weighed
 from starcal_uq.likelihood.effect_likelihood import EffectLikelihood
@@ -173,7 +173,7 @@ def _noise(cal: Calibration, shape: tuple[int, ...], rng: np.random.Generator) -
     share = rng.beta(1.0, nu / 2.0, shape[-1])
     # Weights (nu + 2) / (nu + r^2) bound what is left.
     square = nu * share / (1.0 - share) if cal.star_weights is None else (nu + 2.0) * share
-    return noise * np.sqrt(square / np.sum(noise[0] ** 2, axis=0))
+    return floats(noise * np.sqrt(square / np.sum(noise[0] ** 2, axis=0)))
 
 
 def _draws(

@@ -205,10 +205,9 @@ def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
             words in said for words in ("Not usable, because ", "would tell: ")
         ), said
         summary = out.splitlines()
-        begin = next(
-            i for i, line in enumerate(summary) if re.match(r"\S+: [\d\W]+ stars? in", line)
-        )
-        assert len(summary[begin:]) <= 24, out[-2500:]
+        # The table of the calibration begins like the summary, which stands last.
+        begun = [i for i, line in enumerate(summary) if re.match(r"\S+: [\d\W]+ stars? in", line)]
+        assert len(summary[begun[-1] :]) <= 24, out[-2500:]
         steps.append(Step(options, status, doubts, commands, said))
         for command in set(commands) - set(runs):
             status, _, err = call(shlex.split(command)[1:])
