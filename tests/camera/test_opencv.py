@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CameraError
+from tests.camera.test_camera import awkward, matrix
 
 PAPER = Camera(1024, 1024, 12.0, 70.2262, 500.0, 530.0, "brown", (2.0e-10, -3.5e-15))
-
-
-def awkward(distortion: str) -> Camera:
-    """A camera none of whose numbers has a short decimal form."""
-    n = len(get_model(distortion).coefficients)
-    coefficients = tuple(-(10.0**-9.1) / 3**k for k in range(n))
-    return Camera(
-        640, 480, 10.0 / 3.0, math.pi * 7, 1 / 3, -2 / 7, distortion, coefficients, 'é "x"'
-    )
 
 
 @pytest.mark.parametrize("distortion", ["brown", "brown3", "brown_tangential"])
@@ -55,10 +44,6 @@ def test_opencv_scales_by_powers_of_the_focal_length():
         Camera.from_opencv(PAPER.to_opencv()[0], np.zeros((1, 14)), 1024, 1024, 12.0).distortion
         == "brown"
     )
-
-
-def matrix(fx=5000.0, fy=5000.0, skew=0.0):
-    return np.array([[fx, skew, 500.0], [0.0, fy, 500.0], [0.0, 0.0, 1.0]])
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,10 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.estimation.weights import weighed
+from tests.estimation.test_noise_model import worse_outside
 from tests.helpers.outside import campaign
 
 DRAWS = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 100, "n_burn": 30, "seed": 3}
-
-
-def worse_outside(radius, mag, frame):
-    """Three times the noise at the edge of the field."""
-    return 0.05 * (1.0 + 2.0 * (radius / 0.75) ** 4)
 
 
 def spoilt(seed, share=0.05, **options):
@@ -138,7 +134,6 @@ def selected(made, seed, effects="auto"):
         (clean, ()),
         (uneven_gaussian, ("noise",)),
         (heavy, ("tails",)),
-        pytest.param(uneven_and_wrong, ("noise", "tails"), marks=pytest.mark.slow),
     ],
 )
 def test_auto_takes_up_noise_and_tails_where_the_data_ask_for_them(made, chosen):

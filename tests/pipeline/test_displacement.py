@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 import starcal_uq as sc
 from starcal_uq.pipeline.displacement import as_measured, undisplaced
@@ -15,11 +14,7 @@ from starcal_uq.sky.apparent import (
     make_apparent,
 )
 from tests.helpers.ground_scenes import CAMERA, SITE, as_centroids, ground_frames
-
-
-def rotated_onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    rotation, _ = Rotation.align_vectors(b, a)
-    return rotation.apply(a)
+from tests.sky.test_refraction import rotated_onto
 
 
 @pytest.fixture(scope="module")

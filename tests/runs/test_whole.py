@@ -11,6 +11,8 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.cli.app import main
+from starcal_uq.cli.schemas import document
+from tests.cli.conftest import check_document
 from tests.helpers.scenes import observations
 
 FEW = {"n_steps": 20, "n_draws": 50, "n_ensembles": 2}
@@ -41,10 +43,31 @@ def cli(unpainted, monkeypatch, tmp_path):
     return call
 
 
-def test_the_call_has_the_numbers_of_the_command(few, cli):
-    made = sc.run(few, sc.paper.paper_start(), seed=3, **FEW)
-    assert cli("run", "obs.ecsv", "camera.toml", "-o", "run", *TYPED, "--seed", "3") in (0, 1)
+def test_the_command_writes_everything_and_the_call_has_its_numbers(few, cli, capsys):
+    status = cli("run", "obs.ecsv", "camera.toml", "-o", "run", *TYPED, "--seed", "3")
+    assert status in (0, 1)
+    out = capsys.readouterr().out
+    for heading in ("Calibration", "posterior ± 1 sigma", "Attitude error", "Report:"):
+        assert heading in out
     typed = sc.Run("run")
+    run = sc.runs.RunFolder(typed.path)
+    stars = (run.observations, run.camera, run.calibration)
+    for path in (*stars, run.posterior, run.coupling, run.attitude, run.report):
+        assert path.stat().st_size > 0, path
+    page = run.report.read_text(encoding="utf-8")
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    # The same verdict for programs.
+    verdict = check_document(run.verdict.read_text("utf-8"), status)
+    found = typed.verdict
+    assert verdict == document("verdict", found, status) == found.to_dict()
+    assert verdict["headline"] in " ".join(out.split())
+    assert [check["name"] for check in verdict["checks"]] == [c.name for c in found.checks]
+    assert all(
+        check["remedy"] or check["advice"] or check["level"] == "pass"
+        for check in verdict["checks"]
+    )
+    made = sc.run(few, sc.paper.paper_start(), seed=3, **FEW)
     assert np.array_equal(made.posterior.draws, typed.posterior.draws)
     assert np.array_equal(made.attitude.headline_arcsec, typed.attitude.headline_arcsec)
     assert made.error_budget.to_dataframe().equals(typed.error_budget.to_dataframe())
