@@ -464,10 +464,7 @@ def test_missing_columns(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("empty.csv", b"", "the file is empty"),
         ("blank.csv", b" \n\n", "the file is empty"),
-        ("empty.ecsv", b"", "the file is empty"),
-        ("empty.parquet", b"", "the file is empty"),
         ("comment.csv", b"# nothing\n", "comments only"),
         ("header.csv", b"frame,x_px,y_px,ra_deg,dec_deg\n", "a header but no rows"),
         ("latin.csv", b"frame,x_px,y_px,ra_deg,dec_deg\n1,2,3,4,\xe9\n", "line 2: the text is not"),
