@@ -16,6 +16,7 @@ import numpy as np
 from starcal_uq.attitude.heads import HeadArray, HeadTest, apart_from, body_weights
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import HeadError, check_known, require
 from starcal_uq.core.types import FloatArray
 from starcal_uq.maths.linear import inverses
@@ -50,6 +51,8 @@ class Misalignments:
         Whether heads differ after the correction as their covariances say. A drift that was left
         out shows here.
     """
+
+    __dir__ = public_names
 
     heads: HeadArray
     reference: str

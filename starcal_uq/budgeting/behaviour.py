@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from starcal_uq.attitude.profile import TableColumns, check_order, read_columns
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import listed
 from starcal_uq.core.types import BoolArray, FloatArray, PathLike
@@ -63,6 +64,8 @@ class Behaviour:
     mean_arcsec : float
         Mean of a series, arcsec.
     """
+
+    __dir__ = public_names
 
     kind: Kind
     seconds: float = math.nan

@@ -113,7 +113,7 @@ class PlaceSettings:
         """
         return {
             "directions": self.directions,
-            "site": None if self.site is None else sc.sky.Site.load(self.site),
+            "site": sc.sky.Site.of(self.site),
             "in_space": self.in_space,
         }
 

@@ -6,9 +6,11 @@ that here, by its class, when somebody asks.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import partial
+from functools import wraps
 from typing import Any
 
 
@@ -25,6 +27,8 @@ class View:
     figures: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
 
 
+# The figure that a user gave to draw into; None for one of its own.
+GIVEN: ContextVar[Any] = ContextVar("GIVEN", default=None)
 _VIEWS: list[Callable[[], Mapping[type, View]]] = []
 
 
@@ -50,6 +54,8 @@ def view_of(cls: type) -> View:
 class Figures:
     """The figures of one result: ``result.plot.<name>(...)`` draws, and tab completion lists the
     names.
+
+    With ``fig=``, a Figure or SubFigure of matplotlib, it draws into that one.
     """
 
     def __init__(self, result: Any, figures: Mapping[str, Callable[..., Any]]) -> None:
@@ -63,9 +69,20 @@ class Figures:
                 f"a {type(self._result).__name__} has no figure {name!r}; it has {known}"
             )
         figure = self._figures[name]
-        bound = partial(figure, self._result)
-        bound.__doc__ = figure.__doc__
-        return bound
+
+        @wraps(figure)
+        def draw(*args: Any, fig: Any = None, **options: Any) -> Any:
+            token = GIVEN.set(fig)
+            try:
+                return figure(self._result, *args, **options)
+            finally:
+                GIVEN.reset(token)
+
+        _, *own = inspect.signature(figure).parameters.values()
+        own.append(inspect.signature(draw, follow_wrapped=False).parameters["fig"])
+        own.sort(key=lambda parameter: parameter.kind)
+        draw.__signature__ = inspect.Signature(own)  # type: ignore[attr-defined]
+        return draw
 
     def __dir__(self) -> list[str]:
         return sorted(self._figures)
@@ -74,8 +91,15 @@ class Figures:
         return f"figures of this {type(self._result).__name__}: {', '.join(dir(self))}"
 
 
+def public_names(thing: object) -> list[str]:
+    """Names for tab completion, without the private ones."""
+    return [name for name in object.__dir__(thing) if not name.startswith("_")]
+
+
 class Shown:
     """What every result can do once somebody above has said how."""
+
+    __dir__ = public_names
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -14,6 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.settings import Limit
@@ -201,6 +202,8 @@ class Section:
 
 class Stated:
     """What people state in a table of a TOML file, which `SECTION` checks: base of a frozen record."""
+
+    __dir__ = public_names
 
     SECTION: ClassVar[Section]
 

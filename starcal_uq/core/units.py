@@ -6,35 +6,15 @@ They are known by what they offer: astropy is loaded by those who use it, and on
 from __future__ import annotations
 
 import re
+import tomllib
+from pathlib import Path
 from typing import Any
 
 from starcal_uq.core.errors import SettingError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import shown
 
-_UNITS = {
-    "um": "um",
-    "mm": "mm",
-    "m": "m",
-    "km": "km",
-    "km_s": "km / s",
-    "deg": "deg",
-    "deg_s": "deg / s",
-    "arcsec": "arcsec",
-    "mas": "mas",
-    "rad": "rad",
-    "rad_s": "rad / s",
-    "s": "s",
-    "hz": "Hz",
-    "years": "yr",
-    "c": "deg_C",
-    "k": "K",
-    "hpa": "hPa",
-    "px": "pix",
-    "e": "electron",
-    "e_s": "electron / s",
-    "e_px_s": "electron / (pix s)",
-}
+_UNITS = tomllib.loads(Path(__file__).with_name("units.toml").read_text("utf-8"))
 # The longest unit that ends a name.
 _OF_NAME = re.compile(rf".*?_({'|'.join(_UNITS)})")
 

@@ -24,7 +24,7 @@ from starcal_uq.camera.distortion import rivals
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.settings import Seed, bounded, seed_of
+from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.beside import without_effects
 from starcal_uq.estimation.fit import refit
@@ -194,7 +194,6 @@ def compare_models(
     StarcalError
         When no model can be calibrated.
     """
-    seed = seed_of(seed)
     obs = weighed(obs, cal)
     obs = without_effects(obs, cal)
     own = cal.camera.distortion

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.settings import Bayer, Mosaic
 from starcal_uq.core.types import AnyDict
@@ -47,6 +48,8 @@ class Image:
     of_colours : bool
         Whether each pixel was put together from several colours in reading.
     """
+
+    __dir__ = public_names
 
     data: np.ndarray[Any, Any]
     name: str = ""

@@ -25,7 +25,7 @@ from starcal_uq.camera.projection import (
 )
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
-from starcal_uq.core.settings import Seed, bounded, check_memory, seed_of
+from starcal_uq.core.settings import Seed, bounded, check_memory
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.likelihood.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
@@ -143,7 +143,6 @@ def prior_predictive(
     PriorError
         For priors of another distortion model or kind of noise, or too few draws.
     """
-    seed = seed_of(seed)
     if priors.distortion != camera.distortion:
         raise PriorError(
             f"the priors are for {priors.distortion!r}, the camera has {camera.distortion!r}: "

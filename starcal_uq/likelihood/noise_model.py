@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.display import public_names
 from starcal_uq.core.findings import clause
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
@@ -63,6 +64,8 @@ class NoiseModel:
     axis_correlation : float
         Correlation of the errors of x and y.
     """
+
+    __dir__ = public_names
 
     terms: tuple[str, ...]
     coefficients: FloatArray

@@ -42,8 +42,8 @@ def _values(column: Any) -> Any:
     """A column of astropy: an array of numbers without gaps, or texts."""
     if hasattr(column, "isot"):
         return np.atleast_1d(plain("time_utc", column)).tolist()
-    gaps = np.ma.getmaskarray(getattr(column, "value", column))
-    values = np.asarray(np.ma.getdata(getattr(column, "value", column)))
+    held = getattr(column, "value", column)
+    gaps, values = np.ma.getmaskarray(held), np.asarray(np.ma.getdata(held))
     if values.dtype.kind in "iuf" and not gaps.any():
         return values
     texts = np.char.decode(values) if values.dtype.kind == "S" else values

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args
 
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.facts import Facts
 from starcal_uq.core.types import AnyDict
@@ -170,6 +171,8 @@ class CentroidsOrigin(Facts):
 
 class Sourced:
     """A table with plain values about it, `meta`, and the facts among them, `origin`."""
+
+    __dir__ = public_names
 
     meta: AnyDict
 

@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq.attitude.relative import RelativeAttitudes
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.likelihood.ties import Ties
 from starcal_uq.maths.linear import inverses
@@ -36,6 +37,8 @@ class PlannedTies:
     of_mount : bool
         Whether the camera is on a fixed mount, whose attitude is free.
     """
+
+    __dir__ = public_names
 
     sigma_arcsec: float
     alignment_arcsec: float = 0.0

@@ -26,7 +26,7 @@ from starcal_uq.camera.projection import unproject, unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import DistortionError
-from starcal_uq.core.settings import Seed, bounded, seed_of
+from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -151,7 +151,6 @@ def distortion_curve(
     DistortionError
         For a camera without distortion, or when a draw folds the distortion within the detector.
     """
-    seed = seed_of(seed)
     if n < 2 or not 0.0 < level < 1.0:
         raise ValueError(
             f"a curve needs at least 2 radii and a level between 0 and 1, not {n} and {level:g}."

@@ -25,7 +25,7 @@ from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.core.records import Saved
-from starcal_uq.core.settings import Seed, bounded, seed_of
+from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.geometry import FrameGeometry
@@ -81,7 +81,6 @@ def error_spectrum(
     DistortionError, ObservationError, DegenerateFrameError
         For the reasons that `starcal_uq.propagate` has.
     """
-    seed = seed_of(seed)
     time, index = _series(obs, times_s)
     step, size = float((time[-1] - time[0]) / (len(time) - 1)), len(time)
     filled, weight = _neighbours(index, size)

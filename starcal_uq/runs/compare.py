@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.core.errors import ComparisonError, RunFolderError
-from starcal_uq.core.settings import Seed, bounded, seed_of
+from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.types import PathLike
 from starcal_uq.estimation.duplicates import fingerprints_of
 from starcal_uq.runs.run import Run
@@ -99,7 +99,6 @@ def compare_split(
     CalibrationError
         When a half does not determine the camera.
     """
-    seed = seed_of(seed)
     whole = Run(run)
     cal = whole.calibration
     obs = _table(whole)

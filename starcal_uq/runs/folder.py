@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from starcal_uq.core.conflicts import parsed
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import STEP, as_plain, check_new_folder, new_folder
 from starcal_uq.core.manifest import (
@@ -159,6 +160,8 @@ class RunFolder:
     notebook : Path
         The results as an executed notebook.
     """
+
+    __dir__ = public_names
 
     path: Path
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import RunFolderError, StarcalError
 from starcal_uq.core.manifest import entry_of
 from starcal_uq.core.provenance import installed_versions, provenance
@@ -73,6 +74,8 @@ def _of_file(file: str, module: str, record: str) -> Any:
 
 class StoredRun:
     """A run folder with what it holds; see `Run`, which adds the steps."""
+
+    __dir__ = public_names
 
     # Result, its file, and the record that the file holds.
     camera: cached_property[Camera] = _of_file("camera", "camera.camera", "Camera")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.settings import Seed, bounded, seed_of
+from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.types import AnyDict, BoolArray, IntArray
 
 if TYPE_CHECKING:
@@ -71,7 +71,6 @@ def contaminate(
     ValueError
         For a kind or fraction that makes no sense.
     """
-    seed = seed_of(seed)
     if kind not in KINDS or not 0.0 <= fraction <= 1.0:
         raise ValueError(
             f"kind={kind!r}, fraction={fraction}: use {' or '.join(KINDS)}, and a number from 0 "

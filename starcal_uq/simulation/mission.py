@@ -16,7 +16,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.formatting import count, plural, significant
-from starcal_uq.core.settings import Seed, bounded, seed_of
+from starcal_uq.core.settings import Seed, bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.table import Observations
 from starcal_uq.simulation.frames import Tracker, simulate
@@ -74,7 +74,6 @@ def mission_frames(
     ObservationError
         When `noise_like` states no noise.
     """
-    seed = seed_of(seed)
     frames = simulate(
         *(stars, camera),
         n_frames=n_frames,

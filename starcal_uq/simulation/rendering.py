@@ -240,10 +240,8 @@ def render(
     by Gauss-Legendre quadrature.
     """
     seed = seed_of(seed)
-    if seed < 0 or frame < 0:
-        raise SensorError(
-            f"rendering: seed is {seed} and frame {frame}; give whole numbers of 0 or more."
-        )
+    if frame < 0:
+        raise SensorError(f"rendering: frame is {frame}; give a whole number of 0 or more.")
     return Scene(stars, camera, Sensor() if sensor is None else sensor).render(
         rotation,
         np.random.default_rng([seed, frame]),

@@ -19,6 +19,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import PriorError, StarcalError, StudyError, check_known
 from starcal_uq.core.files import atomic_write_text, ensure_new, shown
 from starcal_uq.core.remedy import Remedy
@@ -141,6 +142,8 @@ class StudyDefinition:
     position_km : list of float or None
         The spacecraft from the Earth's centre, ICRS axes, km, where the sensor excludes the Earth.
     """
+
+    __dir__ = public_names
 
     camera: Camera
     sweep: dict[str, tuple[Any, ...]]

@@ -4,6 +4,7 @@ the process.
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import itertools
 import subprocess
@@ -301,3 +302,42 @@ def test_the_gallery_has_every_figure(monkeypatch):
     }
     shown = [name for scene in SCENES for name in scene.figures]
     assert (set(shown), len(shown)) == (figures, len(figures))
+
+
+@pytest.mark.slow
+def test_every_figure_is_drawn_into_that_of_the_user(monkeypatch, tmp_path):
+    """Those of the paper's field experiment, which takes minutes, alone are left out."""
+    from matplotlib import pyplot
+    from matplotlib.figure import Figure
+
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    monkeypatch.chdir(tmp_path)
+    from gallery_figures import SCENES
+
+    made = []
+    initialise = Figure.__init__
+
+    def counted(self, *args, **options):
+        made.append(self)
+        initialise(self, *args, **options)
+
+    monkeypatch.setattr(Figure, "__init__", counted)
+    results, n_drawn = {}, 0
+    for scene in (scene for scene in SCENES if scene.drawn):
+        exec(scene.code, results)
+        for (name, (_, _, code)), layout in itertools.product(
+            scene.figures.items(), (None, "constrained")
+        ):
+            whole = Figure(figsize=(14.0, 7.0), layout=layout)
+            other, own = whole.subfigures(1, 2)
+            made.clear()
+            call = ast.parse(code, mode="eval")
+            call.body.keywords.append(ast.keyword("fig", ast.Name("own", ast.Load())))
+            compiled = compile(ast.fix_missing_locations(call), name, "eval")
+            drawn = eval(compiled, {**results, "own": own})
+            whole.canvas.draw()
+            assert (drawn if isinstance(drawn, type(own)) else drawn.figure) is own, name
+            assert own.axes and not other.axes and not made, name
+            assert not pyplot.get_fignums(), name
+            n_drawn += 1
+    assert n_drawn > 60

@@ -13,6 +13,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.display import public_names
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import reading
 from starcal_uq.core.records import to_plain
@@ -102,6 +103,8 @@ class RecursiveCalibration:
     CalibrationError
         For an unknown method, or options that the method does not have.
     """
+
+    __dir__ = public_names
 
     def __init__(
         self, camera: Camera, method: str = "griffith", options: RecursionOptions | None = None

@@ -11,10 +11,11 @@ import io
 import re
 import sys
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from starcal_uq.core.display import GIVEN
 from starcal_uq.core.formatting import MINUS, significant, superscript
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.figures.scales import round_below, round_levels, ticks_at_levels
@@ -43,7 +44,11 @@ BARS: AnyDict = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.1}
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that no window manager knows of and that shows itself in a notebook."""
+    """The figure that a user gave, or an empty one that no window manager knows of and that shows
+    itself in a notebook.
+    """
+    if (given := GIVEN.get()) is not None:
+        return cast("Figure", given)
     return _notebook_figure()(
         figsize=(width_in, height_in), layout="constrained", facecolor="white"
     )
@@ -75,8 +80,10 @@ def panels(
     Many small panels of known labels are laid out at once: measuring every label takes longer than
     drawing all of them.
     """
-    figure.set_layout_engine("none")
-    width, height = figure.get_size_inches()
+    if GIVEN.get() is None:
+        figure.set_layout_engine("none")
+    size: Any = figure.bbox.size
+    width, height = size / figure.dpi
     left, right, bottom, top = margins_in
     across, down = gaps_in
     return figure.add_gridspec(
@@ -98,7 +105,7 @@ def new_axes(width_in: float, height_in: float) -> Axes:
     In a notebook the figure is handed to pyplot, because only then does the notebook show it below
     the cell although the caller holds the Axes; elsewhere pyplot is left alone.
     """
-    if _in_notebook():
+    if GIVEN.get() is None and _in_notebook():
         from matplotlib import pyplot
 
         figure = pyplot.figure(

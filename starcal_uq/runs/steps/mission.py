@@ -65,7 +65,6 @@ class MissionSky:
         """Noise-free frames, with the noise of the observed ones by magnitude where it is
         stated.
         """
-        seed = seed_of(seed)
         from starcal_uq.attitude.profile import load_attitude_profile
         from starcal_uq.simulation.mission import mission_frames, profile_frames
         from starcal_uq.sky.catalogue import load_catalogue
