@@ -377,7 +377,7 @@ WITHOUT_NAMESAKE = {
     "cli": "answers console results run schema settings starters",
     "comparison": "covariance result significance",
     "core": (
-        "conflicts constants display documents errors facts findings remedy status times types"
+        "conflicts constants documents errors facts findings remedy status times types"
     ),
     "diagnostics": "explain misfit_test noise_tests residuals shape_sums",
     "estimation": (
