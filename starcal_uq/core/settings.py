@@ -192,10 +192,7 @@ def bounded(function: Callable[P, R]) -> Callable[P, R]:
     """A function that refuses, with `SettingError`, settings outside the limits of their names, and
     takes quantities and times of astropy in place of numbers and text.
     """
-    parameters = inspect.signature(function).parameters
-    names = tuple(parameters)
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    limits = {name: limit for name, limit in LIMITS.items() if takes_any or name in names}
+    names = tuple(inspect.signature(function).parameters)
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -203,8 +200,8 @@ def bounded(function: Callable[P, R]) -> Callable[P, R]:
         others: Any = {name: plain(name, value) for name, value in kwargs.items()}
         given: Iterable[tuple[str, Any]] = (*zip(names, placed, strict=False), *others.items())
         for name, value in given:
-            if name in limits and not limits[name].holds(value):
-                raise SettingError(f"{name} is {shown(value)}: {limits[name].wanted()}.")
+            if name in LIMITS and not LIMITS[name].holds(value):
+                raise SettingError(f"{name} is {shown(value)}: {LIMITS[name].wanted()}.")
         return function(*placed, **others)
 
     return checked

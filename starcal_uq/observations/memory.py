@@ -19,7 +19,7 @@ def raw_table(table: Any) -> RawTable:
     units = {}
     if hasattr(table, "colnames"):
         meta, columns = dict(table.meta), {str(n): _values(table[n]) for n in table.colnames}
-        units = {name: str(table[name].unit or "") for name in columns if _has_unit(table[name])}
+        units = {name: str(getattr(table[name], "unit", None) or "") for name in columns}
     else:
         import pyarrow as pa
 
@@ -32,10 +32,6 @@ def raw_table(table: Any) -> RawTable:
         columns = {n: values for n, values in columns.items() if not n.startswith("__index_level")}
     n_rows = len(next(iter(columns.values()), ()))
     return RawTable(columns, list(columns), np.arange(1, n_rows + 1), "row", meta, units)
-
-
-def _has_unit(column: Any) -> bool:
-    return getattr(column, "unit", None) is not None
 
 
 def _values(column: Any) -> Any:
