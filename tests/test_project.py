@@ -376,9 +376,7 @@ WITHOUT_NAMESAKE = {
     "camera": "fields formats",
     "cli": "answers console results run schema settings starters",
     "comparison": "covariance result significance",
-    "core": (
-        "conflicts constants documents errors facts findings remedy status times types"
-    ),
+    "core": "conflicts constants documents errors facts findings remedy status times types",
     "diagnostics": "explain misfit_test noise_tests residuals shape_sums",
     "estimation": (
         "assemble duplicates kept local_effects normals "
