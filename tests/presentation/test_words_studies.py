@@ -53,6 +53,9 @@ def test_the_axis_that_decouples_is_named_with_its_numbers(decoupled: Study) -> 
     assert ("number of frames", "−0.50") in {(row[1], row[-1]) for row in changes.rows}
     assert len(medians.rows) == 6 and "1000" in [row[1] for row in medians.rows]
     answer = " ".join(study_answer(decoupled))
+    # A hundred times as many frames; the error falls as their root.
+    assert "most valuable axis is number of frames: 1000 instead of 10 divides" in answer
+    assert "by 10 (median)" in answer
     assert "one of f and k1 in 100" in answer and "with 1.8 times the variance" in answer
     assert "The target of 0.5 arcsec is met in 3 of 8 places" in answer
     assert "The target of 0.050 px for f is met in 3 of 8 places" in answer
@@ -78,6 +81,7 @@ def test_nothing_is_claimed_where_nothing_couples() -> None:
     assert study_text(study).startswith("0 of 10 pairs of parameters are coupled")
     answer = " ".join(study_answer(study))
     assert "with 1.3 times the variance" in answer and "would do in 0 of 9" in answer
+    assert "most valuable" not in answer
     assert [table.title for table in study_tables(study)] == [
         "Medians over seeds and all other axes"
     ]
@@ -128,6 +132,12 @@ def test_figures_draw(decoupled: Study) -> None:
     )
     lines = decoupled.plot.correlation([("f", "k1")]).axes[0].get_lines()
     np.testing.assert_allclose(lines[1].get_ydata(), [0.97, 0.8, 0.3], atol=0.003)
+    # Where lines coincide, the first are wider.
+    widths = [line.get_linewidth() for line in decoupled.plot.correlation().axes[0].get_lines()]
+    assert widths == sorted(widths, reverse=True) and len(set(widths)) == len(widths) > 1
+    error = decoupled.plot.needed().axes[0]
+    assert "target 0.5" in error.get_title(loc="left")
+    assert 0.5 in {line.get_ydata()[0] for line in error.get_lines()}
     with pytest.raises(ValueError, match='mode = "simulate"'):
         decoupled.plot.coverage()
     with pytest.raises(ValueError, match="'stars' was not swept: use one of fov_deg, frames"):

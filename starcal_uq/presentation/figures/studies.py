@@ -23,13 +23,12 @@ from starcal_uq.presentation.figures.sweeps import (
     small_multiples,
     some,
     target_line,
-    target_words,
     ticks,
     two_axes,
 )
 from starcal_uq.presentation.words.axes import axis_label, value_words
 from starcal_uq.presentation.words.numbers import capital
-from starcal_uq.presentation.words.studies import model_bias, simpler_models
+from starcal_uq.presentation.words.studies import best_axis, model_bias, simpler_models
 from starcal_uq.propagation.coupling import PART
 
 if TYPE_CHECKING:
@@ -119,7 +118,7 @@ def plot_study_correlation(
         pairs = [pair.names for pair in main[:_MOST_PANELS]]
     panels, posterior = {}, {}
     for first, second in pairs:
-        r = correlation_of(study, first, second)
+        r = _correlation(study, first, second)
         title = f"{symbol(first)} and {symbol(second)}{_sign_words(r[sweep.ok])}"
         panels[title] = np.abs(r)
         if "posterior_correlation" in study.data and second not in AXES:
@@ -133,7 +132,7 @@ def plot_study_correlation(
     return figure
 
 
-def correlation_of(study: Study, first: str, second: str) -> FloatArray:
+def _correlation(study: Study, first: str, second: str) -> FloatArray:
     """Correlation of two parameters, or of a parameter and an axis of the common rotation, of every
     cell.
     """
@@ -365,17 +364,19 @@ def plot_needed(
         at which other axes are held, their middle ones by default.
     """
     target = study.definition.target_arcsec if target_arcsec is None else target_arcsec
-    panels = {"Error that differs from frame to frame [arcsec]": study.sweep.frame_error}
+    title = "Error that differs from frame to frame [arcsec]"
+    panels = {
+        title if target is None else f"{title}; dashed: target {target:g}": study.sweep.frame_error
+    }
     if target is not None:
         panels[f"Frames for {target:g} arcsec"] = study.frames_for(target)
     figure, (ax, *_) = plot_swept(study.sweep, panels, **where, wide=2.0)
+    figure.supxlabel("".join(best_axis(study)), fontsize=style.LABEL_SIZE, color=style.GREY)
     if target is not None:
         low, high = ax.get_ylim()
         ax.set_ylim(min(low, target / 1.5), max(high, target * 1.5))
         plain(ax.yaxis)
         target_line(ax, target)
-        ground = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
-        target_words(ax, target, f"target {target:g} arcsec", bbox=ground)
     return figure
 
 

@@ -135,10 +135,14 @@ def small_multiples(
     the variable ``dashed``, which the legend calls `dashed`. More than three panels stand in two
     rows; `wide` is the width of one over the usual one.
     """
+    from matplotlib.patheffects import withStroke
+
     data = data.expand_dims("line") if hue is None else data.rename({hue: "line"})
     data = data.isel(line=some(data.sizes["line"], _MOST_LINES))
     names = data["line"].values.tolist() if hue else [""]
     looks = _looks(names)
+    # Dashed lines are seen on full ones, too.
+    edge = {"path_effects": [withStroke(linewidth=2.8, foreground="white")]}
     titles = data["panel"].values
     rows = 1 if len(titles) <= 3 else 2
     columns = -(-len(titles) // rows)
@@ -152,9 +156,11 @@ def small_multiples(
             good = one["median"].notnull().values
             low, median, high = (one[name].values[good] for name in ("low", "median", "high"))
             style.band(ax, places[good], low, high, look["color"], alpha=0.2)
-            ax.plot(places[good], median, linewidth=1.5, **look)
+            ax.plot(places[good], median, **look)
             if "dashed" in data:
-                ax.plot(places, one["dashed"], color=look["color"], linewidth=1.2, dashes=(4, 2))
+                ax.plot(
+                    places, one["dashed"], color=look["color"], linewidth=1.2, dashes=(4, 2), **edge
+                )
         if log:
             logarithmic(ax, data if sharey else data.sel(panel=title))
         style.label(ax, title, axis_label(x))
@@ -174,14 +180,19 @@ def small_multiples(
 
 
 def _looks(names: Sequence[Any]) -> list[AnyDict]:
-    """Colours and markers of lines: in order of numbers, or apart for names."""
+    """Colours and markers of lines: in order of numbers, or apart for names; the first ones are
+    wider, so that all are seen where they coincide.
+    """
     colours: Sequence[Any] = _NAMED
     if numeric(names):
         import matplotlib
 
         colours = list(matplotlib.colormaps["viridis"](np.linspace(0.0, 0.86, len(names))))
-    pairs = zip(colours, _MARKERS, strict=False)
-    return [{"color": c, "marker": m, "markersize": 4.5} for c, m in pairs][: len(names)]
+    sizes = range(len(names) - 1, -1, -1)
+    return [
+        {"color": c, "marker": m, "markersize": 4.5 + size, "linewidth": 1.5 + 0.9 * size}
+        for c, m, size in zip(colours, _MARKERS, sizes, strict=False)
+    ]
 
 
 def held_title(figure: Figure, held: AnyMapping) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -65,7 +63,6 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
         study=study,
         words=words,
         cells=cells_table(study, _CELLS_SHOWN),
-        provenance=_provenance(study),
         images=images,
         explorer=explorer(study),
     )
@@ -83,23 +80,3 @@ def cells_table(study: Study, n: int) -> TextTable:
         pd.DataFrame(where | frame).head(n), formats={**forms, **dict.fromkeys(where, value_words)}
     )
     return replace(table, marks=tuple("" if good else "warning" for good in study.ok[:n]))
-
-
-def _provenance(study: Study) -> list[tuple[str, str]]:
-    """Settings and origin of the study, as rows."""
-    rows = []
-    for key, value in study.definition.to_dict().items():
-        entries = value.items() if isinstance(value, Mapping) else [("", value)]
-        rows += [(f"{key}: {name}" if name else key, _told(entry)) for name, entry in entries]
-    rows += [
-        (str(key), _told(value))
-        for key, value in study.data.attrs.items()
-        if key not in ("definition", "title")
-    ]
-    return rows
-
-
-def _told(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    return json.dumps(value, default=str).strip('"')

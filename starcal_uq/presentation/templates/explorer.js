@@ -4,7 +4,8 @@
   "use strict";
   const root = document.currentScript.closest(".explorer"), find = (of) => root.querySelector(of);
   const data = JSON.parse(find("script[type='application/json']").textContent);
-  const { names, parameters, target } = data, p = parameters.length, q = names.length, study = "places" in data;
+  const { names, target } = data, p = data.parameters.length, q = names.length, study = "places" in data;
+  const parameters = data.parameters.map(([name, unit, scale]) => ({ name, unit, scale }));
   const errors = study ? ["frame-dependent rest", "common rotation", "centroid noise (NEA)"] : names.slice(p);
   const headline = study ? "Attitude error across the boresight, 1 σ" : "Common rotation, 1 σ";
 
@@ -33,10 +34,14 @@
 
   // A coupling is swept over measurements from elsewhere, by their sigma in sigmas of the calibration.
   const shares = [null, 3, 1, 0.3, 0.1, 0.03, 0.01];
-  const axes = data.axes ?? parameters.map((one, i) => ({
+  const swept = data.axes?.map((axis) => {
+    const [, name, of = ""] = axis.label.match(/^(.*?)(?: \[(.*)\])?$/);
+    return { ...axis, name, words: axis.values.map((value) => value + (of === "°" ? of : unit(of))) };
+  });
+  const axes = swept ?? parameters.map((one, i) => ({
     name: `${one.name} measured elsewhere`, label: `σ of another measurement of ${one.name}`, start: 0,
     values: shares.map((share) => share ? `${share} σ` : "none"),
-    words: shares.map((share) => share ? `± ${number(share * data.sigma[i])}${unit(one.unit)}` : "not measured"),
+    words: shares.map((share) => share ? `± ${number(share * data.sigma[i] / one.scale)}${unit(one.unit)}` : "not measured"),
   }));
   const at = axes.map((axis) => axis.start);
 
@@ -44,8 +49,8 @@
   const lookedUp = (place) => {
     const row = data.places[place.reduce((flat, i, axis) => flat * axes[axis].values.length + i, 0)];
     if (!row.some(known)) return null;
-    const cut = (from, n) => row.slice(from, from + n);
-    return { r: cut(0, p * q), sigma: cut(p * q, p), alone: cut(p * q + p, p), errors: cut(p * q + 2 * p, errors.length) };
+    const scaled = (from) => parameters.map((one, i) => known(row[from + i]) ? row[from + i] / one.scale : null);
+    return { r: row.slice(0, p * q), sigma: scaled(p * q), alone: scaled(p * q + p), errors: row.slice(p * q + 2 * p) };
   };
   // A measurement of parameter i with the share m of its sigma adds 1 / m² to the information: an update of rank one.
   const computed = (place) => {
@@ -60,7 +65,8 @@
     const root = c.map((row, i) => Math.sqrt(Math.max(row[i], 0)));
     const sigma = data.sigma.map((s, i) => s * root[i]);
     const r = c.slice(0, p).flatMap((row, a) => row.map((value, b) => Math.max(-1, Math.min(1, value / (root[a] * root[b])))));
-    return { r, sigma: sigma.slice(0, p), alone, errors: sigma.slice(p) };
+    const scaled = (values) => parameters.map((one, i) => values[i] / one.scale);
+    return { r, sigma: scaled(sigma), alone: scaled(alone), errors: sigma.slice(p) };
   };
   const numbers = study ? lookedUp : computed;
   // First the strongest pair of parameters, and along the axis that changes the first error most.
@@ -160,15 +166,15 @@
       make("text", svg, { x: left - 6, y: y(tick) + 4, "text-anchor": "end" }, text(tick));
     }
     // Numbers are joined by lines, and as many are printed as there is room for; names stand apart, in two rows.
-    const swept = axis.values.every((value) => /^(none|[−0-9.\s]+σ?)$/.test(value));
-    const long = Math.max(...axis.values.map((value) => value.length)), every = swept ? Math.ceil(n * long * 7 / (right - left)) : 1;
+    const numeric = axis.values.every((value) => /^(none|[−0-9.\s]+σ?)$/.test(value));
+    const long = Math.max(...axis.values.map((value) => value.length)), every = numeric ? Math.ceil(n * long * 7 / (right - left)) : 1;
     axis.values.forEach((value, i) => {
       if (i !== n - 1 && (i % every || i && n - 1 - i < every)) return;
       const short = value.length > 20 ? `${value.slice(0, 19)}…` : value, reach = 3 * short.length;
       const middle = Math.max(reach, Math.min(420 - reach, x(i)));
-      make("text", svg, { x: middle, y: bottom + 16 + (swept ? 0 : 13 * (i % 2)), "text-anchor": "middle" }, short);
+      make("text", svg, { x: middle, y: bottom + 16 + (numeric ? 0 : 13 * (i % 2)), "text-anchor": "middle" }, short);
     });
-    make("text", svg, { x: (left + right) / 2, y: bottom + (swept ? 34 : 44), "text-anchor": "middle" }, axis.label);
+    make("text", svg, { x: (left + right) / 2, y: bottom + (numeric ? 34 : 44), "text-anchor": "middle" }, axis.label);
     if (line) make("path", svg, { d: `M${left} ${y(line)}H${right}`, class: "target" });
     let start = 6;
     series.forEach((s, k) => {
@@ -177,7 +183,7 @@
       const name = make("text", svg, { x: start + 13, y: 36 }, s.name);
       start += 26 + (name.getComputedTextLength() || 6.4 * s.name.length);
       // The first lines are wider: where two coincide, both are seen.
-      const path = s.values.map((v, i) => usable(v) ? `${swept && i && usable(s.values[i - 1]) ? "L" : "M"}${x(i)} ${y(v)}` : "").join("");
+      const path = s.values.map((v, i) => usable(v) ? `${numeric && i && usable(s.values[i - 1]) ? "L" : "M"}${x(i)} ${y(v)}` : "").join("");
       make("path", svg, { d: path, class: `line s${k}`, style: `stroke-width:${1.6 + 2.2 * (series.length - 1 - k)}` });
     });
     if (line) make("text", svg, { x: right, y: y(line) - 5, "text-anchor": "end", class: "target" }, `target ${number(line)} ${of}`);

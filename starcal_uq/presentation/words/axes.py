@@ -42,16 +42,11 @@ def value_words(value: Any) -> str:
     return f"{number:.3g}".replace("-", "\N{MINUS SIGN}")
 
 
-def with_unit(axis: str, value: Any) -> str:
-    """A value with its unit: ``10°``."""
-    unit = _unit(axis)
-    space = "" if unit in ("", "°") else " "
-    return f"{value_words(value)}{space}{unit}"
-
-
 def said(axis: str, value: Any) -> str:
     """A value with its axis: ``field of view 10°``."""
-    return f"{axis_name(axis)} {with_unit(axis, value)}"
+    unit = _unit(axis)
+    space = "" if unit in ("", "°") else " "
+    return f"{axis_name(axis)} {value_words(value)}{space}{unit}"
 
 
 def place(values: AnyMapping) -> str:

@@ -115,6 +115,7 @@ def _environment() -> jinja2.Environment:
         "brief": _brief,
         "confidence_text": confidence_text,
         "largest": lambda values: int(np.argmax(np.abs(values))),
+        "exp": np.exp,
         "mean": np.mean,
         "median": np.median,
         "repr": repr,

@@ -76,10 +76,24 @@ def study_answer(study: Study) -> list[str]:
         say("Study.weakest", **_weakest(study)),
         say("Study.price", price=price),
         say("Study.attitude", **spans),
+        *best_axis(study),
         *_targets(study),
         *_simpler(study),
         *_simulated(study),
     ]
+
+
+def best_axis(study: Study) -> list[str]:
+    """The axis, of those that can be chosen, that changes the frame-dependent error most; nothing
+    where none matters.
+    """
+    curves = study.sweep.curves(np.log(study.sweep.frame_error))
+    mattering = [curve for curve in curves if curve.matters and curve.axis not in _GIVEN]
+    best = max(mattering, key=lambda curve: curve.change, default=None)
+    if best is None:
+        return []
+    least, most = (value_words(best.values[i]) for i in (best.least, best.most))
+    return [say("Study.best", it=best, axis=axis_label(best.axis), least=least, most=most)]
 
 
 def _span(values: Any, form: Callable[[float], str] = lambda value: significant(value, 3)) -> str:
