@@ -136,7 +136,8 @@ def by_frame(frames: StarFrames, columns: FloatArray) -> tuple[FloatArray, IntAr
 class Freed:
     """Residuals without what attitudes, parameters and effects reproduce, all of them free."""
 
-    own: ByFrame  # Attitudes and effects of frames, orthonormal
+    frames: StarFrames
+    a: FloatArray  # (c, 2, N): attitudes and effects of frames, orthonormal in each
     h: FloatArray  # (r, 2, N): parameters and effects of the run beside these, orthonormal
     e: FloatArray  # (2, N): whitened residuals
     frame_dof: FloatArray  # (K,): degrees of freedom of every frame, `h` not fitted
@@ -160,11 +161,9 @@ class Freed:
         for part, state, columns, rows in likelihood.linearised(
             cal.theta, np.ones(len(unit)), start, _STARS_AT_ONCE
         ):
-            frames, basis = part.frames, part.attitudes(state).orthonormal
-            apart = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, frames.n_frames))
-            h = np.tensordot(turn, columns[:-1], axes=1)
+            a, h = part.attitudes(state).orthonormal, np.tensordot(turn, columns[:-1], axes=1)
             e = columns[-1] - np.tensordot(along, h, axes=1)
-            yield cls(ByFrame(frames, basis, apart), h, e, floats(2.0 * frames.sizes - 3.0), rows)
+            yield cls(part.frames, a, h, e, floats(2.0 * part.frames.sizes - 3.0), rows)
 
     @classmethod
     def of(cls, obs: Observations, cal: Calibration, axes: bool) -> Freed:
@@ -193,4 +192,4 @@ class Freed:
         e = own.removed_from(e[None])[0]
         e = e - np.tensordot(np.tensordot(h, e, axes=2), h, axes=1)
         dof = floats(2.0 * frames.sizes - 3.0 - rank)
-        return cls(own, h, np.asarray(e), dof, slice(0, frames.n_stars))
+        return cls(frames, basis, h, np.asarray(e), dof, slice(0, frames.n_stars))

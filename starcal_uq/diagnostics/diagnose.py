@@ -43,6 +43,7 @@ from starcal_uq.diagnostics.times import (
 from starcal_uq.diagnostics.verdict.observed import terms
 from starcal_uq.estimation.effects import with_effects
 from starcal_uq.estimation.fit import fit
+from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.estimation.ties import without_ties
 from starcal_uq.estimation.weights import by_noise_model, weighed
@@ -296,13 +297,17 @@ def diagnose(
         effects = whole.effects.names if whole.effects is not None else ()
         model = whole.nominal.model
         cal = calibrate(obs, whole.nominal, model=model, effects=effects, duplicates="keep")
-    found = jackknife_of_all(whole) or _jackknife(obs, cal)
+    # Two tests leave frames out.
+    normals = None if has_effects(cal) else FrameNormals.at(obs, cal)
+    found = jackknife_of_all(whole) or _jackknife(obs, cal, normals)
     step(1, 4)
     predictive = predictive_check(obs, whole, post, seed=seed)
     step(2, 4)
     # A single frame cannot be left out, and a field holds what other models would add to the lens.
     asked = obs.n_frames > 1 and not (cal.effects is not None and "field" in cal.effects.names)
-    comparison = compare_models(obs, cal, models, seed=seed) if models and asked else None
+    comparison = None
+    if models and asked:
+        comparison = compare_models(obs, cal, models, seed=seed, normals=normals)
     step(3, 4)
     rest = None if apart is None or whole.partitions is not None else apart()
     if rest is None:
@@ -319,9 +324,11 @@ def diagnose(
     )
 
 
-def _jackknife(obs: Observations, cal: Calibration) -> Jackknife | None:
+def _jackknife(
+    obs: Observations, cal: Calibration, normals: FrameNormals | None
+) -> Jackknife | None:
     try:
-        return jackknife_frames(obs, cal)
+        return jackknife_frames(obs, cal, normals)
     except StarcalError:
         # Too few frames: the report then says that there is none.
         return None

@@ -154,7 +154,7 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     axes = noise.axes
     if obs.noise_axes is not None:
         alike, axes = Freed.of(obs, cal, axes=False), AxisSums()
-        axes.add(alike.own.frames, alike.own.columns, alike.h, alike.e)
+        axes.add(alike.frames, alike.a, alike.h, alike.e)
     names = "noise that differs between the axes", "noise whose axes correlate"
     known = noise_model_of(cal)
     for name, z in zip(names, axes.noise(noise.dof).z(known), strict=True):

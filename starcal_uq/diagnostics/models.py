@@ -174,6 +174,7 @@ def compare_models(
     *,
     n_draws: int = _DRAWS,
     seed: Seed = 0,
+    normals: FrameNormals | None = None,
 ) -> ModelComparison:
     """Compare distortion models by cross-validation over frames.
 
@@ -188,6 +189,8 @@ def compare_models(
         Posterior draws of each model.
     seed : int or Generator
         Seed of the draws.
+    normals : FrameNormals, optional
+        The frames' normal equations of a calibration without effects, where they are at hand.
 
     Raises
     ------
@@ -198,10 +201,10 @@ def compare_models(
     obs = without_effects(obs, cal)
     own = cal.camera.distortion
     names = tuple(dict.fromkeys((own, *(rivals(own) if models is None else models))))
-    fits, failed = {}, {}
+    fits, failed = {} if normals is None else {own: normals}, {}
     for name in names:
         try:
-            fits[name] = _normals(obs, cal, name)
+            fits[name] = fits.get(name) or _normals(obs, cal, name)
         except StarcalError as error:
             failed[name] = str(error)
     if not fits:

@@ -46,7 +46,7 @@ class NoiseSums:
         self._held: dict[str, FloatArray | float] = dict.fromkeys(weights, 0.0)
         by_frame, matrices, rank = [], [], 0
         for piece in pieces:
-            frames, a, h = piece.own.frames, piece.own.columns, piece.h
+            frames, a, h = piece.frames, piece.a, piece.h
             self.axes.add(frames, a, h, piece.e)
             square, of_all = np.sum(piece.e**2, axis=0), np.sum(h**2, axis=(0, 1))
             taken, columns, rank = of_all + np.sum(a**2, axis=(0, 1)), [*a, *h], len(h)
