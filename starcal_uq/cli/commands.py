@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
@@ -30,16 +31,15 @@ class _Command(TyperCommand):
     """A command whose help lists options under what they are for."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        sections: dict[str, list[tuple[str, str]]] = {}
+        sections: AnyDict = defaultdict(list)
         for parameter in self.get_params(ctx):
             kind = f"{parameter.param_type_name.capitalize()}s"
             section = getattr(parameter, "rich_help_panel", None) or kind
-            row = parameter.get_help_record(ctx)
-            if row is not None:
-                sections.setdefault(section, []).append(row)
+            sections[section].append(parameter.get_help_record(ctx))
         for section, rows in sections.items():
-            with formatter.section(section):
-                formatter.write_dl(rows)
+            if any(rows):
+                with formatter.section(section):
+                    formatter.write_dl(filter(None, rows))
 
 
 class _Program(TyperGroup):

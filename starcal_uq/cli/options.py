@@ -303,7 +303,7 @@ PATHS = {
 }
 
 
-_VALUES = {bool: "", Path: "FILE", float: "NUMBER", int: "N", str: "TEXT"}
+_VALUES = {Path: "FILE", float: "NUMBER", int: "N", str: "TEXT"}
 
 
 def _metavar_and_choices(kind: Any) -> tuple[str | None, str]:

@@ -489,7 +489,6 @@ def unfolded(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
     if common is not None:
         whole = typer.Option(
             "--help-all",
-            metavar="",
             is_eager=True,
             callback=_print_all,
             help="Show every option and exit.",
