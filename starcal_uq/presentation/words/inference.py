@@ -27,3 +27,8 @@ def posterior_table(post: Posterior) -> TextTable:
         bulk=post.diagnostics.ess_bulk,
         tail=post.diagnostics.ess_tail,
     )
+
+
+def posterior_notes(post: Posterior) -> list[str]:
+    """Its checks."""
+    return [*map(str, post.diagnostics.checks)]

@@ -68,3 +68,8 @@ def choice_table(choice: FrameChoice, n: int = 20) -> TextTable:
     return TextTable.of(
         choice.to_dataframe().head(n), f"The first {min(n, len(choice.candidate))} frames to take"
     )
+
+
+def worth_table(choice: FrameChoice) -> TextTable:
+    """What the chosen frames bring against random ones and those with most stars."""
+    return TextTable.of(choice.worth())

@@ -169,3 +169,8 @@ def spectrum_table(spectrum: ErrorSpectrum) -> TextTable:
         }
     )
     return TextTable.of(rows, missing="not known")
+
+
+def attitude_notes(error: AttitudeError) -> list[str]:
+    """What the errors are made from."""
+    return [f"{error.n_draws} posterior draws through QUEST on {error.told_frames}."]
