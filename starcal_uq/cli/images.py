@@ -98,7 +98,8 @@ def identify_command(
     """
     from starcal_uq.observations.files import WRITTEN
     from starcal_uq.pipeline.images import observations_from_centroids, of_one_size
-    from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
+    from starcal_uq.presentation.words.images import MOST_FRAMES
+    from starcal_uq.presentation.words.sentences import rows
 
     table_ending(out, WRITTEN)
     ensure_new(out, force)
@@ -147,7 +148,7 @@ def identify_command(
             start.save(sheet, force=force)
             note(f"the camera to calibrate these stars with is {sheet}.")
     if len(found.frames) <= MOST_FRAMES:
-        print_table(identification_table(found))
+        print_table(rows("identification", found))
     several = out.suffix == ".corr" and obs is not None and obs.n_frames > 1
     written = None if obs is None else out.with_name(f"{out.stem}_*.corr") if several else out
     say(f"{found.text}{'' if written is None else f' Table: {written}'}")

@@ -124,17 +124,17 @@ def show_budget(found: Budget) -> None:
     from starcal_uq.presentation.words.budgeting import (
         contributors_table,
         explanations,
-        filter_table,
         indices_table,
         totals_table,
     )
+    from starcal_uq.presentation.words.sentences import rows
 
     print_table(contributors_table(found))
     print_table(totals_table(found))
     if found.index_totals:
         print_table(indices_table(found))
     if found.filter:
-        print_table(filter_table(found))
+        print_table(rows("filter", found))
     for sentence in (*explanations(found), *found.notes):
         say(sentence)
     for outcome in found.outcomes:
@@ -162,7 +162,7 @@ def compare_command(
     stated.
     """
     from starcal_uq.presentation.pages.write import write_page
-    from starcal_uq.presentation.words.comparison import comparison_table
+    from starcal_uq.presentation.words.sentences import rows
 
     if len(runs) != (2 if split is None else 1):
         raise typer.BadParameter(
@@ -180,7 +180,7 @@ def compare_command(
             runs[0], split, **(options if names is None else options | {"labels": names})
         )
     page = None if out is None else write_page(found, out)
-    print_table(comparison_table(found))
+    print_table(rows("compared", found))
     say(found.text)
     if page is not None:
         say(f"Page: {page.resolve()}")
@@ -315,10 +315,10 @@ def _show_plan(
     found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None
 ) -> list[str]:
     """Show the plan; the sentences beside its own text."""
-    from starcal_uq.presentation.words.planning import choice_table, costs_table, plan_table
-    from starcal_uq.presentation.words.sentences import told
+    from starcal_uq.presentation.words.planning import costs_table
+    from starcal_uq.presentation.words.sentences import rows, told
 
-    print_table(plan_table(found))
+    print_table(rows("plan", found))
     costs = found.effects
     if costs is not None:
         print_table(costs_table(costs))
@@ -331,7 +331,7 @@ def _show_plan(
     notes = [sentence for sentence in notes if sentence]
     words = [found.text, *notes]
     if choice is not None:
-        print_table(choice_table(choice))
+        print_table(rows("choice", choice))
         words.append(choice.text)
     if simulated is not None:
         words.append(simulated.text)

@@ -26,7 +26,7 @@ def validate_command(
     of them.
     """
     from starcal_uq.core.manifest import making
-    from starcal_uq.presentation.words.diagnostics import validation_table
+    from starcal_uq.presentation.words.sentences import rows
 
     sensor = sc.Camera.load(camera)
     with (
@@ -45,7 +45,7 @@ def validate_command(
             found.save(stage / "validation.npz")
             write_csv(table, stage / "validation.csv")
             atomic_write_bytes(stage / "validation.png", png_bytes(found.plot.ranks()))
-    print_table(validation_table(found))
+    print_table(rows("validation", found))
     say(found.text, style="green" if found.ok else "red")
     if out is not None:
         say(f"Figure: {(out / 'validation.png').resolve()}")
@@ -99,7 +99,7 @@ def merge_command(
     """Combine the likelihoods of several runs into one, without going back to the stars; tests that
     they agree.
     """
-    from starcal_uq.presentation.words.estimation import consistency_table
+    from starcal_uq.presentation.words.sentences import rows
 
     merged = sc.runs.merge_runs(
         runs,
@@ -111,7 +111,7 @@ def merge_command(
     )
     agreement = sc.estimation.consistency_of(merged)
     if agreement is not None:
-        print_table(consistency_table(agreement))
+        print_table(rows("consistency", agreement))
         words = agreement.messages or ("The runs agree.",)
         say(f"{' '.join(words)} (p = {agreement.p_value:.2g})")
     show_calibration(merged)

@@ -110,9 +110,9 @@ def template_environment() -> Environment:
         "wrapped": wrapped,
         "when": lambda utc: utc.replace("T", " ").replace("Z", " UTC"),
     }
-    from starcal_uq.presentation.words.sentences import say, told
+    from starcal_uq.presentation.words.sentences import rows, say, told
 
-    environment.globals |= {"say": say, "told": told}
+    environment.globals |= {"rows": rows, "say": say, "told": told}
     names = ("count", "fixed", "join_words", "percent", "plural", "significant")
     environment.globals |= {name: getattr(formatting, name) for name in names}
     environment.globals["TextTable"] = TextTable

@@ -13,6 +13,7 @@ from starcal_uq.core.display import View
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.sentences import rows as named_rows
 from starcal_uq.presentation.words.sentences import told
 
 
@@ -45,6 +46,8 @@ def _view(entry: AnyDict) -> View:
     for part in ("say", "table", "notes", "frame", "html"):
         if part in entry:
             entry[part] = _found(entry[part])
+    if "rows" in entry:
+        entry["table"] = partial(named_rows, entry["rows"])
     said = entry["say"] if "say" in entry else partial(told, entry["text"])
     html = partial(_html, said, entry) if "title" in entry else entry.get("html")
     return View(said, html, entry["figures"])

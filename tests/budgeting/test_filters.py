@@ -218,7 +218,7 @@ def test_rows_are_states_by_what_they_state():
 def test_states_are_saved_and_shown(tmp_path):
     from starcal_uq.presentation.pages.budgeting import sheet_html
     from starcal_uq.presentation.pages.write import write_page
-    from starcal_uq.presentation.words.budgeting import filter_table
+    from starcal_uq.presentation.words.sentences import rows
 
     openpyxl = pytest.importorskip("openpyxl")
     found = budget()
@@ -227,7 +227,7 @@ def test_states_are_saved_and_shown(tmp_path):
     pd.testing.assert_frame_equal(table, found.filter_dataframe())
     assert {REST, NEA} <= {name for one in found.filter for name in one.contributors}
     assert len(found.to_dict()["filter"]) == len(table)
-    assert len(filter_table(found).rows) == len(table)
+    assert len(rows("filter", found).rows) == len(table)
     write_page(found, tmp_path / "b.html")
     assert "States of a filter" in (tmp_path / "b.html").read_text("utf-8")
     assert sheet_html(found).count('<td style="text-align:left">correlated</td>') == 3

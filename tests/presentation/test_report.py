@@ -29,7 +29,8 @@ from starcal_uq.presentation.pages import printing
 from starcal_uq.presentation.report.drawing import FIGURES, Ahead, draw_figures
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.summary import terminal_summary, verdict_lines
-from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows
+from starcal_uq.presentation.report.tables import parameter_rows
+from starcal_uq.presentation.words.propagation import attitude_rows
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.onboard_error import EffectError, OnboardError
 from tests.helpers.scenes import camera, nominal, observations

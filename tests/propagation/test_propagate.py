@@ -266,7 +266,7 @@ def test_what_the_model_misses_is_added_to_the_calibration() -> None:
 def test_file_of_an_earlier_version_is_read_and_the_interaction_not_known(tmp_path: Path) -> None:
     import pandas as pd
 
-    from starcal_uq.presentation.report.tables import attitude_rows
+    from starcal_uq.presentation.words.propagation import attitude_rows
 
     found, path = error(), tmp_path / "attitude.csv"
     found.save(path)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.budgeting.rows import confidence_text
-from starcal_uq.core.constants import AXES
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
 from starcal_uq.core.manifest import making
 from starcal_uq.core.records import to_plain
@@ -28,9 +27,9 @@ from starcal_uq.presentation.figures.planning import (
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import page
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words import planning as words
 from starcal_uq.presentation.words.numbers import span
-from starcal_uq.presentation.words.sentences import SCOPE_NAMES, table, told
+from starcal_uq.presentation.words.planning import costs_table
+from starcal_uq.presentation.words.sentences import SCOPE_NAMES, rows, table, told
 
 PAGE = "plan.html"
 # Settings that the record has as they are.
@@ -44,22 +43,6 @@ _RECORDED = (
     "scope",
     "target_arcsec",
 )
-# Heads of the columns of the forecast's table; those of sigmas of coefficients are left to the CSV.
-_HEADS = {
-    "n_frames": "Frames",
-    "x0_px": "x₀ [px]",
-    "y0_px": "y₀ [px]",
-    "f_px": "f [px]",
-    "f_mm": "f [mm]",
-    "distortion_corner_px": "Corner [px]",
-    **{f"common_{axis}_arcsec": f"Common rotation, {axis} [arcsec]" for axis in AXES},
-    **{f"rest_{axis}_arcsec": f"Rest, {axis} [arcsec]" for axis in AXES},
-    "radius_arcsec": "Two-axis error [arcsec]",
-    "radius_low_arcsec": "least of 90 %",
-    "radius_high_arcsec": "most of 90 %",
-    "radius_least_arcsec": "least distortion",
-    "radius_most_arcsec": "most distortion",
-}
 
 
 def write_plan(
@@ -156,12 +139,12 @@ def render_plan(
         choice=choice,
         check=check,
         needs=_needs_table(plan),
-        forecast=_forecast_table(plan),
+        forecast=rows("forecast", plan),
         infinite=lambda values: not np.isfinite(values).all(),
-        words=words,
         level=confidence_text(plan.confidence),
         scope=SCOPE_NAMES[plan.scope],
         distortion_span="" if plan.distortion is None else span(plan.distortion),
+        costs_table=costs_table,
         images=images,
     )
 
@@ -177,13 +160,3 @@ def _needs_table(plan: Plan) -> TextTable:
         it=plan.needs,
         frames=[spread and spread.frames_range(need.scope) for need in plan.needs],
     )
-
-
-def _forecast_table(plan: Plan) -> TextTable:
-    """The forecast by number of frames; the focal length once, in millimetres where the pitch is
-    known.
-    """
-    found = plan.to_dataframe().rename(columns=_HEADS)
-    left_out = "f [px]" if "f [mm]" in found else ""
-    columns = [head for head in _HEADS.values() if head in found and head != left_out]
-    return TextTable.of(found, columns=columns)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import Parameter, parameters, scales_of, sigma_parameter
-from starcal_uq.core.constants import INTERACTION
 from starcal_uq.core.formatting import (
     count,
     decimals_for,
@@ -29,14 +28,12 @@ from starcal_uq.presentation.figures.scales import symbol as written
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable, with_units
 from starcal_uq.presentation.words.sentences import table
-from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.result import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.pipeline.record import ImageRecord
     from starcal_uq.presentation.report.results import Results
-    from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
 
 Row = AnyDict
@@ -71,71 +68,6 @@ def parameter_rows(results: Results) -> list[Row]:
     columns = dict(zip((*names, "known"), zip(*found, strict=True), strict=True))
     rows = table("parameters", **columns).records
     return [{**row, "symbol": symbol(row["name"])} for row in rows]
-
-
-_ATTITUDE_NOTES = (
-    "random, new in every frame",
-    "one constant for the mission",
-    "depends on where the stars are",
-    "common rotation and rest together",
-    "beyond the sum of both",
-)
-
-
-def attitude_rows(error: AttitudeError) -> list[Row]:
-    """Contributions to the attitude error by both their figures: 1 sigma, 95 % and 99.7 % for each
-    axis, arcsec.
-    """
-    every = error.to_dataframe()
-    rows = []
-    for (contributor, group), note in zip(
-        every.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True
-    ):
-        text = str(contributor)
-        shown = _small if text == INTERACTION else significant
-        figures = []
-        for name, column in (
-            (WITH_MISFIT_FOUND, "with_misfit_found"),
-            (IF_MODEL_HOLDS, "if_model_holds"),
-        ):
-            untested = column == "with_misfit_found" and error.misfit is None
-            values = {
-                head: []
-                if untested
-                else [shown(float(v)) for v in group[f"{start}{column}_arcsec"]]
-                for head, start in (("sigma", ""), ("p95", "p95_"), ("p997", "p997_"))
-            }
-            figures.append({"name": name, "untested": untested, **values})
-        if all(figures[0][head] == figures[1][head] for head in ("sigma", "p95", "p997")):
-            figures = [{**figures[0], "name": "both"}]
-        if group["if_model_holds_arcsec"].isna().any():
-            note = "not sampled by the version that wrote this run"
-        absorbed = str(group["absorbed_by_alignment"].iloc[0])
-        name = text[0].upper() + text[1:]
-        rows.append(
-            {
-                "name": name,
-                "note": note,
-                "absorbed": absorbed,
-                "total": text == CONTRIBUTORS[3],
-                "figures": figures,
-                "first_order": [shown(float(v)) for v in group["first_order_arcsec"]],
-            }
-        )
-    return rows
-
-
-def _small(arcsec: float) -> str:
-    """The interaction is shown to be small, and no more: twelve columns leave no room for powers of
-    ten.
-    """
-    if np.isnan(arcsec):
-        return "—"
-    return (
-        "< 0.001".replace(" ", "\N{NO-BREAK SPACE}")
-        if 0.0 < arcsec < 0.001
-        else significant(arcsec)
-    )
 
 
 def weak_directions(coupling: Coupling) -> list[Row]:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.status import Code
-from starcal_uq.core.types import AnyDict, AnyMapping
+from starcal_uq.core.types import AnyMapping
 from starcal_uq.diagnostics.verdict.observed import refraction
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.words.estimation import calibration_table
@@ -16,7 +15,6 @@ from starcal_uq.presentation.words.inference import posterior_table
 from starcal_uq.presentation.words.sentences import told
 
 if TYPE_CHECKING:
-    from starcal_uq.diagnostics.verdict.judge import Verdict
     from starcal_uq.presentation.report.results import Results
 
 
@@ -35,45 +33,6 @@ def data_sentence(results: Results) -> str:
     obs, cal = results.observations, results.calibration
     stars = () if obs.star_id is None else np.unique(obs.star_id)
     return told("data", results, n_different=len(stars), refraction=refraction(obs, cal))
-
-
-# What the uncertainties assume, and the checks that look for the opposite.
-_ASSUMPTIONS = (
-    (
-        "Centroid errors are Gaussian, with the noise that is stated.",
-        (Code.OUTLIERS, Code.POSTERIOR_PREDICTIVE_CHECK),
-    ),
-    (
-        "The noise is the same over field, magnitude and time, or stated star by star.",
-        (Code.EVENNESS_OF_THE_NOISE,),
-    ),
-    (
-        "Stars of one frame share no error but the attitude (motion, refraction, temperature).",
-        (Code.JACKKNIFE_OVER_FRAMES, Code.UNEXPLAINED_STRUCTURE),
-    ),
-    (
-        "A star brings no error along (catalogue position and motion, blend, colour).",
-        (Code.ERRORS_OF_THE_STARS,),
-    ),
-    (
-        "Directions are those that the camera saw: aberration, and refraction in air.",
-        (Code.CATALOGUE_DIRECTIONS,),
-    ),
-    (
-        "The lens follows the distortion model, the same in all frames.",
-        (Code.PATTERN_IN_THE_RESIDUALS, Code.UNEXPLAINED_STRUCTURE, Code.DISTORTION_MODEL),
-    ),
-    ("Every star is the one that it is said to be.", (Code.OUTLIERS, Code.TWO_ESTIMATORS)),
-)
-
-
-def assumption_rows(verdict: Verdict) -> list[AnyDict]:
-    """What is assumed, with the outcome of the checks that were made for it."""
-    made = {check.code: check for check in verdict.checks}
-    return [
-        {"assumed": words, "checks": [made[code] for code in codes if code in made]}
-        for words, codes in _ASSUMPTIONS
-    ]
 
 
 # What makes sums over all stars, by the name that a provenance has for it.

@@ -19,7 +19,7 @@ from starcal_uq.core.formatting import decimals_for, fixed, join_words, signific
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.numbers import bound
-from starcal_uq.presentation.words.sentences import table, told
+from starcal_uq.presentation.words.sentences import rows, table, told
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 Row = AnyDict
@@ -53,7 +53,7 @@ def tables(budget: Budget) -> AnyDict:
         "classes": class_rows(budget),
         "totals": total_rows(budget),
         "indices": index_rows(budget),
-        "filter": filter_table(budget) if budget.filter else None,
+        "filter": rows("filter", budget) if budget.filter else None,
         "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
         "requirements": table("outcomes", it=budget.outcomes, sampled=sampled).records,
         "headline": told("budget", budget),
@@ -313,10 +313,3 @@ def indices_table(budget: Budget) -> TextTable:
     if taken:
         title += f"; at most, as their behaviour in time is not stated: {join_words([*taken])}"
     return TextTable(heads, rows, title, "lllll")
-
-
-def filter_table(budget: Budget) -> TextTable:
-    """One row per state of a gyro-stellar filter."""
-    title = "For a filter, after alignment, 1 sigma"
-    formats = {"axis": AXIS_LABELS.__getitem__, "contributors": join_words}
-    return TextTable.of(budget.filter_dataframe(), title, formats=formats)

@@ -95,20 +95,6 @@ def diagnosis_html(found: Diagnosis) -> str:
     return "".join(part._repr_html_() or "" for part in parts if part is not None)
 
 
-def validation_table(found: Validation) -> TextTable:
-    """Coverage and ranks, one row per quantity."""
-    columns = (
-        "quantity",
-        "unit",
-        "coverage_95",
-        "coverage_low",
-        "coverage_high",
-        "coverage_p",
-        "rank_p",
-    )
-    return TextTable.of(found.to_dataframe(), "Validation", columns)
-
-
 def validation_text(found: Validation) -> str:
     """One paragraph: is all well, on what evidence, what does not hold, and what else to know."""
     # Errors of camera parameters that are rejected together; the log likelihood has no symmetric

@@ -9,16 +9,12 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters, scales_of
 from starcal_uq.core.formatting import (
     decimals_for,
-    fixed,
     pretty_unit,
 )
-from starcal_uq.estimation.merging import Consistency
 from starcal_uq.estimation.result import Calibration
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.effects import effects_table
-from starcal_uq.presentation.words.sentences import table, told
-
-_SHOWN_ROWS = 30
+from starcal_uq.presentation.words.sentences import rows, table, told
 
 
 def noise_kind(cal: Calibration) -> str:
@@ -64,20 +60,4 @@ def screening_text(screening: Screening) -> str:
 
 def screening_table(screening: Screening) -> TextTable | None:
     """The first rejected rows, each with its reason; None where none is rejected."""
-    if not screening.n_rejected:
-        return None
-
-    def number(value: float) -> str:
-        return "∞" if np.isinf(value) else fixed(value, 3)
-
-    rejected = screening.rejected.head(_SHOWN_ROWS)
-    formats = dict.fromkeys(
-        ("x_px", "y_px", "residual_px", "offset_deg", "statistic", "threshold"), number
-    )
-    more = f", the first {len(rejected)}" if len(rejected) < screening.n_rejected else ""
-    return TextTable.of(rejected, f"Rejected stars{more}", formats=formats, missing="")
-
-
-def consistency_table(consistency: Consistency) -> TextTable:
-    """One row per run."""
-    return TextTable.of(consistency.to_dataframe(), "Agreement of the runs")
+    return rows("screening", screening) if screening.n_rejected else None

@@ -7,36 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from starcal_uq.core.remedy import Remedy
-from starcal_uq.identification.result import Identification
-from starcal_uq.images.centroids import Centroids
 from starcal_uq.pipeline.images import FAINTEST
 from starcal_uq.pipeline.inspection import IDENTIFIED, Frames, InspectedFrame
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
-from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.sentences import told
 
 MOST_FRAMES = 40
-
-
-def centroids_table(centroids: Centroids) -> TextTable:
-    """The first frames."""
-    columns = ("frame", "n_stars", "image", "background", "noise", "psf_sigma_px", "problem")
-    formats = dict.fromkeys(("background", "noise", "psf_sigma_px"), "{:.4g}".format)
-    return TextTable.of(centroids.frames_dataframe().head(MOST_FRAMES), "", columns, formats)
-
-
-def identification_table(identification: Identification) -> TextTable:
-    """What became of the first frames."""
-    columns = (
-        "frame",
-        "image",
-        "status",
-        "n_centroids",
-        "n_identified",
-        "log10_expected_false",
-        "milliseconds",
-    )
-    return TextTable.of(identification.to_dataframe().head(MOST_FRAMES), "Identification", columns)
 
 
 def image_calibration_text(images: ImageCalibration) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pandas as pd
 
 from starcal_uq.camera.camera import Camera
@@ -12,7 +11,6 @@ from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.table import Observations
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.sentences import say
-from starcal_uq.sky.catalogue import StarCatalogue
 
 _FIRST_ROWS = 5
 
@@ -39,9 +37,3 @@ def observations_table(obs: Observations) -> TextTable:
     head = pd.DataFrame({name: values[:_FIRST_ROWS] for name, values in obs.columns.items()})
     formats = {name: "{:.5f}".format for name in head if COLUMNS[name].kind == "number"}
     return TextTable.of(head, formats=formats)
-
-
-def catalogue_table(stars: StarCatalogue) -> TextTable:
-    """The first stars."""
-    head = stars.select(np.arange(min(_FIRST_ROWS, len(stars)))).to_dataframe()
-    return TextTable.of(head, formats=dict.fromkeys(("ra_deg", "dec_deg"), "{:.6f}".format))

@@ -8,8 +8,6 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import fixed
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.costs import EffectCosts
-from starcal_uq.planning.design import FrameChoice
-from starcal_uq.planning.planned import Plan
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.numbers import frames
 from starcal_uq.presentation.words.sentences import told
@@ -21,22 +19,6 @@ def check_text(check: ForecastCheck) -> str:
     worst = table.loc[(table["ratio"] - 1.0).abs().idxmax()]
     outside = [int(n) for n in np.array(check.forecast.n_frames)[check.nees_rejected]]
     return told("forecast_check", check, worst=worst, outside=outside)
-
-
-def plan_table(plan: Plan) -> TextTable:
-    """The forecast by number of frames."""
-    focal = "f_px" if plan.camera.pixel_um is None else "f_mm"
-    columns = (
-        "n_frames",
-        "x0_px",
-        focal,
-        "common_pitch_arcsec",
-        "rest_pitch_arcsec",
-        "nea_pitch_arcsec",
-    )
-    title = "Forecast, standard deviations; the radius holds the stated confidence"
-    spread = () if plan.distortion is None else ("radius_least_arcsec", "radius_most_arcsec")
-    return TextTable.of(plan.to_dataframe(), title, (*columns, "radius_arcsec", *spread))
 
 
 def costs_table(costs: EffectCosts) -> TextTable:
@@ -61,15 +43,3 @@ def costs_table(costs: EffectCosts) -> TextTable:
     title = f"What effects cost after {frames(costs.n_frames)}: growth of sigmas, and the rest"
     forms = dict.fromkeys(known, lambda factor: f"× {fixed(factor, 2)}")
     return TextTable.of(table, title, formats=forms, missing="")
-
-
-def choice_table(choice: FrameChoice, n: int = 20) -> TextTable:
-    """The first frames to take, most valuable first."""
-    return TextTable.of(
-        choice.to_dataframe().head(n), f"The first {min(n, len(choice.candidate))} frames to take"
-    )
-
-
-def worth_table(choice: FrameChoice) -> TextTable:
-    """What the chosen frames bring against random ones and those with most stars."""
-    return TextTable.of(choice.worth())

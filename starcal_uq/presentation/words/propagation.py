@@ -9,14 +9,16 @@ import numpy as np
 import pandas as pd
 
 from starcal_uq.camera.distortion import Parameter, scales_of
-from starcal_uq.core.constants import AXES
+from starcal_uq.core.constants import AXES, INTERACTION
 from starcal_uq.core.formatting import (
     fixed,
     significant,
 )
+from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.sentences import table, told
 from starcal_uq.propagation.attitude_error import (
+    CONTRIBUTORS,
     IF_MODEL_HOLDS,
     WITH_MISFIT_FOUND,
     Agreement,
@@ -40,42 +42,76 @@ def agreement_text(agreement: Agreement) -> str:
     return told("agreement", agreement, where=where)
 
 
-def agreement_table(agreement: Agreement) -> TextTable:
-    """One row per contributor and axis."""
-    return TextTable.of(
-        agreement.to_dataframe(),
-        formats={"sampled_over_first_order": lambda v: fixed(v, 5)},
-        missing="not known",
-    )
+_NOTES = (
+    "random, new in every frame",
+    "one constant for the mission",
+    "depends on where the stars are",
+    "common rotation and rest together",
+    "beyond the sum of both",
+)
+# Columns of 1 sigma, 95 % and 99.7 % by what they begin with.
+_GROUPS = {"sigma": "", "p95": "p95_", "p997": "p997_"}
+
+
+def attitude_rows(error: AttitudeError) -> list[AnyDict]:
+    """Contributions to the attitude error by both their figures, once where these print alike: 1
+    sigma, 95 % and 99.7 % for each axis, arcsec.
+    """
+    kinds = {WITH_MISFIT_FOUND: "with_misfit_found", IF_MODEL_HOLDS: "if_model_holds"}
+    rows = []
+    groups = error.to_dataframe().groupby("contributor", sort=False)
+    for (contributor, group), note in zip(groups, _NOTES, strict=True):
+        name = str(contributor)
+        shown = _small if name == INTERACTION else significant
+        figures = []
+        for kind, column in kinds.items():
+            values = {
+                head: [shown(float(v)) for v in group[f"{start}{column}_arcsec"]]
+                for head, start in _GROUPS.items()
+            }
+            untested = kind == WITH_MISFIT_FOUND and error.misfit is None
+            figures.append({"name": kind, "untested": untested, **values})
+        found, held = figures
+        if not found["untested"] and all(found[head] == held[head] for head in _GROUPS):
+            figures = [{**held, "name": "both"}]
+        if group["if_model_holds_arcsec"].isna().any():
+            note = "not sampled by the version that wrote this run"
+        rows.append(
+            {
+                "contributor": name,
+                "note": note,
+                "absorbed": str(group["absorbed_by_alignment"].iloc[0]),
+                "total": name == CONTRIBUTORS[3],
+                "figures": figures,
+            }
+        )
+    return rows
+
+
+def _small(arcsec: float) -> str:
+    """The interaction is shown to be small, and no more: twelve columns leave no room for powers of
+    ten.
+    """
+    if np.isnan(arcsec):
+        return "—"
+    return "<\N{NO-BREAK SPACE}0.001" if 0.0 < arcsec < 0.001 else significant(arcsec)
 
 
 def attitude_table(error: AttitudeError) -> TextTable:
     """Contributors by axis, by both figures: 1 sigma, and the half-width across the boresight that
     holds 95 %.
     """
-    held, found = error.if_model_holds_arcsec, error.with_misfit_found_arcsec
-    widths = (error.half_widths_with_misfit_found_arcsec[0], error.p95_arcsec)
-    absorbed = (
-        error.to_dataframe().groupby("contributor", sort=False)["absorbed_by_alignment"].first()
-    )
     rows: list[tuple[str, ...]] = []
-    for place, (contributor, words) in enumerate(absorbed.items()):
-        figures = []
-        for name, sigma, width in zip(
-            (WITH_MISFIT_FOUND, IF_MODEL_HOLDS), (found, held), widths, strict=True
-        ):
-            values = [*sigma[place], width[place, 3]]
-            # The interaction is not known of runs of old.
-            figures.append(
-                (
-                    f"  {name}",
-                    *("not known" if np.isnan(v) else significant(v) for v in values),
-                    "",
-                )
-            )
-        once = error.misfit is None or figures[0][1:] == figures[1][1:]
-        rows.append((str(contributor), *(figures[1][1:-1] if once else [""] * 5), str(words)))
-        rows += [] if once else figures
+    for row in attitude_rows(error):
+        figures = [figure for figure in row["figures"] if not figure["untested"]]
+        several = len(figures) > 1
+        for figure in figures:
+            cells = (*figure["sigma"], figure["p95"][3])
+            rows.append((f"  {figure['name']}" if several else row["contributor"], *cells, ""))
+        if several:
+            rows.insert(-2, (row["contributor"], *[""] * 5, row["absorbed"]))
+        else:
+            rows[-1] = (*rows[-1][:-1], row["absorbed"])
     heads = ("contributor", *AXES, "across", "two-axis 95 %", "absorbed by alignment")
     which = f", {IF_MODEL_HOLDS}" if error.misfit is None else ""
     return TextTable(heads, tuple(rows), f"Attitude error, arcsec, 1 sigma{which}", "lrrrrrl")

@@ -12,7 +12,7 @@ import shlex
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from itertools import compress
 from typing import Any
@@ -21,7 +21,7 @@ import jinja2
 import numpy as np
 
 from starcal_uq.attitude.earth import DENSITY_SPREAD
-from starcal_uq.budgeting.rows import confidence_text
+from starcal_uq.budgeting.rows import AXIS_LABELS, confidence_text
 from starcal_uq.calibration.fallback import fallback_facts
 from starcal_uq.core import formatting
 from starcal_uq.core.conflicts import words_of
@@ -92,8 +92,10 @@ def templates() -> dict[str, str]:
     """
     found = {}
     for name, entry in _entries().items():
-        parts = [entry] if isinstance(entry, str) else [*entry.values()]
         kind, _, table = name.partition(".")
+        parts = [entry] if isinstance(entry, str) else [*entry.values()]
+        if kind == "Rows":
+            parts = [entry.get("title", "")]
         if kind == "Table":
             cells = {head: text for head, text in entry.items() if head not in _OF_TABLES}
             parts = [entry.get("mark", ""), *cells.values()]
@@ -130,6 +132,7 @@ def _environment() -> jinja2.Environment:
         "AFTER_FRAMES": AFTER_FRAMES,
         "ALPHA": ALPHA,
         "AXES": AXES,
+        "AXIS_LABELS": AXIS_LABELS,
         "COMPRESSED_BOUND": COMPRESSED_BOUND,
         "CONFLICTS": (CONFLICT, WEAK),
         "DENSITY_SPREAD": DENSITY_SPREAD,
@@ -181,6 +184,32 @@ def table(
         "".join(compress(align, kept)),
         tuple(mark for mark, *_ in filled) if any(mark for mark, *_ in filled) else (),
     )
+
+
+def rows(name: str, it: Any, first: int | None = None) -> TextTable:
+    """A table of a result's data frame, by its name in the table; the first rows alone if so asked."""
+    entry = _entries()[f"Rows.{name}"]
+    frame = getattr(it, entry.get("frame", "to_dataframe"))
+    frame = frame() if callable(frame) else frame
+    columns = entry.get("columns", [*frame])
+    heads = columns if isinstance(columns, dict) else dict(zip(columns, columns, strict=True))
+    instead = entry.get("instead", {})
+    shown = {
+        old: new for old, new in heads.items() if old in frame and instead.get(old) not in frame
+    }
+    forms = {
+        heads[column]: partial(_filled, text) for column, text in entry.get("forms", {}).items()
+    }
+    return TextTable.of(
+        frame[[*shown]].head(first or entry.get("first", len(frame))).rename(columns=shown),
+        say(f"Rows.{name}", it=it, first=first or entry.get("first")),
+        formats=forms,
+        missing=entry.get("missing", "–"),
+    )
+
+
+def _filled(text: str, value: Any) -> str:
+    return _environment().from_string(text).render(it=value)
 
 
 def told(name: str, it: object, /, **facts: Any) -> str:
