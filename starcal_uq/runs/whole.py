@@ -286,13 +286,7 @@ def finish(
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
     from starcal_uq.diagnostics.diagnose import diagnose_apart
-    from starcal_uq.presentation.report.drawing import (
-        AFTER_BUDGET,
-        AFTER_CALIBRATION,
-        AFTER_DIAGNOSIS,
-        AFTER_PROPAGATION,
-        AFTER_SAMPLING,
-    )
+    from starcal_uq.presentation.report.drawing import AFTER
 
     propagation = _of(PropagationOptions, options)
     profile = propagation.get("temperature_profile")
@@ -304,26 +298,26 @@ def finish(
     if run.calibration.partitions is None and not run.did("diagnose"):
         apart = ahead.begin(partial(diagnose_apart, seed=seed), run.observations, run.calibration)
     watch.tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
-    ahead.draw(run.calibrated, AFTER_CALIBRATION)
+    ahead.draw(run.calibrated, AFTER["calibration"])
     if run.images is not None:
         ahead.draw_frames(run.shown_frames)
     if not run.did("sample"):
         sampling = _of(SamplingOptions, options) | {"dof": options.get("dof")}
         with watch.bar("sampling") as progress:
             sample_run(run, sampling, seed=seed, progress=progress)
-    ahead.draw(run.results, AFTER_SAMPLING)
+    ahead.draw(run.results, AFTER["sampling"])
     if not run.did("coupling"):
         run.couple()
     if not run.did("propagate"):
         run.propagate(seed=seed, **propagation)
-    ahead.draw(run.results, AFTER_PROPAGATION)
+    ahead.draw(run.results, AFTER["propagation"])
     if not run.did("diagnose"):
         with watch.bar("diagnosis") as progress:
             run.diagnose(seed=seed, progress=progress, apart=apart)
-    ahead.draw(run.results, AFTER_DIAGNOSIS)
+    ahead.draw(run.results, AFTER["diagnosis"])
     if not run.did("budget"):
         run.budget(file=options.get("budget"), seed=seed)
-    ahead.draw(run.results, AFTER_BUDGET)
+    ahead.draw(run.results, AFTER["budget"])
     if report:
         run.report(ahead.figures)
 

@@ -83,6 +83,11 @@ def plot_effects(
     return figure
 
 
+def plot_fitted_effects(cal: Calibration, obs: Observations) -> Figure | None:
+    """`plot_effects`; None where no shift was fitted."""
+    return plot_effects(cal, obs) if cal.effects is not None and cal.effects.fitted else None
+
+
 def plot_effect_scales(effects: Effects, ax: Axes | None = None) -> Axes:
     """Scale of every effect with its 95 % interval, and the shift that it explains."""
     ax = style.panel(ax, 4.6, 1.3 + 0.35 * len(effects.fitted))

@@ -3,52 +3,33 @@
 from __future__ import annotations
 
 import gc
+import tomllib
 from collections.abc import Callable, Collection
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import ExitStack, suppress
-from functools import partial
+from functools import partial, reduce
+from importlib.resources import files
 from multiprocessing import active_children
+from pkgutil import resolve_name
 from typing import Any, TypeVar
 
 from starcal_uq.core.tasks import processes, processors, submit
 from starcal_uq.core.types import Progress
 from starcal_uq.pipeline.inspection import Frames
-from starcal_uq.presentation.figures.budgeting import plot_budget
-from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
-from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
-from starcal_uq.presentation.figures.effects import plot_effects
-from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
-from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
-from starcal_uq.presentation.figures.propagation import (
-    glance_attitude,
-    glance_field,
-    glance_residuals,
-    plot_attitude,
-    plot_distortion_curve,
-    plot_field_map,
-    plot_thermal,
-)
 from starcal_uq.presentation.figures.style import figure_of, label, new_axes, svg_bytes
 from starcal_uq.presentation.report.results import Results
 
 T = TypeVar("T")
 
 # Figures by the step after which they can be drawn.
-AFTER_CALIBRATION = ("glance_residuals", "residuals", "residual_profiles", "effects", "convergence")
-AFTER_SAMPLING = (
-    "corner",
-    "prior_posterior",
-    "correlation",
-    "price_of_coupling",
-    "distortion_curve",
+_STEPS: dict[str, dict[str, list[str]]] = tomllib.loads(
+    files("starcal_uq.presentation.report").joinpath("drawing.toml").read_text("utf-8")
 )
-AFTER_PROPAGATION = ("glance_field", "field_map", "thermal")
-AFTER_DIAGNOSIS = ("glance_attitude", "misfit", "attitude")
-AFTER_BUDGET = ("budget",)
+AFTER = {step: tuple(figures) for step, figures in _STEPS.items()}
 # The frames of a run from images stand among the figures by this name: a piece of a page, not a
 # picture.
 GALLERY = "gallery"
-FIGURES = (*AFTER_CALIBRATION, *AFTER_SAMPLING, *AFTER_PROPAGATION, *AFTER_DIAGNOSIS, *AFTER_BUDGET)
+FIGURES = tuple(name for names in AFTER.values() for name in names)
 
 
 def draw_figures(
@@ -74,37 +55,16 @@ def draw_gallery(frames: Frames) -> dict[str, bytes]:
 
 def _figure(results: Results, name: str) -> Any:
     """One figure; None where the results lack what it shows."""
-    plot, needed = _PLOTS[name]
-    shown = {what: getattr(results, what) for what in needed.split()}
-    if any(part is None for what, part in shown.items() if what != "truth"):
+    where, *needed = next(figures[name] for figures in _STEPS.values() if name in figures)
+    shown = [reduce(_part, what.split("."), results) for what in needed]
+    if any(part is None for part, what in zip(shown, needed, strict=True) if what != "truth"):
         return None
-    drawn = plot(*shown.values())
+    drawn = resolve_name(f"starcal_uq.presentation.figures.{where}")(*shown)
     return None if drawn is None else figure_of(drawn)
 
 
-# What draws each figure, and what of the results it takes; the truth may be missing.
-_PLOTS: dict[str, tuple[Callable[..., Any], str]] = {
-    "glance_attitude": (glance_attitude, "attitude"),
-    "glance_residuals": (glance_residuals, "calibration observations"),
-    "glance_field": (glance_field, "field_map"),
-    "residuals": (plot_residuals, "calibration observations"),
-    "residual_profiles": (plot_residual_profiles, "calibration observations"),
-    "effects": (
-        lambda cal, obs: plot_effects(cal, obs) if cal.effects and cal.effects.fitted else None,
-        "calibration observations",
-    ),
-    "convergence": (plot_convergence, "calibration truth"),
-    "misfit": (plot_diagnosis, "diagnosis"),
-    "corner": (plot_corner, "posterior calibration truth"),
-    "prior_posterior": (plot_prior_posterior, "posterior truth"),
-    "correlation": (plot_correlations, "coupling"),
-    "price_of_coupling": (plot_couplings, "coupling"),
-    "attitude": (plot_attitude, "attitude"),
-    "thermal": (lambda error: error.thermal and plot_thermal(error.thermal), "attitude"),
-    "field_map": (plot_field_map, "field_map"),
-    "distortion_curve": (plot_distortion_curve, "distortion_curve"),
-    "budget": (plot_budget, "budget"),
-}
+def _part(of: Any, name: str) -> Any:
+    return getattr(of, name, None)
 
 
 class Ahead:

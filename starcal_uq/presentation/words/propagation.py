@@ -53,16 +53,16 @@ _NOTES = (
 _GROUPS = {"sigma": "", "p95": "p95_", "p997": "p997_"}
 
 
-def attitude_rows(error: AttitudeError) -> list[AnyDict]:
+def attitude_rows(error: AttitudeError, small: bool = True) -> list[AnyDict]:
     """Contributions to the attitude error by both their figures, once where these print alike: 1
-    sigma, 95 % and 99.7 % for each axis, arcsec.
+    sigma, 95 % and 99.7 % for each axis, arcsec; with `small` the interaction is but bounded.
     """
     kinds = {WITH_MISFIT_FOUND: "with_misfit_found", IF_MODEL_HOLDS: "if_model_holds"}
     rows = []
     groups = error.to_dataframe().groupby("contributor", sort=False)
     for (contributor, group), note in zip(groups, _NOTES, strict=True):
         name = str(contributor)
-        shown = _small if name == INTERACTION else significant
+        shown = _small if small and name == INTERACTION else significant
         figures = []
         for kind, column in kinds.items():
             values = {
@@ -102,7 +102,7 @@ def attitude_table(error: AttitudeError) -> TextTable:
     holds 95 %.
     """
     rows: list[tuple[str, ...]] = []
-    for row in attitude_rows(error):
+    for row in attitude_rows(error, small=False):
         figures = [figure for figure in row["figures"] if not figure["untested"]]
         several = len(figures) > 1
         for figure in figures:

@@ -38,6 +38,7 @@ from starcal_uq.estimation.merging import ALPHA
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.planning.open_distortion import AFTER_FRAMES
+from starcal_uq.presentation.html import functions
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import numbers
 from starcal_uq.propagation.onboard_error import with_cross
@@ -50,15 +51,6 @@ SCOPE_NAMES = {
     "calibration": "calibration (common rotation and rest)",
     "total": "calibration and centroid noise",
 }
-_NUMBERS = (
-    *("capital", "two_figures", "with_error", "change", "numbers", "digits", "percents", "least"),
-    *("bound", "axis_label", "frames", "need_words", "range_words", "corner", "span"),
-    *("across_and_roll", "mean_to_mcse", "pair", "both"),
-)
-_FORMATTING = (
-    *("count", "fixed", "join_words", "p_words", "percent", "plural", "plus_minus", "significant"),
-    *("decimals_for", "p_value", "pretty_unit", "superscript", "with_sigma"),
-)
 
 
 # What an entry for a table has beside the cells of its columns.
@@ -110,8 +102,8 @@ def _environment() -> jinja2.Environment:
         loader=jinja2.DictLoader(templates()), undefined=_Absent, extensions=["jinja2.ext.do"]
     )
     own: dict[str, Callable[..., Any]] = {
-        **{name: getattr(numbers, name) for name in _NUMBERS},
-        **{name: getattr(formatting, name) for name in _FORMATTING},
+        **functions(formatting),
+        **functions(numbers),
         "all_finite": lambda values: bool(np.isfinite(values).all()),
         "some_finite": lambda values: bool(np.isfinite(values).any()),
         "brief": _brief,
