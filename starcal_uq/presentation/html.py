@@ -6,10 +6,9 @@ import base64
 import io
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from html import escape
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core import formatting
@@ -88,14 +87,6 @@ def page(template: str, made: Provenance, /, **known: Any) -> str:
     return f"{text}\n"
 
 
-def functions(module: ModuleType) -> dict[str, Callable[..., Any]]:
-    """What a module makes, for templates."""
-    own = (
-        one for one in vars(module).values() if getattr(one, "__module__", "") == module.__name__
-    )
-    return {one.__name__: one for one in own if not one.__name__.startswith("_")}
-
-
 @cache
 def template_environment() -> Environment:
     """Jinja's environment for the templates of the package: everything is escaped but text, and a
@@ -119,7 +110,7 @@ def template_environment() -> Environment:
         "wrapped": wrapped,
         "when": lambda utc: utc.replace("T", " ").replace("Z", " UTC"),
     }
-    from starcal_uq.presentation.words.sentences import rows, say, told
+    from starcal_uq.presentation.words.sentences import functions, rows, say, told
 
     environment.globals |= {"rows": rows, "say": say, "told": told}
     environment.globals |= functions(formatting)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Collection, Iterable
 from functools import cache, partial
 from importlib.resources import files
 from itertools import compress
+from types import ModuleType
 from typing import Any
 
 import jinja2
@@ -38,7 +39,6 @@ from starcal_uq.estimation.merging import ALPHA
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK
 from starcal_uq.planning.open_distortion import AFTER_FRAMES
-from starcal_uq.presentation.html import functions
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import numbers
 from starcal_uq.propagation.onboard_error import with_cross
@@ -94,6 +94,14 @@ def templates() -> dict[str, str]:
             found[f"Heads.{table}"] = "¶".join([entry.get("title", ""), *cells])
         found[name] = "¶".join(parts)
     return found
+
+
+def functions(module: ModuleType) -> dict[str, Callable[..., Any]]:
+    """What a module makes, for templates."""
+    own = (
+        one for one in vars(module).values() if getattr(one, "__module__", "") == module.__name__
+    )
+    return {one.__name__: one for one in own if not one.__name__.startswith("_")}
 
 
 @cache
