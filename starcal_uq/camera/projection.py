@@ -201,6 +201,27 @@ def forward_kernel(model_name: str, order: str) -> Kernel:
 
 
 @lru_cache(maxsize=32)
+def slope_kernel(model_name: str) -> Kernel:
+    """Kernel of what a star adds to the slope of ``(e^T W e + log |A^T W A|) / 2`` over (theta, phi),
+    (p + 3,), at phi = 0.
+
+    e is its residual and A the derivatives of its frame's pixels by phi. The inputs end with the
+    measured pixel, W (4,) and the inverse of ``A^T W A`` (9,).
+    """
+    import casadi as ca
+
+    s, weight, inverse = _symbols(model_name), ca.SX.sym("w", 2, 2), ca.SX.sym("m", 3, 3)
+    xy = forward_expression(model_name, s, newton_steps=2)
+    columns = ca.horzcat(xy - s.pixel, ca.jacobian(xy, s.phi))
+    # The slope of a log determinant is that of a trace with the inverse held.
+    half = 0.5 * ca.dot(columns, weight @ columns @ ca.diagcat(1, inverse))
+    slope = ca.densify(ca.gradient(half, ca.vertcat(s.theta, s.phi)))
+    slope = ca.substitute(slope, s.phi, ca.SX.zeros(3))
+    inputs = [s.theta, s.b, s.root, s.pixel, ca.vec(weight), ca.vec(inverse)]
+    return build_kernel(f"slope_{model_name}", inputs, [slope], [(slope.numel(),)])
+
+
+@lru_cache(maxsize=32)
 def backward_kernel(model_name: str, derivatives: bool) -> Kernel:
     """Kernel from pixels to unit vectors: value (3,), with `derivatives` also d/dtheta (p, 3)."""
     import casadi as ca

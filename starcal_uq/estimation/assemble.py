@@ -4,7 +4,7 @@ likelihood at it.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import undistorted
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.later import Later
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.kept import KeptFrames
@@ -25,10 +26,10 @@ from starcal_uq.estimation.undetermined import (
     remedy_of,
     undetermined,
 )
-from starcal_uq.likelihood.compressed import compress, settled, unit_covariance
+from starcal_uq.likelihood.compressed import CompressedLikelihood, compress, settled
 from starcal_uq.likelihood.marginal import TURN_RAD, MarginalLikelihood
-from starcal_uq.likelihood.solvers import is_singular, reason_of
-from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
+from starcal_uq.likelihood.solvers import Normal, is_singular, reason_of
+from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
     from starcal_uq.observations.frames import StarFrames
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
 # Noise above this fraction of the detector's width means that the stars are not the ones they are
 # said to be.
 IMPLAUSIBLE_NOISE = 0.01
+# What may be left of the way to the estimate, in standard deviations, and most passes over the stars.
+_REST, _PASSES = 3e-10, 12
 # Attitudes this near to the best ones tell such a noise.
 _NEARLY_RAD = 1e-4
 # Noise that is assumed where there is no estimate to take it from.
@@ -50,57 +53,100 @@ class PairEstimate(NamedTuple):
     covariance: FloatArray  # (p, p)
 
 
+# Stages, and the estimate from interstar angles that they led to.
+Way = tuple[list[Stage], PairEstimate]
+
+
+class Peak(NamedTuple):
+    """The end of a search, and the normal equations there."""
+
+    least: FloatArray  # (p,): end of the stages, px units, or, settled, the least sum of squares
+    theta: FloatArray  # (p,): the estimate, px units
+    normal: Normal  # At `least`
+    refined: bool  # Whether positions led there
+
+
+def peak_near(likelihood: MarginalLikelihood, theta: FloatArray) -> Peak | None:
+    """The maximum of a likelihood a few sigmas from theta (p,); None where steps of Gauss and Newton
+    do not settle.
+    """
+    dof, before = likelihood.dof - len(theta), 0.0
+    for _ in range(_PASSES):
+        found = likelihood.sums(theta, tolerance=np.inf)
+        normal = found[0].normal
+        if is_singular(normal.matrix):
+            return None
+        likelihood.use_sums(*found)
+        unit = scaled_inverse(normal.matrix)
+        step = unit @ normal.gradient
+        theta, gain, variance = theta - step, float(step @ normal.gradient), normal.cost / dof
+        # The next two steps shrink as this one did.
+        if gain**3 <= (_REST * min(before, variance)) ** 2 * variance:
+            # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma.
+            slope = likelihood.slope(theta, variance**0.5, found[1])
+            return Peak(theta, theta - unit @ slope, normal, True)
+        before = gain
+    return None
+
+
 def assemble(
     obs: Observations,
     nominal: Camera,
     likelihood: MarginalLikelihood,
     stages: list[Stage],
     status: Status,
-    pairs: PairEstimate,
+    pairs: Callable[[], PairEstimate],
     settings: AnyDict,
 ) -> Calibration:
-    """Everything that a calibration tells about the end of its last stage.
+    """The calibration of the end of its last stage; one named ``refinement`` is near the maximum of
+    `likelihood`.
 
-    The last of `stages` ends in the estimate; one named ``refinement`` is the maximum of
-    `likelihood`. Without it, the covariance of the result is that of `pairs`, the estimate from
-    interstar angles. `settings` hold ``method`` and ``solver``. CalibrationError when there is no
-    estimate that residuals could be taken at.
+    The rest is as for `calibration_at`.
     """
-    theta = stages[-1].theta
-    refined = stages[-1].name == "refinement"
-    p = len(theta)
-    if not status.ok and not np.isfinite(noise_px(likelihood, theta)):
-        raise failed(likelihood, nominal.theta, nominal, status)
-    normal = likelihood.sums(theta, tolerance=TURN_RAD)[0].normal
-    if not np.isfinite(normal.cost) or is_singular(normal.matrix):
-        raise failed(likelihood, theta, nominal, reason_of(status, normal.cost))
-    dof = likelihood.dof - p
+    theta, refined = stages[-1].theta, stages[-1].name == "refinement"
+    peak = peak_near(likelihood, theta) if refined and status.ok else None
+    if peak is None:
+        normal = likelihood.sums(theta, tolerance=TURN_RAD)[0].normal
+        peak = Peak(theta, theta, normal, refined)
+    return calibration_at(
+        obs, nominal, likelihood, peak, status, lambda: (stages, pairs()), settings
+    )
+
+
+def calibration_at(
+    obs: Observations,
+    nominal: Camera,
+    likelihood: MarginalLikelihood,
+    peak: Peak,
+    status: Status,
+    way: Callable[[], Way],
+    settings: AnyDict,
+) -> Calibration:
+    """Everything that a calibration tells about an estimate.
+
+    `way` is called when its stages or the estimate from interstar angles are first needed. Where the
+    estimate is not refined, its covariance is that of the latter. `settings` hold ``method`` and
+    ``solver``. CalibrationError when there is no estimate that residuals could be taken at.
+    """
+    normal, least, theta = peak.normal, peak.least, peak.theta
+    if is_singular(normal.matrix):
+        raise failed(likelihood, least, nominal, reason_of(status, normal.cost))
+    dof = likelihood.dof - len(theta)
     sigma = float(np.sqrt(normal.cost / dof))
-    status = check_camera(nominal.with_theta(theta), status)
-    names, factors = undetermined(likelihood, theta, normal.matrix, sigma, nominal, status)
-    if names:
-        status = Status.SINGULAR
-    pair_covariance = pairs.covariance * np.outer(factors, factors)
-    efficient, information = scaled_inverse(normal.matrix) * sigma**2, normal.matrix / sigma**2
-    compressed = compress(likelihood, theta, efficient)
-    if refined and status.ok:
-        compressed = settled(compressed)
-        theta, last = compressed.theta_hat, stages[-1]
-        sigma = float(np.sqrt(compressed.gram[0, 0] / dof))
-        efficient = unit_covariance(compressed) * sigma**2
-        information = symmetric_inverse(efficient)
-        ended = replace(
-            last,
-            trajectory=np.vstack([last.trajectory, theta]),
-            cost=np.append(last.cost, compressed.gram[0, 0]),
-        )
-        stages = [*stages[:-1], ended]
-    if refined:
-        # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma: one
-        # Newton step.
-        theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
+    settling = peak.refined and status.ok
+    status = check_camera(nominal.with_theta(least), status)
+    names, factors = undetermined(likelihood, least, normal.matrix, sigma, nominal, status)
+    wide = np.outer(factors, factors)
+    efficient = scaled_inverse(normal.matrix) * sigma**2
     e = np.empty((2, likelihood.frames.n_stars))
     sums, attitudes = likelihood.sums(theta, e)
+    gone = Later(way)
+
+    def compressed() -> CompressedLikelihood:
+        found = compress(likelihood, least, efficient, attitudes.at(least))
+        return settled(found) if settling else found
+
+    pair_covariance = Later(lambda: gone.value[1].covariance * wide)
     made = {name: settings[name] for name in ("method", "solver")}
     return Calibration.of(
         nominal,
@@ -109,18 +155,18 @@ def assemble(
         theta=theta,
         sigma=sigma,
         dof=dof,
-        status=status,
+        status=Status.SINGULAR if names else status,
         record={"kernels": likelihood.kernels} | coma_record(nominal, factors),
-        covariance=efficient * np.outer(factors, factors) if refined else pair_covariance,
-        stages=tuple(stages),
+        covariance=efficient * wide if peak.refined else pair_covariance.value,
+        stages=Later(lambda: tuple(gone.value[0])),
         undetermined=names,
         chi2=sums.normal.cost,
-        information=information,
+        information=normal.matrix / sigma**2,
         rotation_per_theta=np.mean(attitudes.response, axis=2),
         attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
-        pair_theta=pairs.theta,
+        pair_theta=Later(lambda: gone.value[1].theta),
         pair_covariance=pair_covariance,
-        compressed=compressed,
+        compressed=Later(compressed),
     )
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.attitude.wahba import DegenerateFrameError
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, undistorted
 from starcal_uq.core.errors import CalibrationError
@@ -16,12 +19,15 @@ from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.assemble import (
     IMPLAUSIBLE_NOISE,
     PairEstimate,
+    Way,
     assemble,
+    calibration_at,
     check_count,
     check_noise,
     failed,
     noise_of,
     noise_px,
+    peak_near,
     raise_unless_good,
 )
 from starcal_uq.estimation.kept import KeptFrames
@@ -56,10 +62,12 @@ from starcal_uq.observations.table import Observations
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong
 # distortion.
 _FAR = 0.05
+# Stars that are explained to this, px per axis, are the ones they are said to be.
+_PLAIN_NOISE_PX = 1.0
 # Frames and stars of a sample that is near enough to the minimum of all.
 _SAMPLE_FRAMES, _SAMPLE_STARS = 150, 2500
 # Stages that nobody reads need only lead to the next.
-_LEADING = Search(tolerance=1e-4, last="unseen")
+_LEADING = Search(tolerance=1e-4, seen=False)
 # Standard deviations of the last step: of the estimate from interstar angles of all frames, which
 # is then known to a thousandth of that, and of the refinement, which is left to Newton's method on
 # the expansion: a few 1e-9 of them.
@@ -88,19 +96,55 @@ def _gaussian_fit(obs: Observations, camera: Camera, settings: EstimationSetting
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
     search = Search(settings.solver, settings.max_iterations)
+    made = {"method": settings.method, "solver": settings.solver}
     refinement = None
     if settings.method == "efficient":
-        refinement = replace(search, tolerance=_gain(likelihood, _LAST_STEP), last="left")
+        refinement = replace(search, tolerance=_gain(likelihood, _LAST_STEP), seen=False)
+        # A solver and a limit of the iterations are those of every stage.
+        near = _near(likelihood, camera) if search == Search() else None
+        peak = near and peak_near(likelihood, near.theta)
+        if near and peak and noise_of(peak.normal.cost, likelihood.frames) <= _PLAIN_NOISE_PX:
+            way = partial(_way, pairs, camera, search, refinement, near)
+            found = calibration_at(obs, camera, likelihood, peak, near.status, way, made)
+            if found.status.ok:
+                return found
     stages, status = _stages(pairs, camera, likelihood, search, refinement)
-    pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
-    estimate = _pair_estimate(pairs, likelihood, pair_theta)
-    made = {"method": settings.method, "solver": settings.solver}
+    estimate = partial(_pair_estimate, pairs, likelihood, stages)
     return assemble(obs, camera, likelihood, stages, status, estimate, made)
 
 
+def _near(likelihood: MarginalLikelihood, camera: Camera) -> Stage | None:
+    """The refinement from a nominal camera, on a sample of the frames where that saves time; None
+    where it strays.
+
+    `likelihood` starts its later searches from there.
+    """
+    own = MarginalLikelihood(_sample(likelihood.frames), camera.distortion)
+    stage = refinement_stage(own, camera.theta, _LEADING)
+    if _strayed(stage, camera):
+        return None
+    likelihood.use_rotations(likelihood.start_rotations(stage.theta))
+    return stage
+
+
+def _way(
+    pairs: PairObjective, camera: Camera, search: Search, refinement: Search, near: Stage
+) -> Way:
+    """What leads to an estimate through interstar angles, or else from `near`."""
+    own = MarginalLikelihood(pairs.frames, camera.distortion)
+    try:
+        stages, _ = _stages(pairs, camera, own, search, refinement)
+    except DegenerateFrameError:
+        none = np.full((len(near.theta), len(near.theta)), np.nan)
+        return [near], PairEstimate(none[0], none)
+    last = [] if stages[-1].name == near.name else [near]
+    return stages + last, _pair_estimate(pairs, own, stages)
+
+
 def _pair_estimate(
-    pairs: PairObjective, likelihood: MarginalLikelihood, pair_theta: FloatArray
+    pairs: PairObjective, likelihood: MarginalLikelihood, stages: Sequence[Stage]
 ) -> PairEstimate:
+    pair_theta = [stage.theta for stage in stages if stage.name != "refinement"][-1]
     # The scatter of many frames needs no noise.
     chi2 = (
         np.nan if enough_frames(pairs) else likelihood.profile(pair_theta, likelihood.rotations)[1]
@@ -149,7 +193,7 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
     check_count(likelihood, start)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     theta = cal.camera.replace(distortion=model).theta
-    search = Search(tolerance=_gain(likelihood, _LAST_STEP), last="unseen")
+    search = Search(tolerance=_gain(likelihood, _LAST_STEP), seen=False)
     stage = refinement_stage(likelihood, theta, search)
     try:
         return _fitted(likelihood, start, stage.theta, stage.status)
@@ -185,7 +229,7 @@ def _stages(
     """
     stages: list[Stage] = []
     if refinement is not None and search.solver == "lm":
-        near = replace(search, tolerance=_gain(likelihood, _LAST_PAIR_STEP), last="unseen")
+        near = replace(search, tolerance=_gain(likelihood, _LAST_PAIR_STEP), seen=False)
         stages = _sampled_stages(pairs, camera, near)
     stages = stages or _pair_stages(pairs, camera, search)
     most = IMPLAUSIBLE_NOISE * camera.width_px
@@ -197,7 +241,7 @@ def _stages(
         own = MarginalLikelihood(likelihood.frames, camera.distortion)
         direct = direct_stage(own, camera, search.max_iterations)
         if direct.status.ok:
-            if search.last == "seen" or noise_px(own, direct.theta) > noise:
+            if search.seen or noise_px(own, direct.theta) > noise:
                 again = joint_stage(pairs, camera, direct.theta, search)
                 stages[-1] = min(stages[-1], again, key=_badness)
                 noise = _noise_at(pairs, likelihood, stages[-1].theta)
@@ -250,7 +294,7 @@ def _with_noise_model(
         search = Search(max_iterations=max_iterations, tolerance=REFINEMENT_TOLERANCE)
         stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, search)]
         pairs = PairObjective(likelihood.frames, camera.distortion)
-        estimate = _pair_estimate(pairs, likelihood, calibration.pair_theta)
+        estimate = partial(_pair_estimate, pairs, likelihood, stages)
         made = {"method": settings.method, "solver": settings.solver}
         calibration = assemble(obs, camera, likelihood, stages, stages[-1].status, estimate, made)
     return model, calibration
@@ -358,7 +402,7 @@ def _robust_fit(obs: Observations, camera: Camera, settings: EstimationSettings)
         rotation_per_theta=information.rotation_per_theta,
         attitude_noise=information.attitude_noise,
         pair_theta=pair_theta,
-        pair_covariance=_pair_estimate(pairs, gaussian, pair_theta).covariance,
+        pair_covariance=_pair_estimate(pairs, gaussian, start.stages).covariance,
         compressed=compress_reweighted(found),
     )
 
@@ -371,13 +415,10 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, search: Search) -> lis
     many frames that it saves time, or where the sample or all frames from its estimate do not
     converge.
     """
-    frames = pairs.frames
-    wanted = max(_SAMPLE_FRAMES, -(-_SAMPLE_STARS * frames.n_frames // frames.n_stars))
-    if frames.n_frames < 3 * wanted:
+    frames, some = pairs.frames, _sample(pairs.frames)
+    if some is frames:
         return []
-    chosen = np.zeros(frames.n_frames, dtype=bool)
-    chosen[one_of_each(frames.n_frames, wanted)] = True
-    sample = PairObjective(frames.select(np.repeat(chosen, frames.sizes)), pairs.model_name)
+    sample = PairObjective(some, pairs.model_name)
     leading = replace(_LEADING, max_iterations=search.max_iterations)
     stages = _pair_stages(sample, camera, leading)
     if not stages[-1].status.ok:
@@ -391,6 +432,15 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, search: Search) -> lis
         replace(stage, cost=stage.cost * scales.get(stage.name, by_pair)) for stage in stages[:-1]
     ]
     return [*first, begun_on_sample(stages[-1], last, by_pair)]
+
+
+def _sample(frames: StarFrames) -> StarFrames:
+    """Some of the frames, where there are so many that it saves time."""
+    wanted = max(_SAMPLE_FRAMES, -(-_SAMPLE_STARS * frames.n_frames // frames.n_stars))
+    if frames.n_frames < 3 * wanted:
+        return frames
+    chosen = np.isin(np.arange(frames.n_frames), one_of_each(frames.n_frames, wanted))
+    return frames.select(np.repeat(chosen, frames.sizes))
 
 
 def _pair_stages(pairs: PairObjective, camera: Camera, search: Search) -> list[Stage]:

@@ -18,6 +18,7 @@ from starcal_uq.camera.projection import fold_radius_px, unproject
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, reading
+from starcal_uq.core.later import Deferring
 from starcal_uq.core.manifest import digest
 from starcal_uq.core.provenance import Provenance, Traced, in_order, provenance
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
@@ -97,13 +98,16 @@ _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
 
 
 @dataclass(frozen=True)
-class Calibration(Shown, Traced):
+class Calibration(Deferring, Shown, Traced):
     """Optics and distortion estimated from star observations.
 
     p is the number of parameters, K of frames, N of stars. A recursive method that was given a
     stream of frames has kept none of them: its `frame_ids`, `quaternions` and `residuals_px` are
     empty, `chi2` and `compressed` are those of the linearised frames, and `n_stars` and `n_frames`
     count what went by.
+
+    `stages`, `pair_theta`, `pair_covariance` and `compressed` may be computed when they are first
+    read; until then the calibration keeps the stars. Files hold them.
 
     Attributes
     ----------

@@ -24,7 +24,6 @@ from starcal_uq.likelihood.paths import sums_for
 from starcal_uq.likelihood.solvers import (
     Constraints,
     Evaluate,
-    Last,
     Normal,
     Solution,
     levenberg_marquardt,
@@ -55,9 +54,9 @@ class Search:
 
     solver: str = "lm"
     max_iterations: int = ITERATIONS
-    # Relative gain of the last step, and what becomes of that step, both of Levenberg-Marquardt.
+    # Relative gain of the last step of Levenberg-Marquardt, and whether the model is evaluated after it.
     tolerance: float = PAIR_TOLERANCE
-    last: Last = "seen"
+    seen: bool = True
 
     def minimum(self, evaluate: Evaluate, start: FloatArray) -> Solution:
         """Levenberg-Marquardt from a start (p,)."""
@@ -66,7 +65,7 @@ class Search:
             start,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
-            last=self.last,
+            seen=self.seen,
         )
 
 

@@ -133,8 +133,15 @@ def without_ties(obs: Observations, cal: Calibration) -> Calibration:
     likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=True)
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     stages, settings = [*cal.stages[:-1]], dict(cal.provenance.settings)
-    pairs = PairEstimate(cal.pair_theta, cal.pair_covariance)
-    found = assemble(obs, cal.nominal, likelihood, stages, Status.CONVERGED, pairs, settings)
+    found = assemble(
+        obs,
+        cal.nominal,
+        likelihood,
+        stages,
+        Status.CONVERGED,
+        lambda: PairEstimate(cal.pair_theta, cal.pair_covariance),
+        settings,
+    )
     if not found.status.ok:
         return cal
     provenance = _with_coma(cal, found.width_factors)

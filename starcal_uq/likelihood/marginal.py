@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.camera.projection import forward_kernel, forward_root
+from starcal_uq.camera.projection import forward_kernel, forward_root, slope_kernel
 from starcal_uq.core.types import FloatArray
 from starcal_uq.likelihood.arrays import BLOCK_STARS, attitudes
 from starcal_uq.likelihood.elimination import ByFrame, products_by_frame
@@ -381,6 +381,25 @@ class MarginalLikelihood:
         eliminated.
         """
         return self.project_out(state, columns).reshape(len(columns), -1)
+
+    def slope(self, theta: FloatArray, sigma: float, near: Attitudes) -> FloatArray:
+        """Slope (p,) of minus the log likelihood at theta (p,), times ``sigma**2``; attitudes follow
+        from `near`.
+        """
+        frames, rotations = self.frames, near.at(theta)
+        weight = np.linalg.inv(np.eye(2) if frames.axes is None else frames.axes).ravel()
+        kernel, slope = slope_kernel(self.model_name), np.zeros_like(theta)
+        for first, last in frames.parts(BLOCK_STARS):
+            part, response = frames.part(first, last), near.response[..., first:last]
+            b = part.rotated(rotations[first:last])
+            root = forward_root(self.model_name, theta, b)
+            inverse = part.spread(sigma**2 * near.inverse[..., first:last].reshape(9, -1))
+            (found,) = kernel(part.n_stars, theta, b, root, part.pixel, weight, inverse)
+            if part.weight is not None:
+                found *= part.weight**2
+            turned = np.einsum("ik,ipk->p", part.sum(found[-3:]), response)
+            slope += found[:-3].sum(axis=1) + turned
+        return slope
 
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,6 @@ class Normal(NamedTuple):
 
 
 Evaluate = Callable[[FloatArray], Normal]
-Last = Literal["seen", "unseen", "left"]
 Residuals = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
@@ -108,15 +107,13 @@ def levenberg_marquardt(
     *,
     max_iterations: int = 200,
     tolerance: float = 1e-15,
-    last: Last = "seen",
+    seen: bool = True,
 ) -> Solution:
     """Minimise a sum of squares from its normal equations.
 
     `max_iterations`: most accepted and refused steps.
     `tolerance`: converged when the predicted relative reduction of the cost is below this.
-    `last`: what becomes of a full step that promises no more than `tolerance`: it is taken and the
-    model evaluated
-        there, taken without that, or left to what follows.
+    `seen`: whether the model is evaluated after a full step that promises no more than `tolerance`.
     It ends CONVERGED, MAX_ITERATIONS, SINGULAR, STALLED or NOT_FINITE.
     """
     theta = np.array(start, dtype=np.float64)
@@ -147,11 +144,10 @@ def levenberg_marquardt(
         curvature = float(step @ normal.matrix @ step) / normal.cost
         penalty = damping * length**2 / normal.cost
         predicted = curvature + 2.0 * penalty
-        if last != "seen" and damping == 0.0 and predicted <= tolerance:
-            if last == "unseen":
-                theta = trial_theta
-                trajectory.append(theta)
-                costs.append(normal.cost * (1.0 - predicted))
+        if not seen and damping == 0.0 and predicted <= tolerance:
+            theta = trial_theta
+            trajectory.append(theta)
+            costs.append(normal.cost * (1.0 - predicted))
             return finish(Status.CONVERGED)
         trial = evaluate(trial_theta)
         evaluations += 1

@@ -253,16 +253,32 @@ def _lookalikes(marks: Fingerprints) -> tuple[IntArray, IntArray]:
     reach = _REACH_SIGMAS * (float(np.median(marks.error_px)) / 1.1774 + 1e-4)
     points = triangles[frame, which].view(np.float64)
     points /= np.repeat([_REACH_PX, reach, reach], 2)
+    # Most have no other near in three of the coordinates; a tree of the rest is small.
+    kept = np.flatnonzero(_crowded(points[:, 3:]))
+    first = np.isin(kept, np.unique(frame, return_index=True)[1])
+    points, frame = points[kept], frame[kept]
     tree = cKDTree(points)
     near = tree.query(points, _NEAREST, p=np.inf, distance_upper_bound=1.0)[1]
     row, column = np.nonzero(near < len(frame))
     low, high = np.sort([frame[row], frame[near[row, column]]], axis=0)
     n = len(marks.sizes)
     pairs = np.stack(np.divmod(np.unique((low * n + high)[low != high]), n), axis=1)
-    some, at = np.unique(frame, return_index=True)
     partners = np.zeros(n, dtype=np.int64)
-    partners[some] = tree.query_ball_point(points[at], 1.0, p=np.inf, return_length=True) - 1
+    partners[frame[first]] = (
+        tree.query_ball_point(points[first], 1.0, p=np.inf, return_length=True) - 1
+    )
     return pairs, partners
+
+
+def _crowded(points: FloatArray) -> BoolArray:
+    """Whether another of points (n, 3) may be within one of each along all axes."""
+    crowded = np.zeros(len(points), dtype=bool)
+    # Such points share a cell of twice that size in one of eight grids; few cells share a number.
+    for shift in np.ndindex(2, 2, 2):
+        number = np.floor(0.5 * (points + shift)) @ (1.0, 4099.0, 16801801.0)
+        _, cell, count = np.unique(number, return_inverse=True, return_counts=True)
+        crowded |= count[cell] > 1
+    return crowded
 
 
 def _common(

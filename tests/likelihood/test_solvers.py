@@ -7,7 +7,7 @@ import pytest
 
 from starcal_uq.core.status import Status
 from starcal_uq.likelihood.ipopt import ipopt
-from starcal_uq.likelihood.solvers import Constraints, Last, Normal, levenberg_marquardt, minpack
+from starcal_uq.likelihood.solvers import Constraints, Normal, levenberg_marquardt, minpack
 
 # Data, starts and certified values: NIST StRD,
 # https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml
@@ -155,20 +155,15 @@ def test_iteration_limit_is_named():
     )
 
 
-def test_last_step_is_taken_unseen_or_left():
+def test_last_step_is_taken_unseen():
     evaluate, start = _normal(_saturation(MISRA1A)), np.array([250.0, 5e-4])
-    seen, unseen, left = (
-        levenberg_marquardt(evaluate, start, tolerance=1e-8, last=x) for x in Last.__args__
+    seen, unseen = (
+        levenberg_marquardt(evaluate, start, tolerance=1e-8, seen=x) for x in (True, False)
     )
-    assert (unseen.status, left.status) == (Status.CONVERGED, Status.CONVERGED)
-    assert unseen.evaluations == left.evaluations == seen.evaluations - 1
-    assert np.array_equal(unseen.theta, seen.theta) and np.array_equal(
-        left.theta, seen.trajectory[-2]
-    )
-    assert (
-        unseen.costs[-1] == pytest.approx(seen.costs[-1], rel=1e-10)
-        and unseen.normal.cost == left.normal.cost
-    )
+    assert unseen.status is Status.CONVERGED
+    assert unseen.evaluations == seen.evaluations - 1
+    assert np.array_equal(unseen.theta, seen.theta)
+    assert unseen.costs[-1] == pytest.approx(seen.costs[-1], rel=1e-10)
 
 
 def test_exact_fit_converges():

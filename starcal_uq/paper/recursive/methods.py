@@ -75,7 +75,7 @@ def least_squares(
         likelihood,
         [stage],
         status,
-        PairEstimate(stage.theta, covariance),
+        lambda: PairEstimate(stage.theta, covariance),
         {"method": "least_squares", "solver": solver} | settings,
     )
 
@@ -122,7 +122,7 @@ def recursive(
         likelihood,
         stages,
         status,
-        PairEstimate(estimate.theta, estimate.covariance),
+        lambda: PairEstimate(estimate.theta, estimate.covariance),
         filtering.settings(estimate, stream=False),
     )
 
