@@ -347,14 +347,13 @@ COMMANDS = {
 ELSEWHERE = {
     "calibrate OBS CAMERA --effects temperature": "tests/cli/test_steps_effects.py",
     "centroid": "tests/cli/test_images.py",
-    "demo": "tests/cli/test_commands.py",
+    "demo": "tests/runs/test_run.py",
     "diagnose RUN": "tests/cli/test_statistics.py",
     "diagnose RUN --force": "tests/cli/test_statistics.py",
     "inspect RUN": "tests/cli/test_images.py",
     "propagate RUN --attitudes PROFILE": "tests/cli/test_mission.py",
     "propagate RUN --temperature-profile FILE": "tests/cli/test_steps_effects.py",
     "propagate RUN --temperature-profile FILE --force": "tests/cli/test_steps_effects.py",
-    "report": "tests/presentation/test_report.py",
     "report RUN --format pdf": "tests/presentation/test_report.py",
     "report RUN --notebook": "tests/presentation/test_report.py",
     "schema": "tests/cli/test_schemas.py",
@@ -539,7 +538,8 @@ def texts():
     """All texts of the package; those of the help stand in a table beside the modules."""
     for _, tree in trees():
         yield from sentences(tree)
-    for path in (*(PACKAGE / "cli").glob("*.toml"), *(PACKAGE / "presentation").rglob("*.toml")):
+    cli, presentation = PACKAGE / "cli", PACKAGE / "presentation"
+    for path in (*cli.glob("*.toml"), *cli.glob("*.txt"), *presentation.rglob("*.toml")):
         yield path.read_text(encoding="utf-8").replace("\\\n", "")
 
 
