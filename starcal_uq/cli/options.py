@@ -174,7 +174,9 @@ def _known_to(reader: str) -> Callable[[str], None]:
         try:
             attrgetter(name)(import_module(f"starcal_uq.{module}"))(text)
         except StarcalError as error:
-            raise typer.BadParameter(str(error).removeprefix("The time ")) from None
+            # The option says what it is of.
+            words = str(error).removeprefix("The time ").removeprefix("distortion model ")
+            raise typer.BadParameter(words) from None
 
     return check
 
